@@ -30,7 +30,6 @@ from flows.results.dataset import check, count
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.body.model import BodyParameters
 from worldpose.detection.enlargement import SeesParts, expect_parts
-from worldpose.detection.interfaces import People
 from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.formats.challenge import write_moving_camera
@@ -87,7 +86,7 @@ def measure_detection(options: Namespace) -> Tables:
         detector = load_bundled_detector(weights[0])
         assert isinstance(detector, SeesParts)
         looking, found = time_work(partial(detector.detect_parts, pictures, parts))
-        people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]
+        people = [p.select(p.scores >= SURE) for p in found]
         pose = load_bundled_pose(weights[1])
         pairs = list(zip(pictures, (each.boxes for each in people), strict=True))
         posing, _ = time_work(partial(list, starmap(pose.estimate, pairs)))

@@ -38,7 +38,7 @@ from worldpose.static_calibration.from_paint.proposal import (
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 from worldpose.static_calibration.sides import SeenPeople, decide_sides, turn_camera
-from worldpose.tracking.feet import locate_feet
+from worldpose.tracking.plane.feet import locate_feet
 
 Lines = dict[str, list[list[float]]]
 """Drawn points of one image by marking, as shares of its width and height."""

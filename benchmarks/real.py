@@ -62,8 +62,8 @@ from worldpose.static_calibration.line_refinement import LineRefinement
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.store.store import Store
-from worldpose.tracking.feet import locate_feet
-from worldpose.tracking.ground_tracks import track_on_plane
+from worldpose.tracking.plane.feet import locate_feet
+from worldpose.tracking.plane.tracker import track_on_plane
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.training.labels import PictureCache, read_labels
 from worldpose.training.metrics import score_keypoints

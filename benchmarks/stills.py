@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from common import fetch_file, read_changes, read_image, run_worldpose, tell
 from registry import DATA, SET, Table, Tables, benchmark, integer, option
+from yolo_labels import read_yolo_labels
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.detection.interfaces import People
@@ -33,7 +34,6 @@ from worldpose.training.labels import (
     PictureCache,
     read_labels,
     read_picture,
-    read_yolo_labels,
     write_labels,
 )
 from worldpose.training.metrics import (
@@ -41,7 +41,6 @@ from worldpose.training.metrics import (
     detect_labelled,
     judge_boxes,
     score_keypoints,
-    score_people,
 )
 from worldpose.training.settings import FineTuningSettings
 
@@ -176,7 +175,7 @@ def keep_pitch(
     for each, still in zip(found, stills, strict=True):
         outline = outlines[still.path.name]
         on = feet_inside(each.boxes, outline)
-        people.append(People(each.boxes[on], each.scores[on]))
+        people.append(each.select(on))
         off = ~feet_inside(still.boxes, outline)
         labelled.append(replace(still, ignored=still.ignored | off))
     return people, labelled
@@ -189,7 +188,7 @@ def score_boxes(
     hits = asked = boxes = 0
     for people, still in zip(found, stills, strict=True):
         sure = people.scores >= threshold
-        _, right, _ = judge_boxes(People(people.boxes[sure], people.scores[sure]), still)
+        _, right = judge_boxes(people.select(sure), still)
         hits, boxes = hits + int(right.sum()), boxes + len(right)
         asked += int((~still.ignored).sum())
     return {
@@ -317,9 +316,8 @@ def stored_ap50(labels: Path, files: dict[str, Path]) -> float:
         load_bundled_detector(files.get("people")),
         load_bundled_pose(files.get("keypoints")),
     )
-    return score_people(detect_labelled(detector, held_out, PictureCache(1 << 28), pose), held_out)[
-        0
-    ]
+    found = detect_labelled(detector, held_out, PictureCache(1 << 28), pose)
+    return average_precision(found, held_out)
 
 
 def rendered_labels(folder: Path, scenes: int) -> Path:

@@ -6,6 +6,7 @@ reader needs no other source to know what the numbers are.
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -80,6 +81,38 @@ class ArrayLayout(Record):
     def attributes(self) -> dict[str, Any]:
         """Attributes stored with the array."""
         return {"unit": self.unit, "missing": self.missing, "about": self.about}
+
+
+_FORM = re.compile(r"\(([\w, *]*)\) (\w+) \[([^\]]+)\](?:, missing (\S+))?")
+
+
+def array_layout(name: str, form: str, about: str) -> ArrayLayout:
+    """Return the layout of an array.
+
+    Args:
+        name: its name.
+        form: dimensions, type, unit and missing value, such as
+            `(*frame, person, joint) float32 [px], missing nan`; a star marks `chunk_dim`.
+        about: meaning of the numbers, with their coordinate frame.
+
+    Raises:
+        ValueError: the form is not of this kind, or has an unknown type or missing value.
+    """
+    found = _FORM.fullmatch(form)
+    if found is None:
+        raise ValueError(f"array {name}: not the form of an array: {form!r}")
+    dims = [dim for dim in found[1].split(", ") if dim]
+    return ArrayLayout.model_validate(
+        {
+            "name": name,
+            "dims": tuple(dim.removeprefix("*") for dim in dims),
+            "dtype": found[2],
+            "unit": found[3],
+            "missing": found[4] or "none",
+            "about": about,
+            "chunk_dim": next((dim[1:] for dim in dims if dim.startswith("*")), None),
+        }
+    )
 
 
 class GroupLayout(Record):

@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
 from data_contracts.tracking import PERSON
 from data_contracts.triangulation import EXTRA_JOINTS
 
-
-def _pose_array(name: str, length: str, unit: str, about: str) -> ArrayLayout:
-    return ArrayLayout(
-        name=name,
-        dims=("frame", "person", length),
-        dtype="float64",
-        unit=unit,
-        missing="nan",
-        about=about,
-        chunk_dim="frame",
-    )
-
-
 EXTRA_BODIES = (
     *EXTRA_JOINTS,
-    ArrayLayout(
-        name="extra_offsets",
-        dims=("point", "segment_axis"),
-        dtype="float64",
-        unit="m",
-        missing="none",
-        about="offset from the body's point to the detector's, in the axes of the point's segment, "
+    array_layout(
+        "extra_offsets",
+        "(point, segment_axis) float64 [m]",
+        "offset from the body's point to the detector's, in the axes of the point's segment, "
         "the same for all persons",
     ),
 )
@@ -40,69 +24,54 @@ BODY_FITTING = GroupLayout(
     about="Shape, pose, orientation and translation of every person's body model.",
     coordinates=(FRAME, PERSON),
     arrays=(
-        ArrayLayout(
-            name="betas",
-            dims=("person", "shape_component"),
-            dtype="float64",
-            unit="1",
-            missing="nan",
-            about="body shape; comparable only within one body model",
+        array_layout(
+            "betas",
+            "(person, shape_component) float64 [1], missing nan",
+            "body shape; comparable only within one body model",
         ),
-        ArrayLayout(
-            name="betas_covariance",
-            dims=("person", "shape_component", "shape_component_"),
-            dtype="float64",
-            unit="1",
-            missing="nan",
-            about="covariance of `betas`",
+        array_layout(
+            "betas_covariance",
+            "(person, shape_component, shape_component_) float64 [1], missing nan",
+            "covariance of `betas`",
         ),
-        _pose_array("global_orient", "rotation", "rad", "axis-angle of the pelvis, world"),
-        _pose_array("body_pose", "rotation_23", "rad", "axis-angle of the 23 other joints"),
-        _pose_array("transl", "coordinate", "m", "translation, world, added after rotation"),
-        ArrayLayout(
-            name="joints",
-            dims=("frame", "person", "joint", "coordinate"),
-            dtype="float64",
-            unit="m",
-            missing="nan",
-            about="keypoints of the bodies, world",
-            chunk_dim="frame",
+        array_layout(
+            "global_orient",
+            "(*frame, person, rotation) float64 [rad], missing nan",
+            "axis-angle of the pelvis, world",
         ),
-        ArrayLayout(
-            name="covariance",
-            dims=("frame", "person", "joint", "coordinate", "coordinate_"),
-            dtype="float64",
-            unit="m^2",
-            missing="nan",
-            about="covariance of `joints`: from poses, the detector's offsets, individual offsets "
+        array_layout(
+            "body_pose",
+            "(*frame, person, rotation_23) float64 [rad], missing nan",
+            "axis-angle of the 23 other joints",
+        ),
+        array_layout(
+            "transl",
+            "(*frame, person, coordinate) float64 [m], missing nan",
+            "translation, world, added after rotation",
+        ),
+        array_layout(
+            "joints",
+            "(*frame, person, joint, coordinate) float64 [m], missing nan",
+            "keypoints of the bodies, world",
+        ),
+        array_layout(
+            "covariance",
+            "(*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan",
+            "covariance of `joints`: from poses, the detector's offsets, individual offsets "
             "and the bias that all views share",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="filled",
-            dims=("frame", "person"),
-            dtype="bool",
-            unit="1",
-            missing="none",
-            about="the frame has no joint of the person; the motion model filled the body",
-            chunk_dim="frame",
+        array_layout(
+            "filled",
+            "(*frame, person) bool [1]",
+            "the frame has no joint of the person; the motion model filled the body",
         ),
-        ArrayLayout(
-            name="guided",
-            dims=("frame", "person"),
-            dtype="bool",
-            unit="1",
-            missing="none",
-            about="a monocular estimate contributed to the body",
-            chunk_dim="frame",
+        array_layout(
+            "guided", "(*frame, person) bool [1]", "a monocular estimate contributed to the body"
         ),
-        ArrayLayout(
-            name="joint_offsets",
-            dims=("joint", "body_axis"),
-            dtype="float64",
-            unit="m",
-            missing="none",
-            about="offset from the body's joint to the detector's joint, the same for all persons",
+        array_layout(
+            "joint_offsets",
+            "(joint, body_axis) float64 [m]",
+            "offset from the body's joint to the detector's joint, the same for all persons",
         ),
         *EXTRA_BODIES,
     ),

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.cameras import CAMERA_LABELS
 from data_contracts.keypoints import FRAME
 from data_contracts.records import CONTRACT_VERSION, FRAME_LIMIT, Record
@@ -42,26 +42,6 @@ FRAME_STATUS = ("missing", "bridged", "followed", "players", "lines", "key_frame
 of the background, players, painted lines detected in the image, or clicks."""
 
 
-def _by_frame(
-    name: str, dims: tuple[str, ...], unit: str, about: str, missing: Literal["nan"] = "nan"
-) -> ArrayLayout:
-    return ArrayLayout(
-        name=name,
-        dims=("frame", *dims),
-        dtype="float64",
-        unit=unit,
-        missing=missing,
-        about=about,
-        chunk_dim="frame",
-    )
-
-
-def _count_array(name: str, about: str) -> ArrayLayout:
-    return ArrayLayout(
-        name=name, dims=("frame",), dtype="int32", unit="1", missing="0", about=about
-    )
-
-
 _BEFORE = "the same before the joint fit with players: each frame from its painted lines alone"
 
 BROADCAST_CALIBRATION = GroupLayout(
@@ -69,77 +49,95 @@ BROADCAST_CALIBRATION = GroupLayout(
     about="The broadcast camera in every frame of a clip, with covariance and evidence.",
     coordinates=(FRAME,),
     arrays=(
-        _by_frame("focal", ("axis",), "px", "focal lengths fx, fy"),
-        _by_frame("principal_point", ("axis",), "px", "principal point, one for the clip"),
-        _by_frame("distortion", ("coefficient",), "1", "k1, k2, p1, p2, k3 in OpenCV's order"),
-        _by_frame("rotation", ("cam_coordinate", "coordinate"), "1", "R in x_cam = R x_world + t"),
-        _by_frame("translation", ("cam_coordinate",), "m", "t in x_cam = R x_world + t"),
-        ArrayLayout(
-            name="image_size",
-            dims=("axis",),
-            dtype="int64",
-            unit="px",
-            missing="none",
-            about="width, height",
+        array_layout("focal", "(*frame, axis) float64 [px], missing nan", "focal lengths fx, fy"),
+        array_layout(
+            "principal_point",
+            "(*frame, axis) float64 [px], missing nan",
+            "principal point, one for the clip",
         ),
-        ArrayLayout(
-            name="center",
-            dims=("coordinate",),
-            dtype="float64",
-            unit="m",
-            missing="none",
-            about="the camera's center, world, one for the clip",
+        array_layout(
+            "distortion",
+            "(*frame, coefficient) float64 [1], missing nan",
+            "k1, k2, p1, p2, k3 in OpenCV's order",
         ),
-        _by_frame(
+        array_layout(
+            "rotation",
+            "(*frame, cam_coordinate, coordinate) float64 [1], missing nan",
+            "R in x_cam = R x_world + t",
+        ),
+        array_layout(
+            "translation",
+            "(*frame, cam_coordinate) float64 [m], missing nan",
+            "t in x_cam = R x_world + t",
+        ),
+        array_layout("image_size", "(axis) int64 [px]", "width, height"),
+        array_layout(
+            "center", "(coordinate) float64 [m]", "the camera's center, world, one for the clip"
+        ),
+        array_layout(
             "covariance",
-            ("parameter", "parameter_"),
-            "1",
+            "(*frame, parameter, parameter_) float64 [1], missing nan",
             "covariance of a step of the frame's camera, in the units of its parameters; zero for "
             "parameters that were not solved for",
         ),
-        _by_frame(
+        array_layout(
             "shared_covariance",
-            ("parameter", "clip_parameter"),
-            "1",
+            "(*frame, parameter, clip_parameter) float64 [1], missing nan",
             "covariance of a step of the frame's camera with what all frames share",
         ),
-        ArrayLayout(
-            name="clip_covariance",
-            dims=("clip_parameter", "clip_parameter_"),
-            dtype="float64",
-            unit="1",
-            missing="none",
-            about="covariance of what all frames share",
+        array_layout(
+            "clip_covariance",
+            "(clip_parameter, clip_parameter_) float64 [1]",
+            "covariance of what all frames share",
         ),
-        _by_frame("focal_before", ("axis",), "px", _BEFORE),
-        _by_frame("principal_point_before", ("axis",), "px", _BEFORE),
-        _by_frame("distortion_before", ("coefficient",), "1", _BEFORE),
-        _by_frame("rotation_before", ("cam_coordinate", "coordinate"), "1", _BEFORE),
-        _by_frame("translation_before", ("cam_coordinate",), "m", _BEFORE),
-        ArrayLayout(
-            name="status",
-            dims=("frame",),
-            dtype="uint8",
-            unit="1",
-            missing="0",
-            about="evidence for the frame's camera, an index into the attribute `status_names`",
+        array_layout("focal_before", "(*frame, axis) float64 [px], missing nan", _BEFORE),
+        array_layout("principal_point_before", "(*frame, axis) float64 [px], missing nan", _BEFORE),
+        array_layout(
+            "distortion_before", "(*frame, coefficient) float64 [1], missing nan", _BEFORE
         ),
-        _by_frame(
+        array_layout(
+            "rotation_before",
+            "(*frame, cam_coordinate, coordinate) float64 [1], missing nan",
+            _BEFORE,
+        ),
+        array_layout(
+            "translation_before", "(*frame, cam_coordinate) float64 [m], missing nan", _BEFORE
+        ),
+        array_layout(
+            "status",
+            "(frame) uint8 [1], missing 0",
+            "evidence for the frame's camera, an index into the attribute `status_names`",
+        ),
+        array_layout(
             "reprojection_error",
-            (),
-            "px",
+            "(*frame) float64 [px], missing nan",
             "expected image error of a player's position, root mean square over the visible pitch",
         ),
-        _by_frame(
+        array_layout(
             "marking_rms",
-            (),
-            "px",
+            "(*frame) float64 [px], missing nan",
             "rms distance of detected painted lines, across them",
         ),
-        _by_frame("player_rms", (), "px", "rms residual of the keypoints of matched players"),
-        _count_array("marking_count", "samples of painted lines used in the frame"),
-        _count_array("player_count", "players matched with people from the static cameras"),
-        _count_array("flow_count", "points tracked from this frame to the next"),
+        array_layout(
+            "player_rms",
+            "(*frame) float64 [px], missing nan",
+            "rms residual of the keypoints of matched players",
+        ),
+        array_layout(
+            "marking_count",
+            "(frame) int32 [1], missing 0",
+            "samples of painted lines used in the frame",
+        ),
+        array_layout(
+            "player_count",
+            "(frame) int32 [1], missing 0",
+            "players matched with people from the static cameras",
+        ),
+        array_layout(
+            "flow_count",
+            "(frame) int32 [1], missing 0",
+            "points tracked from this frame to the next",
+        ),
     ),
     labels={
         **CAMERA_LABELS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout
+from data_contracts.arrays import array_layout
 from data_contracts.tracking import TRACKING
 
 _GROUND = ("ground", "ground_velocity", "ground_covariance", "ground_height")
@@ -12,14 +12,10 @@ BROADCAST_TRACKING = TRACKING.model_copy(
         "stage": "broadcast_tracking",
         "about": "The people of a broadcast clip on the pitch, where no static camera films them.",
         "arrays": (
-            ArrayLayout(
-                name="detection_index",
-                dims=("frame", "person"),
-                dtype="int16",
-                unit="1",
-                missing="-1",
-                about="index among the clip's detections of the frame, in `ingest` or `detection`",
-                chunk_dim="frame",
+            array_layout(
+                "detection_index",
+                "(*frame, person) int16 [1], missing -1",
+                "index among the clip's detections of the frame, in `ingest` or `detection`",
             ),
             *(TRACKING.layout(name) for name in _GROUND),
         ),

@@ -2,141 +2,97 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout, GroupLayout, Missing
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.static_calibration import CAMERA_STEP
-
-
-def _of_cameras(name: str, last: str, unit: str, missing: Missing, about: str) -> ArrayLayout:
-    return ArrayLayout(
-        name=name,
-        dims=("camera", last),
-        dtype="float64",
-        unit=unit,
-        missing=missing,
-        about=about,
-    )
-
 
 _CAMERAS = tuple(
     array.model_copy(update={"dims": ("camera", *array.dims)}) for array in CAMERA_ARRAYS
 )
 _ACCEPTANCE = (
-    ArrayLayout(
-        name="camera_covariance",
-        dims=("camera", "parameter", "parameter_"),
-        dtype="float64",
-        unit="1",
-        missing="none",
-        about="covariance of a step of each camera, in the units of its parameters; zero for a "
+    array_layout(
+        "camera_covariance",
+        "(camera, parameter, parameter_) float64 [1]",
+        "covariance of a step of each camera, in the units of its parameters; zero for a "
         "given camera whose change was refused; relative to the rig if all cameras are given",
     ),
-    ArrayLayout(
-        name="accepted",
-        dims=("camera",),
-        dtype="bool",
-        unit="1",
-        missing="none",
-        about="the adjusted camera was accepted; otherwise it is that of `static_calibration`",
+    array_layout(
+        "accepted",
+        "(camera) bool [1]",
+        "the adjusted camera was accepted; otherwise it is that of `static_calibration`",
     ),
     *(
-        ArrayLayout(
-            name=f"moved_{name}",
-            dims=("camera",),
-            dtype="float64",
-            unit=unit,
-            missing="0",
-            about=about,
-        )
+        array_layout(f"moved_{name}", f"(camera) float64 [{unit}], missing 0", about)
         for name, unit, about in (
             ("center", "m", "distance between the camera's centers before and after"),
             ("rotation", "rad", "angle between its axes before and after"),
             ("focal", "1", "relative change of its focal length"),
         )
     ),
-    ArrayLayout(
-        name="judges",
-        dims=("camera",),
-        dtype="int64",
-        unit="1",
-        missing="0",
-        about="keypoints of held-out people that validated the camera",
+    array_layout(
+        "judges",
+        "(camera) int64 [1], missing 0",
+        "keypoints of held-out people that validated the camera",
     ),
-    _of_cameras("held_out_loss", "side", "1", "nan", "mean loss of these keypoints"),
-    _of_cameras("held_out_error", "side", "px", "nan", "median error of these keypoints"),
-    _of_cameras(
+    array_layout(
+        "held_out_loss", "(camera, side) float64 [1], missing nan", "mean loss of these keypoints"
+    ),
+    array_layout(
+        "held_out_error",
+        "(camera, side) float64 [px], missing nan",
+        "median error of these keypoints",
+    ),
+    array_layout(
         "marking_error",
-        "side",
-        "px",
-        "nan",
+        "(camera, side) float64 [px], missing nan",
         "root mean square error per axis of the clicked points that calibration uses",
     ),
-    _of_cameras(
+    array_layout(
         "weak_step",
-        "parameter",
-        "1",
-        "none",
+        "(camera, parameter) float64 [1]",
         "one standard deviation along the least certain direction of the camera",
     ),
 )
 _REVIEW = (
     *(
-        ArrayLayout(
-            name=f"outlier_{name}",
-            dims=("outlier",),
-            dtype="int64",
-            unit="frame" if name == "frame" else "1",
-            missing="-1" if name == "joint" else "none",
-            about=f"{about} of an outlier keypoint, the largest Mahalanobis distance first",
+        array_layout(
+            f"outlier_{name}",
+            f"(outlier) int64 {form}",
+            f"{about} of an outlier keypoint, the largest Mahalanobis distance first",
         )
-        for name, about in (
-            ("frame", "match frame"),
-            ("camera", "index of the camera"),
-            ("person", "person id"),
-            ("joint", "joint, missing if most joints of the person in this image are outliers,"),
+        for name, form, about in (
+            ("frame", "[frame]", "match frame"),
+            ("camera", "[1]", "index of the camera"),
+            ("person", "[1]", "person id"),
+            (
+                "joint",
+                "[1], missing -1",
+                "joint, missing if most joints of the person in this image are outliers,",
+            ),
         )
     ),
-    ArrayLayout(
-        name="outlier_surprise",
-        dims=("outlier",),
-        dtype="float64",
-        unit="1",
-        missing="none",
-        about="its Mahalanobis distance to the position from the other cameras",
+    array_layout(
+        "outlier_surprise",
+        "(outlier) float64 [1]",
+        "its Mahalanobis distance to the position from the other cameras",
     ),
-    ArrayLayout(
-        name="click_camera",
-        dims=("click",),
-        dtype="int64",
-        unit="1",
-        missing="none",
-        about="camera index of a clicked point, the largest Mahalanobis distance first",
+    array_layout(
+        "click_camera",
+        "(click) int64 [1]",
+        "camera index of a clicked point, the largest Mahalanobis distance first",
     ),
-    ArrayLayout(
-        name="click_residual",
-        dims=("click", "axis"),
-        dtype="float64",
-        unit="px",
-        missing="nan",
-        about="projected minus clicked, after adjustment; missing if the camera cannot image it",
+    array_layout(
+        "click_residual",
+        "(click, axis) float64 [px], missing nan",
+        "projected minus clicked, after adjustment; missing if the camera cannot image it",
     ),
-    ArrayLayout(
-        name="click_surprise",
-        dims=("click",),
-        dtype="float64",
-        unit="1",
-        missing="nan",
-        about="Mahalanobis distance of the residual, given all other evidence; missing if the "
+    array_layout(
+        "click_surprise",
+        "(click) float64 [1], missing nan",
+        "Mahalanobis distance of the residual, given all other evidence; missing if the "
         "camera cannot image the point",
     ),
-    ArrayLayout(
-        name="click_wrong",
-        dims=("click",),
-        dtype="bool",
-        unit="1",
-        missing="none",
-        about="proposed for removal; a person decides",
-    ),
+    array_layout("click_wrong", "(click) bool [1]", "proposed for removal; a person decides"),
 )
 
 BUNDLE_ADJUSTMENT = GroupLayout(

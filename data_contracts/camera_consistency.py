@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.records import Name, Number, Record, Share
 
 FaultKind = Literal[
@@ -47,13 +47,10 @@ CAMERA_CONSISTENCY = GroupLayout(
     stage="camera_consistency",
     about="Agreement of the static cameras on the people of the clip.",
     arrays=(
-        ArrayLayout(
-            name="agreement",
-            dims=("camera", "camera_"),
-            dtype="float32",
-            unit="1",
-            missing="none",
-            about="detections of two cameras that match, above chance, per frame",
+        array_layout(
+            "agreement",
+            "(camera, camera_) float32 [1]",
+            "detections of two cameras that match, above chance, per frame",
         ),
     ),
     attributes={

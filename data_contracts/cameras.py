@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from data_contracts.arrays import ArrayLayout
+from data_contracts.arrays import array_layout
 from data_contracts.conventions import DISTORTION
 from data_contracts.records import ImageLength, Name, Record
 
@@ -71,53 +71,17 @@ CAMERA_LABELS: dict[str, tuple[str, ...]] = {
 }
 
 CAMERA_ARRAYS = (
-    ArrayLayout(
-        name="focal",
-        dims=("axis",),
-        dtype="float64",
-        unit="px",
-        missing="none",
-        about="focal lengths fx, fy",
+    array_layout("focal", "(axis) float64 [px]", "focal lengths fx, fy"),
+    array_layout(
+        "principal_point",
+        "(axis) float64 [px]",
+        "principal point cx, cy; (0, 0) is the centre of the top-left pixel",
     ),
-    ArrayLayout(
-        name="principal_point",
-        dims=("axis",),
-        dtype="float64",
-        unit="px",
-        missing="none",
-        about="principal point cx, cy; (0, 0) is the centre of the top-left pixel",
+    array_layout("distortion", "(coefficient) float64 [1]", "k1, k2, p1, p2, k3 in OpenCV's order"),
+    array_layout(
+        "rotation", "(cam_coordinate, coordinate) float64 [1]", "R in x_cam = R x_world + t"
     ),
-    ArrayLayout(
-        name="distortion",
-        dims=("coefficient",),
-        dtype="float64",
-        unit="1",
-        missing="none",
-        about="k1, k2, p1, p2, k3 in OpenCV's order",
-    ),
-    ArrayLayout(
-        name="rotation",
-        dims=("cam_coordinate", "coordinate"),
-        dtype="float64",
-        unit="1",
-        missing="none",
-        about="R in x_cam = R x_world + t",
-    ),
-    ArrayLayout(
-        name="translation",
-        dims=("cam_coordinate",),
-        dtype="float64",
-        unit="m",
-        missing="none",
-        about="t in x_cam = R x_world + t",
-    ),
-    ArrayLayout(
-        name="image_size",
-        dims=("axis",),
-        dtype="int64",
-        unit="px",
-        missing="none",
-        about="width, height",
-    ),
+    array_layout("translation", "(cam_coordinate) float64 [m]", "t in x_cam = R x_world + t"),
+    array_layout("image_size", "(axis) int64 [px]", "width, height"),
 )
 """Arrays of one static camera."""

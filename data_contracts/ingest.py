@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.keypoints import (
     EXTRA_ARRAYS,
     FRAME,
@@ -13,30 +13,17 @@ from data_contracts.keypoints import (
 )
 
 VIDEO_ARRAYS = (
-    ArrayLayout(
-        name="picture_of_frame",
-        dims=("frame",),
-        dtype="int64",
-        unit="1",
-        missing="-1",
-        about="number of the video image that shows this match frame",
+    array_layout(
+        "picture_of_frame",
+        "(frame) int64 [1], missing -1",
+        "number of the video image that shows this match frame",
     ),
-    ArrayLayout(
-        name="picture_stamp",
-        dims=("picture",),
-        dtype="int64",
-        unit="1",
-        missing="none",
-        about="presentation time stamp of each image in display order, in units of the time base",
+    array_layout(
+        "picture_stamp",
+        "(picture) int64 [1]",
+        "presentation time stamp of each image in display order, in units of the time base",
     ),
-    ArrayLayout(
-        name="picture_key",
-        dims=("picture",),
-        dtype="bool",
-        unit="1",
-        missing="none",
-        about="whether decoding can begin at this image",
-    ),
+    array_layout("picture_key", "(picture) bool [1]", "whether decoding can begin at this image"),
 )
 """The index of a video, and its mapping to match frames."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
-from data_contracts.arrays import AnyFloats, ArrayLayout, ClipArray, Flags, Integers
+from data_contracts.arrays import AnyFloats, ClipArray, Flags, Integers, array_layout
 from data_contracts.conventions import COCO17
 
 Array = TypeVar("Array", bound=ClipArray, default=AnyFloats, covariant=True)
@@ -92,18 +92,13 @@ class KeypointDetections(Generic[Array]):
             stored: arrays by name, those of `KEYPOINT_ARRAYS` and `frame`; those of
                 `EXTRA_ARRAYS` with the names `point` if there are any.
         """
-        extra: dict[str, Any] = {}
+        names = [array.name for array in KEYPOINT_ARRAYS]
+        points: tuple[str, ...] = ()
         if EXTRA_ARRAYS[0].name in stored:
-            extra = {each.name: np.asarray(stored[each.name]) for each in EXTRA_ARRAYS}
-            extra["points"] = tuple(map(str, np.asarray(stored["point"]).tolist()))
-        return KeypointDetections(
-            keypoints=np.asarray(stored["keypoints"]),
-            confidence=np.asarray(stored["confidence"]),
-            boxes=np.asarray(stored["boxes"]),
-            score=np.asarray(stored["score"]),
-            frame=np.asarray(stored["frame"]),
-            **extra,
-        )
+            names += [array.name for array in EXTRA_ARRAYS]
+            points = tuple(map(str, np.asarray(stored["point"]).tolist()))
+        arrays: dict[str, Any] = {name: np.asarray(stored[name]) for name in names}
+        return KeypointDetections(**arrays, frame=np.asarray(stored["frame"]), points=points)
 
     @staticmethod
     def concatenate(parts: Sequence[KeypointDetections]) -> KeypointDetections:
@@ -138,20 +133,14 @@ class KeypointDetections(Generic[Array]):
 
     def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
         """Return the detections of some rows of the frame dimension, in memory."""
+        arrays: dict[str, Any] = {name: array[frames] for name, array in self.arrays().items()}
         return KeypointDetections(
-            keypoints=self.keypoints[frames],
-            confidence=self.confidence[frames],
-            boxes=self.boxes[frames],
-            score=self.score[frames],
+            **arrays,
             frame=self.frame[frames] if len(self.frame) else self.frame,
             detection_index=self.detection_index[frames]
             if len(self.detection_index)
             else self.detection_index,
             points=self.points,
-            extra_keypoints=None if self.extra_keypoints is None else self.extra_keypoints[frames],
-            extra_confidence=None
-            if self.extra_confidence is None
-            else self.extra_confidence[frames],
         )
 
     def assign_people(self, detection_index: NDArray[np.integer]) -> KeypointDetections[Array]:
@@ -193,7 +182,7 @@ class KeypointDetections(Generic[Array]):
             padded[name][row] = array
         return self.with_arrays(padded, frame)
 
-    def arrays(self: KeypointDetections) -> dict[str, AnyFloats]:
+    def arrays(self) -> dict[str, Array]:
         """Return the arrays by their names in a store, `KEYPOINT_ARRAYS` and `EXTRA_ARRAYS`."""
         arrays = {
             "keypoints": self.keypoints,
@@ -283,74 +272,40 @@ KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {
     "corner": ("x0", "y0", "x1", "y1"),
 }
 
-FRAME = ArrayLayout(
-    name="frame",
-    dims=("frame",),
-    dtype="int64",
-    unit="frame",
-    missing="none",
-    about="match frame",
-)
+FRAME = array_layout("frame", "(frame) int64 [frame]", "match frame")
 
 KEYPOINT_ARRAYS = (
-    ArrayLayout(
-        name="keypoints",
-        dims=("frame", "detection", "joint", "axis"),
-        dtype="float32",
-        unit="px",
-        missing="nan",
-        about="detected 2D joints; the index of a detection in its frame identifies it",
-        chunk_dim="frame",
+    array_layout(
+        "keypoints",
+        "(*frame, detection, joint, axis) float32 [px], missing nan",
+        "detected 2D joints; the index of a detection in its frame identifies it",
     ),
-    ArrayLayout(
-        name="confidence",
-        dims=("frame", "detection", "joint"),
-        dtype="float32",
-        unit="1",
-        missing="nan",
-        about="the detector's confidence of each keypoint, in (0, 1]",
-        chunk_dim="frame",
+    array_layout(
+        "confidence",
+        "(*frame, detection, joint) float32 [1], missing nan",
+        "the detector's confidence of each keypoint, in (0, 1]",
     ),
-    ArrayLayout(
-        name="boxes",
-        dims=("frame", "detection", "corner"),
-        dtype="float32",
-        unit="px",
-        missing="nan",
-        about="bounding boxes",
-        chunk_dim="frame",
+    array_layout(
+        "boxes", "(*frame, detection, corner) float32 [px], missing nan", "bounding boxes"
     ),
-    ArrayLayout(
-        name="score",
-        dims=("frame", "detection"),
-        dtype="float32",
-        unit="1",
-        missing="nan",
-        about="the detector's confidence of each person",
-        chunk_dim="frame",
+    array_layout(
+        "score",
+        "(*frame, detection) float32 [1], missing nan",
+        "the detector's confidence of each person",
     ),
 )
 """Arrays of the people one camera saw; the detection dimension is padded with missing values."""
 
 EXTRA_ARRAYS = (
-    ArrayLayout(
-        name="extra_keypoints",
-        dims=("frame", "detection", "point", "axis"),
-        dtype="float32",
-        unit="px",
-        missing="nan",
-        about="detected points besides COCO-17, such as heels and toes; attribute `point` names "
-        "them",
-        chunk_dim="frame",
+    array_layout(
+        "extra_keypoints",
+        "(*frame, detection, point, axis) float32 [px], missing nan",
+        "detected points besides COCO-17, such as heels and toes; attribute `point` names them",
     ),
-    ArrayLayout(
-        name="extra_confidence",
-        dims=("frame", "detection", "point"),
-        dtype="float32",
-        unit="1",
-        missing="nan",
-        about="the detector's confidence of each of these points, in (0, 1]",
-        chunk_dim="frame",
+    array_layout(
+        "extra_confidence",
+        "(*frame, detection, point) float32 [1], missing nan",
+        "the detector's confidence of each of these points, in (0, 1]",
     ),
 )
 """Arrays of points besides COCO-17; absent where the detector gave none."""

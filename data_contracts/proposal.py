@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.keypoints import FRAME
 
@@ -15,21 +15,15 @@ PROPOSAL = GroupLayout(
     coordinates=(FRAME,),
     arrays=(
         *CAMERA_ARRAYS,
-        ArrayLayout(
-            name="place",
-            dims=("frame", "detection", "coordinate_2d"),
-            dtype="float64",
-            unit="m",
-            missing="nan",
-            about="x, y of people on the pitch, world, with the camera on the assumed side",
+        array_layout(
+            "place",
+            "(frame, detection, coordinate_2d) float64 [m], missing nan",
+            "x, y of people on the pitch, world, with the camera on the assumed side",
         ),
-        ArrayLayout(
-            name="place_covariance",
-            dims=("frame", "detection", "coordinate_2d", "coordinate_2d_"),
-            dtype="float64",
-            unit="m^2",
-            missing="nan",
-            about="covariance of `place` by the error of feet in the image",
+        array_layout(
+            "place_covariance",
+            "(frame, detection, coordinate_2d, coordinate_2d_) float64 [m^2], missing nan",
+            "covariance of `place` by the error of feet in the image",
         ),
     ),
     labels={

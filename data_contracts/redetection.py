@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.keypoints import (
     EXTRA_ARRAYS,
     FRAME,
@@ -20,24 +20,16 @@ REDETECTION = GroupLayout(
     arrays=(
         *KEYPOINT_ARRAYS,
         *EXTRA_ARRAYS,
-        ArrayLayout(
-            name="found_again",
-            dims=("frame", "detection"),
-            dtype="int32",
-            unit="1",
-            missing="-1",
-            about="person id of the previous iteration for a redetected person; missing for the "
+        array_layout(
+            "found_again",
+            "(*frame, detection) int32 [1], missing -1",
+            "person id of the previous iteration for a redetected person; missing for the "
             "detections of `detection`",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="shift",
-            dims=("frame", "detection", "joint", "axis"),
-            dtype="float32",
-            unit="px",
-            missing="0",
-            about="systematic error of the keypoints of redetected people, as in `filtering`",
-            chunk_dim="frame",
+        array_layout(
+            "shift",
+            "(*frame, detection, joint, axis) float32 [px], missing 0",
+            "systematic error of the keypoints of redetected people, as in `filtering`",
         ),
     ),
     labels=KEYPOINT_LABELS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout
+from data_contracts.arrays import array_layout
 from data_contracts.body_fitting import BODY_FITTING
 
 REFITTING = BODY_FITTING.model_copy(
@@ -12,32 +12,19 @@ REFITTING = BODY_FITTING.model_copy(
         "shapes of other clips; or the bodies of people that the broadcast camera alone films.",
         "arrays": (
             *BODY_FITTING.arrays,
-            ArrayLayout(
-                name="recognised",
-                dims=("frame", "person"),
-                dtype="bool",
-                unit="1",
-                missing="none",
-                about="the broadcast camera contributed a view of the person",
-                chunk_dim="frame",
+            array_layout(
+                "recognised",
+                "(*frame, person) bool [1]",
+                "the broadcast camera contributed a view of the person",
             ),
-            ArrayLayout(
-                name="pooled",
-                dims=("person",),
-                dtype="bool",
-                unit="1",
-                missing="none",
-                about="other clips contributed to the person's shape",
+            array_layout(
+                "pooled", "(person) bool [1]", "other clips contributed to the person's shape"
             ),
-            ArrayLayout(
-                name="views",
-                dims=("frame", "person", "joint"),
-                dtype="int16",
-                unit="1",
-                missing="0",
-                about="1 where the broadcast camera shows the joint; only of people that no static "
+            array_layout(
+                "views",
+                "(*frame, person, joint) int16 [1], missing 0",
+                "1 where the broadcast camera shows the joint; only of people that no static "
                 "camera films",
-                chunk_dim="frame",
             ),
         ),
         "optional": ("views", *BODY_FITTING.optional),

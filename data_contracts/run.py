@@ -37,9 +37,6 @@ class StoredFile(Record):
     size: Count
     """[byte]"""
     sha256: Digest
-    parts: tuple[tuple[Count, Digest], ...] = ()
-    """Size [byte] and SHA-256 of its consecutive parts, the chunks of an array and their index, so
-    that a reader of one chunk can verify it by itself; none for a file that is one part."""
 
 
 class ResultManifest(Record):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.records import CONTRACT_VERSION, Name, PixelCoordinate, Record
 
@@ -57,124 +57,74 @@ CAMERA_STEP = (
 logarithm of the focal length, principal point [px], distortion [1]."""
 
 _GROUND = tuple(
-    ArrayLayout(
-        name=f"ground_{axis}",
-        dims=(f"ground_{axis}",),
-        dtype="float64",
-        unit="m",
-        missing="none",
-        about=f"{axis} of the places of `ground_error`, world",
+    array_layout(
+        f"ground_{axis}",
+        f"(ground_{axis}) float64 [m]",
+        f"{axis} of the places of `ground_error`, world",
     )
     for axis in ("x", "y")
 )
 _EVIDENCE = (
-    ArrayLayout(
-        name="covariance",
-        dims=("parameter", "parameter_"),
-        dtype="float64",
-        unit="1",
-        missing="none",
-        about="covariance of a step of the camera, in the units of its parameters; zero for "
+    array_layout(
+        "covariance",
+        "(parameter, parameter_) float64 [1]",
+        "covariance of a step of the camera, in the units of its parameters; zero for "
         "parameters that were not solved for",
     ),
-    ArrayLayout(
-        name="point_pixel",
-        dims=("point", "axis"),
-        dtype="float64",
-        unit="px",
-        missing="none",
-        about="clicked pixel",
+    array_layout("point_pixel", "(point, axis) float64 [px]", "clicked pixel"),
+    array_layout(
+        "point_residual",
+        "(point, axis) float64 [px], missing nan",
+        "projected minus clicked; missing if the camera cannot image the point",
     ),
-    ArrayLayout(
-        name="point_residual",
-        dims=("point", "axis"),
-        dtype="float64",
-        unit="px",
-        missing="nan",
-        about="projected minus clicked; missing if the camera cannot image the point",
-    ),
-    ArrayLayout(
-        name="point_surprise",
-        dims=("point",),
-        dtype="float64",
-        unit="1",
-        missing="nan",
-        about="Mahalanobis distance of the residual, given the other evidence; missing if the "
+    array_layout(
+        "point_surprise",
+        "(point) float64 [1], missing nan",
+        "Mahalanobis distance of the residual, given the other evidence; missing if the "
         "camera cannot image the point",
     ),
-    ArrayLayout(
-        name="point_inlier",
-        dims=("point",),
-        dtype="bool",
-        unit="1",
-        missing="none",
-        about="the click is an inlier",
+    array_layout("point_inlier", "(point) bool [1]", "the click is an inlier"),
+    array_layout(
+        "marking_rms",
+        "(marking) float64 [px]",
+        "root mean square distance of the drawn pixels to the projected marking",
     ),
-    ArrayLayout(
-        name="marking_rms",
-        dims=("marking",),
-        dtype="float64",
-        unit="px",
-        missing="none",
-        about="root mean square distance of the drawn pixels to the projected marking",
+    array_layout(
+        "marking_worst",
+        "(marking) float64 [px]",
+        "largest distance of a drawn pixel to the projected marking",
     ),
-    ArrayLayout(
-        name="marking_worst",
-        dims=("marking",),
-        dtype="float64",
-        unit="px",
-        missing="none",
-        about="largest distance of a drawn pixel to the projected marking",
-    ),
-    ArrayLayout(
-        name="marking_inlier",
-        dims=("marking",),
-        dtype="bool",
-        unit="1",
-        missing="none",
-        about="the drawn marking is an inlier",
-    ),
-    ArrayLayout(
-        name="ground_error",
-        dims=("ground_y", "ground_x"),
-        dtype="float64",
-        unit="m",
-        missing="nan",
-        about="expected distance on the surface between a place and the back-projection of its "
+    array_layout("marking_inlier", "(marking) bool [1]", "the drawn marking is an inlier"),
+    array_layout(
+        "ground_error",
+        "(ground_y, ground_x) float64 [m], missing nan",
+        "expected distance on the surface between a place and the back-projection of its "
         "true pixel; missing outside of the camera's view",
     ),
 )
 _VENUE = (
-    ArrayLayout(
-        name="venue_number",
-        dims=("unknown",),
-        dtype="int64",
-        unit="1",
-        missing="none",
-        about="unknowns of the pitch that all cameras share: 3 p + axis = error of the template's "
+    array_layout(
+        "venue_number",
+        "(unknown) int64 [1]",
+        "unknowns of the pitch that all cameras share: 3 p + axis = error of the template's "
         "point p; from -1000000 down, uneven paint; the last two, crown and end fall",
     ),
-    *(
-        ArrayLayout(
-            name=f"venue_{name}", dims=dims, dtype="float64", unit=unit, missing="none", about=about
-        )
-        for name, dims, unit, about in (
-            ("prior_mean", ("unknown",), "m", "the unknowns before the image"),
-            ("prior", ("unknown", "unknown_"), "1/m^2", "information of `venue_prior_mean`"),
-            ("mean", ("unknown",), "m", "the unknowns at this camera"),
-            (
-                "information",
-                ("unknown", "unknown_"),
-                "1/m^2",
-                "what the evidence of this camera alone tells about the unknowns",
-            ),
-            (
-                "response",
-                ("parameter", "unknown"),
-                "1/m",
-                "step of the camera per change of the unknowns, in the units of its parameters",
-            ),
-        )
+    array_layout("venue_prior_mean", "(unknown) float64 [m]", "the unknowns before the image"),
+    array_layout(
+        "venue_prior",
+        "(unknown, unknown_) float64 [1/m^2]",
+        "information of `venue_prior_mean`",
+    ),
+    array_layout("venue_mean", "(unknown) float64 [m]", "the unknowns at this camera"),
+    array_layout(
+        "venue_information",
+        "(unknown, unknown_) float64 [1/m^2]",
+        "what the evidence of this camera alone tells about the unknowns",
+    ),
+    array_layout(
+        "venue_response",
+        "(parameter, unknown) float64 [1/m]",
+        "step of the camera per change of the unknowns, in the units of its parameters",
     ),
 )
 _ABOUT = {

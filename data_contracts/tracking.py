@@ -4,88 +4,54 @@ from __future__ import annotations
 
 from typing import Literal
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME
 from data_contracts.records import Amount, Count, Frame, Name, Number, PersonId, Record
 
-PERSON = ArrayLayout(
-    name="person",
-    dims=("person",),
-    dtype="int32",
-    unit="1",
-    missing="none",
-    about="person id, stable within the clip, from 0",
-)
+PERSON = array_layout("person", "(person) int32 [1]", "person id, stable within the clip, from 0")
 
 TRACKING = GroupLayout(
     stage="tracking",
     about="The person of every camera's detections.",
     coordinates=(FRAME, PERSON),
     arrays=(
-        ArrayLayout(
-            name="detection_index",
-            dims=("frame", "camera", "person"),
-            dtype="int16",
-            unit="1",
-            missing="-1",
-            about="index among this camera's detections of the frame, in `ingest`, `detection` or, "
+        array_layout(
+            "detection_index",
+            "(*frame, camera, person) int16 [1], missing -1",
+            "index among this camera's detections of the frame, in `ingest`, `detection` or, "
             "from the second iteration on, `redetection`",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="ray_distance",
-            dims=("frame", "camera", "person"),
-            dtype="float32",
-            unit="m",
-            missing="nan",
-            about="mean distance of the detection's rays to the person's joints when matched",
-            chunk_dim="frame",
+        array_layout(
+            "ray_distance",
+            "(*frame, camera, person) float32 [m], missing nan",
+            "mean distance of the detection's rays to the person's joints when matched",
         ),
-        ArrayLayout(
-            name="joints",
-            dims=("frame", "person", "joint", "coordinate"),
-            dtype="float32",
-            unit="m",
-            missing="nan",
-            about="the tracker's fast 3D joints, world; those of `triangulation` are accurate",
-            chunk_dim="frame",
+        array_layout(
+            "joints",
+            "(*frame, person, joint, coordinate) float32 [m], missing nan",
+            "the tracker's fast 3D joints, world; those of `triangulation` are accurate",
         ),
-        ArrayLayout(
-            name="ground",
-            dims=("frame", "person", "axis"),
-            dtype="float32",
-            unit="m",
-            missing="nan",
-            about="place on the pitch from the feet, smoothed; finite exactly in the frames in "
+        array_layout(
+            "ground",
+            "(*frame, person, axis) float32 [m], missing nan",
+            "place on the pitch from the feet, smoothed; finite exactly in the frames in "
             "which the person is not triangulated but placed by the feet (kind `plane`)",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="ground_velocity",
-            dims=("frame", "person", "axis"),
-            dtype="float32",
-            unit="m/s",
-            missing="nan",
-            about="derivative of `ground`",
-            chunk_dim="frame",
+        array_layout(
+            "ground_velocity",
+            "(*frame, person, axis) float32 [m/s], missing nan",
+            "derivative of `ground`",
         ),
-        ArrayLayout(
-            name="ground_covariance",
-            dims=("frame", "person", "axis", "axis_"),
-            dtype="float32",
-            unit="m^2",
-            missing="nan",
-            about="covariance of `ground`: noise of the feet, and calibration",
-            chunk_dim="frame",
+        array_layout(
+            "ground_covariance",
+            "(*frame, person, axis, axis_) float32 [m^2], missing nan",
+            "covariance of `ground`: noise of the feet, and calibration",
         ),
-        ArrayLayout(
-            name="ground_height",
-            dims=("person",),
-            dtype="float32",
-            unit="m",
-            missing="nan",
-            about="height of people who are placed by their feet, by their boxes",
+        array_layout(
+            "ground_height",
+            "(person) float32 [m], missing nan",
+            "height of people who are placed by their feet, by their boxes",
         ),
     ),
     labels={

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
 from data_contracts.tracking import PERSON
@@ -15,44 +15,29 @@ EXCHANGED_PARTS = {
 """Parts of a body whose left and right sides a detector swaps together, and their joints."""
 
 EXTRA_JOINTS = (
-    ArrayLayout(
-        name="extra_joints",
-        dims=("frame", "person", "point", "coordinate"),
-        dtype="float64",
-        unit="m",
-        missing="nan",
-        about="points besides COCO-17, world; attribute `point` names them",
-        chunk_dim="frame",
+    array_layout(
+        "extra_joints",
+        "(*frame, person, point, coordinate) float64 [m], missing nan",
+        "points besides COCO-17, world; attribute `point` names them",
     ),
-    ArrayLayout(
-        name="extra_covariance",
-        dims=("frame", "person", "point", "coordinate", "coordinate_"),
-        dtype="float64",
-        unit="m^2",
-        missing="nan",
-        about="covariance of `extra_joints`, from the same errors as `covariance`",
-        chunk_dim="frame",
+    array_layout(
+        "extra_covariance",
+        "(*frame, person, point, coordinate, coordinate_) float64 [m^2], missing nan",
+        "covariance of `extra_joints`, from the same errors as `covariance`",
     ),
 )
 """Points besides COCO-17 in 3D; absent where no detector gave any."""
 EXTRA_TRIANGULATION = (
     *EXTRA_JOINTS,
-    ArrayLayout(
-        name="extra_views",
-        dims=("frame", "person", "point"),
-        dtype="uint8",
-        unit="1",
-        missing="0",
-        about="number of inlier cameras of `extra_joints`",
-        chunk_dim="frame",
+    array_layout(
+        "extra_views",
+        "(*frame, person, point) uint8 [1], missing 0",
+        "number of inlier cameras of `extra_joints`",
     ),
-    ArrayLayout(
-        name="extra_common_bias",
-        dims=("point",),
-        dtype="float64",
-        unit="m",
-        missing="none",
-        about="as `common_bias`; `extra_covariance` contains it",
+    array_layout(
+        "extra_common_bias",
+        "(point) float64 [m]",
+        "as `common_bias`; `extra_covariance` contains it",
     ),
 )
 """The same as triangulation gives them."""
@@ -62,143 +47,80 @@ TRIANGULATION = GroupLayout(
     about="3D joints of every person, with covariance and inlier views.",
     coordinates=(FRAME, PERSON),
     arrays=(
-        ArrayLayout(
-            name="joints",
-            dims=("frame", "person", "joint", "coordinate"),
-            dtype="float64",
-            unit="m",
-            missing="nan",
-            about="joints, world",
-            chunk_dim="frame",
+        array_layout(
+            "joints",
+            "(*frame, person, joint, coordinate) float64 [m], missing nan",
+            "joints, world",
         ),
-        ArrayLayout(
-            name="covariance",
-            dims=("frame", "person", "joint", "coordinate", "coordinate_"),
-            dtype="float64",
-            unit="m^2",
-            missing="nan",
-            about="covariance of `joints`: the detector's noise as the residuals show it, "
+        array_layout(
+            "covariance",
+            "(*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan",
+            "covariance of `joints`: the detector's noise as the residuals show it, "
             "calibration, and the bias that all views share",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="shared_covariance",
-            dims=("frame", "person", "coordinate", "coordinate_"),
-            dtype="float64",
-            unit="m^2",
-            missing="nan",
-            about="the part of `covariance` that all joints of a person share: calibration moves "
+        array_layout(
+            "shared_covariance",
+            "(*frame, person, coordinate, coordinate_) float64 [m^2], missing nan",
+            "the part of `covariance` that all joints of a person share: calibration moves "
             "the whole person",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="common_bias",
-            dims=("joint",),
-            dtype="float64",
-            unit="m",
-            missing="none",
-            about="standard deviation per axis of the error that all views of a joint share; "
+        array_layout(
+            "common_bias",
+            "(joint) float64 [m]",
+            "standard deviation per axis of the error that all views of a joint share; "
             "`covariance` contains it",
         ),
-        ArrayLayout(
-            name="views",
-            dims=("frame", "person", "joint"),
-            dtype="uint8",
-            unit="1",
-            missing="0",
-            about="number of inlier cameras",
-            chunk_dim="frame",
+        array_layout(
+            "views", "(*frame, person, joint) uint8 [1], missing 0", "number of inlier cameras"
         ),
-        ArrayLayout(
-            name="spread",
-            dims=("frame", "person", "joint"),
-            dtype="float32",
-            unit="rad",
-            missing="nan",
-            about="widest angle between rays of inlier cameras, at most a right angle",
-            chunk_dim="frame",
+        array_layout(
+            "spread",
+            "(*frame, person, joint) float32 [rad], missing nan",
+            "widest angle between rays of inlier cameras, at most a right angle",
         ),
-        ArrayLayout(
-            name="reprojection_error",
-            dims=("frame", "person", "joint"),
-            dtype="float32",
-            unit="px",
-            missing="nan",
-            about="root mean square over the inlier cameras",
-            chunk_dim="frame",
+        array_layout(
+            "reprojection_error",
+            "(*frame, person, joint) float32 [px], missing nan",
+            "root mean square over the inlier cameras",
         ),
-        ArrayLayout(
-            name="inliers",
-            dims=("frame", "camera", "person", "joint"),
-            dtype="bool",
-            unit="1",
-            missing="none",
-            about="this camera's observation is an inlier of the joint",
-            chunk_dim="frame",
+        array_layout(
+            "inliers",
+            "(*frame, camera, person, joint) bool [1]",
+            "this camera's observation is an inlier of the joint",
         ),
-        ArrayLayout(
-            name="exchanged",
-            dims=("frame", "camera", "person", "part"),
-            dtype="bool",
-            unit="1",
-            missing="none",
-            about="this camera's detection has left and right of this part swapped; joints and "
+        array_layout(
+            "exchanged",
+            "(*frame, camera, person, part) bool [1]",
+            "this camera's detection has left and right of this part swapped; joints and "
             "`inliers` are computed after correction",
-            chunk_dim="frame",
         ),
-        ArrayLayout(
-            name="offsets",
-            dims=("frame", "camera", "person", "axis"),
-            dtype="float32",
-            unit="px",
-            missing="0",
-            about="common image offset of the person in this camera, from calibration errors",
-            chunk_dim="frame",
+        array_layout(
+            "offsets",
+            "(*frame, camera, person, axis) float32 [px], missing 0",
+            "common image offset of the person in this camera, from calibration errors",
         ),
-        ArrayLayout(
-            name="smoothed",
-            dims=("frame", "person", "joint", "coordinate"),
-            dtype="float64",
-            unit="m",
-            missing="nan",
-            about="joints smoothed over the whole track, world",
-            chunk_dim="frame",
+        array_layout(
+            "smoothed",
+            "(*frame, person, joint, coordinate) float64 [m], missing nan",
+            "joints smoothed over the whole track, world",
         ),
-        ArrayLayout(
-            name="smoothed_covariance",
-            dims=("frame", "person", "joint", "coordinate", "coordinate_"),
-            dtype="float64",
-            unit="m^2",
-            missing="nan",
-            about="covariance of `smoothed`; it grows inside gaps",
-            chunk_dim="frame",
+        array_layout(
+            "smoothed_covariance",
+            "(*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan",
+            "covariance of `smoothed`; it grows inside gaps",
         ),
-        ArrayLayout(
-            name="filled",
-            dims=("frame", "person", "joint"),
-            dtype="bool",
-            unit="1",
-            missing="none",
-            about="`smoothed` is present and `joints` is missing",
-            chunk_dim="frame",
+        array_layout(
+            "filled",
+            "(*frame, person, joint) bool [1]",
+            "`smoothed` is present and `joints` is missing",
         ),
-        ArrayLayout(
-            name="clock_late",
-            dims=("camera",),
-            dtype="float64",
-            unit="frame",
-            missing="nan",
-            about="clock offset: frame t shows the time t + clock_late of the cameras' mean clock; "
+        array_layout(
+            "clock_late",
+            "(camera) float64 [frame], missing nan",
+            "clock offset: frame t shows the time t + clock_late of the cameras' mean clock; "
             "missing without enough motion",
         ),
-        ArrayLayout(
-            name="clock_error",
-            dims=("camera",),
-            dtype="float64",
-            unit="frame",
-            missing="none",
-            about="standard error of `clock_late`",
-        ),
+        array_layout("clock_error", "(camera) float64 [frame]", "standard error of `clock_late`"),
         *EXTRA_TRIANGULATION,
     ),
     labels={

@@ -20,7 +20,8 @@ from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from worldpose.body.body_file import given_body_folder
 from worldpose.errors import StoreError, UsageError
-from worldpose.store.recipes import code_version, libraries, recipe_key
+from worldpose.sources import code_version
+from worldpose.store.recipes import libraries, recipe_key
 from worldpose.store.store import Store
 
 

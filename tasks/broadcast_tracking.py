@@ -23,9 +23,9 @@ from worldpose.broadcast_calibration.pitch_errors import SIZES
 from worldpose.broadcast_calibration.uncertainty import moving_from_arrays, static_covariance
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Store
-from worldpose.tracking.feet import GroundPositions, locate_feet
-from worldpose.tracking.ground_tracks import track_on_plane
-from worldpose.tracking.shirts import measure_shirts
+from worldpose.tracking.plane.feet import GroundPositions, locate_feet
+from worldpose.tracking.plane.shirts import measure_shirts
+from worldpose.tracking.plane.tracker import track_on_plane
 from worldpose.video.folder import open_video
 
 

@@ -19,13 +19,13 @@ from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.body_fitting.objective import perceived_joints
 from worldpose.compiled import map_in_threads
+from worldpose.filtering.held_out import measure_held_out
 from worldpose.filtering.judging import (
     BodyViews,
     Judgement,
     TriangulatedDetections,
     judge_detections,
     learn_keypoint_spread,
-    measure_held_out,
     perceived_covariance,
     view_bodies,
 )

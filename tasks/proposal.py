@@ -26,7 +26,7 @@ from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.settings import ProposalSettings, StaticCalibrationSettings
 from worldpose.store.store import Store
-from worldpose.tracking.feet import locate_feet
+from worldpose.tracking.plane.feet import locate_feet
 from worldpose.video.folder import open_video
 
 _NOT_PROPOSED: Mapping[str, Any] = {

@@ -26,20 +26,20 @@ from worldpose.review.identities import (
 )
 from worldpose.store.store import Store
 from worldpose.tracking.diagnosis import diagnose_no_people
-from worldpose.tracking.feet import (
+from worldpose.tracking.joins import describe_doubts
+from worldpose.tracking.plane.clocks import PlaneClocks, estimate_plane_clocks
+from worldpose.tracking.plane.feet import (
     FrameBlocks,
     GroundPositions,
     count_covering_cameras,
     locate_feet,
 )
-from worldpose.tracking.ground_tracks import (
+from worldpose.tracking.plane.tracker import (
     TriangulatedPeople,
     locate_tracks,
     track_on_plane,
     triangulated_places,
 )
-from worldpose.tracking.joins import describe_doubts
-from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 
@@ -259,7 +259,9 @@ def _estimate_clocks(
     """
     if np.isfinite(joints).any():
         count = len(clip.camera_ids)
-        return PlaneClocks(np.zeros(count), np.full(count, np.inf), 0)
+        return PlaneClocks(
+            np.zeros(count), np.full(count, np.inf), 0, np.zeros(count, dtype=np.bool_)
+        )
     size = (pitch.length, pitch.width)
     return estimate_plane_clocks(positions, clip.fps, pitch_size=size)
 

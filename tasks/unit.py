@@ -35,7 +35,8 @@ from worldpose.errors import (
     require_memory,
 )
 from worldpose.ingest.registration import digest_of_files
-from worldpose.store.recipes import code_version, libraries, recipe_key
+from worldpose.sources import code_version
+from worldpose.store.recipes import libraries, recipe_key
 from worldpose.store.store import Store
 
 RETRIES: Final = 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,6 +16,7 @@ from numba import njit
 from numba.core import config
 
 from worldpose.cache_folder import find_cache_folder
+from worldpose.sources import code_version
 
 Function = TypeVar("Function", bound=Callable[..., object])
 Item = TypeVar("Item")
@@ -27,11 +27,6 @@ THREADS: Final = 2
 large machine do not hinder each other."""
 
 _PACKAGE = Path(__file__).resolve().parent
-_IMPORT = re.compile(
-    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([\w.]+))",
-    re.MULTILINE,
-)
-_OWN = ("worldpose", "data_contracts")
 
 
 def compile_kernel(function: Function) -> Function:
@@ -105,47 +100,8 @@ def _cache_folder(module: str) -> Path | None:
     root = find_cache_folder().path
     if root is None:
         return None
-    sources, waiting = dict[str, str](), [module]
-    while waiting:
-        name = waiting.pop()
-        if name not in sources:
-            sources[name] = _source(name) or ""
-            waiting.extend(_imports(name))
-    digest = hashlib.sha256("\0".join(text for _, text in sorted(sources.items())).encode())
+    digest = hashlib.sha256("".join(code_version(module).values()).encode())
     return root / f"kernels-{digest.hexdigest()[:16]}"
-
-
-@functools.cache
-def _imports(module: str) -> frozenset[str]:
-    """Return the modules of worldpose and data_contracts from which a module takes names."""
-    found = set()
-    for origin, names, whole in _IMPORT.findall(_source(module) or ""):
-        origin = origin or whole
-        if origin.split(".")[0] in _OWN:
-            found |= {_origin(origin, name) for name in re.findall(r"\w+", names)} or {origin}
-    return frozenset(found - {module})
-
-
-@functools.cache
-def _origin(package: str, name: str) -> str:
-    """Return the module that a name from a module or package comes from."""
-    if _source(f"{package}.{name}") is not None:
-        return f"{package}.{name}"
-    if (_PACKAGE.parent.joinpath(*package.split(".")) / "__init__.py").is_file():
-        for origin, names, _ in _IMPORT.findall(_source(package) or ""):
-            if origin.split(".")[0] in _OWN and name in re.findall(r"\w+", names):
-                return _origin(origin, name)
-    return package
-
-
-@functools.cache
-def _source(module: str) -> str | None:
-    """Return the source of a module or of a package's `__init__`; None if there is none."""
-    place = _PACKAGE.parent.joinpath(*module.split("."))
-    for file in (place.with_suffix(".py"), place / "__init__.py"):
-        if file.is_file():
-            return file.read_text(encoding="utf-8")
-    return None
 
 
 @compile_kernel

@@ -27,8 +27,9 @@ from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.ingest.clicks import import_clicks
-from worldpose.ingest.importing import import_lenses, import_match, import_pose2sim, import_videos
+from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import unclicked_clips
+from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from landmark_labels import read_landmarks, render_landmarks
 from numpy.typing import NDArray
+from real_looks import RealLooks
 from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY
 from torch import Tensor
 from torch.nn import functional
@@ -33,7 +34,7 @@ from worldpose.detection.bundled_nets import (
 )
 from worldpose.detection.landmark_net import POINTS, LandmarkNet, SeenLandmarks, locate
 from worldpose.detection.models import BUNDLED_WEIGHTS
-from worldpose.training.augmentation import REAL_LOOKS, AugmentationSettings
+from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.fine_tuning import MIN_HEIGHT, Training, train
 from worldpose.training.keypoint_training import (
     HIDDEN_WEIGHT,
@@ -54,7 +55,7 @@ SCENES: Final = {
     "held_out": (HELD_OUT, 10, 3, 3),
 }
 """Kind, scenes, views of each and moments of each view."""
-CROPS: Final = KeypointCrops(elsewhere=0.0, looks=REAL_LOOKS)
+CROPS: Final = KeypointCrops(elsewhere=0.0, looks=RealLooks())
 """Crops of people, with the image formation of real cameras."""
 PHASES: Final = tuple(
     TrainingSettings(steps=steps, check_every=400, keep="last", rate=rate, seed=seed, bfloat16=True)

@@ -7,6 +7,7 @@ of the panorama's match and the videos from frame 100 on are for tests and never
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -24,7 +25,10 @@ from worldpose.detection.onnx_nets import load_onnx_pose
 from worldpose.detection.suppression import suppress
 from worldpose.detection.views import TiledDetector
 from worldpose.geometry.boxes import box_iou
-from worldpose.training.labels import LabelledPicture, label_boxes, read_yolo_labels, write_labels
+from worldpose.training.labels import LabelledPicture, write_labels
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from yolo_labels import label_boxes, read_yolo_labels
 
 FRAMES: Final = range(2, 100, 12)
 """Frames of each video: half a second apart, people have moved."""

@@ -29,7 +29,7 @@ from worldpose.detection.models import (
     load_bundled_detector,
     load_bundled_pose,
 )
-from worldpose.training.labels import LabelledPicture, PictureCache, read_labels, read_yolo_labels
+from worldpose.training.labels import LabelledPicture, PictureCache, read_labels
 from worldpose.training.metrics import (
     average_precision,
     calibration_error,
@@ -39,6 +39,7 @@ from worldpose.training.metrics import (
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import stills
+from yolo_labels import read_yolo_labels
 
 SCENES = 10
 """Rendered scenes, of four images each."""
@@ -68,7 +69,7 @@ def fit_score_map(sets: Sequence[tuple[Floats, Flags]]) -> ScoreMap:
 
 def judge(found: Sequence[People], pictures: Sequence[LabelledPicture]) -> tuple[Floats, Flags]:
     """Return the scores of all boxes that count (boxes,), and whether they are right."""
-    judged = [judge_boxes(*each)[:2] for each in zip(found, pictures, strict=True)]
+    judged = [judge_boxes(*each) for each in zip(found, pictures, strict=True)]
     scores, right = zip(*judged, strict=True)
     return np.concatenate(scores), np.concatenate(right)
 

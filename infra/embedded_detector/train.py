@@ -24,6 +24,7 @@ from typing import Final, Literal, TypeVar
 import numpy as np
 import torch
 from real_frames import label_pair, read_panorama
+from real_looks import RealLooks
 from scenes import CHECKING, CROWDS, FAR, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
 from worldpose.detection.bundled_detector import BundledDetector
@@ -31,16 +32,10 @@ from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weight
 from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.settings import DetectionSettings
 from worldpose.geometry.boxes import box_iou
-from worldpose.training.augmentation import REAL_LOOKS
-from worldpose.training.fine_tuning import MIN_HEIGHT, train_keypoint_net, train_people_net
+from worldpose.training.fine_tuning import MIN_HEIGHT, train_net
 from worldpose.training.keypoint_training import KeypointCrops
 from worldpose.training.labels import LabelledPicture, PictureCache, read_labels
-from worldpose.training.metrics import (
-    HEIGHTS,
-    detect_labelled,
-    score_keypoints,
-    score_people,
-)
+from worldpose.training.metrics import average_precision, detect_labelled, score_keypoints
 from worldpose.training.people_training import PeopleWindows
 from worldpose.training.settings import TrainingSettings
 
@@ -144,9 +139,9 @@ PHASES: Final = {
     ),
 }
 """Phases of the shipped weights, with exceptions in the model card."""
-SMALL_WINDOWS: Final = PeopleWindows(height=(20.0, 160.0), aimed=0.65, looks=REAL_LOOKS)
+SMALL_WINDOWS: Final = PeopleWindows(height=(20.0, 160.0), aimed=0.65, looks=RealLooks())
 """Windows of the detector's last phases."""
-REAL_CROPS: Final = KeypointCrops(looks=REAL_LOOKS)
+REAL_CROPS: Final = KeypointCrops(looks=RealLooks())
 """Crops of the pose estimator's last phases."""
 
 
@@ -235,18 +230,8 @@ def train_phase(
     """
     learned, checked, cache = given
     settings, checkpoint = phase.settings(share), done.with_suffix(".checkpoint")
-    if isinstance(net, PeopleNet):
-        windows = SMALL_WINDOWS if phase.real else None
-        train_people_net(
-            net, learned, checked, cache, settings,
-            windows=windows, checkpoint=checkpoint, progress=say,
-        )  # fmt: skip
-    else:
-        crops = REAL_CROPS if phase.real else None
-        train_keypoint_net(
-            net, learned, checked, cache, settings,
-            crops=crops, checkpoint=checkpoint, progress=say,
-        )  # fmt: skip
+    cut = (SMALL_WINDOWS if isinstance(net, PeopleNet) else REAL_CROPS) if phase.real else None
+    train_net(net, learned, checked, cache, settings, cut, checkpoint=checkpoint, progress=say)
 
 
 def _read(folder: Path, name: str, data: Mapping[RealImages, Path]) -> list[LabelledPicture]:
@@ -265,11 +250,15 @@ def score(
     pose = BundledPoseEstimator(
         load_weights(folder / "embedded_keypoints.safetensors", KeypointNet())
     )
-    classes = ["all", *(f"{low:g} to {high:g} px" for low, high in HEIGHTS)]
+    heights = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
+    classes = ["all", *(f"{low:g} to {high:g} px" for low, high in heights)]
     found, kept = (detect_labelled(detector, pictures, cache, each) for each in (None, pose))
     beside = detect_labelled(detector, pictures, cache, pose, DetectionSettings(find_occluded=True))
     alone, stored, free, more = (
-        dict(zip(classes, score_people(people, labels), strict=True))
+        {
+            name: average_precision(people, labels, each)
+            for name, each in zip(classes, ((0.0, np.inf), *heights), strict=True)
+        }
         for people, labels in (
             (found, pictures),
             (kept, pictures),
@@ -277,7 +266,7 @@ def score(
             (beside, pictures),
         )
     )
-    limits = [(MIN_HEIGHT, 1e9), *HEIGHTS]
+    limits = [(MIN_HEIGHT, 1e9), *heights]
     placed = {
         name: score_keypoints(pose, pictures, cache, each).__dict__
         for name, each in zip(classes, limits, strict=True)

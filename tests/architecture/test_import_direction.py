@@ -26,6 +26,7 @@ ORDER_IN_WORLDPOSE = (
     "errors",
     "cache_folder",
     "parsing",
+    "sources",
     "compiled",
     "geometry",
     "pickles",

@@ -60,18 +60,12 @@ kinds(
         "one_smaller_image": (2 / 3, 1, 1, 1),
         "mixed_image_sizes": (2 / 3, 4 / 3, 1, 2),
         "image_of_8k": (4, 1, 1, 1),
-        "odd_image_size": (641 / 1920, 1, 1, 1),
     },
     _scale,
     phase=FILM,
     harmless=True,
 )
-kinds(
-    "camera",
-    {"images_of_160_by_90": 1 / 12, "image_of_one_pixel": (1 / 1920, 1, 1, 1)},
-    _scale,
-    phase=FILM,
-)
+kinds("camera", {"images_of_160_by_90": 1 / 12}, _scale, phase=FILM)
 
 
 @kind("camera", phase=FILM, harmless=True)
@@ -97,7 +91,7 @@ def _roll(draft, rng, angle):
 
 kinds(
     "camera",
-    {"rolled_a_little": 0.15, "rolled_by_90": math.pi / 2, "upside_down": math.pi},
+    {"rolled_by_90": math.pi / 2, "upside_down": math.pi},
     _roll,
     phase=FILM,
     harmless=True,
@@ -110,8 +104,6 @@ def _lens(draft, rng, distortion):
 
 LENSES = {
     "barrel_lens": (-0.15, 0.03, 0.0, 0.0, 0.0),
-    "pincushion_lens": (0.1, 0.0, 0.0, 0.0, 0.0),
-    "tangential_lens": (-0.05, 0.0, 0.002, -0.001, 0.0),
     "sixth_order_lens": (-0.2, 0.08, 0.0, 0.0, -0.02),
 }
 kinds("camera", LENSES, _lens, phase=FILM, base="given", harmless=True)
@@ -120,7 +112,6 @@ kinds(
     {
         **{f"clicked_{name}": lens for name, lens in LENSES.items()},
         "folding_lens": (-0.9, 0.0, 0.0, 0.0, 0.0),
-        "strong_lens": (-0.5, 0.3, 0.0, 0.0, -0.1),
     },
     _lens,
     phase=FILM,
@@ -138,11 +129,6 @@ kinds(
 )
 
 
-@kind("camera", phase=FILM)
-def off_center_image(draft, rng):
-    change(draft, rng, principal=(959.5 + 192.0, 539.5 - 162.0))
-
-
 def _place(draft, rng, place):
     name = some(draft, rng)
     middle = target_of(draft)
@@ -158,13 +144,9 @@ kinds(
     "camera",
     {
         "at_eye_level": (25.0, 1.6, 0.0),
-        "under_the_roof": (40.0, 40.0, 0.0),
         "among_the_people": (4.0, 1.7, 0.0),
-        "underground": (25.0, -3.0, 0.0),
         "far_away": (200.0, 30.0, 0.0),
         "looking_away": (25.0, 10.0, 500.0),
-        "overhead": (0.5, 25.0, 0.0),
-        "inside_a_person": (0.1, 1.0, 1.0),
     },
     _place,
     phase=FILM,
@@ -182,8 +164,8 @@ def _count(draft, rng, count):
         put(draft, f"more{len(draft.cameras)}", draft.cameras[names[0]].looking(place, middle))
 
 
-kinds("camera", {"three_cameras": 3, "six_cameras": 6}, _count, phase=FILM, harmless=True)
-kinds("camera", {"one_camera": 1, "two_cameras": 2, "sixteen_cameras": 16}, _count, phase=FILM)
+kinds("camera", {"three_cameras": 3}, _count, phase=FILM, harmless=True)
+kinds("camera", {"one_camera": 1, "two_cameras": 2}, _count, phase=FILM)
 
 
 @kind("camera", phase=FILM)
@@ -235,7 +217,6 @@ kinds(
     {
         "one_lens_in_another_order": ((0, 1, 4, 2, 3), False),
         "all_lenses_in_another_order": ((0, 1, 4, 2, 3), True),
-        "lenses_backwards": ((4, 3, 2, 1, 0), True),
     },
     _lens_order,
     base="given",
@@ -253,13 +234,9 @@ kinds(
     {
         "one_camera_in_millimetres": ("translation", 1000.0, False),
         "all_cameras_in_millimetres": ("translation", 1000.0, True),
-        "all_cameras_in_centimetres": ("translation", 100.0, True),
-        "all_cameras_in_kilometres": ("translation", 1e-3, True),
         "all_cameras_in_yards": ("translation", 1.0936, True),
         "one_rotation_in_degrees": ("rotation", 57.29577951, False),
-        "all_rotations_in_degrees": ("rotation", 57.29577951, True),
         "one_inverse_rotation": ("rotation", -1.0, False),
-        "all_inverse_rotations": ("rotation", -1.0, True),
         "one_inverse_translation": ("translation", -1.0, False),
     },
     _scaled_entry,
@@ -278,15 +255,10 @@ kinds(
     "toml",
     {
         "one_focal_10_percent_long": (1.1, False),
-        "one_focal_10_percent_short": (0.9, False),
-        "all_focals_10_percent_long": (1.1, True),
         "one_focal_in_millimetres": (0.0055, False),
-        "one_focal_of_nothing": (1e-12, False),
         "one_huge_focal": (1e5, False),
         "one_negative_focal": (-1.0, False),
-        "zero_focal": (0.0, False),
         "one_infinite_focal": (math.inf, False),
-        "one_missing_focal": (math.nan, False),
     },
     _focal_entry,
     base="given",
@@ -303,45 +275,26 @@ kinds(
     "toml",
     {
         "rotation_of_text": ("rotation", "north"),
-        "rotation_missing_a_number": ("rotation", lambda r: r[:2]),
-        "rotation_as_quaternion": ("rotation", lambda r: [1.0, *r]),
         "rotation_beyond_numbers": ("rotation", [1e200, 0.0, 0.0]),
-        "huge_rotation": ("rotation", [1e8, 2e8, 3e8]),
-        "no_rotation": ("rotation", [0.0, 0.0, 0.0]),
         "translation_of_nan": ("translation", "raw:[nan, 0.0, 1.0]"),
-        "translation_of_infinity": ("translation", "raw:[inf, 0.0, 1.0]"),
         "huge_translation": ("translation", [1e9, 0.0, 0.0]),
-        "huge_whole_translation": ("translation", "raw:[" + "9" * 400 + ", 0, 1]"),
         "translation_of_text": ("translation", ["1.0", "2.0", "3.0"]),
-        "translation_of_truth": ("translation", [True, False, True]),
         "size_swapped": ("size", lambda s: s[::-1]),
-        "size_of_zero": ("size", [0, 0]),
         "size_of_fractions": ("size", [1920.5, 1080.5]),
-        "huge_size": ("size", [10**12, 10**12]),
         "matrix_transposed": ("matrix", lambda m: np.transpose(m).tolist()),
-        "matrix_of_four": ("matrix", lambda m: [m[0][0], m[1][1], m[0][2], m[1][2]]),
         "matrix_with_skew": ("matrix", lambda m: [[m[0][0], 5.0, m[0][2]], m[1], m[2]]),
-        "ragged_matrix": ("matrix", lambda m: [m[0], m[1][:2], m[2]]),
         "empty_matrix": ("matrix", []),
-        "principal_point_swapped": (
-            "matrix",
-            lambda m: [[m[0][0], 0.0, m[1][2]], [0.0, m[1][1], m[0][2]], m[2]],
-        ),
         "principal_point_far_outside": (
             "matrix",
             lambda m: [[m[0][0], 0.0, 1e7], [0.0, m[1][1], 1e7], m[2]],
         ),
-        "lens_of_six": ("distortions", [0.1] * 6),
         "lens_of_fisheye": ("fisheye", True),
         "lens_of_eight": ("distortions", lambda d: [*d, 0.3, 0.2, 0.1]),
         "huge_lens": ("distortions", [1e8, -1e8, 0.0, 0.0, 1e8]),
-        "lens_of_one": ("distortions", [1.0, 1.0, 1.0, 1.0, 1.0]),
         "name_with_umlaut": ("name", "Kamera ä"),
         "name_of_another_camera": ("name", "somebody"),
         "name_that_climbs": ("name", "../cam0"),
-        "name_that_is_empty": ("name", ""),
         "name_that_is_a_number": ("name", 3),
-        "name_that_is_a_list": ("name", ["cam0"]),
     },
     _entry,
     base="given",
@@ -350,9 +303,7 @@ kinds(
     "toml",
     {
         "lens_of_four": ("distortions", lambda d: d[:4]),
-        "lens_of_eight_with_zeros": ("distortions", lambda d: [*d, 0.0, 0.0, 0.0]),
         "translation_as_column": ("translation", lambda t: [[v] for v in t]),
-        "rotation_of_six_decimals": ("rotation", lambda r: np.round(r, 6).tolist()),
         "rotation_as_matrix": ("rotation", lambda r: cv2.Rodrigues(np.array(r))[0].tolist()),
         "rounded_matrix": (
             "rotation",
@@ -370,20 +321,6 @@ kinds(
 def rotation_transposed_as_matrix(draft, rng):
     table = one_table(draft, rng)
     table["rotation"] = cv2.Rodrigues(np.array(table["rotation"]))[0].T.tolist()
-
-
-@kind("toml", base="given")
-def mirrored_rotation(draft, rng):
-    table = one_table(draft, rng)
-    turned = cv2.Rodrigues(np.array(table["rotation"]))[0]
-    turned[0] *= -1
-    table["rotation"] = turned.tolist()
-
-
-@kind("toml", base="given")
-def places_instead_of_translations(draft, rng):
-    for table, camera in zip(draft.given.values(), draft.cameras.values(), strict=False):
-        table["translation"] = camera.center.tolist()
 
 
 @kind("toml", base="given")
@@ -446,11 +383,6 @@ def calibration_of_a_further_camera(draft, rng):
 
 
 @kind("toml", base="given")
-def calibration_twice(draft, rng):
-    draft.given["again"] = dict(one_table(draft, rng))
-
-
-@kind("toml", base="given")
 def calibration_without_a_key(draft, rng):
     table = one_table(draft, rng)
     del table[str(rng.choice(["size", "matrix", "distortions", "rotation", "translation"]))]
@@ -486,48 +418,23 @@ kinds(
     "pitch",
     {
         "pitch_in_millimetres": {"length": 105000.0, "width": 68000.0},
-        "pitch_in_centimetres": {"length": 10500.0, "width": 6800.0},
         "pitch_in_yards": {"length": 114.8, "width": 74.4},
-        "pitch_in_feet": {"length": 344.5, "width": 223.1},
         "pitch_swapped": {"length": 68.0, "width": 105.0},
         "pitch_of_another_size": {"length": 100.0, "width": 64.0},
         "huge_pitch": {"length": 1e9, "width": 68.0},
-        "wide_pitch": {"length": 105.0, "width": 1e9},
-        "pitch_beyond_numbers": {"length": 1e308, "width": 1e308},
-        "tiny_pitch": {"length": 10.0, "width": 6.0},
         "pitch_of_zero": {"length": 0, "width": 0},
-        "negative_pitch": {"length": -105.0, "width": 68.0},
         "pitch_of_text": {"length": "105 m", "width": 68.0},
         "crown_of_50_m": {"crown": 50.0},
-        "crown_in_millimetres": {"crown": 200.0},
-        "negative_crown": {"crown": -0.2},
-        "no_crown": {"crown": 0.0},
         "pitch_with_a_typo": {"lenght": 105.0},
         "pitch_as_list": [105.0, 68.0],
-        "surveyed_in_millimetres": lambda: {"points": _surveyed(1000.0)},
         "surveyed_mirrored": lambda: {
             "points": {name: [-x, y, z] for name, (x, y, z) in _surveyed().items()}
         },
         "surveyed_point_5_m_off": {"points": {"corner_left_near": [-47.5, -34.0, 0.0]}},
-        "surveyed_point_1000_km_off": {"points": {"corner_left_near": [1e6, -34.0, 0.0]}},
         "surveyed_points_all_one": lambda: {
             "points": {name: [0.0, 0.0, 0.0] for name in _surveyed()}
         },
-        "surveyed_in_two_numbers": {"points": {"corner_left_near": [-52.5, -34.0]}},
         "line_to_nowhere": {"lines": {"x": {"start": "corner_left_near", "end": "moon"}}},
-        "line_of_one_point": {
-            "lines": {"touch_line_near": {"start": "center_mark", "end": "center_mark"}}
-        },
-        "arc_in_degrees": {
-            "arcs": {
-                "x": {"center": "center_mark", "radius": 9.15, "start_angle": 0, "end_angle": 360}
-            }
-        },
-        "huge_arc": {
-            "arcs": {
-                "x": {"center": "center_mark", "radius": 1e9, "start_angle": 0, "end_angle": 6.28}
-            }
-        },
         "ten_thousand_arcs": lambda: {
             "arcs": {
                 f"a{n}": {
@@ -554,11 +461,6 @@ def pitch_named_and_missing(draft, rng):
 @kind("pitch", base="clicked")
 def no_pitch_but_clicks(draft, rng):
     draft.spec["pitch"] = "none"
-
-
-@kind("pitch", base="clicked")
-def pitch_that_climbs(draft, rng):
-    draft.spec["pitch"] = "../../etc/passwd"
 
 
 @kind("pitch", base="given")

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from . import camera_kinds, file_kinds, people_kinds, service_kinds  # noqa: F401 - they register
+from . import (  # noqa: F401 - they register
+    array_kinds,
+    camera_kinds,
+    click_kinds,
+    file_kinds,
+    people_kinds,
+    service_kinds,
+)
 from .judging import (
     DEFECTS,
     REFUSED,

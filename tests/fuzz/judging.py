@@ -29,7 +29,7 @@ STATED_ERROR = 2.0
 that it does not know is no silent error [1]."""
 MIN_JOINTS = 10
 
-RIGHT, WARNED, STATED, GATED = "right", "warned", "stated", "gated"
+RIGHT, WARNED, STATED = "right", "warned", "stated"
 REFUSED, UNJUDGED = "refused", "unjudged"
 DEFECTS = (
     "traceback",
@@ -39,12 +39,11 @@ DEFECTS = (
     "hang",
     "crash",
     "nonsense",
-    "gated",
     "half-written",
 )
 """Classes of defects: an error that is none of worldpose's; one that says that worldpose is wrong;
 an array contract's; a refusal without its parts; too slow; a dead process; a wrong result that
-nothing tells of, or that only `--gates auto` would; leftovers in the store."""
+nothing tells of; leftovers in the store."""
 
 
 def forked(work, *arguments):
@@ -220,20 +219,6 @@ def warnings_said(record, match):
     return said
 
 
-def gate_objections(record):
-    """Questions of `--gates auto`, except those that clicks without a still always raise."""
-    from flows.gates import GATES
-
-    usual = ("expected_ground_error", "weak is")
-    found = []
-    for name, figures in record.figures.items():
-        for gate in GATES:
-            if gate.stage == name.partition("/")[0]:
-                lines = gate.objections(figures)
-                found += [f"{name}: {line}" for line in lines if not line.startswith(usual)]
-    return found
-
-
 def score(store, match_id, record, truth):
     """Return how a result compares with the truth.
 
@@ -298,8 +283,7 @@ def visible_truth(draft):
 def judge(draft, store, match, record, failures):
     """The outcome of a run that was recorded."""
     said = warnings_said(record, match)
-    gated = gate_objections(record)
-    answer = {"state": record.state, "warnings": said[:5], "gates": gated[:5]}
+    answer = {"state": record.state, "warnings": said[:5]}
     if failures:
         classes = [(name, *failure_class(error)) for name, error in failures]
         worst = next((each for each in classes if each[1] in DEFECTS), None)
@@ -328,8 +312,6 @@ def judge(draft, store, match, record, failures):
         return answer | {"class": WARNED}
     if is_found and error <= STATED_ERROR * (stated or 0.0):
         return answer | {"class": STATED}
-    if gated:
-        return answer | {"class": GATED}
     return answer | {
         "class": "nonsense",
         "message": f"coverage {coverage:.2f}, error {error}, {extra} extra",

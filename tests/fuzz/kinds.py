@@ -61,3 +61,20 @@ def kinds(group, values, apply, **options):
     """Register a family: `apply(draft, rng, value)` for each named value."""
     for label, value in values.items():
         kind(group, name=label, **options)(lambda draft, rng, value=value: apply(draft, rng, value))
+
+
+def one(rng, values):
+    """One of the values, by chance."""
+    return values[int(rng.integers(len(values)))]
+
+
+def exchange(content, rng):
+    """Exchange the entries of two cameras."""
+    if len(content) > 1:
+        a, b = rng.choice(list(content), 2, replace=False)
+        content[a], content[b] = content[b], content[a]
+
+
+def drop(content, rng):
+    """Remove the entry of one camera."""
+    del content[str(rng.choice(list(content)))]

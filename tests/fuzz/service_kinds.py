@@ -7,8 +7,7 @@ import shutil
 import numpy as np
 
 from .file_kinds import SPOILS, TEXTUAL
-from .kinds import kinds
-from .people_kinds import one
+from .kinds import kinds, one
 
 MATCH = "fuzz"
 TOKEN = "a-token-of-twenty-four.."
@@ -140,24 +139,17 @@ kinds(
         "runs_lost": lambda p: shutil.rmtree(p.root / "runs"),
         "staging_left": lambda p: (p.root / "staging" / "dead" / "c").mkdir(parents=True),
         "match_under_another_name": lambda p: _rename(p, f"matches/{MATCH}.json", "matches/b.json"),
-        "results_are_a_file": lambda p: (
-            shutil.rmtree(p.root / "results"),
-            (p.root / "results").write_text("x"),
-        ),
         "reservation_of_the_dead": lambda p: (p.root / f"runs/{MATCH}/0002.open.json").write_text(
             "{}"
         ),
-        "reservation_empty": lambda p: (p.root / f"runs/{MATCH}/0007.open.json").write_bytes(b""),
         "record_of_huge_number": lambda p: shutil.copy(
             p.root / f"runs/{MATCH}/0001.json", p.root / f"runs/{MATCH}/{'9' * 40}.json"
         ),
-        "record_is_a_folder": lambda p: (p.root / f"runs/{MATCH}/0002.json").mkdir(),
         "registration_is_a_folder": lambda p: (p.root / "matches/b.json").mkdir(),
         "record_links_to_itself": lambda p: (p.root / f"runs/{MATCH}/0002.json").symlink_to(
             "0002.json"
         ),
         "match_folder_lost": lambda p: shutil.rmtree(p.folder),
-        "match_folder_is_a_file": lambda p: (shutil.rmtree(p.folder), p.folder.write_text("x")),
         "match_yaml_lost": lambda p: (p.folder / "match.yaml").unlink(),
         "match_yaml_of_another_match": lambda p: (p.folder / "match.yaml").write_text(
             (p.folder / "match.yaml").read_text().replace("fuzz", "other")
@@ -231,184 +223,51 @@ NAMES = {
     "unknown": "nobody",
     "empty": "%20",
     "climbing": "..%2f..%2fetc%2fpasswd",
-    "of_unicode": "%E7%90%83",
     "of_bad_utf8": "%ff%fe",
     "of_nul": "a%00b",
-    "of_newlines": "a%0d%0aSet-Cookie:x",
-    "long": "x" * 4000,
     "of_markup": "%3Cscript%3E",
-    "of_surrogate": "%ed%a0%80",
-    "with_a_leading_dot": ".x",
-    "of_spaces": "a%20b",
 }
 NUMBERS = {
     "negative": "-1",
     "huge": "9" * 30,
-    "very_long": "9" * 5000,
-    "fractional": "1.5",
     "textual": "abc",
-    "nan": "nan",
     "empty": "",
-    "beyond_the_clip": "100000",
 }
+
+
+def edit_body(kind, **fields):
+    """A request that makes one correction."""
+    entry = {"id": f"{kind}.000000000001", "edit": {"kind": kind, **fields}}
+    return json.dumps({"edits": [entry]})
+
+
 DEEP = "[" * 50000 + "]" * 50000
 BODIES = {
     "null": "null",
-    "list": "[]",
     "mapping": "{}",
     "text": '"x"',
-    "number": "1e400",
-    "nan": "NaN",
     "not_json": "{",
     "empty": "",
     "deep": DEEP,
     "bytes": b"\xff\xfe\x00",
     "surrogate": '{"who": "\\ud800", "token": "\\ud800"}',
-    "token_surrogate": '{"who": "Ada", "token": "\\ud800"}',
     "token_of_unicode": '{"who": "Ada", "token": "\u00e9\u4e16"}',
     "login_of_number": '{"who": 7, "token": 8}',
-    "login_of_newlines": '{"who": "a\\nb\\u0000", "token": "' + TOKEN + '"}',
     "large": '{"a": "' + "x" * 900_000 + '"}',
     "too_large": '{"a": "' + "x" * 1_200_000 + '"}',
     "points_of_unknown_name": '{"points": {"moon": [1, 2]}}',
-    "points_of_space": '{"points": {"a b": [1, 2]}}',
-    "points_of_surrogate": '{"points": {"\\ud800": [1, 2]}}',
     "points_of_huge_number": '{"points": {"center_mark": [1e308, -1e308]}}',
-    "points_outside": '{"points": {"center_mark": [-9000, 20]}}',
     "points_many": json.dumps({"points": {f"p{n}": [n, n] for n in range(250)}}),
-    "points_at_one_place": json.dumps(
-        {
-            "points": {
-                n: [5, 5]
-                for n in ("center_mark", "halfway_near", "halfway_far", "corner_left_near")
-            }
-        }
-    ),
-    "points_on_a_line": json.dumps(
-        {
-            "points": {
-                n: [k * 300, 500]
-                for k, n in enumerate(
-                    (
-                        "center_mark",
-                        "halfway_near",
-                        "halfway_far",
-                        "corner_left_near",
-                        "corner_right_far",
-                    )
-                )
-            }
-        }
-    ),
-    "drawn_many": json.dumps({"drawn": {"halfway_line": [[n % 1900, 5] for n in range(50000)]}}),
     "drawn_empty": '{"drawn": {"halfway_line": []}}',
     "refine": '{"points": {"center_mark": [5, 5]}, "refine": true}',
-    "edits_of_null": '{"edits": null}',
     "edits_of_unknown_kind": '{"edits": [{"id": "x.000000000001", "edit": {"kind": "x"}}]}',
-    "edit_of_huge_frame": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "moved_keypoint.000000000001",
-                    "edit": {
-                        "kind": "moved_keypoint",
-                        "camera": "cam0",
-                        "frame": 10**30,
-                        "detection": 0,
-                        "joint": "nose",
-                        "xy": [1, 2],
-                    },
-                }
-            ]
-        }
+    "edit_of_huge_detection": edit_body(
+        "added_detection", camera="cam0", frame=0, detection=10**9, box=[0, 0, 10, 10]
     ),
-    "edit_of_negative_detection": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "deleted_detection.000000000001",
-                    "edit": {
-                        "kind": "deleted_detection",
-                        "camera": "cam0",
-                        "frame": 0,
-                        "detection": -1,
-                    },
-                }
-            ]
-        }
+    "edit_of_huge_pixel": edit_body(
+        "moved_point", camera="cam0", marking="center_mark", xy=[1e300, 2]
     ),
-    "edit_of_huge_detection": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "added_detection.000000000001",
-                    "edit": {
-                        "kind": "added_detection",
-                        "camera": "cam0",
-                        "frame": 0,
-                        "detection": 10**9,
-                        "box": [0, 0, 10, 10],
-                    },
-                }
-            ]
-        }
-    ),
-    "edit_of_unknown_camera": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "deleted_detection.000000000001",
-                    "edit": {
-                        "kind": "deleted_detection",
-                        "camera": "moon",
-                        "frame": 0,
-                        "detection": 0,
-                    },
-                }
-            ]
-        }
-    ),
-    "edit_of_huge_pixel": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "moved_point.000000000001",
-                    "edit": {
-                        "kind": "moved_point",
-                        "camera": "cam0",
-                        "marking": "center_mark",
-                        "xy": [1e300, 2],
-                    },
-                }
-            ]
-        }
-    ),
-    "edit_of_many_pixels": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "redrawn_marking.000000000001",
-                    "edit": {
-                        "kind": "redrawn_marking",
-                        "camera": "cam0",
-                        "marking": "halfway_line",
-                        "xy": [[n % 1900, 7] for n in range(40000)],
-                    },
-                }
-            ]
-        }
-    ),
-    "tracks_of_huge_ids": json.dumps(
-        {
-            "edits": [
-                {
-                    "id": "merged_tracks.000000000001",
-                    "edit": {"kind": "merged_tracks", "clip": "clip", "kept": 10**40, "merged": -1},
-                }
-            ]
-        }
-    ),
-    "accept_of_two": '{"at_least": 2}',
+    "tracks_of_huge_ids": edit_body("merged_tracks", clip="clip", kept=10**40, merged=-1),
     "accept_of_huge_frames": json.dumps({"people": [[10**30, 10**30]]}),
     "verdict_of_nothing": '{"verdict": ""}',
 }
@@ -416,21 +275,12 @@ TYPES = {
     "text": "text/plain",
     "form": "application/x-www-form-urlencoded",
     "none": None,
-    "charset": "application/json; charset=utf-16",
-    "multipart": "multipart/form-data; boundary=x",
-    "unicode": "application/json; x=\u00e9".encode("latin-1"),
 }
 HEADERS = {
     "cookie_of_noise": {"cookie": "\x01=\xff; a=b; ;;=".encode("latin-1")},
-    "cookie_of_a_session": {"cookie": "worldpose_review_00000000=e30.0"},
     "origin_of_evil": {"origin": "http://evil.example"},
-    "origin_that_is_none": {"origin": "http://[::1"},
     "host_of_evil": {"host": "evil.example"},
-    "host_that_is_none": {"host": "[::1"},
     "length_of_text": {"content-length": "abc"},
-    "length_negative": {"content-length": "-5"},
-    "length_of_digits": {"content-length": "\u00b2".encode("latin-1")},
-    "secret_of_noise": {"x-form-secret": b"\xff\xfe"},
     "range_of_noise": {"range": "bytes=9-1,abc"},
 }
 GOOD = {"match_id": MATCH, "owner": "cam0", "camera": "cam0", "clip": "clip", "number": "0"}

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tasks.tracking import BLOCK, _Feet
-from worldpose.tracking.feet import FrameBlocks, GroundPositions
+from worldpose.tracking.plane.feet import FrameBlocks, GroundPositions
 
 # Two frames of one camera with five detections; 1 and 4, then 0 alone, are not triangulated.
 DETECTION = np.array([[[1, 4]], [[0, -1]]], dtype=np.int16)

@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 
 import worldpose.compiled
-from worldpose.cache_folder import own_temporary_folder
+from worldpose.cache_folder import find_cache_folder, own_temporary_folder
+from worldpose.sources import code_version
 
 ROOT = Path(worldpose.compiled.__file__).parents[1]
 
 CALLER = """
 from worldpose.compiled import compile_kernel
-from worldpose.callees import callee
+from worldpose.callees.callee import callee
 
 @compile_kernel
 def caller():
@@ -40,12 +41,9 @@ def test_an_edit_in_another_file_reaches_the_kernels_that_can_depend_on_it(tmp_p
     for folder in ("callers", "callees", "others"):
         (package / folder).mkdir(parents=True)
         (package / folder / "__init__.py").touch()
-    for module in ("cache_folder.py", "compiled.py"):
+    for module in ("cache_folder.py", "compiled.py", "errors.py", "parsing.py", "sources.py"):
         shutil.copy(Path(worldpose.compiled.__file__).with_name(module), package)
     (package / "__init__.py").touch()
-    (package / "callees" / "__init__.py").write_text(
-        "from worldpose.callees.callee import (\n    callee,\n)\n"
-    )
     (package / "callers" / "caller.py").write_text(CALLER)
 
     def result(value):
@@ -75,11 +73,7 @@ def test_the_modules_whose_change_compiles_a_kernel_again_include_all_that_it_us
         if "\n@compile_kernel\n" not in path.read_text():
             continue
         name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        reached, waiting = set(), [name]
-        while waiting:
-            if (module := waiting.pop()) not in reached:
-                reached.add(module)
-                waiting += worldpose.compiled._imports(module)
+        reached = code_version(name)
         for kernel in vars(importlib.import_module(name)).values():
             if getattr(kernel, "py_func", None) is None or kernel.py_func.__module__ != name:
                 continue
@@ -109,50 +103,20 @@ main()
 """
 
 
-def list_scenarios(home, temporary):
-    around = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
-    return subprocess.run(
+def test_kernels_of_a_user_without_a_home_are_kept_in_a_temporary_folder(tmp_path):
+    around = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
+    told = subprocess.run(
         [sys.executable, "-c", LIST_SCENARIOS],
-        env={**around, "HOME": str(home)},
+        env={**around, "HOME": "/dev/null"},
         capture_output=True,
         text=True,
         check=True,
     ).stderr
-
-
-def test_kernels_of_a_package_that_cannot_be_written_to_are_kept_at_home(tmp_path):
-    assert list_scenarios(tmp_path, tmp_path / "none") == ""
-    assert list((tmp_path / ".cache" / "worldpose" / "__pycache__").rglob("*.nbc"))
-
-
-def test_kernels_of_a_user_without_a_home_are_kept_in_a_temporary_folder(tmp_path):
-    told = list_scenarios("/dev/null", tmp_path)
     folder = tmp_path / f"worldpose-{os.getuid()}"
     assert told.count("warning: ") == 1
     assert f"compiled code is kept in {folder}. Set NUMBA_CACHE_DIR" in told
     assert folder.stat().st_mode & 0o777 == 0o700
     assert list(folder.rglob("*.nbc"))
-
-
-def test_a_folder_in_which_others_can_write_machine_code_is_not_used(tmp_path):
-    folder = tmp_path / f"worldpose-{os.getuid()}"
-    folder.mkdir()
-    folder.chmod(0o777)
-    assert "each process compiles its code again" in list_scenarios("/dev/null", tmp_path)
-    assert list(folder.iterdir()) == []
-
-
-@pytest.mark.parametrize("planted", ["link", "of another user"])
-def test_a_temporary_folder_that_another_user_planted_is_not_used(tmp_path, monkeypatch, planted):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    user = os.getuid()
-    if planted == "link":
-        (tmp_path / "theirs").mkdir(mode=0o700)
-        (tmp_path / f"worldpose-{user}").symlink_to(tmp_path / "theirs")
-    else:
-        (tmp_path / f"worldpose-{user + 1}").mkdir(mode=0o700)
-        monkeypatch.setattr(os, "getuid", lambda: user + 1)
-    assert own_temporary_folder() is None
 
 
 def test_items_read_ahead_come_in_order_and_no_further_than_asked():
@@ -183,3 +147,30 @@ def test_an_error_ahead_is_raised_in_its_turn():
         for item in worldpose.compiled.read_ahead(source(), 8):
             found.append(item)
     assert found == [1, 2]
+
+
+def test_without_a_writable_package_compiled_code_is_kept_at_home(tmp_path, monkeypatch):
+    monkeypatch.setattr("worldpose.cache_folder._PACKAGE", Path("/dev/null"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    expected = tmp_path / ".cache" / "worldpose" / "__pycache__"
+    assert find_cache_folder.__wrapped__() == (expected, True)
+    assert expected.is_dir()
+
+
+@pytest.mark.parametrize("planted", ["link", "of another user", "writable by others"])
+def test_a_temporary_folder_that_another_user_can_change_is_not_used(
+    tmp_path, monkeypatch, planted
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    user = os.getuid()
+    assert own_temporary_folder() == tmp_path / f"worldpose-{user}"
+    if planted == "link":
+        (tmp_path / f"worldpose-{user}").rename(tmp_path / "theirs")
+        (tmp_path / f"worldpose-{user}").symlink_to(tmp_path / "theirs")
+    elif planted == "of another user":
+        (tmp_path / f"worldpose-{user + 1}").mkdir(mode=0o700)
+        monkeypatch.setattr(os, "getuid", lambda: user + 1)
+    else:
+        (tmp_path / f"worldpose-{user}").chmod(0o777)
+    assert own_temporary_folder() is None

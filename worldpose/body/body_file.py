@@ -27,10 +27,6 @@ OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/reference/body_model.md)."""
 NARROW_OPEN_BODY: Final = "open-neutral/3"
 """The open body with hip joints as far apart as people's; its surface is the same."""
-HIP_WIDTH: Final = 0.175
-"""Distance between the hip joints of the mean narrow body [m], 0.230 in the other. Hip centres lie
-14 % of the distance between the anterior superior iliac spines medial of these (Bell, Brand and
-Pedersen, Human Movement Science 8, 1989), which leaves 0.72 of some 0.24 m."""
 
 KEYS: Final = (
     "v_template",
@@ -50,9 +46,6 @@ BODY_FOLDER_VARIABLE: Final = "WORLDPOSE_BODY_FOLDER"
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
-_SHAPES: Final = 10
-"""Number of betas that are read, as in the released poses (X3)."""
-
 
 def load_open_body(name: str = OPEN_BODY) -> BodyModel:
     """Return the open body: 6890 vertices, 24 joints, 10 betas, free for any use (CC0).
@@ -66,7 +59,8 @@ def load_open_body(name: str = OPEN_BODY) -> BodyModel:
 def _move_hips(wide: BodyModel) -> BodyModel:
     """Return the open body with the hip joints moved towards each other, for every shape alike."""
     left, right = wide.joint_template[1:3]
-    share = 0.5 * (1.0 - HIP_WIDTH / float(np.linalg.norm(left - right)))
+    # Distance between the hip joints of the mean narrow body [m], 0.230 in the other.
+    share = 0.5 * (1.0 - 0.175 / float(np.linalg.norm(left - right)))
     regressor = wide.joint_regressor.copy()
     moved = (1.0 - share) * regressor[1:3] + share * regressor[2:0:-1]
     regressor[1:3] = moved.astype(np.float32)  # as in a body's file
@@ -133,30 +127,24 @@ def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[
     Raises:
         InputError: the file cannot be read, names anything but arrays, or lacks a key.
     """
-    from worldpose.pickles import plain, read_notes  # late: they import scipy
+    from worldpose.pickles import read_pickle  # late: it imports scipy
 
     try:
-        content = read_notes(path)
-    except OSError as error:
+        content = read_pickle(path)
+    except (OSError, MemoryError) as error:
         raise _body_file_error(path, f"a file that cannot be read ({error})") from None
     except ValueError as error:
         raise _body_file_error(path, f"a file that cannot be read as a pickle ({error})") from error
     if not isinstance(content, dict):
-        raise _body_file_error(path, f"a pickled {type(content).__name__.strip('_').lower()}")
+        raise _body_file_error(path, f"a pickled {type(content).__name__.lower()}")
     lacking = [key for key in keys if key not in content]
     if lacking:
         raise _body_file_error(path, f"no array named {', '.join(lacking)}")
-    arrays = {}
     for key in keys:
-        try:
-            array = plain(content[key])
-        except (ValueError, MemoryError) as error:
-            reason = str(error) or type(error).__name__
-            raise _body_file_error(path, f"{key} that is not an array ({reason})") from None
+        array = content[key]
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise _body_file_error(path, f"{key} that is not an array of numbers")
-        arrays[key] = array
-    return arrays
+    return {key: content[key] for key in keys}
 
 
 def _body_file_error(path: Path, found: str) -> InputError:
@@ -185,7 +173,8 @@ def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Pat
         return BodyModel(
             name=name,
             template=arrays["v_template"].astype(np.float64),
-            shape_directions=arrays["shapedirs"][:, :, :_SHAPES].astype(np.float64),
+            # Number of betas that are read, as in the released poses (X3).
+            shape_directions=arrays["shapedirs"][:, :, :10].astype(np.float64),
             pose_directions=arrays["posedirs"].astype(np.float64),
             joint_regressor=arrays["J_regressor"].astype(np.float64),
             weights=arrays["weights"].astype(np.float64),
@@ -214,12 +203,10 @@ def install_body(file: Path, folder: Path | None = None, name: str | None = None
     """Return a model read from SMPL's own file, after saving it as a safe npz file.
 
     Args:
-        file: SMPL's .pkl or .npz, as downloaded. Only its first 10 shape directions are used. The
-            pickle's content is read, never run (`read_pickled_arrays`).
+        file: SMPL's .pkl or .npz, as downloaded.
         folder: where `<name>.npz` is written, `body_folder()` by default; one of the same name is
             replaced.
-        name: name of the model in results; from the file's name by default, so that
-            SMPL_NEUTRAL.pkl becomes smpl-neutral.
+        name: name of the model in results.
 
     Raises:
         InputError: the file is not a body model in SMPL's layout, or names code to run.

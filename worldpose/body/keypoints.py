@@ -168,24 +168,6 @@ BODY25: Final = (
 )
 """OpenPose's 25 points in its order."""
 
-EVALUATED14: Final = (
-    "nose",
-    "neck",
-    "left_shoulder",
-    "right_shoulder",
-    "left_elbow",
-    "right_elbow",
-    "left_wrist",
-    "right_wrist",
-    "left_hip",
-    "right_hip",
-    "left_knee",
-    "right_knee",
-    "left_ankle",
-    "right_ankle",
-)
-"""The joints that the paper scores (E4)."""
-
 CHALLENGE15: Final = (
     "nose",
     "right_shoulder",
@@ -209,7 +191,23 @@ SKELETONS: Final = MappingProxyType(
     {
         "coco17": COCO17,
         "body25": BODY25,
-        "evaluated14": EVALUATED14,
+        # The joints that the paper scores (E4).
+        "evaluated14": (
+            "nose",
+            "neck",
+            "left_shoulder",
+            "right_shoulder",
+            "left_elbow",
+            "right_elbow",
+            "left_wrist",
+            "right_wrist",
+            "left_hip",
+            "right_hip",
+            "left_knee",
+            "right_knee",
+            "left_ankle",
+            "right_ankle",
+        ),
         "challenge15": CHALLENGE15,
         "smpl24": JOINT_NAMES,
     }
@@ -301,8 +299,7 @@ def fold_regressor(
     Args:
         model: the body.
         joint_shares: (keypoints, 24), weights of the posed joints.
-        vertex_shares: (keypoints, vertices), weights of the posed vertices; the two together have
-            the sum 1 for every keypoint.
+        vertex_shares: (keypoints, vertices), weights of the posed vertices.
 
     Raises:
         InputError: the shapes differ from these, or a sum differs from 1.

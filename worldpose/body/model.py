@@ -26,8 +26,7 @@ class BodyParameters:
 
     Rotations are axis-angle vectors relative to the parent joint. `global_orient` rotates the body
     about its pelvis joint, and `transl` is added after that: the pelvis of a body stands at
-    `transl` plus the pelvis of its unposed shape. The model itself stands upright along +y, so in a
-    world with z up a standing body has a `global_orient` near (pi / 2, 0, 0).
+    `transl` plus the pelvis of its unposed shape.
 
     Raises:
         InputError: an array has the wrong trailing shape or the batches do not broadcast.

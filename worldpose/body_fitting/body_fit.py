@@ -5,11 +5,9 @@ Quality metrics of a fit need no ground truth.
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +29,7 @@ from worldpose.body_fitting.extra_points import (
     select_points,
 )
 from worldpose.body_fitting.monocular import MonocularPoses, MonocularPrior, monocular_priors
-from worldpose.body_fitting.objective import (
-    Evidence,
-    Ground,
-)
+from worldpose.body_fitting.objective import Evidence, Ground
 from worldpose.body_fitting.pose_space import load_pose_prior, nearest_matrices
 from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
@@ -46,18 +41,10 @@ from worldpose.body_fitting.solver import (
     pose_covariance,
     spread_intervals,
 )
+from worldpose.body_fitting.windows import long_gaps, split_windows, trim_people
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.triangulation.passes import ExtraJoints
-
-KEPT_BIAS: Final = 0.01
-"""Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets
-model the rest."""
-WINDOW_FRAMES: Final = 3000
-"""Frames that are solved together: a person's equations take 60 KB per frame."""
-MARGIN_S: Final = 3.0
-"""Time before and after a window that is solved with it [s]. Motion ties a pose to those within
-some tenths of a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +149,7 @@ class ClipEvidence:
         joints: (frames, persons, 17, 3) [m], world, COCO-17; NaN where missing.
         covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`.
         fps: [1/s].
-        common_bias: (17,) per axis, error that all views share [m]; `covariance` contains it. Body
-            fitting does not reduce it: on real people (Shelf) joints of bodies are as far from the
-            labels as triangulated joints. None = none.
+        common_bias: (17,) per axis, error that all views share [m]; None = none.
         ray_constraints: lines of sight of joints that are not triangulated, for the same frames and
             persons; a person without joints is present as long as these last.
         monocular_poses: poses of the same frames and persons, used where few joints are well
@@ -172,8 +157,7 @@ class ClipEvidence:
         shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
             joints of a person together: no number of joints reduces it. NaN = unknown in this
             frame; None = none.
-        extra: points besides COCO-17 of the same frames and persons; None = none. They determine
-            poses, those of the feet too, and no shapes.
+        extra: points besides COCO-17 of the same frames and persons; None = none.
 
     Raises:
         InputError: the shapes do not match.
@@ -265,15 +249,7 @@ def fit_in_windows(
 
     Shape starts from bone lengths, poses from hips and torso; then betas, coarse poses and the
     detector's shared offsets are estimated together from some seconds of each person, and last the
-    poses of all frames with fixed betas and offsets. A long clip is solved in overlapping windows,
-    so that memory does not grow with it.
-
-    Args:
-        model: the body.
-        evidence: as of `fit_bodies`.
-        settings: as of `fit_bodies`.
-        ground: as of `fit_bodies`.
-        known_shapes: as of `fit_bodies`.
+    poses of all frames with fixed betas and offsets.
 
     Yields:
         Frames, and the bodies in these frames.
@@ -285,22 +261,9 @@ def fit_in_windows(
         ),
         known_shapes or {},
     )
-    for window, kept in _windows(evidence.size[0], evidence.fps, settings):
+    for window, kept in split_windows(evidence.size[0], evidence.fps, settings):
         # Not bound here, so that its memory is free while the next window is fitted.
         yield kept, clip.fit(evidence.read(window), window, kept)
-
-
-def _windows(
-    frames: int, fps: float, settings: BodyFittingSettings
-) -> Iterator[tuple[slice, slice]]:
-    """Yield frames that are solved together, and those of them that are kept."""
-    margin = math.ceil(max(MARGIN_S, 2.0 * settings.max_filled_gap_s) * fps)
-    size = max(WINDOW_FRAMES, 2 * margin)
-    starts = range(0, frames, size) if frames > size + margin else (0,)
-    for start in starts:
-        stop = start + size if len(starts) > 1 and start + size < frames else frames
-        first, last = max(0, start - margin), min(frames, stop + margin)
-        yield slice(first, last), slice(start, stop)
 
 
 def _learn_clip(
@@ -308,7 +271,7 @@ def _learn_clip(
 ) -> _ClipBodies:
     """Return the shapes and offsets of a clip."""
     (frames, persons), fps = evidence.size, evidence.fps
-    parts = [kept for _, kept in _windows(frames, fps, solver.settings)]
+    parts = [kept for _, kept in split_windows(frames, fps, solver.settings)]
     seen = np.zeros((frames, persons), dtype=np.bool_)
     number = np.zeros((frames, persons), dtype=np.int16)
     points: dict[str, None] = {}
@@ -386,10 +349,7 @@ class _ClipBodies:
     """Shapes, offsets and spans, which all frames of a clip share.
 
     Attributes:
-        solver: solver of the joints.
-        shapes: betas of each person, and the detector's offsets.
         spans: frames from a person's first joint to the last.
-        fps: [1/s].
         points: points besides COCO-17; None without evidence about any.
     """
 
@@ -404,11 +364,6 @@ class _ClipBodies:
 
         Where the window begins or ends without any observation of a person, or the frames to keep
         have none, the person is missing.
-
-        Args:
-            evidence: evidence in the window.
-            window: its frames in the clip.
-            kept: those of them whose bodies count.
         """
         settings, bias, fps = self.solver.settings, evidence.bias, self.fps
         covariance = random_covariance(evidence.covariance, bias)
@@ -428,7 +383,8 @@ class _ClipBodies:
                 person: self.points.add(person, own, points[spans[person]], fps)
                 for person, own in people.items()
             }
-        spans, people = _trim(spans, people, kept.start - window.start, kept.stop - window.start)
+        core = slice(kept.start - window.start, kept.stop - window.start)
+        spans, people = trim_people(spans, people, core.start, core.stop)
         solver = self.solver if self.points is None else self.points.solver
         model = self.solver.chained.model
         result = FittedArrays.empty(model, *evidence.size)
@@ -464,7 +420,7 @@ class _ClipBodies:
                 result.guided[spans[person], person] = prior.used
         for person, span in spans.items():
             result.filled[span, person] = ~seen[span, person]
-            gone = _long_gaps(present[span, person], settings.max_filled_gap_s * fps)
+            gone = long_gaps(present[span, person], settings.max_filled_gap_s * fps)
             shared = evidence.shared_covariance
             moving = None if shared is None else nearest_matrices(shared[span, person])[:, None]
             for arrays in (result,) if extra is None else (result, extra):
@@ -476,27 +432,7 @@ class _ClipBodies:
             result.betas_covariance[person] = self.shapes.people[person].covariance
         fit = BodyFit.of(result, self.shapes)
         fit = fit if extra is None else replace(fit, extra=extra.fit())
-        if kept == window:
-            return fit
-        return fit[kept.start - window.start : kept.stop - window.start]
-
-
-def _trim(
-    spans: Mapping[int, slice], people: Mapping[int, Evidence], first: int, last: int
-) -> tuple[dict[int, slice], dict[int, Evidence]]:
-    """Return frames and evidence of people from their first observation in a window to the last.
-
-    People without any observation in the frames from `first` to `last` are left out.
-    """
-    trimmed, evidence = {}, {}
-    for person, span in spans.items():
-        here = np.flatnonzero(people[person].known.any(axis=1))
-        if ((here + span.start >= first) & (here + span.start < last)).any():
-            own = slice(int(here[0]), int(here[-1]) + 1)
-            trimmed[person] = slice(span.start + own.start, span.start + own.stop)
-            its = people[person]
-            evidence[person] = Evidence(its.joints[own], its.information[own])
-    return trimmed, evidence
+        return fit if kept == window else fit[core]
 
 
 def _gather_evidence(
@@ -505,14 +441,7 @@ def _gather_evidence(
     spans: Mapping[int, slice],
     settings: BodyFittingSettings,
 ) -> tuple[dict[int, Evidence], Flags]:
-    """Return each person's joints and lines of sight, and the frames (frames, persons) with any.
-
-    Args:
-        evidence: joints and lines of sight.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of the joints, without modelled bias.
-        spans: frames of each person.
-        settings: scale and correlation time of the noise.
-    """
+    """Return each person's joints and lines of sight, and the frames (frames, persons) with any."""
     fps, present = evidence.fps, np.asarray(evidence.joint_seen.any(-1))
     for view in evidence.ray_constraints:
         present = present | view.seen
@@ -538,18 +467,9 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
         covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
         common_bias: (17,) per axis [m], included in `covariance`.
     """
-    modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
+    # 1 cm per axis stays; the shared offsets model the rest.
+    modelled = np.maximum(common_bias**2 - 0.01**2, 0.0)
     random = covariance.astype(np.float64)
     for axis in range(3):
         random[..., axis, axis] -= modelled
     return random
-
-
-def _long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:
-    """Return the frames in gaps of more than `max_frames` frames."""
-    places = np.flatnonzero(seen)
-    long = np.zeros(len(seen), dtype=bool)
-    for first, last in itertools.pairwise(places):
-        if last - first - 1 > max_frames:
-            long[first + 1 : last] = True
-    return long

@@ -23,10 +23,6 @@ BONES: Final = (
     *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),
 )
 """Pairs of COCO-17 joints whose distance no pose changes."""
-LIMBS: Final = ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16))
-"""Arms and legs of COCO-17, outward."""
-MAX_SHORTENING: Final = 0.15
-"""Maximum relative shortening of bones [1]: beyond it noise is not small."""
 DEFINITION_STD_M: Final = 0.02
 """Distance between a detector's definition of a joint and the body model's [m]: no number of frames
 makes a bone's length more accurate than this times sqrt(2)."""
@@ -94,7 +90,8 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
         covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
     """
     shortened = joints.copy()
-    for near, middle, far in LIMBS:
+    # Arms and legs of COCO-17, outward.
+    for near, middle, far in ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16)):
         for a, b, moved in ((near, middle, (middle, far)), (middle, far, (far,))):
             bone, error = joints[:, b] - joints[:, a], covariance[:, a] + covariance[:, b]
             length = np.linalg.norm(bone, axis=-1)
@@ -102,7 +99,8 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
             across = np.trace(error, axis1=-2, axis2=-1) - np.einsum(
                 "fa,fab,fb->f", along, error, along
             )
-            longer = np.minimum(0.5 * across / np.maximum(length, 1e-9), MAX_SHORTENING * length)
+            # Maximum relative shortening of bones [1]: beyond it noise is not small.
+            longer = np.minimum(0.5 * across / np.maximum(length, 1e-9), 0.15 * length)
             longer = np.where(np.isfinite(longer), longer, 0.0)
             along = np.where(np.isfinite(along), along, 0.0)
             for joint in moved:

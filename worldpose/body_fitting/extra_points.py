@@ -30,25 +30,8 @@ from worldpose.body_fitting.solver import Shapes, Solver
 from worldpose.compiled import map_in_threads
 from worldpose.triangulation.passes import ExtraJoints
 
-OFFSET_STD_M: Final = 0.02
-"""Expected offset of a detector's point from the body's, per axis of the segment [m]: soles and toe
-caps of shoes are 1 to 3 cm thick."""
-OWN_STD_M: Final = 0.01
-"""Difference of that offset between persons, per axis [m]."""
-PASSES: Final = 2
-"""Estimates of the offsets, each from poses that know the one before."""
-SAMPLE_S: Final = 2.0
-"""Time of each person from which offsets are learned [s]: they are few numbers."""
-MIN_FOOT_POINTS: Final = 2
-"""Points that determine the pose of a foot in a frame [1]: a heel and a toe."""
-FOOT_TIME_S: Final = 0.1
-"""Time around such a frame for which the motion determines the pose of a foot [s]."""
 MIRROR: Final = np.array([-1.0, 1.0, 1.0])
 """Of vectors in the axes of the unposed body: left, up, forward."""
-KEPT_BIAS_M: Final = 0.01
-"""Least part of the points' common bias that stays in their covariance per axis [m]."""
-NORMAL_MAD: Final = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +120,10 @@ def learn_point_offsets(
     """
     model = solver.chained.model
     offsets = np.zeros((len(points), 3))
-    variance = np.full(offsets.shape, OFFSET_STD_M**2)
+    # Expected offset of a detector's point from the body's, per axis of the segment [m]: soles and
+    # toe caps of shoes are 1 to 3 cm thick.
+    offset_std_m = 0.02
+    variance = np.full(offsets.shape, offset_std_m**2)
 
     def residuals(person: int) -> Floats:
         part = people[person]
@@ -148,7 +134,9 @@ def learn_point_offsets(
         away: Floats = part.joints[:, len(COCO17) :] - places
         return np.asarray(np.einsum("fpba,fpb->fpa", turned, away))
 
-    for _ in range(PASSES):
+    own_std_m = 0.01  # Difference of that offset between persons, per axis [m].
+    # Estimates of the offsets, each from poses that know the one before.
+    for _ in range(2):
         moved = move_points(solver, points, offsets)
         medians, spreads = [], []
         for own in map_in_threads(residuals, people):
@@ -158,7 +146,9 @@ def learn_point_offsets(
             for point in np.flatnonzero(seen.any(axis=0)):
                 its = own[seen[:, point], point]
                 median[point] = np.median(its, axis=0)
-                spread[point] = (NORMAL_MAD * np.median(np.abs(its - median[point]), axis=0)) ** 2
+                # Standard deviation of a normal distribution over its median absolute deviation
+                # [1].
+                spread[point] = (1.4826 * np.median(np.abs(its - median[point]), axis=0)) ** 2
             medians.append(median)
             spreads.append(spread)
         each, around = np.array(medians), np.array(spreads)
@@ -168,8 +158,8 @@ def learn_point_offsets(
             if other is not None:
                 values = np.concatenate([values, each[:, other] * MIRROR])
             values = values[np.isfinite(values[:, 0])]
-            weight = len(values) / OWN_STD_M**2 + 1.0 / OFFSET_STD_M**2
-            offsets[place] = values.sum(axis=0) / OWN_STD_M**2 / weight
+            weight = len(values) / own_std_m**2 + 1.0 / offset_std_m**2
+            offsets[place] = values.sum(axis=0) / own_std_m**2 / weight
             variance[place] = 1.0 / weight
     with np.errstate(invalid="ignore"):
         varying = np.nan_to_num(np.nansum(around, axis=0) / np.isfinite(around).sum(axis=0))
@@ -183,16 +173,12 @@ def _kept_variance(
 
     A net errs alike in the landmarks of one segment, in all views and for many frames: together
     they count as one, whose error is that of residuals over time.
-
-    Args:
-        model: the body.
-        points: names of the points.
-        varying: (points, 3) [m^2], variance of residuals around the offsets.
-        common_bias: (points,) per axis [m], expected without residuals.
     """
-    least = np.maximum(varying, KEPT_BIAS_M**2)
+    # Least part of the points' common bias that stays in their covariance per axis [m].
+    kept_bias_m = 0.01
+    least = np.maximum(varying, kept_bias_m**2)
     if not any(point in LANDMARKS for point in points):
-        usual = np.minimum(KEPT_BIAS_M**2, common_bias**2)
+        usual = np.minimum(kept_bias_m**2, common_bias**2)
         return np.repeat(usual[:, None], 3, axis=1)
     its = point_segments(model, points)
     alike: Floats = (its[:, None] == its).sum(axis=1)[:, None] * least
@@ -208,14 +194,15 @@ def _mirror_place(points: tuple[str, ...], place: int) -> int | None:
 
 
 def densest_interval(known: NDArray[np.integer], fps: float) -> slice:
-    """Return the interval of `SAMPLE_S` with the most points.
+    """Return the interval of two seconds with the most points.
 
     Args:
         known: (frames,) number of a person's points in each frame.
         fps: [1/s].
     """
     total = np.concatenate([[0], np.cumsum(known, dtype=np.int64)])
-    length = min(max(3, round(SAMPLE_S * fps)), len(known))
+    # Time of each person from which offsets are learned [s]: they are few numbers.
+    length = min(max(3, round(2.0 * fps)), len(known))
     start = int((total[length:] - total[: len(total) - length]).argmax())
     return slice(start, start + length)
 
@@ -226,11 +213,13 @@ def feet_determined(
     """Return the frames in which points determine the left and right foot (frames, 2)."""
     its = point_segments(model, points)
     known = evidence.known[:, len(COCO17) :]
-    reach = round(FOOT_TIME_S * fps)
+    # Time around such a frame for which the motion determines the pose of a foot [s].
+    reach = round(0.1 * fps)
     determined = np.zeros((len(known), 2), dtype=np.bool_)
     for side, name in enumerate(("left", "right")):
         foot = [JOINT_NAMES.index(f"{name}_{part}") for part in ("ankle", "foot")]
-        sure = known[:, np.isin(its, foot)].sum(axis=1) >= MIN_FOOT_POINTS
+        # Points that determine the pose of a foot in a frame [1]: a heel and a toe.
+        sure = known[:, np.isin(its, foot)].sum(axis=1) >= 2
         near = np.convolve(sure, np.ones(2 * reach + 1), mode="full")
         determined[:, side] = near[reach : reach + len(sure)] > 0.0
     return determined

@@ -4,9 +4,6 @@ The comparison shows where bodies lose to their own input, triangulated joints. 
 cameras after the other is held out. The others triangulate all people, bodies are fitted to these
 joints, and both are compared with the keypoints of the held-out cameras. The errors of these
 keypoints raise both mean squares alike, so that their difference is that of the joints' own errors.
-It does not show an error that all cameras share: a body may leave the joints of a detector for
-better ones, and this comparison still prefers the detector's. So bodies are taken in the detector's
-definition of joints.
 """
 
 from __future__ import annotations
@@ -37,23 +34,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.passes import Triangulation, learn_detector, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
-BLOCK: Final = 256
-"""Frames of detections in memory at a time."""
-MAX_OFFSET: Final = 3.0
-"""Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
-FOLDS: Final = 4
-"""Groups of cameras; each is held out once."""
-PIECE_S: Final = 0.5
-"""Length of the compared intervals [s]: errors of neighbouring frames are alike, so that many short
-intervals say more than few long ones; much shorter ones would take the motion from the bodies."""
-MAX_BODIES: Final = 400
-"""Bodies fitted for each group of cameras [1]: about half a second of one core."""
-MAX_DISTANCE_M: Final = 0.2
-"""A keypoint farther than this from a joint counts as this far [m]: it shows something else."""
-MIN_CLUSTERS: Final = 3
-"""Intervals of persons, and cameras, needed for a standard error [1]."""
-CERTAINTY: Final = 0.975
-"""Probability of `certain_excess`, by Student's distribution of the smaller number of clusters."""
 _GROUP_OF: Final = np.array(
     [
         next(g for g, parts in enumerate(JOINT_GROUPS.values()) if any(p in name for p in parts))
@@ -94,8 +74,7 @@ class FitMetrics:
 
     Args:
         fps: [1/s].
-        stride: of this many values of a part, medians and spreads use one; those of image
-            distances use one of this many blocks of frames, which are read faster than frames.
+        stride: of this many values of a part, medians and spreads use one.
     """
 
     def __init__(self, fps: float, stride: int = 1) -> None:
@@ -137,8 +116,9 @@ class FitMetrics:
             self._keep("jerk", person, np.array([[squares.sum(), len(squares)]]))
         if seen is None:
             return
-        for first in range(0, len(joints), BLOCK * self._stride):
-            rows = slice(first, min(first + BLOCK, len(joints)))
+        block = 256  # Frames of detections in memory at a time.
+        for first in range(0, len(joints), block * self._stride):
+            rows = slice(first, min(first + block, len(joints)))
             distances = _reprojection(perceived[rows], seen, rows)
             for person, values in enumerate(distances):
                 self._keep("reprojection", person, values.astype(np.float32))
@@ -194,13 +174,7 @@ def report_fit(
 def _reprojection(
     perceived: Floats, seen: tuple[Camera, TrackedFrames], rows: slice
 ) -> list[Floats]:
-    """Return distances of each person's seen keypoints (n,) [px] in some frames.
-
-    Args:
-        perceived: (rows, persons, 17, 3) [m], world, the detector's joints of bodies.
-        seen: cameras and detections as of `FitMetrics.add`.
-        rows: frames among the detections.
-    """
+    """Return distances of each person's seen keypoints (n,) [px] in some frames."""
     cameras, reader = seen
     detections = reader[rows]
     index = detections.detection_index
@@ -244,11 +218,13 @@ def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, 
         By joint, left and right as one: length of the offset and its usual maximum [m].
     """
     length = np.linalg.norm(offsets, axis=-1)
-    far = (length > MAX_OFFSET * common_bias) & (common_bias > 0.0)
+    # Offsets beyond this are unusual for any detector [standard deviations]: one in 34.
+    max_offset = 3.0
+    far = (length > max_offset * common_bias) & (common_bias > 0.0)
     return {
         COCO17[joint].removeprefix("left_"): (
             float(length[joint]),
-            MAX_OFFSET * float(common_bias[joint]),
+            max_offset * float(common_bias[joint]),
         )
         for joint in np.flatnonzero(far)
         if not COCO17[joint].startswith("right")
@@ -285,8 +261,7 @@ class HeldOutComparison:
         triangulated: the same of the triangulated joints.
         standard_error: of `excess` [m], from intervals of persons and from cameras.
         certain_excess: root of the mean square error of bodies' joints beyond that of triangulated
-            joints [m], its lower limit; 0 where bodies may be as near. Unlike `excess`, it does
-            not depend on the errors of the held-out keypoints.
+            joints [m], its lower limit.
         keypoints: number of compared keypoints.
     """
 
@@ -330,19 +305,13 @@ def compare_held_out(
     Shapes, the detector's offsets and noise are those of the whole clip: few numbers, which
     thousands of keypoints determine. Joints and poses know nothing of the held-out cameras.
 
-    Args:
-        model: the body.
-        settings: settings of the fit.
-        ground: height of the surface under the feet, as for the fit.
-        clip: cameras and detections.
-        fit: bodies of the clip, fitted to joints of all its cameras.
-
     Returns:
         None without people, or if too few cameras remain to triangulate.
     """
     count, frames = clip.cameras.batch_shape[0], len(clip.detections.detection_index)
     known = np.flatnonzero(np.isfinite(fit.betas).all(-1))
-    if count - max(1, count // FOLDS) < clip.settings.min_views or not len(known):
+    folds = 4  # Groups of cameras; each is held out once.
+    if count - max(1, count // folds) < clip.settings.min_views or not len(known):
         return None
     pieces = _choose_pieces(frames, len(known), clip.fps)
     chosen = np.concatenate([np.arange(piece.start, piece.stop) for piece in pieces])
@@ -352,9 +321,9 @@ def compare_held_out(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
     )
     detector = learn_detector(clip.cameras, detections, clip.settings, clip.camera_covariance)
-    fold = np.arange(count) % FOLDS
+    fold = np.arange(count) % folds
     rows: list[tuple[NDArray[np.int64], ...]] = []
-    for left_out in range(min(FOLDS, count)):
+    for left_out in range(min(folds, count)):
         index = np.where((fold == left_out)[:, None], np.int16(-1), detections.detection_index)
         others = replace(detections, detection_index=index.astype(np.int16))
         placed = triangulate_joints(
@@ -401,8 +370,11 @@ def _fit_poses(
 
 def _choose_pieces(frames: int, persons: int, fps: float) -> list[slice]:
     """Return evenly spread intervals of a clip's frames."""
-    length = min(frames, max(3, round(PIECE_S * fps)))
-    count = int(np.clip(MAX_BODIES // (persons * length), 1, frames // length))
+    # Length of the compared intervals [s]: errors of neighbouring frames are alike, so that many
+    # short intervals say more than few long ones.
+    length = min(frames, max(3, round(0.5 * fps)))
+    # Bodies fitted for each group of cameras [1]: about half a second of one core.
+    count = int(np.clip(400 // (persons * length), 1, frames // length))
     starts = np.linspace(0, frames - length, count).astype(np.int64)
     return [slice(int(start), int(start) + length) for start in starts]
 
@@ -414,15 +386,7 @@ def _compare(
     both: tuple[Floats, Floats],
     length: int,
 ) -> tuple[NDArray[np.int64], ...]:
-    """Return joint, interval of a person, camera and two squared distances [m^2] of keypoints.
-
-    Args:
-        cameras: batch (cameras,).
-        camera: index of the held-out camera.
-        detections: detections in the compared frames.
-        both: fitted and triangulated joints (frames, persons, 17, 3) [m], world.
-        length: frames of an interval.
-    """
+    """Return joint, interval of a person, camera and two squared distances [m^2] of keypoints."""
     index = detections.detection_index[:, camera]
     frame, person = np.nonzero(index >= 0)
     seen = np.asarray(detections.keypoints[frame, camera, index[frame, person]], dtype=np.float64)
@@ -433,7 +397,8 @@ def _compare(
     scale = view.focal.mean() / np.maximum(place @ axis + depth, 1e-3)
     for joints in both:
         away = np.linalg.norm(view.project(joints[frame, person]) - seen, axis=-1) / scale
-        squares.append(np.minimum(away, MAX_DISTANCE_M) ** 2)
+        # A keypoint farther than this from a joint counts as this far [m]: it shows something else.
+        squares.append(np.minimum(away, 0.2) ** 2)
     row, joint = np.nonzero(np.isfinite(squares[0]) & np.isfinite(squares[1]))
     persons = detections.detection_index.shape[2]
     return (
@@ -459,11 +424,14 @@ def _summarize(
         mine = _GROUP_OF[joint] == group
         number[group] = mine.sum()
         clusters = min(len(np.unique(each[mine])) for each in (interval, camera))
-        if clusters < MIN_CLUSTERS:
+        # Intervals of persons, and cameras, needed for a standard error [1].
+        if clusters < 3:
             continue
         squares = fitted[mine] - triangulated[mine]
         deviation = np.sqrt(_clustered_variance(squares, interval[mine], camera[mine]))
-        certain = squares.mean() - stdtrit(clusters - 1, CERTAINTY) * deviation
+        # Probability of `certain_excess`, by Student's distribution of the smaller number of
+        # clusters.
+        certain = squares.mean() - stdtrit(clusters - 1, 0.975) * deviation
         one, two = np.sqrt(fitted[mine].mean()), np.sqrt(triangulated[mine].mean())
         # The difference of roots is the difference of the squares over their sum.
         found[:, group] = one, two, deviation / max(one + two, 1e-9), np.sqrt(max(certain, 0.0))

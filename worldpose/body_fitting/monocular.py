@@ -29,21 +29,11 @@ from worldpose.formats.files import require_file
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
-ESTIMATE_BYTES: Final = 1 << 30
-"""Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices."""
-
 WHOLE: Final = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
 """Names of all 24 rotations in one array."""
 ROOT: Final = ("global_orient", "pred_global_orient")
 REST: Final = ("body_pose", "pred_body_pose")
 """Names of the pelvis' rotation and of the 23 others."""
-CROPS: Final = ("box_center", "bbox", "bboxes")
-"""Names of crops: centers, or x0 y0 x1 y1. Bodies of crops face the crop's center."""
-PLACES: Final = ("transl", "pred_cam_t_full", "cam_t", "trans")
-"""Names of positions in front of a whole image [m], of full perspective."""
-MAX_DEVIATION: Final = 0.035
-"""Joints are well determined if their median standard deviation per axis is below this [m]: 16
-cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +67,8 @@ def read_monocular(path: Path) -> MonocularEstimates:
         InputError: unreadable, or without rotations or positions.
     """
     require_file(path)
-    return parse_monocular(read_npz(path, ESTIMATE_BYTES), path)
+    # Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices.
+    return parse_monocular(read_npz(path, 1 << 30), path)
 
 
 def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
@@ -105,7 +96,9 @@ def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> Monocula
         rotations = _rotation_matrices(whole, where, "rotations", JOINTS)
     rows = len(rotations)
     frame = np.asarray(arrays.get("frame", arrays.get("frames", np.arange(rows)))).ravel()
-    crop, place = _first_present(arrays, CROPS), _first_present(arrays, PLACES)
+    # Crops have centers, or x0 y0 x1 y1; whole images positions in front of the camera [m].
+    crop = _first_present(arrays, ("box_center", "bbox", "bboxes"))
+    place = _first_present(arrays, ("transl", "pred_cam_t_full", "cam_t", "trans"))
     if crop is not None:
         crop = np.asarray(crop, dtype=np.float64)
         center = crop if crop.shape[1:] == (2,) else 0.5 * (crop[..., :2] + crop[..., 2:4])
@@ -153,10 +146,6 @@ def _format_error(where: Path, expected: str, found: str) -> InputError:
     )
 
 
-GATE: Final = 0.35
-"""Maximum image distance between an estimate and its person [person height]."""
-
-
 @dataclass(frozen=True, eq=False)
 class MonocularPoses:
     """Poses of people, estimated from images of one camera."""
@@ -199,14 +188,15 @@ def place_monocular_poses(
     high = np.where(known, image, -np.inf).max(axis=2, initial=-np.inf)
     with np.errstate(invalid="ignore"):  # without a camera, inf - inf
         middle, height = 0.5 * (low + high), high[..., 1] - low[..., 1]
+    gate = 0.35  # Maximum image distance between an estimate and its person [person height].
     for place in np.flatnonzero(np.isin(frame, estimates.frame)):
         rows = np.flatnonzero(estimates.frame == frame[place])
         with np.errstate(invalid="ignore", divide="ignore"):
             away = np.linalg.norm(estimates.center[rows, None] - middle[place], axis=-1)
             away = away / height[place]
         away = np.where(np.isfinite(away), away, np.inf)
-        row, person = linear_sum_assignment(np.minimum(away, GATE))
-        near = away[row, person] < GATE
+        row, person = linear_sum_assignment(np.minimum(away, gate))
+        near = away[row, person] < gate
         row, person = rows[row[near]], person[near]
         at = camera[int(place)]
         turned = estimates.rotations[row, 0]
@@ -232,19 +222,11 @@ def _rotate_axis_to(plane: Floats) -> Floats:
 
 PRIOR_SPREAD: Final = 0.25
 """Prior standard deviation of an angle [rad]: 80 mm on a limb of 0.3 m."""
-PRIOR_WEIGHT: Final = 5.0
-"""Weight of that prior in independent estimates [1]."""
-TAIL: Final = 2.5
-"""Deviation, root mean square over the angles, at which an estimate has half its weight [standard
-deviations]: backs mistaken for fronts."""
 
 CORRELATION_S: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 INDEPENDENT_SHARE: Final = 0.3
 """Share of an estimate's variance that is independent from frame to frame [1]."""
-MAX_CORRELATION_TIMES: Final = 2.0
-"""Range of known errors in correlation times [1]: farther ones explain a fiftieth of the
-variance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +259,9 @@ class MonocularPrior:
         surer = 1.0 / np.broadcast_to(self.left, len(away))
         weighted = away @ self.precision * surer[:, None]
         square = (weighted * away).sum(-1)
-        tail = TAIL**2 * len(self.precision)
+        # Deviation, root mean square over the angles, at which an estimate has half its weight
+        # [standard deviations]: backs mistaken for fronts.
+        tail = 2.5**2 * len(self.precision)
         weight = self.used / (1.0 + square / tail) / self.correlated_frames
         by_pose = np.broadcast_to(np.eye(3 + SIZE), (len(away), 3 + SIZE, 3 + SIZE)).copy()
         by_pose[:, :3, :3] = np.linalg.solve(left_jacobian(away[:, :3]), left_jacobian(orient))
@@ -307,8 +291,9 @@ def learn_precision(
     away = deviations(
         monocular.orient[there], monocular.angles[there], orient[there], angles[there]
     )
-    square = PRIOR_WEIGHT * PRIOR_SPREAD**2 + (away**2).sum(axis=0) / correlated_frames
-    return np.diag((PRIOR_WEIGHT + len(away) / correlated_frames) / square).astype(np.float64)
+    prior_weight = 5.0  # Weight of that prior in independent estimates [1].
+    square = prior_weight * PRIOR_SPREAD**2 + (away**2).sum(axis=0) / correlated_frames
+    return np.diag((prior_weight + len(away) / correlated_frames) / square).astype(np.float64)
 
 
 def carry_errors(
@@ -332,7 +317,9 @@ def carry_errors(
     turn, angles, left = known.copy(), known_angles.copy(), np.ones(len(off))
     there = np.flatnonzero(np.isfinite(off).all(axis=-1))
     asked = np.flatnonzero(used)
-    reach = MAX_CORRELATION_TIMES * lasting
+    # Range of known errors in correlation times [1]: farther ones explain a fiftieth of the
+    # variance.
+    reach = 2.0 * lasting
     for block in np.unique(asked // reach):
         at = asked[asked // reach == block]
         near = there[(there >= at[0] - reach) & (there <= at[-1] + reach)]
@@ -389,7 +376,9 @@ def monocular_priors(
         fps: [1/s].
     """
     variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
-    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < MAX_DEVIATION**2
+    # Joints are well determined if their median standard deviation per axis is below this [m]: 16
+    # cameras leave 0.02 to 0.03, two 0.04 to 0.1.
+    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < 0.035**2
     correlated_frames = 1.0 + CORRELATION_S * fps
     fitted, body_pose = poses
     angles = body_pose @ GATHER.T

@@ -233,16 +233,10 @@ def ankle_height(model: BodyModel, betas: Floats) -> float:
 
 UNKNOWNS: Final = 6 + SIZE
 """Unknowns per frame: translation, orientation and angles; more with points of the feet."""
-POINT_ACCELERATION: Final = 6.0
-"""Acceleration of points besides COCO-17 as a multiple of the hips': heels and toes."""
 ACCELERATION_SCALE: Final = np.array(
     [1, 1, 1, 1, 1, 1, 1, 2, 2, 3, 3, 1, 1, 5, 5, 5, 5], dtype=np.float64
 )
 """Accelerations of joints as multiples of the hips'; averages of simulated players."""
-CACHED_FRAMES: Final = 64
-"""Frames that are differentiated together: 2 MB of derivatives."""
-_MAX_ROTATION: Final = 0.6
-"""Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +259,9 @@ class Pose:
 
     def apply_step(self, step: Floats, betas: Floats | float = 0.0) -> Pose:
         """Return the pose after a step (frames, 36), with rotations clipped to the linear range."""
-        turns = np.clip(step[:, 3:], -_MAX_ROTATION, _MAX_ROTATION)
+        # Maximum change of an angle per step [rad]; beyond it the linear model is invalid.
+        max_rotation = 0.6
+        turns = np.clip(step[:, 3:], -max_rotation, max_rotation)
         orient = self.orient + turns[:, :3]
         angle = np.linalg.norm(orient, axis=-1, keepdims=True)
         # The same rotation by the smaller angle.
@@ -384,8 +380,9 @@ class Track:
         """
         parameters, frames = pose.parameters(), len(pose.transl)
         keypoints, betas, rows = (np.empty(0) for _ in range(3))
-        for start in range(0, frames, CACHED_FRAMES):
-            part = slice(start, start + CACHED_FRAMES)
+        cached_frames = 64  # Frames that are differentiated together: 2 MB of derivatives.
+        for start in range(0, frames, cached_frames):
+            part = slice(start, start + cached_frames)
             body = self.chained.differentiate(parameters[part], by_betas=by_betas)
             if not start:
                 keypoints = np.empty((frames, *body.keypoints.shape[1:]))
@@ -407,7 +404,8 @@ class Track:
         if frames > 2:
             further = points - len(ACCELERATION_SCALE)
             # A body accelerates as one: many points tell no more of it than those of the feet.
-            many = POINT_ACCELERATION * max(1.0, further / len(FEET)) ** 0.5
+            # Acceleration of points besides COCO-17 as a multiple of the hips': heels and toes.
+            many = 6.0 * max(1.0, further / len(FEET)) ** 0.5
             scale = np.concatenate([ACCELERATION_SCALE, np.full(further, many)])
             spread = self.acceleration * scale / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]

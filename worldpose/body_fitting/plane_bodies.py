@@ -3,12 +3,7 @@
 No view determines the distance of such a person. The feet give it, since they stand on the pitch; a
 monocular method gives the pose, turned into the world by the calibrated camera; the image's
 keypoints correct both across the line of sight. The fit is that of triangulated people (S1-S3) with
-other evidence: lines of sight instead of joints, and places on the pitch with their covariance.
-Betas of a monocular method are not used: its size of a person is a guess, and betas of two body
-models are not comparable. The keypoints at the distance of the feet give the size.
-
-A person without estimates, or with estimates that contradict the keypoints, has no body. The place
-on the pitch remains.
+other evidence: lines of sight, and places on the pitch with their covariance.
 """
 
 from __future__ import annotations
@@ -55,23 +50,14 @@ from worldpose.body_fitting.solver import (
     solve_shapes,
     spread_intervals,
 )
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.tracking.ground_tracks import CORRELATION_S as PLACE_CORRELATION_S
+from worldpose.tracking.plane.kalman import CORRELATION_S as PLACE_CORRELATION_S
 
 HIPS: Final = (11, 12)
 """Hips in COCO-17; the place on the pitch is below their middle."""
 PIXEL_STD: Final = 1.0
 """Standard deviation of a keypoint in the image [px], in addition to `ray_std_m`."""
-MIN_GAIN: Final = 0.75
-"""A body turned half round contradicts the estimates if it misses the keypoints by less than this
-share of what the body as estimated does [1]: sides of limbs and bends tell front from back. In two
-simulated worlds 1.5 to 3.4 for estimates as they are, and 0.4 to 0.6 for turned ones."""
-START_WINDOW_S: Final = 0.2
-"""Monocular poses so near in time make a start [s]: single frames with a wrong pose drop out."""
-MAX_BRIDGED_S: Final = 0.5
-"""Frames farther than this from any monocular pose of the person have no body [s]."""
 MIN_KEYPOINTS: Final = 6
 """Minimum keypoints of a frame to judge an estimate [1]."""
 MAX_MISFIT: Final = 0.85
@@ -79,25 +65,9 @@ MAX_MISFIT: Final = 0.85
 position and size [root mean square, relative to that of the keypoints about their middle]. In two
 simulated worlds 0.2 to 0.6 with angles off by 8 degrees, up to 0.8 with 15 degrees, 0.9 to 1 for
 bodies that lie or stand on their heads."""
-MIN_AGREEING: Final = 0.5
-"""Minimum share of a person's estimates that agree with the keypoints [1]."""
-KEYPOINT_STD: Final = 0.07
-"""Standard deviation of a keypoint per axis in the same measure [1]: 2 % of the person's height, as
-keypoints lie 0.28 heights from their middle."""
 MAX_FITTED_MISFIT: Final = 2.0
 """Maximum misfit of a fitted body, median over frames, relative to the keypoints' noise [1]. In the
-two worlds 0.7 to 1.1, also where estimates are poor, and 1.6 to 5 where bodies look the other way
-or stand on their heads."""
-STEPS: Final = 10
-"""Gauss-Newton steps: a start from monocular poses is farther away than one from joints."""
-FOOT_BIAS_M: Final = 0.03
-"""Error of a foot's height that lasts for a clip [m]: where the detector sees the ankle, and the
-height of the ankle above the pitch. Divided by the slope of the line of sight it is an error of the
-distance."""
-
-LEAN_STD: Final = 0.08
-"""Error of a whole body's lean along the line of sight that lasts for a clip [rad]: 5 degrees. From
-one side a lean and a size look alike, and monocular methods lean all people the same way."""
+two worlds 0.7 to 1.1, also for poor estimates, and 1.6 to 5 for bodies the wrong way round."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +84,6 @@ class PlaneEvidence:
         calibration: (frames, persons, 2, 2) [m^2], part of it that the camera's calibration causes,
             which all frames share.
         fps: [1/s].
-
-    Raises:
-        InputError: the shapes do not match.
     """
 
     camera: Camera
@@ -127,35 +94,6 @@ class PlaneEvidence:
     place_covariance: Floats
     calibration: Floats
     fps: float
-
-    def __post_init__(self) -> None:
-        shape = self.place.shape[:-1]
-        found = (
-            self.keypoints.shape,
-            self.confidence.shape,
-            self.place.shape,
-            self.place_covariance.shape,
-            self.calibration.shape,
-            self.number.shape,
-            self.camera.batch_shape,
-        )
-        expected = (
-            (*shape, 17, 2),
-            (*shape, 17),
-            (*shape, 2),
-            (*shape, 2, 2),
-            (*shape, 2, 2),
-            shape[:1],
-            shape[:1],
-        )
-        if len(shape) != 2 or found != expected:
-            raise InputError(
-                "bodies on the plane",
-                expected="keypoints (frames, persons, 17, 2), confidence (frames, persons, 17), "
-                "place (frames, persons, 2) with covariance, and as many cameras as frames",
-                found=", ".join(map(str, found)),
-                todo="Give all arrays for the same frames and persons.",
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,16 +128,10 @@ def fit_bodies_on_plane(
 
     The covariance contains the distance that the feet leave open, the foot's bias over the slope of
     the line of sight, and a lean. Joints in depth are as uncertain as the monocular angles.
-
-    Args:
-        model: the body.
-        evidence: keypoints, places and the camera.
-        estimates: monocular poses in the camera's images.
-        ground: height of the surface under the feet, in a world with z up.
-        settings: expected errors of detectors, bodies and motion.
     """
     frames, persons = evidence.place.shape[:2]
-    settings = settings.model_copy(update={"steps": max(settings.steps, STEPS)})
+    # Gauss-Newton steps: a start from monocular poses is farther away than one from joints.
+    settings = settings.model_copy(update={"steps": max(settings.steps, 10)})
     keypoints = fold_keypoints(model, COCO17)
     solver = Solver(ChainedKeypoints.of(keypoints), load_pose_prior(), settings, ground)
     lifted = _lift_keypoints(evidence)
@@ -299,12 +231,15 @@ class _Clip:
         place = self.evidence.place[:, person]
         known, at = np.isfinite(place).all(axis=-1), np.flatnonzero(self.agreeing[:, person])
         frames = np.arange(len(place))
-        covered = known & (np.abs(frames - nearest_known(at, frames)) <= MAX_BRIDGED_S * fps)
+        # Frames farther than this from any monocular pose of the person have no body [s].
+        covered = known & (np.abs(frames - nearest_known(at, frames)) <= 0.5 * fps)
         first, last = np.flatnonzero(covered)[[0, -1]]
         span = slice(int(first), int(last) + 1)
         own = frames[span]
         place = np.stack([np.interp(own, frames[known], axis[known]) for axis in place.T], axis=-1)
-        orient, angles = _smooth_poses(self.poses, person, at, own, START_WINDOW_S * fps)
+        # Monocular poses so near in time make a start [s]: single frames with a wrong pose drop
+        # out.
+        orient, angles = _smooth_poses(self.poses, person, at, own, 0.2 * fps)
         betas = np.zeros(self.solver.chained.model.shapes)
         start = stand_on_ground(
             self.solver, Pose(np.zeros_like(orient), orient, angles, betas), place
@@ -434,11 +369,15 @@ class _Clip:
         centers = self.evidence.camera[rows].center
         offset = place - centers
         slope = -offset[:, 2] / np.linalg.norm(offset[:, :2], axis=-1)
-        shared = (FOOT_BIAS_M / slope)[:, None, None] ** 2 * sight[:, :, None] * sight[:, None]
+        # Error of a foot's height that lasts for a clip [m]: where the detector sees the ankle, and
+        # the height of the ankle above the pitch.
+        shared = (0.03 / slope)[:, None, None] ** 2 * sight[:, :, None] * sight[:, None]
         shared[:, :2, :2] += self.evidence.calibration[rows, person]
         line = joints - centers[:, None]
         line /= np.linalg.norm(line, axis=-1, keepdims=True)
-        line *= LEAN_STD * (joints[..., 2:] - place[:, None, 2:])
+        # Error of a whole body's lean along the line of sight that lasts for a clip [rad]: 5
+        # degrees.
+        line *= 0.08 * (joints[..., 2:] - place[:, None, 2:])
         return np.asarray(shared[:, None] + line[..., :, None] * line[..., None, :])
 
 
@@ -472,10 +411,6 @@ def _misfit(joints: Floats, evidence: PlaneEvidence) -> tuple[Floats, Floats]:
 
     Both are root mean squares relative to that of the keypoints about their middle. Position and
     size in the image do not count, as the place and the mean body are not exact.
-
-    Args:
-        joints: (frames, persons, 17, 3) [m], world.
-        evidence: keypoints and camera.
     """
     frames = len(joints)
     image = evidence.camera.project(joints.reshape(frames, -1, 3)).reshape(*joints.shape[:3], 2)
@@ -489,7 +424,9 @@ def _misfit(joints: Floats, evidence: PlaneEvidence) -> tuple[Floats, Floats]:
         away = seen - np.maximum(size, 0.0)[..., None, None] * ours
         extent = np.sqrt((seen**2).sum(axis=(-1, -2)))
         misfit = np.sqrt((away**2).sum(axis=(-1, -2))) / extent
-        noise = np.sqrt(2.0 * (KEYPOINT_STD**2 + count * (PIXEL_STD / extent) ** 2))
+        # Standard deviation of a keypoint per axis in the same measure [1]: 2 % of the person's
+        # height, as keypoints lie 0.28 heights from their middle.
+        noise = np.sqrt(2.0 * (0.07**2 + count * (PIXEL_STD / extent) ** 2))
     return np.where(count >= MIN_KEYPOINTS, misfit, np.nan), noise
 
 
@@ -506,7 +443,8 @@ def _find_contradiction(misfit: Floats) -> str | None:
     if not len(compared):
         return "no monocular estimate lies at the person's keypoints"
     share = float(np.mean(compared <= MAX_MISFIT))
-    if share < MIN_AGREEING:
+    # Minimum share of a person's estimates that agree with the keypoints [1].
+    if share < 0.5:
         return (
             f"the monocular estimates contradict the keypoints in {1.0 - share:.0%} of their "
             f"{len(compared)} frames"
@@ -515,12 +453,7 @@ def _find_contradiction(misfit: Floats) -> str | None:
 
 
 def _judge_fit(misfit: Floats, turned: Floats) -> str | None:
-    """Return why a person's fitted body is refused; None if it is accepted.
-
-    Args:
-        misfit: (frames,), of the fitted body, relative to the noise of keypoints.
-        turned: (frames,), of the body turned half round.
-    """
+    """Return why a person's fitted body is refused; None if it is accepted."""
     compared = np.isfinite(misfit) & np.isfinite(turned)
     if not compared.any():
         return f"no frame has a body and {MIN_KEYPOINTS} keypoints"
@@ -530,7 +463,9 @@ def _judge_fit(misfit: Floats, turned: Floats) -> str | None:
             f"the body fitted to the monocular estimates misses the keypoints by {middle:.1f} "
             f"times their noise (at most {MAX_FITTED_MISFIT:g})"
         )
-    if other < MIN_GAIN * middle:
+    # A body turned half round contradicts the estimates if it misses the keypoints by less than
+    # this share of what the body as estimated does [1].
+    if other < 0.75 * middle:
         return (
             "the monocular estimates contradict the keypoints, which show the person turned half "
             f"round (misfit {middle:.1f} times their noise, turned {other:.1f})"
@@ -545,15 +480,7 @@ def _smooth_poses(
     frames: NDArray[np.int64],
     reach: float,
 ) -> tuple[Floats, Floats]:
-    """Return robust means of a person's orientations (frames, 3) and angles (frames, 30) [rad].
-
-    Args:
-        poses: monocular poses.
-        person: the person.
-        at: frames with poses to use.
-        frames: frames of the result.
-        reach: half of the window [frame]; farther from any pose, the nearest one counts.
-    """
+    """Return robust means of a person's orientations (frames, 3) and angles (frames, 30) [rad]."""
     orient = np.empty((len(frames), 3, 3))
     angles = np.empty((len(frames), SIZE))
     width = np.maximum(reach, np.abs(frames - nearest_known(at, frames)))

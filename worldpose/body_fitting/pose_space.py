@@ -4,10 +4,6 @@ COCO's 17 points leave many of a body's 69 angles undetermined: the bend of sing
 hands and feet. 30 coordinates remain: bend of the whole spine and of the whole neck, hips, knees,
 shoulders and elbows. The other angles follow from them (spine and neck share evenly) or from the
 ground (feet). Where a detector gives points of the feet, 8 more coordinates bend ankles and toes.
-
-Initial poses have limbs along the joints, frame by frame. Root alignment follows the paper:
-translation and orientation from hips and torso alone. Two-bone directions orient the limbs, which
-starts elbows and knees near the correct one of several minima.
 """
 
 from __future__ import annotations
@@ -61,9 +57,6 @@ _LIMITS: Final = {
 FOOT_JOINTS: Final = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 """Joints of further coordinates: three of each ankle, and the bend of the toes of each foot."""
 FOOT_SIZE: Final = 8
-_FOOT_SPREAD: Final = (0.4, 0.2, 0.2, 0.4, 0.2, 0.2, 0.3, 0.3)
-"""Standard deviations of these coordinates [rad], about a foot at a right angle to the shank: the
-range of motion of walking and running."""
 
 
 def _limits() -> tuple[Floats, Floats]:
@@ -126,7 +119,11 @@ class PosePrior:
         size = len(self.mean) + FOOT_SIZE
         precision = np.zeros((size, size))
         precision[:-FOOT_SIZE, :-FOOT_SIZE] = self.precision
-        precision[-FOOT_SIZE:, -FOOT_SIZE:] = np.diag(1.0 / np.array(_FOOT_SPREAD) ** 2)
+        # Standard deviations of these coordinates [rad], about a foot at a right angle to the
+        # shank: the range of motion of walking and running.
+        precision[-FOOT_SIZE:, -FOOT_SIZE:] = np.diag(
+            1.0 / np.array((0.4, 0.2, 0.2, 0.4, 0.2, 0.2, 0.3, 0.3)) ** 2
+        )
         return PosePrior(np.concatenate([self.mean, np.zeros(FOOT_SIZE)]), precision)
 
 
@@ -147,8 +144,6 @@ def load_pose_prior() -> PosePrior:
 
 TORSO: Final = (5, 6, 11, 12)
 """Shoulders and hips of COCO-17."""
-_KNEE: Final = (1.0, 0.0, 0.0)
-_FORWARD: Final = (0.0, 0.0, 1.0)
 _LIMBS: Final = (
     # COCO's joints, the body's joints, slices of their coordinates, and the hinge of the second.
     ((5, 7, 9), (16, 18, 20), (slice(18, 21), slice(24, 27)), "elbow"),
@@ -195,8 +190,7 @@ def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
 
     Args:
         rest: (4, 3) [m], shoulders and hips of the unposed body.
-        torso: (frames, 4, 3) [m], world; NaN points do not count. A frame with fewer than three
-            takes the orientation of the nearest frame that has them; upright without any.
+        torso: (frames, 4, 3) [m], world; NaN points do not count.
     """
     seen = np.asarray(np.isfinite(torso[..., 0]))
     weight = seen / np.maximum(seen.sum(-1, keepdims=True), 1)
@@ -248,7 +242,11 @@ def start_poses(
         if not (np.isfinite(upper).all() and np.isfinite(lower).all()):
             continue
         first, second = (rest[bones[k + 1]] - rest[bones[k]] for k in (0, 1))
-        axis = np.array(_KNEE) if hinge == "knee" else _unit(cross(first, np.array(_FORWARD)))
+        axis = (
+            np.array((1.0, 0.0, 0.0))
+            if hinge == "knee"
+            else _unit(cross(first, np.array((0.0, 0.0, 1.0))))
+        )
         usual = Rigid.from_rotvec(prior.mean[places[0]], np.zeros(3)).rotation @ axis
         # The bend of the limb determines the hinge, with a weight that grows with the bend.
         across = cross(_unit(upper), _unit(lower)) + 0.1 * (turns @ usual)
@@ -267,8 +265,7 @@ def level_feet(rotations: Floats, clear: Floats) -> Floats:
 
     Args:
         rotations: (frames, 3, 3) rotations of the shank, world.
-        clear: (frames,) [m], height of the ankle above that of a flat foot; a foot 0.15 m up or on
-            a horizontal shank hangs as in the unposed body.
+        clear: (frames,) [m], height of the ankle above that of a flat foot.
     """
     forward = rotations[..., 2].copy()
     forward[..., 2] = 0.0

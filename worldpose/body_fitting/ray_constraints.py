@@ -143,12 +143,6 @@ def expected_joints(joints: Floats) -> Floats:
     return np.where(known, full, middle[:, :, None])
 
 
-GATE: Final = 0.2
-"""Maximum mean distance between keypoints and their person's joints [person height]."""
-MIN_KEYPOINTS: Final = 6
-"""Minimum keypoints to identify people [1]."""
-
-
 def identify_people(camera: Camera, keypoints: NDArray[np.floating], joints: Floats) -> Floats:
     """Return the keypoints (frames, persons, 17, 2) [px] of known people; NaN where not seen.
 
@@ -165,16 +159,19 @@ def identify_people(camera: Camera, keypoints: NDArray[np.floating], joints: Flo
     high = np.where(known, image[..., 1], -np.inf).max(-1, initial=-np.inf)
     height = high - np.where(known, image[..., 1], np.inf).min(-1, initial=np.inf)
     own = np.full((frames, persons, 17, 2), np.nan)
+    # Maximum mean distance between keypoints and their person's joints [person height].
+    gate = 0.2
     for frame in range(frames):
         away = np.linalg.norm(image[frame, :, None] - keypoints[frame, None], axis=-1)
         both = np.isfinite(away)
         count = both.sum(-1)
         mean = np.where(both, away, 0.0).sum(-1) / np.maximum(count, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.where(count >= MIN_KEYPOINTS, mean / height[frame, :, None], np.inf)
+            # Minimum keypoints to identify people [1].
+            mean = np.where(count >= 6, mean / height[frame, :, None], np.inf)
         mean = np.where(np.isfinite(mean), mean, np.inf)
-        person, detection = linear_sum_assignment(np.minimum(mean, GATE))
-        near = mean[person, detection] < GATE
+        person, detection = linear_sum_assignment(np.minimum(mean, gate))
+        near = mean[person, detection] < gate
         own[frame, person[near]] = keypoints[frame, detection[near]]
     return own
 

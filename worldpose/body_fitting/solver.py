@@ -54,11 +54,6 @@ ACCELERATION_WEIGHT: Final = float((1.0 / ACCELERATION_SCALE**2).sum())
 accelerates as one: the search may count them all, the covariance of its poses may not."""
 
 
-DAMPING: Final = 0.01
-"""Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad. Only a lone joint leaves a
-direction that uncertain."""
-
-
 @dataclass(frozen=True, eq=False)
 class Solver:
     """Solver of poses, shared by the fits of all persons."""
@@ -211,7 +206,8 @@ def factor(blocks: Floats) -> BandedFactor:
     """
     places = np.arange(blocks.shape[-1])
     blocks[0][:, places, places] *= 1.0 + 1e-4
-    blocks[0][:, places, places] += DAMPING
+    # Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad.
+    blocks[0][:, places, places] += 0.01
     solved = BandedFactor.of(blocks, overwrite=True)
     if not solved.determined:
         raise DegenerateError(
@@ -223,11 +219,6 @@ def factor(blocks: Floats) -> BandedFactor:
 
 
 Joints = tuple[Floats, Floats]
-
-PIECE_S: Final = 1.0
-"""Length of the intervals sampled from long tracks [s]."""
-BIAS_PRIOR_WEIGHT: Final = 200.0
-"""Weight of `bias_std_m` as a prior, in squared offsets [1]; a clip has 26 offsets."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,14 +267,7 @@ def fit_shapes(
 def solve_shapes(
     solver: Solver, people: Iterable[int], pieces: Sequence[Piece], known: Mapping[int, Shape]
 ) -> Shapes:
-    """Return all persons' betas and the detector's offsets, by Gauss-Newton over poses as well.
-
-    Args:
-        solver: body, prior, settings and ground.
-        people: the persons.
-        pieces: intervals of their tracks; a person without any keeps the prior shape.
-        known: shapes of some persons from other clips; the others start from the prior.
-    """
+    """Return all persons' betas and the detector's offsets, by Gauss-Newton over poses as well."""
     settings, count = solver.settings, solver.chained.model.shapes
     prior_shape = Shape(np.zeros(count), np.eye(count) / settings.shape_weight)
     prior_shapes = {person: known.get(person, prior_shape) for person in people}
@@ -295,6 +279,8 @@ def solve_shapes(
     # way in the frames of all persons.
     seconds = sum(len(piece.pose.transl) / piece.track.fps for piece in pieces)
     prior_weight = max(1.0, seconds / settings.bias_time_s)
+    # Weight of `bias_std_m` as a prior, in squared offsets [1]; a clip has 26 offsets.
+    bias_prior_weight = 200.0
     for step in range(settings.shape_steps if pieces else 0):
         if solver.ground is not None and step == settings.shape_steps // 2:
             pieces = [
@@ -319,8 +305,8 @@ def solve_shapes(
         # Learn the spread of offsets together with the offsets (expectation-maximisation).
         if step >= settings.shape_steps // 2:
             size = float(unknowns @ unknowns + np.trace(spread))
-            prior = BIAS_PRIOR_WEIGHT * settings.bias_std_m**2
-            expected = (size + prior) / (len(unknowns) + BIAS_PRIOR_WEIGHT)
+            prior = bias_prior_weight * settings.bias_std_m**2
+            expected = (size + prior) / (len(unknowns) + bias_prior_weight)
         betas_change = {
             # Large steps of the first, roughest linearisation leave the range of human shapes.
             person: np.clip(
@@ -347,16 +333,7 @@ def solve_shapes(
 def _eliminate_poses(
     pieces: Sequence[Piece], priors: Mapping[int, Shape], offsets: Floats
 ) -> tuple[list[Floats], dict[int, Floats], dict[int, Floats]]:
-    """Return the reduced normal equations of each person's betas with the shared offsets.
-
-    Args:
-        pieces: intervals of tracks.
-        priors: prior shape of each person.
-        offsets: (17, 3) [m], the detector's offsets.
-
-    Returns:
-        Solution of each piece for its border and gradient; matrix and gradient by person.
-    """
+    """Return the reduced normal equations of each person's betas with the shared offsets."""
     shared = MIRRORED_OFFSETS.shape[-1]
     matrices, gradients = {}, {}
     for person, shape in priors.items():
@@ -430,8 +407,9 @@ def spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> 
     """Return evenly spread intervals of `frames`, `shape_time_s` in total; all frames if fewer."""
     if frames <= settings.shape_time_s * fps:
         return [slice(0, frames)]
-    length = max(3, round(PIECE_S * fps))
-    count = max(1, round(settings.shape_time_s / PIECE_S))
+    piece_s = 1.0  # Length of the intervals sampled from long tracks [s].
+    length = max(3, round(piece_s * fps))
+    count = max(1, round(settings.shape_time_s / piece_s))
     starts = np.linspace(0, frames - length, count).astype(np.int64)
     return [slice(int(start), int(start) + length) for start in starts]
 

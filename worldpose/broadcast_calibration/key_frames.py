@@ -40,7 +40,7 @@ from worldpose.static_calibration.sides import (
     SeenPeople,
     compare_sides,
 )
-from worldpose.tracking.feet import locate_feet
+from worldpose.tracking.plane.feet import locate_feet
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,6 @@ from worldpose.detection.interfaces import People
 from worldpose.detection.settings import DetectionSettings
 from worldpose.geometry.boxes import box_iou
 
-SURE_OVERLAP: Final = 0.2
-"""A high-score box continues a track whose predicted box it overlaps more [1]: a small box moves by
-half of its width per frame."""
-DOUBTFUL_OVERLAP: Final = 0.5
-"""A low-score box must lie near the prediction."""
 PLACE_NOISE: Final = 1.0 / 20.0
 """Standard deviation of a box's position and size, over its height [1]; ByteTrack's."""
 SPEED_NOISE: Final = 1.0 / 160.0
@@ -69,8 +64,11 @@ class BoxTracker:
         expected = _as_boxes(self._mean)
         sure = scores >= self._high_score
         for candidates, tracks, least in (
-            (np.flatnonzero(sure), np.ones_like(seen), SURE_OVERLAP),
-            (np.flatnonzero(~sure), self._unseen == frames, DOUBTFUL_OVERLAP),
+            # A high-score box continues a track whose predicted box it overlaps more [1]: a small
+            # box moves by half of its width per frame.
+            (np.flatnonzero(sure), np.ones_like(seen), 0.2),
+            # A low-score box must lie near the prediction.
+            (np.flatnonzero(~sure), self._unseen == frames, 0.5),
         ):
             rows = np.flatnonzero(tracks & ~seen)
             for row, box in _assign_boxes(expected[rows], boxes[candidates], least):

@@ -19,11 +19,7 @@ from worldpose.detection.bundled_nets import (
     decode_boxes,
 )
 from worldpose.detection.enlargement import (
-    CLOSE_UP_GAIN,
-    CLOSE_UPS,
-    SIZING_ZOOM,
     STEPS,
-    SURE_SCORE,
     Part,
     choose_reduction,
     find_groups,
@@ -35,8 +31,6 @@ from worldpose.detection.interfaces import MIN_SCORE, People
 from worldpose.detection.net_inference import QuantizedNet, placed_net
 from worldpose.detection.suppression import suppress
 
-MAX_PEOPLE: Final = 300
-"""Most people per frame."""
 NMS_IOU: Final = 0.7
 """Boxes with a larger intersection over union are of one person [1]."""
 
@@ -46,9 +40,7 @@ class BundledDetector:
 
     Without a camera, a pass over the reduced frame tells the size of its people: a frame of large
     people is seen reduced. A frame without sure people may be a close-up: it is seen at the size at
-    which its surest person is surest. The detector runs again on enlarged tiles where people are
-    small and, if the camera tells so, on the reduced frame where they are large, then on enlarged
-    crops of groups of people who occlude one another.
+    which its surest person is surest.
     """
 
     def __init__(
@@ -72,8 +64,9 @@ class BundledDetector:
     def _people(self, image: Image, parts: Sequence[Part] | None) -> People:
         if parts is None:
             size = (image.shape[1], image.shape[0])
-            sized = self._detect(resize(image, SIZING_ZOOM))
-            zoom = choose_reduction(restore_size(sized, size, SIZING_ZOOM))
+            # Half size shows people of full height in the training and of twice that height.
+            sized = self._detect(resize(image, 0.5))
+            zoom = choose_reduction(restore_size(sized, size, 0.5))
             close = self._close_up(image, float(sized.scores.max(initial=0.0)))
             if close < 1.0:
                 people = suppress(self._detect(resize(image, close)), NMS_IOU)
@@ -85,14 +78,12 @@ class BundledDetector:
     def _close_up(self, image: Image, usual: float) -> float:
         """Return the reduction of a frame that people fill; 1 for other frames [1].
 
-        Args:
-            image: the frame.
-            usual: the best score at `SIZING_ZOOM` [1].
+        People who fill a frame are as high at these reductions as in the training.
         """
-        if usual >= SURE_SCORE:
+        if usual >= 0.6:  # the best score of people of usual size
             return 1.0
-        best, chosen = usual + CLOSE_UP_GAIN, 1.0
-        for zoom in CLOSE_UPS:
+        best, chosen = usual + 0.05, 1.0
+        for zoom in (0.25, 0.125, 0.0884, 0.0625):
             score = float(self._detect(resize(image, zoom)).scores.max(initial=0.0))
             if score > best:
                 best, chosen = score, zoom
@@ -123,7 +114,7 @@ class BundledDetector:
         padded[0, :height, :width] = image
         with torch.inference_mode():
             logits, sides = self._net(padded)
-            boxes, scores = decode_boxes(logits[0], sides[0], MIN_SCORE, MAX_PEOPLE)
+            boxes, scores = decode_boxes(logits[0], sides[0], MIN_SCORE, 300)  # most people
         found = boxes.double().numpy()
         found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)
         real = np.all(found[:, 2:] - found[:, :2] > 1.0, axis=1)

@@ -35,18 +35,12 @@ CELL: Final = 2
 MAP_COUNT: Final = 3
 """The target box, boxes of people in front of the target, and of people behind it: maps that the
 keypoint net takes with a crop."""
-EDGE_CELL: Final = 4
-"""Pixels of the crop per cell of the edge maps [px]."""
-APART: Final = 3
-"""Cells to either side of a position in which no other position is chosen."""
 JOINTS: Final = 17
 GREY_MEAN: Final = 115.0
 GREY_SPREAD: Final = 58.0
 """Mean and standard deviation of grey levels, by which images are normalized [of 255]."""
 FORMAT: Final = "worldpose-net"
 """Key of a file's metadata that names the class of the net."""
-_SCALE: Final = 16.0
-"""Distance of a box side of logarithm 0 from its cell [px]: that of a person of about 60 px."""
 
 
 class Block(nn.Sequential):
@@ -132,15 +126,15 @@ class PeopleNet(nn.Module):
         """
         features, _ = self.pyramid(images)
         maps = self.head(features).float()
-        return maps[:, 0], _SCALE * torch.exp(maps[:, 1:].clamp(-4.0, 4.0))
+        # Distance of a box side of logarithm 0 from its cell [px]: that of a person of about 60 px.
+        return maps[:, 0], 16.0 * torch.exp(maps[:, 1:].clamp(-4.0, 4.0))
 
 
 class Seen(NamedTuple):
     """Output of the keypoint net for crops.
 
     Attributes:
-        maps: logits of each joint's position (batch, 17, rows, columns); a softmax over the cells
-            of a map gives probabilities.
+        maps: logits of each joint's position (batch, 17, rows, columns).
         doubt: logit of each joint from the crop as a whole (batch, 17).
         boxes: x0, y0, x1, y1 of the person (batch, 4) [px of the crop].
         fit: logits of the intersection over union of these and the true boxes (batch,).
@@ -238,12 +232,13 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
         Edges and their standard deviations, both (batch, 4) [px of the crop, cells].
     """
     places, spreads = [], []
+    edge_cell = 4  # Pixels of the crop per cell of the edge maps [px].
     for side in range(4):
         logits = torch.logsumexp(maps[:, side], dim=1 + side % 2)
         chance = functional.softmax(logits, dim=1)
         cell = torch.arange(chance.shape[1], device=maps.device, dtype=maps.dtype)
         place = chance @ cell
-        places.append(EDGE_CELL * place + 0.5 * (EDGE_CELL - 1))
+        places.append(edge_cell * place + 0.5 * (edge_cell - 1))
         spreads.append(((chance @ cell.square()) - place.square()).clamp(min=1e-6).sqrt())
     return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
 
@@ -313,9 +308,12 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _highest_near(maps: Tensor) -> Tensor:
-    """Return the highest value within `APART` cells of each, along rows and columns."""
+    """Return the highest value within three cells of each, along rows and columns.
+
+    No other position is chosen there.
+    """
     for axis in (2, 3):
-        border = (0, 0, APART, APART) if axis == 2 else (APART, APART)
+        border = (0, 0, 3, 3) if axis == 2 else (3, 3)
         wide = functional.pad(maps, border)
         size = maps.shape[axis]
         two = torch.maximum(wide.narrow(axis, 0, size + 5), wide.narrow(axis, 1, size + 5))

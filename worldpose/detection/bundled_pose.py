@@ -34,53 +34,14 @@ from worldpose.detection.net_inference import CROPS, QuantizedNet, placed_net
 from worldpose.detection.suppression import nms_indices, suppress, surest_confidence
 from worldpose.geometry.boxes import box_iou
 
-MARGIN: Final = 1.25
-"""Size of a crop over that of its box [1]: keypoints may lie outside of a box."""
 MAP_CELL: Final = 4
 """Pixels of the crop per cell of the maps of boxes [px]."""
 SAME_PERSON_IOU: Final = 0.6
 """A box that overlaps the target box more is the same person's [1, intersection over union]."""
-MIN_AGREEING_IOU: Final = 0.8
-"""A crop is computed again if the given and the estimated box overlap less [1, intersection over
-union]."""
-MIN_CERTAIN_SCORE: Final = 0.25
-"""A product of fit and surest keypoints from which a person is certain [1]."""
-MIN_AGAIN_SCORE: Final = 0.1
-"""Below this product no crop is computed again [1]."""
-MIN_OVERLAP_IOU: Final = 0.05
-"""A person that overlaps a neighbour more gets a second crop [1, intersection over union]."""
 CANDIDATES: Final = 4
 """Candidate positions per joint [1]."""
-RIVALRY: Final = 2.0
-"""Cost of a candidate that certainly is another person's joint [nats]."""
-JOINT_SPREAD: Final = 0.03
-"""Standard deviation of the distance between two estimates of one joint, as a share of the longer
-side of the smaller box [1]."""
-MIN_RIVAL_IOU: Final = 0.02
-"""People whose boxes overlap more are rivals [1, intersection over union]."""
-MIN_CANDIDATE: Final = 0.01
-"""Candidates of less probability are dropped, except the first [1]."""
-PASSES: Final = 4
-"""Passes of assignment; few joints change after the second."""
-MIN_KNOWN_SCORE: Final = 0.25
-"""Score of a detection from which on its neighbourhood is searched [1]."""
-SIDE_STEP: Final = 0.35
-"""Shift to either side, as a share of the box's width [1], for people who are half occluded.
-Closer, the net shows the detected person; farther, detectors find the other without help."""
-MAX_ROOM_IOU: Final = 0.6
-"""If another detection overlaps the shifted box more, there is no room for a further person [1,
-intersection over union]."""
 KNOWN_PERSON_IOU: Final = 0.7
 """A box that overlaps a detected person more is that person [1, intersection over union]."""
-MIN_SECOND_CROP_SCORE: Final = 0.15
-"""Minimum product of fit and surest keypoints at which a result gets a second crop [1]."""
-MIN_OCCLUDED_SCORE: Final = 0.4
-"""Minimum product at which a result counts as a person [1]. In scenes like those of training, one
-in five of the results kept is a new person; of detector boxes with such scores, one in four is."""
-ONE_PERSON_IOU: Final = 0.5
-"""Two occluded people that overlap more are one [1, intersection over union]."""
-UNSEEN_SCORE: Final = 0.3
-"""Replaces the score of the detector, which does not see these people [1]."""
 
 
 class BundledPoseEstimator:
@@ -96,23 +57,27 @@ class BundledPoseEstimator:
 
         A correct keypoint is within a twentieth of the box's longer side, about a fifth of a torso.
         If the estimated box differs from the given one, a second crop shows the estimated box.
-        People with neighbours also get a second crop, because the positions of the neighbours are
-        then known. Candidate joints that the maps of two people share are assigned to one of them.
         """
         estimates = self._estimate_crops(image, boxes, [np.empty((0, 4))] * len(boxes))
         seen = estimates.boxes
         another = np.all(seen[:, 2:] - seen[:, :2] > 1.0, axis=1)
-        another &= np.diagonal(box_iou(seen, boxes)) < MIN_AGREEING_IOU
+        # A crop is computed again if the given and the estimated box overlap less [1, intersection
+        # over union].
+        another &= np.diagonal(box_iou(seen, boxes)) < 0.8
         asked = np.where(another[:, None], seen, boxes)
         score = estimates.score
+        # A product of fit and surest keypoints from which a person is certain [1].
+        min_certain_score = 0.25
         known = suppress(
-            People(seen[score >= MIN_CERTAIN_SCORE], score[score >= MIN_CERTAIN_SCORE]),
+            People(seen[score >= min_certain_score], score[score >= min_certain_score]),
             SAME_PERSON_IOU,
         ).boxes
         shares = box_iou(asked, known)
         others = [known[row <= SAME_PERSON_IOU] for row in shares]
-        again = ((shares > MIN_OVERLAP_IOU) & (shares <= SAME_PERSON_IOU)).any(axis=1) & (
-            score >= MIN_AGAIN_SCORE
+        # A person that overlaps a neighbour more gets a second crop [1, intersection over union].
+        again = ((shares > 0.05) & (shares <= SAME_PERSON_IOU)).any(axis=1) & (
+            # Below this product no crop is computed again [1].
+            score >= 0.1
         )
         again |= another
         around = [others[index] for index in np.flatnonzero(again)]
@@ -128,13 +93,7 @@ class BundledPoseEstimator:
     def _estimate_crops(
         self, image: Image, boxes: Floats, others: Sequence[Floats]
     ) -> CropEstimates:
-        """Return the net's output for a crop around each box.
-
-        Args:
-            image: the whole frame.
-            boxes: (people, 4) [px].
-            others: boxes (others, 4) of the neighbours of each person [px].
-        """
+        """Return the net's output for a crop around each box."""
         shape = (len(boxes), JOINTS, CANDIDATES)
         estimates = CropEstimates(
             places=np.full((*shape, 2), np.nan),
@@ -232,14 +191,17 @@ def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.int
     people, joints, _ = mass.shape
     taken = np.zeros((people, joints), dtype=np.intp)
     price = -np.log(np.maximum(mass, 1e-9))
-    price[..., 1:][mass[..., 1:] < MIN_CANDIDATE] = np.inf
-    near = box_iou(boxes, boxes) > MIN_RIVAL_IOU
+    # Candidates of less probability are dropped, except the first [1].
+    price[..., 1:][mass[..., 1:] < 0.01] = np.inf
+    # People whose boxes overlap more are rivals [1, intersection over union].
+    near = box_iou(boxes, boxes) > 0.02
     np.fill_diagonal(near, False)
     longer = np.max(boxes[:, 2:] - boxes[:, :2], axis=1)
     order = np.argsort(-mass[..., 0].mean(axis=1), kind="stable")
     other_side = np.array(COCO17_FLIP)
     paired = other_side != np.arange(joints)
-    for _ in range(PASSES):
+    # Passes of assignment; few joints change after the second.
+    for _ in range(4):
         before = taken.copy()
         for person in order[near[order].any(axis=1)]:
             rivals = np.flatnonzero(near[person])
@@ -247,12 +209,15 @@ def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.int
                 places[rivals], taken[rivals][..., None, None], axis=2
             )
             rival_mass = np.take_along_axis(mass[rivals], taken[rivals][..., None], axis=2)
-            spread = JOINT_SPREAD * np.minimum(longer[rivals], longer[person])[:, None, None]
+            # Standard deviation of the distance between two estimates of one joint, as a share of
+            # the longer side of the smaller box [1].
+            spread = 0.03 * np.minimum(longer[rivals], longer[person])[:, None, None]
             rival = _rivalry(places[person], rival_joints, rival_mass, spread)
             rival += paired[:, None] * _rivalry(
                 places[person], rival_joints[:, other_side], rival_mass[:, other_side], spread
             )
-            taken[person] = np.argmin(price[person] + RIVALRY * rival, axis=1)
+            # Cost of a candidate that certainly is another person's joint [nats].
+            taken[person] = np.argmin(price[person] + 2.0 * rival, axis=1)
         if np.array_equal(before, taken):
             break
     return taken
@@ -280,20 +245,28 @@ def find_occluded_people(
     Note:
         Iterative detection conditioned on earlier detections: Rukhovich et al., IterDet, 2020.
     """
-    sure = people.scores >= MIN_KNOWN_SCORE
-    known = suppress(People(people.boxes[sure], people.scores[sure]), KNOWN_PERSON_IOU).boxes
-    step = SIDE_STEP * (known[:, 2] - known[:, 0])[:, None] * [1.0, 0.0, 1.0, 0.0]
+    # Score of a detection from which on its neighbourhood is searched [1].
+    sure = people.scores >= 0.25
+    known = suppress(people.select(sure), KNOWN_PERSON_IOU).boxes
+    # Shift to either side, as a share of the box's width [1], for people who are half occluded.
+    step = 0.35 * (known[:, 2] - known[:, 0])[:, None] * [1.0, 0.0, 1.0, 0.0]
     asked = np.concatenate([known - step, known + step])
     shares = box_iou(asked, known)
     shares[np.tile(np.eye(len(known), dtype=np.bool_), (2, 1))] = 0.0
-    asked = asked[shares.max(axis=1, initial=0.0) <= MAX_ROOM_IOU]
+    # If another detection overlaps the shifted box more, there is no room for a further person [1,
+    # intersection over union].
+    asked = asked[shares.max(axis=1, initial=0.0) <= 0.6]
     seen = estimate(asked, [known[row > 0.0] for row in box_iou(asked, known)])
-    boxes = seen.boxes[_show_others(seen, known, MIN_SECOND_CROP_SCORE)]
+    # Minimum product of fit and surest keypoints at which a result gets a second crop [1].
+    boxes = seen.boxes[_show_others(seen, known, 0.15)]
     seen = estimate(boxes, [known[row <= KNOWN_PERSON_IOU] for row in box_iou(boxes, known)])
-    seen = seen.select(_show_others(seen, known, MIN_OCCLUDED_SCORE))
-    seen = seen.select(nms_indices(People(seen.boxes, seen.score), ONE_PERSON_IOU))
+    # Minimum product at which a result counts as a person [1].
+    seen = seen.select(_show_others(seen, known, 0.4))
+    # Two occluded people that overlap more are one [1, intersection over union].
+    seen = seen.select(nms_indices(People(seen.boxes, seen.score), 0.5))
     likeliest = np.zeros(seen.places.shape[:2], dtype=np.intp)
-    return replace(seen.poses(likeliest), score=np.cbrt(UNSEEN_SCORE * seen.score))
+    # Replaces the score of the detector, which does not see these people [1].
+    return replace(seen.poses(likeliest), score=np.cbrt(0.3 * seen.score))
 
 
 def _show_others(seen: CropEstimates, known: Floats, least: float) -> Flags:
@@ -310,7 +283,8 @@ def crops_around(boxes: Floats) -> Floats:
         boxes: (people, 4) x0, y0, x1, y1 [px].
     """
     sides = boxes[:, 2:] - boxes[:, :2]
-    scale = MARGIN * np.max(sides / np.array(CROP), axis=1)
+    # Size of a crop over that of its box [1]: keypoints may lie outside of a box.
+    scale = 1.25 * np.max(sides / np.array(CROP), axis=1)
     middle = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     return np.column_stack([middle, np.maximum(scale, 1e-3)])
 

@@ -3,8 +3,7 @@
 A detector finds people best at the heights of its training. Where a calibrated camera shows people
 smaller, or the first pass over a frame finds small people, further passes over enlarged tiles
 replace it for them. Where it shows people larger, passes over the reduced frame do; without
-calibration, a frame of large people is seen reduced instead. Groups of people who occlude one
-another are seen enlarged, too.
+calibration, a frame of large people is seen reduced instead.
 """
 
 from __future__ import annotations
@@ -28,39 +27,12 @@ STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
 REDUCTIONS: Final = ((200.0, 0.25), (100.0, 0.5))
 """Heights above which a frame is seen reduced [px], and the reduction [1]: of people of 100 to
 270 px in real stills, full size finds 57 %, half or a quarter 95 %."""
-SIZING_ZOOM: Final = 0.5
-"""Reduction at which the size of a frame's people is estimated [1]: it shows both people of full
-height in the training and those of twice that height."""
-CLOSE_UPS: Final = (0.25, 0.125, 0.0884, 0.0625)
-"""Reductions at which a frame without sure people is sized, too: people who fill it are as high
-there as in the training [1]."""
-SURE_SCORE: Final = 0.6
-"""Best score of a box at `SIZING_ZOOM` from which on the frame shows people of usual size [1]."""
-CLOSE_UP_GAIN: Final = 0.05
-"""Least gain of the best score for which a frame is a close-up [1]."""
-TILE: Final = 1024
-"""Longest side of an enlarged tile without its margin [px]: bounds memory."""
 BLEND: Final = 1.25
 """Factor by which heights of both passes overlap [1]: no person at the limit is lost."""
-STANDING: Final = 1.8
-"""Height of an upright person [m]."""
-GRID: Final = 2.0
-"""Distance of the positions on the pitch at which people are expected [m]."""
-PEOPLE_HEIGHTS: Final = (100.0, 160.0)
-"""The enlarged heights of a group's people [px], one pass per height: the detector is trained on
-heights up to 160; where one pass merges two heads, the other may separate them."""
-ZOOMS: Final = (1.25, 3.0)
-"""A group that needs less enlargement is large enough; none is enlarged more [1]."""
 MIN_GROUP_SCORE: Final = 0.25
 """Boxes from this score on form a group, and tell the size of a frame's people [1]."""
 SAME_PERSON_IOU: Final = 0.6
 """Boxes that overlap more are one person's [1, intersection over union]."""
-MIN_NEIGHBOUR_IOU: Final = 0.15
-"""Neighbours in a group overlap more [1, intersection over union]."""
-GROUP_MARGIN: Final = 0.25
-"""Margin within which people still belong to a group, as a share of its people's height [1]."""
-HEIGHT_RANGE: Final = (0.5, 2.0)
-"""Shortest and tallest box in a group, as a share of its people's height [1]."""
 
 
 @dataclass(frozen=True)
@@ -94,17 +66,13 @@ class Part:
         boxes = restore_size(people, sides, self.zoom).boxes + np.tile(self.corner, 2)
         tall = boxes[:, 3] - boxes[:, 1]
         mine = self._holds(boxes) & (tall > self.heights[0]) & (tall < self.heights[1])
-        return People(boxes[mine], people.scores[mine])
+        return People(boxes, people.scores).select(mine)
 
     def merge(self, earlier: People, seen: People) -> People:
         """Return earlier people of the frame and those found in `crop`, without those replaced."""
         tall = earlier.boxes[:, 3] - earlier.boxes[:, 1]
         kept = ~self._holds(earlier.boxes) | (tall < self.replaced[0]) | (tall >= self.replaced[1])
-        found = self.to_frame(seen)
-        return People(
-            np.concatenate([earlier.boxes[kept], found.boxes]),
-            np.concatenate([earlier.scores[kept], found.scores]),
-        )
+        return People.concatenate([earlier.select(kept), self.to_frame(seen)])
 
     def _holds(self, boxes: Floats) -> Flags:
         """Return whether the centres of boxes lie in `inner` (people,)."""
@@ -117,13 +85,7 @@ class SeesParts(Detector, Protocol):
     """A detector that looks at parts of frames at another size, where people need it."""
 
     def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
-        """Return the people in each image, as `detect`.
-
-        Args:
-            images: images of one size.
-            parts: where people are expected small or large, from the camera; empty where they are
-                not.
-        """
+        """Return the people in each image, as `detect`."""
 
 
 def resize(image: Image, zoom: float) -> Image:
@@ -194,13 +156,14 @@ def expect_parts(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Pa
         margin: around the pitch [m].
     """
     half = np.array([pitch.length, pitch.width]) / 2
+    # People are expected at positions 2 m apart, 1.8 m tall.
     x, y = np.meshgrid(
-        *(np.linspace(-(to + margin), to + margin, round(2 * (to + margin) / GRID)) for to in half)
+        *(np.linspace(-(to + margin), to + margin, round(2 * (to + margin) / 2.0)) for to in half)
     )
     ground = pitch.height(np.clip(x, -half[0], half[0]), np.clip(y, -half[1], half[1]))
     feet = np.stack([x, y, ground], axis=-1).reshape(-1, 3)
     low = camera.project(feet)
-    high = camera.project(feet + np.array([0.0, 0.0, STANDING]))
+    high = camera.project(feet + np.array([0.0, 0.0, 1.8]))
     tall = np.linalg.norm(high - low, axis=1)
     middle = 0.5 * (low + high)
     width, height = (int(side) for side in camera.image_size)
@@ -229,7 +192,8 @@ def _tile(boxes: Floats, shape: tuple[int, ...], step: tuple[float, float]) -> l
     (limit, zoom), size = step, np.array([shape[1], shape[0]])
     low = np.maximum(boxes[:, :2].min(axis=0) - limit, -0.5)
     high = np.minimum(boxes[:, 2:].max(axis=0) + limit, size - 0.5)
-    counts = np.ceil(zoom * (high - low) / TILE).astype(int)
+    # Longest side of an enlarged tile without its margin [px]: bounds memory.
+    counts = np.ceil(zoom * (high - low) / 1024).astype(int)
     x, y = (np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1))
     parts = []
     for row in range(counts[1]):
@@ -240,16 +204,9 @@ def _tile(boxes: Floats, shape: tuple[int, ...], step: tuple[float, float]) -> l
                 continue
             corner = np.maximum(np.floor(wide[:2]), 0).astype(int)
             end = np.minimum(np.ceil(wide[2:]), size).astype(int)
-            parts.append(
-                Part(
-                    corner=(corner[0], corner[1]),
-                    end=(end[0], end[1]),
-                    zoom=zoom,
-                    inner=inner,
-                    heights=(0.0, BLEND * limit),
-                    replaced=(0.0, limit / BLEND),
-                )
-            )
+            found, replaced = (0.0, BLEND * limit), (0.0, limit / BLEND)
+            corners = (corner[0], corner[1]), (end[0], end[1])
+            parts.append(Part(*corners, zoom, inner, found, replaced))
     return parts
 
 
@@ -264,23 +221,26 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
 
     sure = suppress(people, SAME_PERSON_IOU)
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
-    count, member = connected_components(box_iou(boxes, boxes) > MIN_NEIGHBOUR_IOU, directed=False)
+    # Neighbours in a group overlap more [1, intersection over union].
+    count, member = connected_components(box_iou(boxes, boxes) > 0.15, directed=False)
     size = np.array([shape[1], shape[0]])
     found = []
     for number in range(count):
         own = boxes[member == number]
         tall = float(np.median(own[:, 3] - own[:, 1]))
         low, high = own[:, :2].min(axis=0), own[:, 2:].max(axis=0)
-        inner = np.concatenate([low - GROUP_MARGIN * tall, high + GROUP_MARGIN * tall])
-        corner = np.maximum(np.floor(low - 2.0 * GROUP_MARGIN * tall), 0).astype(int)
-        end = np.minimum(np.ceil(high + 2.0 * GROUP_MARGIN * tall), size).astype(int)
+        # People within a margin of a quarter of their height still belong to the group.
+        inner = np.concatenate([low - 0.25 * tall, high + 0.25 * tall])
+        corner = np.maximum(np.floor(low - 0.5 * tall), 0).astype(int)
+        end = np.minimum(np.ceil(high + 0.5 * tall), size).astype(int)
         # No second pass costs more than the first.
         widest = float(np.sqrt(np.prod(size) / np.prod(end - corner)))
-        zooms = {min(height / tall, ZOOMS[1], widest) for height in PEOPLE_HEIGHTS if len(own) > 1}
-        heights = (HEIGHT_RANGE[0] * tall, HEIGHT_RANGE[1] * tall)
+        # One pass per enlarged height [px]: the detector is trained on heights up to 160.
+        zooms = {min(height / tall, 3.0, widest) for height in (100.0, 160.0) if len(own) > 1}
+        heights = (0.5 * tall, 2.0 * tall)  # of boxes in the group
         found += [
             Part((corner[0], corner[1]), (end[0], end[1]), zoom, inner, heights)
             for zoom in sorted(zooms)
-            if zoom >= ZOOMS[0]
+            if zoom >= 1.25  # else the group is large enough
         ]
     return found

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Floats, Image
+from data_contracts.arrays import AnyFloats, Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 
 MIN_SCORE: Final = 0.05
 """A detector reports every box from this score on; the stage applies its own thresholds."""
-MIN_PROBABILITY: Final = 1e-12
-"""Least stored score: a score of 0 would mean that there is no person."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,16 @@ class People:
             np.asarray(detections.boxes, np.float64), np.asarray(detections.score, np.float64)
         )
 
+    @classmethod
+    def concatenate(cls, parts: Sequence[People]) -> People:
+        """Return the people of several detections of one frame."""
+        boxes = np.concatenate([part.boxes for part in parts])
+        return cls(boxes, np.concatenate([part.scores for part in parts]))
+
+    def select(self, rows: Flags | NDArray[np.integer]) -> People:
+        """Return some of the people (people,), by index or flag."""
+        return People(self.boxes[rows], self.scores[rows])
+
 
 @dataclass(frozen=True)
 class ScoreMap:
@@ -54,10 +63,11 @@ class ScoreMap:
 
     def probability(self, scores: AnyFloats) -> Floats:
         """Return the probability of each score [1], within (0, 1]; NaN stays NaN."""
-        score = np.clip(np.asarray(scores, dtype=np.float64), MIN_PROBABILITY, 1.0)
+        least = 1e-12  # a score of 0 would mean that there is no person
+        score = np.clip(np.asarray(scores, dtype=np.float64), least, 1.0)
         with np.errstate(divide="ignore"):
             against = self.slope * (np.log1p(-score) - np.log(score)) - self.offset
-        return np.asarray(np.maximum(1.0 / (1.0 + np.exp(against)), MIN_PROBABILITY))
+        return np.asarray(np.maximum(1.0 / (1.0 + np.exp(against)), least))
 
 
 class Detector(Protocol):
@@ -71,12 +81,7 @@ class Detector(Protocol):
         """
 
     def detect(self, images: Sequence[Image]) -> list[People]:
-        """Return the people in each image, from `MIN_SCORE` on.
-
-        Args:
-            images: images of one size. The detector chooses its batch size; a result must not
-                depend on the other images of a batch.
-        """
+        """Return the people in each image, from `MIN_SCORE` on."""
 
 
 class PoseEstimator(Protocol):
@@ -87,8 +92,7 @@ class PoseEstimator(Protocol):
 
         Args:
             image: the whole frame.
-            boxes: (people, 4) x0, y0, x1, y1 [px]; may reach over the frame's border. No boxes is a
-                valid request.
+            boxes: (people, 4) x0, y0, x1, y1 [px].
 
         Returns:
             The poses in the order of `boxes`. Their boxes are as the estimator sees them in a crop,
@@ -102,12 +106,7 @@ class FindsOccludedPeople(PoseEstimator, Protocol):
     """An estimator that also finds occluded people that a detector misses."""
 
     def find_occluded(self, image: Image, people: People) -> KeypointDetections:
-        """Return occluded people next to the detected ones, with the estimator's boxes.
-
-        Args:
-            image: the whole frame.
-            people: detected in it.
-        """
+        """Return occluded people next to the detected ones, with the estimator's boxes."""
 
 
 class PointEstimator(Protocol):

@@ -33,20 +33,15 @@ from worldpose.geometry.boxes import box_iou
 
 POINTS: Final = (*LANDMARKS, *FEET)
 """Points of the net in order: landmarks of the surface, then heels and toes."""
-MAX_ERROR_SHARE: Final = 0.05
-"""Largest error of a correct point, as a share of the box's longer side [1]; as for joints."""
 MIN_SQUARE: Final = 1e-3
 """Added to the mean square distance, whose logarithm is taken [px^2]."""
-MIN_VISIBLE: Final = 0.5
-"""Points that are less probably visible are missing [1]."""
 
 
 class SeenLandmarks(NamedTuple):
     """Output of the net for crops.
 
     Attributes:
-        maps: logits of each point's position (batch, points, rows, columns); a softmax over the
-            cells of a map gives probabilities.
+        maps: logits of each point's position (batch, points, rows, columns).
         doubt: logarithm of the standard deviation from the crop as a whole (batch, points).
         visible: logits that points are visible (batch, points).
         trust: weight of the logarithm of a map's extent in that of the standard deviation
@@ -143,9 +138,11 @@ class LandmarkEstimator:
         """
         found = self.estimate(image, np.asarray(people.boxes, dtype=np.float64))
         sides = people.boxes[:, 2:] - people.boxes[:, :2]
-        tolerance = MAX_ERROR_SHARE * sides.max(axis=1, initial=0.0)[:, None]
+        # Largest error of a correct point, as a share of the box's longer side [1]; as for joints.
+        tolerance = 0.05 * sides.max(axis=1, initial=0.0)[:, None]
         confidence = np.clip(-np.expm1(-0.5 * (tolerance / found.std) ** 2), 1e-3, 1.0)
-        shown = found.visible >= MIN_VISIBLE
+        # Points that are less probably visible are missing [1].
+        shown = found.visible >= 0.5
         return people.add_points(
             POINTS,
             np.where(shown[..., None], found.places, np.nan),

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from data_contracts.checkpoint import Checkpoint
 from worldpose.cache_folder import user_cache
@@ -37,9 +36,6 @@ BUNDLED_WEIGHTS: Final = (
 
 LANDMARK_WEIGHTS: Final = Path(__file__).with_name("embedded_landmarks.safetensors")
 """Shipped weights of the net of landmarks."""
-
-QUANTIZED_WEIGHTS: Final = tuple(file.with_suffix(".onnx") for file in BUNDLED_WEIGHTS)
-"""The same in 8-bit integers, for CPUs (infra/embedded_detector/quantize.py)."""
 
 SHIPPED_SCORE_MAP: Final = ScoreMap(slope=4.0, offset=-0.42)
 """Map of stored scores of the shipped pair of nets (infra/embedded_detector/score_map.py)."""
@@ -151,13 +147,9 @@ def load_bundled_detector(
     Raises:
         InputError: the file holds other weights than this detector's, or torch is not installed.
     """
-    nets = _bundled_nets()
+    net = _bundled_net("PeopleNet", BUNDLED_WEIGHTS[0], weights, device)
     from worldpose.detection.bundled_detector import BundledDetector
-    from worldpose.detection.net_inference import QuantizedNet
 
-    if weights is None and device == "cpu":
-        return BundledDetector(QuantizedNet(QUANTIZED_WEIGHTS[0]))
-    net = nets.load_weights(weights or BUNDLED_WEIGHTS[0], nets.PeopleNet())
     return BundledDetector(net, device, half)
 
 
@@ -165,13 +157,9 @@ def load_bundled_pose(
     weights: Path | None = None, device: str = "cpu", half: bool = False
 ) -> PoseEstimator:
     """Return the bundled pose estimator; arguments and errors are those of the detector."""
-    nets = _bundled_nets()
+    net = _bundled_net("KeypointNet", BUNDLED_WEIGHTS[1], weights, device)
     from worldpose.detection.bundled_pose import BundledPoseEstimator
-    from worldpose.detection.net_inference import QuantizedNet
 
-    if weights is None and device == "cpu":
-        return BundledPoseEstimator(QuantizedNet(QUANTIZED_WEIGHTS[1]))
-    net = nets.load_weights(weights or BUNDLED_WEIGHTS[1], nets.KeypointNet())
     return BundledPoseEstimator(net, device, half)
 
 
@@ -185,20 +173,17 @@ def load_landmarks(settings: DetectionSettings) -> LandmarkEstimator | None:
     """
     if not settings.landmarks:
         return None
-    nets = _bundled_nets()
-    from worldpose.detection.landmark_net import LandmarkEstimator, LandmarkNet
-    from worldpose.detection.net_inference import QuantizedNet
+    net = _bundled_net("LandmarkNet", LANDMARK_WEIGHTS, None, settings.device)
+    from worldpose.detection.landmark_net import LandmarkEstimator
 
-    if settings.device == "cpu":
-        return LandmarkEstimator(QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx")))
-    net = nets.load_weights(LANDMARK_WEIGHTS, LandmarkNet())
     return LandmarkEstimator(net, settings.device, settings.half)
 
 
-def _bundled_nets() -> ModuleType:
-    """Return the module of the bundled nets, which needs torch."""
+def _bundled_net(kind: str, shipped: Path, weights: Path | None, device: str) -> Any:  # noqa: ANN401
+    """Return a net by the name of its class; the shipped one computes in integers on a CPU."""
     try:
-        from worldpose.detection import bundled_nets
+        from worldpose.detection import bundled_nets, landmark_net
+        from worldpose.detection.net_inference import QuantizedNet
     except ImportError as error:
         raise InputError(
             "bundled nets",
@@ -206,7 +191,10 @@ def _bundled_nets() -> ModuleType:
             found=str(error),
             todo="Install worldpose[detectors].",
         ) from error
-    return bundled_nets
+    if weights is None and device == "cpu":
+        return QuantizedNet(shipped.with_suffix(".onnx"))
+    module = landmark_net if kind == "LandmarkNet" else bundled_nets
+    return bundled_nets.load_weights(weights or shipped, getattr(module, kind)())
 
 
 def weights_of(settings: DetectionSettings) -> dict[str, str | None]:

@@ -33,10 +33,6 @@ CROPS: Final = 16
 """Crops per batch."""
 WEIGHTS_DIGEST: Final = "weights_sha256"
 """Key of the metadata of a net in integers: SHA-256 of the weights that it was made from."""
-MIN_REPEATS: Final = 3
-"""Inputs of one shape from which on a GPU's work on them is captured as a graph [1]."""
-MAX_GRAPHS: Final = 32
-"""Most shapes that are captured [1]: a graph takes some megabytes of the GPU's memory."""
 _CAPTURING: Final = Lock()
 
 
@@ -47,10 +43,6 @@ class PlacedNet(Protocol):
         """Return the outputs on the CPU, the rows of the given images first.
 
         The next call may overwrite them.
-
-        Args:
-            images: (images, height, width, 3).
-            surroundings: (images, ...), second input of nets of crops.
         """
 
 
@@ -87,8 +79,7 @@ class FloatNet:
             device: `cpu` or `cuda`.
             half: convolutions compute in half precision, on a GPU only.
             decode: returns what the caller needs of the outputs, on the device; None = all.
-            batch: most images of a call. If fewer are given, others are computed with them: kernels
-                for other numbers of images round differently.
+            batch: most images of a call.
 
         Raises:
             InputError: torch finds no GPU.
@@ -132,12 +123,7 @@ class GraphReplay:
     """
 
     def __init__(self, compute: Compute, batch: int) -> None:
-        """Wrap a computation.
-
-        Args:
-            compute: returns outputs for inputs on the GPU, by the same kernels each time.
-            batch: rows of its inputs.
-        """
+        """Wrap a computation."""
         self._compute, self._batch = compute, batch
         self._seen = Counter[tuple[torch.Size, ...]]()
         self._graphs: dict[tuple[torch.Size, ...], _Graph] = {}
@@ -148,8 +134,9 @@ class GraphReplay:
         self._seen[shapes] += 1
         if shapes not in self._graphs:
             whole = [_fill(each, self._batch) for each in inputs]
-            # Crops of groups of people have many shapes, each of them seldom.
-            if self._seen[shapes] < MIN_REPEATS or len(self._graphs) >= MAX_GRAPHS:
+            # Crops of groups of people have many shapes, each of them seldom; a graph takes some
+            # megabytes of the GPU's memory.
+            if self._seen[shapes] < 3 or len(self._graphs) >= 32:
                 return tuple(each.cpu() for each in self._compute([each.cuda() for each in whole]))
             self._graphs[shapes] = _Graph.capture(self._compute, whole)
         return self._graphs[shapes].replay(inputs)

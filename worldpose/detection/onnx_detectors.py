@@ -18,10 +18,6 @@ from worldpose.detection.suppression import suppress
 from worldpose.errors import InputError
 from worldpose.parsing import parse_in_turn
 
-VIEW_SIZE: Final = (640, 640)
-"""Input size for a net that takes any size [px]."""
-DUPLICATE_IOU: Final = 0.7
-"""Boxes of a raw grid with a larger intersection over union are of one person [1]."""
 STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))
 """Strides of the grids of YOLO nets, without and with a fourth level [px]."""
 PERSON_NAMES: Final = frozenset({"goalkeeper", "keeper", "person", "player", "referee"})
@@ -49,7 +45,7 @@ class Form:
 
     outputs: str
     decode: Decoder
-    classes: Callable[[Outputs], int] | None
+    classes: Callable[[Outputs], int] | None = None
     scale: float = 1.0 / 255.0
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -87,7 +83,8 @@ def load_onnx_detector(
             found=repr(form),
             todo="Name the form of the net, or write onnx:FILE to let worldpose recognize it.",
         )
-    net = OnnxNet(file, device, VIEW_SIZE)
+    # Input size for a net that takes any size [px].
+    net = OnnxNet(file, device, (640, 640))
     outputs = _probe(net)
     chosen = FORMS[form or recognize_form(net.where, outputs, net.size)]
     names = _class_names(net.metadata)
@@ -285,7 +282,8 @@ def decode_grid(found: Floats, people: Sequence[int], *, with_object: bool) -> P
     scores = found[:, 4:]
     score = scores[:, 0] * _best(scores[:, 1:], people) if with_object else _best(scores, people)
     kept = score >= MIN_SCORE  # most cells are empty
-    return suppress(_above_min_score(_corners(found[kept]), score[kept]), DUPLICATE_IOU)
+    # Boxes of a raw grid with a larger intersection over union are of one person [1].
+    return suppress(_above_min_score(_corners(found[kept]), score[kept]), 0.7)
 
 
 def _decode_yolox(outputs: Outputs, size: tuple[int, int], people: Sequence[int]) -> People:
@@ -294,24 +292,6 @@ def _decode_yolox(outputs: Outputs, size: tuple[int, int], people: Sequence[int]
     found[:, :2] = (found[:, :2] + cells) * strides[:, None]
     found[:, 2:4] = np.exp(np.minimum(found[:, 2:4], 20.0)) * strides[:, None]
     return decode_grid(found, people, with_object=True)
-
-
-def _decode_with_object(outputs: Outputs, _size: tuple[int, int], people: Sequence[int]) -> People:
-    return decode_grid(outputs[0], people, with_object=True)
-
-
-def _decode_columns(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
-    return decode_grid(outputs[0].T, people, with_object=False)
-
-
-def _decode_nms(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
-    found = outputs[0]
-    return _select_labelled(found[:, :4], found[:, 4], found[:, 5], people)
-
-
-def _decode_dets(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
-    found, labels = outputs
-    return _select_labelled(found[:, :4], found[:, 4], labels, people)
 
 
 def _decode_boxes(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
@@ -348,6 +328,36 @@ def _decode_softmax(outputs: Outputs, size: tuple[int, int], people: Sequence[in
     return _above_min_score(_corners(_detr_boxes(outputs)) * [*size, *size], _best(share, people))
 
 
+def _decode_with_object(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
+    return decode_grid(outputs[0], people, with_object=True)
+
+
+def _decode_columns(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
+    return decode_grid(outputs[0].T, people, with_object=False)
+
+
+def _decode_labelled(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
+    """Return people from rows of corners and score, then a label there or in another output."""
+    found = outputs[0]
+    labels = found[:, 5] if found.shape[1] > 5 else outputs[1]
+    return _select_labelled(found[:, :4], found[:, 4], labels, people)
+
+
+def _count_with_object(outputs: Outputs) -> int:
+    return int(outputs[0].shape[1] - 5)
+
+
+def _count_columns(outputs: Outputs) -> int:
+    # Of pose nets, 4 + 1 + 51 rows, the first class alone is one.
+    rows = int(outputs[0].shape[0])
+    return 1 if rows == 56 else rows - 4
+
+
+def _count_logits(outputs: Outputs) -> int:
+    return int(_detr_logits(outputs).shape[1])
+
+
+_BGR: Final[dict[str, Any]] = {"scale": 1.0, "bgr": True}
 _IMAGENET: Final[dict[str, Any]] = {
     "scale": 1.0,
     "mean": tuple(IMAGENET_MEAN.tolist()),
@@ -356,82 +366,58 @@ _IMAGENET: Final[dict[str, Any]] = {
 FORMS: Final[Mapping[str, Form]] = {
     "yolox": Form(
         "(cells, 5 + classes), offsets in cells; takes BGR 0..255",
-        _decode_yolox,
-        lambda outputs: outputs[0].shape[1] - 5,
-        scale=1.0,
-        bgr=True,
+        *(_decode_yolox, _count_with_object),
+        **_BGR,
     ),
     "yolox-decoded": Form(
         "(cells, 5 + classes), pixels; takes BGR 0..255",
-        _decode_with_object,
-        lambda outputs: outputs[0].shape[1] - 5,
-        scale=1.0,
-        bgr=True,
+        *(_decode_with_object, _count_with_object),
+        **_BGR,
     ),
     "yolox-dets": Form(
-        "(boxes, 5) and labels, of mmdeploy; takes BGR 0..255",
-        _decode_dets,
-        None,
-        scale=1.0,
-        bgr=True,
+        "(boxes, 5) and labels, of mmdeploy; takes BGR 0..255", _decode_labelled, **_BGR
     ),
     "yolov5": Form(
         "(3 cells, 5 + classes); also YOLOv7; takes RGB 0..1",
-        _decode_with_object,
-        lambda outputs: outputs[0].shape[1] - 5,
+        *(_decode_with_object, _count_with_object),
     ),
     "yolov6": Form(
         "(cells, 5 + classes), objectness 1; takes RGB 0..1",
-        _decode_with_object,
-        lambda outputs: outputs[0].shape[1] - 5,
+        *(_decode_with_object, _count_with_object),
     ),
     "yolov8": Form(
-        "(4 + classes, cells); also later ones; takes RGB 0..1",
-        _decode_columns,
-        # Of pose nets, 4 + 1 + 51 rows, the first class alone is one.
-        lambda outputs: 1 if outputs[0].shape[0] == 56 else outputs[0].shape[0] - 4,
+        "(4 + classes, cells); also later ones; takes RGB 0..1", _decode_columns, _count_columns
     ),
-    "yolo-nms": Form(
-        "(boxes, 6): corners, score, label; takes RGB 0..1",
-        _decode_nms,
-        None,
-    ),
+    "yolo-nms": Form("(boxes, 6): corners, score, label; takes RGB 0..1", _decode_labelled),
     "detr": Form(
         "logits (queries, classes + 1) and boxes 0..1; takes RGB normalized as ImageNet",
-        _decode_softmax,
-        lambda outputs: _detr_logits(outputs).shape[1],
+        *(_decode_softmax, _count_logits),
         **_IMAGENET,
     ),
     "rfdetr": Form(
         "logits (queries, classes) and boxes 0..1; also Deformable DETR; takes RGB normalized as "
         "ImageNet",
-        _decode_sigmoid,
-        lambda outputs: _detr_logits(outputs).shape[1],
+        *(_decode_sigmoid, _count_logits),
         **_IMAGENET,
     ),
     "rtdetr": Form(
         "logits (queries, classes) and boxes 0..1; also D-FINE; takes RGB 0..1",
-        _decode_sigmoid,
-        lambda outputs: _detr_logits(outputs).shape[1],
+        *(_decode_sigmoid, _count_logits),
     ),
     "rtdetr-boxes": Form(
         "labels, boxes [px] and scores, with a second input for the image size; takes RGB 0..1",
         _decode_boxes,
-        None,
     ),
     "rtmdet": Form(
         "(boxes, 5) and labels, of mmdeploy; takes BGR normalized as ImageNet",
-        _decode_dets,
-        None,
-        scale=1.0,
+        _decode_labelled,
         mean=(103.53, 116.28, 123.675),
         std=(57.375, 57.12, 58.395),
-        bgr=True,
+        **_BGR,
     ),
     "movenet": Form(
         "(people, 56) of MoveNet MultiPose; takes RGB 0..255",
-        _decode_movenet,
-        lambda _: 1,
+        *(_decode_movenet, lambda _: 1),
         scale=1.0,
     ),
 }

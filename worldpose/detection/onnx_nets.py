@@ -24,12 +24,6 @@ _DTYPES: Final[dict[str, np.dtype[Any]]] = {
     "tensor(float16)": np.dtype(np.float16),
     "tensor(float)": np.dtype(np.float32),
 }
-SIZE_INPUTS: Final = ("orig_target_sizes", "target_sizes")
-"""Names of a second input for the width and height of the image [px]."""
-CROP_SIZE: Final = (192, 256)
-"""Input size for a net that takes any size [px]."""
-PADDING: Final = 1.25
-"""Size of crops over that of boxes, as in the training of these nets [1]."""
 IMAGENET_MEAN: Final = np.array([123.675, 116.28, 103.53], dtype=np.float32)
 IMAGENET_STD: Final = np.array([58.395, 57.12, 57.375], dtype=np.float32)
 """Mean and standard deviation of ImageNet, for RTMPose and ViTPose [grey level]."""
@@ -63,7 +57,8 @@ class OnnxNet:
         self._session = open_session(file, device)
         inputs = self._session.get_inputs()
         shape = [side if isinstance(side, int) else None for side in inputs[0].shape]
-        sizes = inputs[1:] and inputs[1].name in SIZE_INPUTS
+        # Names of a second input for the width and height of the image [px].
+        sizes = inputs[1:] and inputs[1].name in ("orig_target_sizes", "target_sizes")
         if len(inputs) > 1 + bool(sizes) or len(shape) != 4 or 3 not in (shape[1], shape[3]):
             raise InputError(
                 self.where,
@@ -236,7 +231,8 @@ def load_onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
     Raises:
         InputError: onnxruntime is not installed, or the file is no such net.
     """
-    net = OnnxNet(file, device, CROP_SIZE)
+    # Input size for a net that takes any size [px].
+    net = OnnxNet(file, device, (192, 256))
     shape = net.outputs[0] if net.outputs else ()
     single = len(shape) == 4 and shape[2:] == (17, 3)
     columns = len(net.outputs) == 2 and all(len(o) == 3 and o[1] == 17 for o in net.outputs)
@@ -261,7 +257,8 @@ class _OnnxPose:
         """Return the pose in each box."""
         if not len(boxes):
             return KeypointDetections.empty()
-        frames = fit_crops(boxes, self._net.size, PADDING)
+        # Size of crops over that of boxes, as in the training of these nets [1].
+        frames = fit_crops(boxes, self._net.size, 1.25)
         crops: Image | Singles = cut_crops(image, frames, self._net.size)
         if self._normal:
             crops = (crops.astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD

@@ -34,11 +34,6 @@ from worldpose.geometry.boxes import box_areas
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 
-HEAD_HEIGHT: Final = 1.75
-"""Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""
-CUT_PX: Final = 3.0
-"""The lower border cuts off a box that ends this near to it [px]."""
-
 
 def on_pitch(
     boxes: Floats, camera: Camera, image_size: tuple[int, int], pitch: PitchTemplate, margin: float
@@ -56,12 +51,15 @@ def on_pitch(
         pitch: its lines and its surface.
         margin: largest distance outside of the lines that still counts as on the pitch [m].
     """
-    cut = boxes[:, 3] > image_size[1] - 1 - CUT_PX
+    # The lower border cuts off a box that ends this near to it [px].
+    cut = boxes[:, 3] > image_size[1] - 1 - 3.0
     pixels = np.stack(
         [boxes[:, [0, 2]].mean(axis=1), np.where(cut, boxes[:, 1], boxes[:, 3])], axis=1
     )
     rays = camera.unproject(pixels)
-    height = np.where(cut, HEAD_HEIGHT, 0.0)
+    # Height of the head above the ground, for a person whose feet the lower border cuts off [m].
+    head_height = 1.75
+    height = np.where(cut, head_height, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         for _ in range(3):  # the crown is flat: the second step changes millimetres
             along = (height - rays.origins[:, 2]) / rays.directions[:, 2]
@@ -71,7 +69,7 @@ def on_pitch(
                 np.clip(np.where(inside, points[:, 0], 0.0), -pitch.length / 2, pitch.length / 2),
                 np.clip(np.where(inside, points[:, 1], 0.0), -pitch.width / 2, pitch.width / 2),
             )
-            height = np.where(cut, HEAD_HEIGHT, 0.0) + ground
+            height = np.where(cut, head_height, 0.0) + ground
         return np.asarray(
             inside
             & (along > 0.0)
@@ -80,14 +78,8 @@ def on_pitch(
         )
 
 
-FRAMES_AHEAD: Final = 8
-"""Frames decoded while earlier ones are searched."""
-CHUNK_FRAMES: Final = 64
-"""Frames per chunk."""
 NO_PEOPLE: Final = People(np.empty((0, 4)), np.empty(0))
 """A frame without people."""
-SUSPICIOUS_FRAMES: Final = 20
-"""Frames without any person that are suspicious."""
 
 
 @dataclass
@@ -121,12 +113,12 @@ class DetectionReport:
     is_given: bool = False
 
     def why_no_person(self) -> str | None:
-        """Return the likely reason why a clip of `SUSPICIOUS_FRAMES` or more shows no person.
+        """Return the likely reason why a clip of 20 frames or more shows no person.
 
         None: people were found, or the clip is shorter.
         """
         frames = self.frames - len(self.unreadable)
-        if self.detections or frames < SUSPICIOUS_FRAMES:
+        if self.detections or frames < 20:
             return None
         found = f"no person in {frames} frames: "
         if self.is_given:
@@ -217,7 +209,8 @@ class PeopleFinder:
                 box is added, left out because of its score or its place, or tracked. None = detect.
         """
         self.report = DetectionReport(is_given=given is not None)
-        frames = read_ahead(frames, FRAMES_AHEAD)
+        # Frames decoded while earlier ones are searched.
+        frames = read_ahead(frames, 8)
         cleaner = BoxCleaner(self._settings)
         self._parts = None
         if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
@@ -245,7 +238,8 @@ class PeopleFinder:
             else:
                 rows.append(self._find_poses(image, people, place))
                 self.report.empty += not len(rows[-1].score)
-            if len(rows) == CHUNK_FRAMES:
+            # Frames per chunk.
+            if len(rows) == 64:
                 yield self._chunk(numbers, rows)
                 rows, numbers = [], []
         if rows:
@@ -266,18 +260,14 @@ class PeopleFinder:
             if settings.fusion == "weighted":
                 people = fuse(list(members), settings.nms_iou)
             else:
-                pooled = People(
-                    np.concatenate([member.boxes for member in members]),
-                    np.concatenate([member.scores for member in members]),
-                )
-                people = suppress(pooled, settings.nms_iou)
+                people = suppress(People.concatenate(members), settings.nms_iou)
             kept = (people.scores >= settings.low_score_threshold) & (box_areas(people.boxes) > 0.0)
-            people = People(people.boxes[kept], people.scores[kept])
+            people = people.select(kept)
             self.report.boxes += len(people.scores)
             if place is not None:
                 inside = self._inside(people, images[0], place)
                 self.report.crowd += int(np.count_nonzero(~inside))
-                people = People(people.boxes[inside], people.scores[inside])
+                people = people.select(inside)
             people_by_frame.append(people)
         return people_by_frame
 
@@ -375,14 +365,7 @@ def detect_people(
 def find_poses(
     estimator: PoseEstimator, image: Image, people: People, settings: DetectionSettings
 ) -> KeypointDetections:
-    """Return the poses of people with the estimator's boxes, then of occluded people next to them.
-
-    Args:
-        estimator: estimator of poses.
-        image: the whole frame.
-        people: detected people.
-        settings: settings of the stage.
-    """
+    """Return poses with the estimator's boxes, then those of occluded people beside them."""
     poses = combine_boxes(people, estimator.estimate(image, people.boxes))
     if not (settings.find_occluded and isinstance(estimator, FindsOccludedPeople)):
         return poses

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +12,6 @@ from data_contracts.conventions import COCO17_SIGMAS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import People
 from worldpose.geometry.boxes import box_areas, box_iou
-
-SUREST: Final = 12
-"""Number of surest keypoints that decide whether a box holds a person: others may be hidden."""
-MAX_SCORE_LOSS: Final = 0.5
-"""Share of its score that a box with the pose of a better box loses [1]."""
 
 
 def nms_indices(people: People, overlap: float) -> NDArray[np.intp]:
@@ -38,28 +32,20 @@ def nms_indices(people: People, overlap: float) -> NDArray[np.intp]:
 
 def suppress(people: People, overlap: float) -> People:
     """Return the people after non-maximum suppression at `overlap` [1], best first."""
-    best = nms_indices(people, overlap)
-    return People(people.boxes[best], people.scores[best])
+    return people.select(nms_indices(people, overlap))
 
 
 def surest_confidence(confidence: AnyFloats) -> Floats:
-    """Return the mean confidence of the `SUREST` keypoints with the highest; 0 without any.
+    """Return the mean confidence of the twelve surest keypoints; others may be hidden.
 
     Args:
-        confidence: (people, 17); NaN where not found.
+        confidence: (people, 17); NaN where not found, which counts as 0.
     """
-    return np.asarray(np.sort(np.nan_to_num(confidence), axis=1)[:, -SUREST:].mean(axis=1))
+    return np.asarray(np.sort(np.nan_to_num(confidence), axis=1)[:, -12:].mean(axis=1))
 
 
 def combine_boxes(people: People, poses: KeypointDetections) -> KeypointDetections:
-    """Return the poses with the estimator's boxes, where it gives any, else the detector's.
-
-    Args:
-        people: people as a detector found them.
-        poses: the estimate for each person. Its score, the expected fit of its box, becomes the
-            geometric mean of the detector's score, the fit and the mean confidence of the surest
-            keypoints; without a fit the detector's score stays.
-    """
+    """Return the poses with the estimator's boxes, where it gives any, else the detector's."""
     real = np.all(poses.boxes[:, 2:] - poses.boxes[:, :2] > 1.0, axis=1)
     boxes = np.where(real[:, None], poses.boxes, people.boxes)
     sure = surest_confidence(poses.confidence)
@@ -73,8 +59,7 @@ def fuse(members: list[People], overlap: float) -> People:
 
     Weighted boxes fusion: a box joins the best scored cluster that it overlaps. A cluster's box is
     the mean of its boxes weighted by score. Its score is the sum of their scores over the number of
-    members, so a person that only one member detects scores less. Each member's duplicates are
-    suppressed first.
+    members, so a person that only one member detects scores less.
 
     Args:
         members: detections of each detector in one frame.
@@ -86,10 +71,7 @@ def fuse(members: list[People], overlap: float) -> People:
     each = [suppress(member, overlap) for member in members]
     if len(each) == 1:
         return each[0]
-    pooled = People(
-        np.concatenate([member.boxes for member in each]),
-        np.concatenate([member.scores for member in each]),
-    )
+    pooled = People.concatenate(each)
     order = _best_first(pooled)
     member = np.concatenate([np.full(len(p.scores), m) for m, p in enumerate(each)])[order]
     boxes, scores = pooled.boxes[order], pooled.scores[order]
@@ -108,8 +90,7 @@ def fuse(members: list[People], overlap: float) -> People:
             fused, weight = np.vstack([fused, box]), np.append(weight, score)
             joined.append({int(who)})
     result = People(fused, weight / len(each))
-    order = _best_first(result)
-    return People(result.boxes[order], result.scores[order])
+    return result.select(_best_first(result))
 
 
 def _best_first(people: People) -> NDArray[np.intp]:
@@ -156,5 +137,6 @@ def suppress_poses(
     for row in np.argsort(-detections.score, kind="stable"):
         most = alike[row, kept].max(initial=0.0)
         kept[row] = found[row].any() and most <= same_pose
-        score[row] *= 1.0 - MAX_SCORE_LOSS * most**2
+        # Share of its score that a box with the pose of a better box loses [1].
+        score[row] *= 1.0 - 0.5 * most**2
     return replace(detections, score=score).select(kept)

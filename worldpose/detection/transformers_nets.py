@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +16,6 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import MIN_SCORE, People
 from worldpose.errors import InputError
-
-DETECTORS: Final = ("rt_detr", "rt_detr_v2", "d_fine", "detr")
-"""Kinds of detectors, by `model_type` of config.json."""
-POSES: Final = ("vitpose",)
-"""Kinds of pose estimators."""
-PERSON: Final = 0
-"""Class of people where the checkpoint does not name its classes."""
 
 
 class TransformersDetector:
@@ -40,7 +33,8 @@ class TransformersDetector:
             InputError: transformers or a GPU is missing, or the folder holds no such net.
         """
         self._torch, library = _libraries(folder)
-        kind = _kind(folder, library, DETECTORS)
+        # Kinds of detectors, by `model_type` of config.json.
+        kind = _kind(folder, library, ("rt_detr", "rt_detr_v2", "d_fine", "detr"))
         # The processors without a suffix need torchvision.
         named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
         self._processor = _load_net(folder, named)
@@ -49,7 +43,8 @@ class TransformersDetector:
         self._device, self._half = device, half
         self._person = next(
             (number for number, name in net.config.id2label.items() if name.lower() == "person"),
-            PERSON,
+            # Class of people where the checkpoint does not name its classes.
+            0,
         )
         size = self._processor.size
         self._size = (int(size.get("width", 640)), int(size.get("height", 640)))
@@ -83,7 +78,8 @@ class TransformersPose:
     def __init__(self, folder: Path, device: str, half: bool) -> None:
         """Load a saved checkpoint; arguments and errors are those of `TransformersDetector`."""
         self._torch, library = _libraries(folder)
-        _kind(folder, library, POSES)
+        # Kinds of pose estimators.
+        _kind(folder, library, ("vitpose",))
         self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
         net = _load_net(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
         self._net = _place_net(net, self._torch, folder, device, half)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +13,6 @@ from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import Detector, People, PoseEstimator
 from worldpose.detection.suppression import suppress
-
-EDGE: Final = 3.0
-"""A view's edge cuts a person whose box ends this near to it [px of the view]."""
-FILLING: Final = 114
-"""Grey level beyond a frame's border, as in the training of detectors."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +68,7 @@ class TiledDetector:
                 self._uncut_people(view, one, image.shape[1], image.shape[0])
                 for view, one in zip(views, found, strict=True)
             ]
-            people.append(
-                suppress(
-                    People(
-                        np.concatenate([one.boxes for one in seen]),
-                        np.concatenate([one.scores for one in seen]),
-                    ),
-                    self._overlap,
-                )
-            )
+            people.append(suppress(People.concatenate(seen), self._overlap))
         return people
 
     def _views(self, width: int, height: int) -> Iterator[View]:
@@ -98,11 +84,12 @@ class TiledDetector:
         """Return the people that no inner edge of the view cuts, in frame pixels."""
         x0, y0, x1, y1 = people.boxes.T
         right, low = round(width * view.scale), round(height * view.scale)
+        edge = 3.0  # A view's edge cuts a person whose box ends this near to it [px of the view].
         cut = (
-            ((x0 < EDGE) & (view.x > 0))
-            | ((y0 < EDGE) & (view.y > 0))
-            | ((x1 > self._size[0] - EDGE) & (view.x + self._size[0] < right))
-            | ((y1 > self._size[1] - EDGE) & (view.y + self._size[1] < low))
+            ((x0 < edge) & (view.x > 0))
+            | ((y0 < edge) & (view.y > 0))
+            | ((x1 > self._size[0] - edge) & (view.x + self._size[0] < right))
+            | ((y1 > self._size[1] - edge) & (view.y + self._size[1] < low))
         )
         return People(view.to_frame(people.boxes[~cut]), people.scores[~cut])
 
@@ -131,7 +118,8 @@ def _cut(image: Image, views: Sequence[View], size: tuple[int, int]) -> list[Ima
             resized = image if view.scale == 1.0 else cv2.resize(image, target, None, 0, 0, way)
             scaled[view.scale] = np.asarray(resized, dtype=np.uint8)
         part = scaled[view.scale][view.y : view.y + size[1], view.x : view.x + size[0]]
-        filled = np.full((size[1], size[0], 3), FILLING, dtype=np.uint8)
+        # Grey level beyond a frame's border, as in the training of detectors.
+        filled = np.full((size[1], size[0], 3), 114, dtype=np.uint8)
         filled[: part.shape[0], : part.shape[1]] = part
         cut.append(filled)
     return cut

@@ -9,15 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Flags, Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.compiled import map_in_threads
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.passes import triangulate_joints
-from worldpose.triangulation.settings import TriangulationSettings
 
 Places = NDArray[np.int64]
 
@@ -103,94 +100,6 @@ def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyView
     return BodyViews(image, variance, scale)
 
 
-FOLDS: Final = 4
-"""Groups of cameras; each is held out once."""
-FARTHEST: Final = 0.2
-"""Maximum error of a keypoint, also of one without a prediction [box height]: half a metre does not
-measure the accuracy of a person's position."""
-SMALLEST: Final = 10.0
-"""Minimum height of a box [px]."""
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Prediction error of keypoints in held-out cameras.
-
-    Attributes:
-        error: mean distance to the nearest person predicted by the other cameras [box height].
-        keypoints: number of keypoints.
-    """
-
-    error: float
-    keypoints: int
-
-
-def measure_held_out(
-    cameras: Camera,
-    used: KeypointDetections,
-    detected: AnyFloats,
-    settings: TriangulationSettings,
-) -> HeldOut | None:
-    """Return the prediction error in held-out cameras; None without data.
-
-    One quarter of the cameras after the other is held out; the others triangulate all people, and
-    every keypoint detected in the held-out cameras is compared with them. The compared keypoints do
-    not depend on tracking or rejection, so leaving detections out cannot reduce the error. There is
-    no data without keypoints, nor if the other cameras are too few to triangulate, such as one of
-    two.
-
-    Args:
-        cameras: batch (cameras,).
-        used: detections for triangulation; NaN where rejected.
-        detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
-        settings: settings of triangulation.
-    """
-    count = cameras.batch_shape[0]
-    if count - max(1, count // FOLDS) < settings.min_views:
-        return None
-    fold = np.arange(count) % FOLDS
-    used = used.with_points(())
-
-    def measure(left_out: int) -> tuple[float, int]:
-        total, keypoints = 0.0, 0
-        index = np.where((fold == left_out)[:, None], np.int16(-1), used.detection_index)
-        others = replace(used, detection_index=index.astype(np.int16))
-        placed = triangulate_joints(cameras, others, settings)
-        for camera in np.flatnonzero(fold == left_out):
-            seen = np.asarray(detected[:, camera], dtype=np.float64)
-            away = _distances(cameras[int(camera)], seen, placed.joints)
-            total += float(away.sum())
-            keypoints += int(np.isfinite(seen[..., 0]).sum())
-        return total, keypoints
-
-    found = list(map_in_threads(measure, range(min(FOLDS, count))))
-    total, keypoints = sum(each for each, _ in found), sum(each for _, each in found)
-    return HeldOut(total / keypoints, keypoints) if keypoints else None
-
-
-def _distances(camera: Camera, seen: Floats, joints: Floats) -> Floats:
-    """Return distances (frames, detections, 17) [box height] to the nearest person, or 0."""
-    frames, persons, count = joints.shape[:3]
-    there = np.isfinite(seen).all(-1)
-    high = np.where(there, seen[..., 1], -np.inf).max(-1, initial=-np.inf)
-    low = np.where(there, seen[..., 1], np.inf).min(-1, initial=np.inf)
-    height = np.where(there.any(-1), np.maximum(high - low, SMALLEST), SMALLEST)
-    image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
-    nearest = np.where(there, FARTHEST, 0.0)
-    best = nearest.sum(-1)
-    for person in range(persons):
-        away = np.linalg.norm(seen - image[:, None, person], axis=-1) / height[..., None]
-        away = np.where(there, np.fmin(away, FARTHEST), 0.0)
-        total = away.sum(-1)
-        better = total < best
-        nearest[better], best[better] = away[better], total[better]
-    return nearest
-
-
-BINS: Final = 8
-"""Confidence classes."""
-ROUNDS: Final = 6
-"""Iterations; the last changes a factor by less than a hundredth."""
 MEDIAN: Final = 2.0 * math.log(2.0)
 """Median squared distance in two dimensions, in variances of an axis."""
 LEAST: Final = 0.05
@@ -230,7 +139,8 @@ def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Flo
     sure = confidence[seen]
     if not len(sure):
         return Spread(np.ones(squared.shape[1]), np.empty(0), np.ones(1))
-    knots = np.unique(np.quantile(sure, np.linspace(0.0, 1.0, BINS + 1)[1:-1]))
+    # Confidence classes.
+    knots = np.unique(np.quantile(sure, np.linspace(0.0, 1.0, 8 + 1)[1:-1]))
     bins = np.searchsorted(knots, sure, side="right")
     joints = np.broadcast_to(np.arange(squared.shape[1]), squared.shape)[seen]
     squares, base, given = squared[seen], stated[seen], known[seen]
@@ -238,7 +148,8 @@ def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Flo
     members = [
         [(each, np.flatnonzero(of == each)) for each in np.unique(of)] for of in (bins, joints)
     ]
-    for _ in range(ROUNDS):
+    # Iterations; the last changes a factor by less than a hundredth.
+    for _ in range(6):
         for groups, factor in zip(members, (by_bin, by_joint), strict=True):
             expected = by_bin[bins] * by_joint[joints] * base
             ratio, shares = squares / (expected + given), expected / (expected + given)
@@ -389,13 +300,6 @@ def body_residuals(
     """Return the residuals of keypoints against the bodies of their tracked persons, if these fit.
 
     The offsets of people in an image are not subtracted, because they contain clock offsets.
-
-    Args:
-        views: the bodies in all images.
-        suspects: detections in these images.
-        judged: their judgement; rejected keypoints do not count.
-        spread: spread of keypoints around bodies.
-        repeated: detections of a person with correlated errors, which count as one.
     """
     unshifted = replace(suspects, offsets=np.zeros_like(suspects.offsets))
     rows, (frame, camera, person), order = _pair_with_bodies(views, unshifted)
@@ -415,12 +319,6 @@ def judge_detections(
     A detection is judged by the body of its tracked person, unless it does not fit that body and
     fits another. A detection of a tracked person that fits no body is dropped, and stays dropped
     until it fits one. A detection of no tracked person is judged only if it fits a body.
-
-    Args:
-        views: the bodies in all images.
-        suspects: detections in these images.
-        spread: spread of keypoints around bodies, learned in the same clip.
-        settings: limits of agreement.
 
     Note:
         Paper, supplement, "SMPL Fitting", last paragraph; its similarity of bones (M4).

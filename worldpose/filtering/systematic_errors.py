@@ -42,8 +42,6 @@ WAVES: Final = (2, 3)
 joint, which the offsets of body fitting cover; higher harmonics would let the bias vary within a
 sixth of a turn."""
 TERMS: Final = 2 * len(WAVES)
-EXPECTED_BIAS: Final = 0.02
-"""Prior standard deviation of each coefficient [m]: a hundredth of a body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +100,8 @@ def learn_view_bias(residuals: Residuals, azimuth: Floats, scale: Floats) -> Vie
     missed = np.where(weight[..., None] > 0.0, residuals.missed, 0.0)
     matrix = np.einsum("nw,nj,nv->jwv", waves, weight, waves, optimize=True)
     right = np.einsum("nw,nj,nja->jwa", waves, weight, missed, optimize=True)
-    matrix = matrix + np.eye(TERMS) / EXPECTED_BIAS**2
+    # Prior standard deviation of each coefficient [m]: a hundredth of a body.
+    matrix = matrix + np.eye(TERMS) / 0.02**2
     return ViewBias(np.linalg.solve(matrix, right).swapaxes(-1, -2).astype(np.float64))
 
 
@@ -111,23 +110,11 @@ def _waves(azimuth: NDArray[np.floating]) -> Floats:
     return np.concatenate([np.cos(angles), np.sin(angles)], axis=-1)
 
 
-LASTING: Final = 0.3
-"""Correlation time of a detector's error, to a factor e [s]."""
-ROUNDS: Final = 2
-"""Passes of judging and learning: the second judges with the result of the first."""
-TURNS: Final = 3
-"""Alternations between view bias and clock offsets within a pass."""
 STEP: Final = 7
 """Parameters of a camera's step: rotation, shift and focal length."""
 EXPECTED: Final = np.array([*(0.003,) * 3, *(0.5,) * 3, 0.005])
 """Standard deviation of a camera's rotation [rad], shift [m] and focal length [1]: ten times the
 error of careful calibration."""
-MIN_INFORMATION: Final = 1e-6
-"""Added to the information of a point [1/m^2]."""
-SPREAD_ROUNDS: Final = 40
-"""Iterations to learn the spread of clock offsets: exact clocks then come out 0.02 frames apart."""
-MIN_SPREAD: Final = 0.005
-"""Minimum spread of clock offsets [frame]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +206,10 @@ def learn_systematic_errors(
         fps: frame rate of these frames [1/s].
     """
     systematic = SystematicErrors.none(cameras.batch_shape[0])
-    repeated = max(1.0, 2.0 * LASTING * fps)
-    for _ in range(ROUNDS):
+    # Correlation time of a detector's error, to a factor e [s].
+    repeated = max(1.0, 2.0 * 0.3 * fps)
+    # Passes of judging and learning: the second judges with the result of the first.
+    for _ in range(2):
         corrected = suspects.subtract(systematic.shift(motion, views))
         spread = learn_keypoint_spread(views, corrected)
         judged = judge_detections(views, corrected, spread, settings)
@@ -232,7 +221,8 @@ def learn_systematic_errors(
             _scale(views)[at],
         )
         clocks = ClockEquations.from_residuals(cameras, joints, image_motion, residuals)
-        for _ in range(TURNS):
+        # Alternations between view bias and clock offsets within a pass.
+        for _ in range(3):
             late = systematic.late[residuals.camera, None, None]
             bias = learn_view_bias(
                 residuals.less(late * np.nan_to_num(image_motion)), azimuth, scale
@@ -290,7 +280,8 @@ class ClockEquations:
         count, width = cameras.batch_shape[0], 1 + STEP
         points = joints.reshape(-1, 3)
         weight = residuals.weight * np.isfinite(image_motion).all(axis=-1)
-        normal = np.tile(MIN_INFORMATION * np.eye(3), (len(points), 1, 1))
+        min_information = 1e-6  # Added to the information of a point [1/m^2].
+        normal = np.tile(min_information * np.eye(3), (len(points), 1, 1))
         mixed = np.zeros((len(points), 3, count, width))
         matrix = np.zeros((count, width, count, width))
 
@@ -318,18 +309,14 @@ class ClockEquations:
             normal[own.place] += by_point
             mixed[own.place, :, camera] = both
             seen.append(own)
-        used = normal[:, 0, 0] > MIN_INFORMATION
+        used = normal[:, 0, 0] > min_information
         flat = mixed[used].reshape(-1, 3, count * width)
         follow = _solve_points(normal[used], flat).reshape(-1, count * width)
         reduced = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
         return cls(tuple(seen), used, follow, reduced)
 
     def learn_clock_offsets(self, residuals: Residuals) -> Floats:
-        """Return clock offsets relative to the mean (cameras,) [frame]; positive = later time.
-
-        Args:
-            residuals: remaining residuals of the keypoints in the equations.
-        """
+        """Return clock offsets relative to the mean (cameras,) [frame]; positive = later time."""
         right = np.zeros((len(self.seen), 1 + STEP))
         pulled = np.zeros((len(self.used), 3))
         for camera, seen in enumerate(self.seen):
@@ -373,10 +360,12 @@ def _solve_clock_offsets(matrix: Floats, right: Floats, count: int) -> Floats:
     If nothing separates clocks from cameras, or all clocks agree, the offsets come out equal.
     """
     spread = 1.0
-    for _ in range(SPREAD_ROUNDS):
+    # Iterations to learn the spread of clock offsets: exact clocks then come out 0.02 frames apart.
+    for _ in range(40):
         prior = np.tile(np.concatenate([[spread**-2], EXPECTED**-2]), count)
         inverse = np.linalg.inv(matrix + np.diag(prior))
         late = (inverse @ right).reshape(count, -1)[:, 0]
         variance = np.diagonal(inverse).reshape(count, -1)[:, 0]
-        spread = max(MIN_SPREAD, float(np.sqrt(np.mean(late**2 + variance))))
+        # Minimum spread of clock offsets [frame].
+        spread = max(0.005, float(np.sqrt(np.mean(late**2 + variance))))
     return np.asarray(late - late.mean())

@@ -20,6 +20,11 @@ from worldpose.parsing import Header, read_npy, read_npy_header
 ARRAY_BYTES: Final = 16 << 30
 """Maximum size of one file's arrays [byte]: two hours of 25 people with covariance at 50
 frames/s are 13 GB."""
+PACKED_RATIO: Final = 200
+"""Maximum ratio of unpacked to packed bytes of arrays from elsewhere: poses with much padding for
+absent people reach 50."""
+PACKED_BYTES: Final = 1 << 26
+"""Unpacked bytes up to which any ratio is allowed."""
 
 _KINDS: Final = {"float": "f", "int": "iu", "text": "U"}
 _MEANINGS: Final = {"float": "float numbers", "int": "int numbers", "text": "text"}
@@ -35,10 +40,15 @@ class Member:
     kind: Literal["float", "int", "text"]
     """Read as float64, int64 or str, whatever the width in the file."""
     required: bool = True
+    dtype: str | None = None
+    """The only type that is allowed, which is also kept, such as `<f4`; None = any width."""
 
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as npz, whole or not at all; equal arrays give equal bytes."""
+    """Write arrays as npz, whole or not at all; equal arrays give equal bytes.
+
+    The file has no compression, since a compressor's output changes with its version.
+    """
     with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
         for name, array in arrays.items():
             little = np.asarray(array, array.dtype.newbyteorder("<"), order="C")
@@ -66,90 +76,19 @@ def read_archive(
     """
     if not path.is_file():
         raise wrong(str(path), "an npz file", "nothing", "Check the path.")
-    try:
-        with zipfile.ZipFile(path) as file:
-            infos = _infos(path, file, members)
-            _check_headers(path, file, infos, members)
-            return {
-                name: _array(path, file, info, members[name])
-                for name, info in infos.items()
-                if only is None or name in only
-            }
-    except (zipfile.BadZipFile, OSError, NotImplementedError) as error:
-        raise wrong(str(path), "a whole npz file", f"{error}") from error
+    with open_npz(path) as file:
+        infos, _ = check_members(path, file, members)
+        require_size(path, infos.values(), ARRAY_BYTES)
+        return {
+            name: read_array(path, file, info, members[name])
+            for name, info in infos.items()
+            if only is None or name in only
+        }
 
 
 def wrong(where: str, expected: str, found: str, todo: str = "Write the file again.") -> InputError:
     """Return the error about one place of a file."""
     return InputError(where, expected=expected, found=found, todo=todo)
-
-
-def _infos(
-    path: Path, file: zipfile.ZipFile, members: Mapping[str, Member]
-) -> dict[str, zipfile.ZipInfo]:
-    found = [info.filename for info in file.infolist()]
-    names = [name.removesuffix(".npy") for name in found]
-    needed = {name for name, member in members.items() if member.required}
-    if not needed <= set(names) or not set(names) <= set(members) or len(set(names)) < len(names):
-        optional = [name for name, member in members.items() if not member.required]
-        expected = f"the members {', '.join(name for name in members if name in needed)}"
-        if optional:
-            expected += f" (and, where known, {', '.join(optional)})"
-        raise wrong(str(path), expected, ", ".join(names[:8]) or "nothing")
-    total = sum(info.file_size for info in file.infolist())
-    if total > ARRAY_BYTES:
-        raise wrong(str(path), f"at most {ARRAY_BYTES} bytes of arrays", f"{total}")
-    return {name: file.getinfo(f"{name}.npy") for name in members if f"{name}.npy" in found}
-
-
-def _check_headers(
-    path: Path,
-    file: zipfile.ZipFile,
-    infos: Mapping[str, zipfile.ZipInfo],
-    members: Mapping[str, Member],
-) -> None:
-    """Check every declared shape before allocating memory for it."""
-    sizes: dict[str, int] = {}
-    for name, info in infos.items():
-        where, member = f"{path}: {name}", members[name]
-        try:
-            with file.open(info) as stream:
-                shape, _, dtype = read_npy_header(stream)
-                start = stream.tell()
-        except Exception as error:  # a hostile header can raise nearly any exception
-            raise wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
-        if dtype.kind not in _KINDS[member.kind]:
-            raise wrong(where, _MEANINGS[member.kind], dtype.str)
-        fits = len(shape) == len(member.dims) and all(
-            n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
-            for n, dim in zip(shape, member.dims, strict=True)
-        )
-        if not fits:
-            known = ", ".join(str(sizes.get(str(dim), dim)) for dim in member.dims)
-            raise wrong(where, f"shape ({known})", f"{shape}")
-        if start + math.prod(shape) * dtype.itemsize != info.file_size:
-            raise wrong(where, f"the bytes of shape {shape}", f"{info.file_size - start} bytes")
-
-
-def _array(
-    path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, member: Member
-) -> NDArray[Any]:
-    try:
-        with file.open(info) as stream:
-            array = read_npy(stream)
-            stream.read()  # to the end, where the checksum is verified
-    except MemoryError:
-        raise
-    except Exception as error:  # see _check_headers
-        raise wrong(f"{path}: {info.filename}", "a whole array", f"{error}") from error
-    return np.ascontiguousarray(array, _READ_AS[member.kind])
-
-
-PACKED_RATIO: Final = 200
-"""Maximum ratio of unpacked to packed bytes: poses with much padding for absent people reach 50."""
-
-PACKED_BYTES: Final = 1 << 26
-"""Unpacked bytes up to which any ratio is allowed."""
 
 
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
@@ -166,8 +105,8 @@ def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
     with open_npz(path) as file:
         infos = [info for info in file.infolist() if info.filename.endswith(".npy")]
         for info in infos:
-            read_header(path, file, info)
-        require_size(path, infos, limit)
+            _read_header(path, file, info)
+        require_size(path, infos, limit, PACKED_RATIO)
         return {info.filename.removesuffix(".npy"): read_array(path, file, info) for info in infos}
 
 
@@ -181,31 +120,67 @@ def open_npz(path: Path) -> zipfile.ZipFile:
         return zipfile.ZipFile(path)
     # ValueError and NotImplementedError: a damaged directory, or one of a later version.
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise npz_error(str(path), "an npz file", _brief(error)) from error
+        raise wrong(str(path), "a whole npz file", _brief(error)) from error
 
 
-def read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
-    """Return the header of a member, checked against its size.
+def check_members(
+    path: Path, file: zipfile.ZipFile, members: Mapping[str, Member]
+) -> tuple[dict[str, zipfile.ZipInfo], dict[str, int]]:
+    """Return the entries of an archive by name, and its named lengths, before anything is loaded.
 
     Raises:
-        InputError: the member is no npy array of plain values, or its size contradicts its header.
+        InputError: a member is missing or unknown, or its header states another type or shape than
+            `members`, or its size contradicts its header.
     """
+    found = [info.filename for info in file.infolist()]
+    names = [name.removesuffix(".npy") for name in found]
+    needed = [name for name, member in members.items() if member.required]
+    if not {*needed} <= {*names} <= {*members} or len(set(names)) < len(names):
+        optional = [name for name in members if name not in needed]
+        expected = f"the members {', '.join(needed)}"
+        if optional:
+            expected += f" (and, where known, {', '.join(optional)})"
+        raise wrong(str(path), expected, ", ".join(names[:8]) or "nothing")
+    infos = {name: file.getinfo(f"{name}.npy") for name in members if f"{name}.npy" in found}
+    sizes: dict[str, int] = {}
+    for name, info in infos.items():
+        where, member = f"{path}: {name}", members[name]
+        shape, _, dtype = _read_header(path, file, info)
+        if member.dtype is not None and dtype != np.dtype(member.dtype):
+            exact = np.dtype(member.dtype)
+            raise wrong(where, f"{exact.str} ({exact.name}, little-endian)", dtype.str)
+        if dtype.kind not in _KINDS[member.kind]:
+            raise wrong(where, _MEANINGS[member.kind], dtype.str)
+        fits = len(shape) == len(member.dims) and all(
+            n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
+            for n, dim in zip(shape, member.dims, strict=True)
+        )
+        if not fits:
+            known = ", ".join(str(sizes.get(str(dim), dim)) for dim in member.dims)
+            raise wrong(where, f"shape ({known})", f"{shape}")
+    return infos, sizes
+
+
+def _read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
+    """Return the header of a member, checked against its size."""
     where = f"{path}: {info.filename}"
     try:
         with file.open(info) as member:
             shape, fortran, dtype = read_npy_header(member)
             start = member.tell()
     except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
-        raise npz_error(where, "an npy array", _brief(error)) from error
+        raise wrong(where, "an npy array", _brief(error)) from error
     if dtype.hasobject:
-        raise npz_error(where, "numbers", "Python objects, which are never loaded")
+        raise wrong(where, "numbers", "Python objects, which are never loaded")
     size = start + math.prod(shape) * dtype.itemsize
     if size != info.file_size or min(shape, default=0) < 0:
-        raise npz_error(where, f"{size} bytes for its shape {shape}", f"{info.file_size} bytes")
+        raise wrong(where, f"{size} bytes for its shape {shape}", f"{info.file_size} bytes")
     return shape, fortran, dtype
 
 
-def require_size(path: Path, infos: list[zipfile.ZipInfo], limit: int) -> None:
+def require_size(
+    path: Path, infos: Collection[zipfile.ZipInfo], limit: int, ratio: int | None = None
+) -> None:
     """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios.
 
     Raises:
@@ -217,8 +192,8 @@ def require_size(path: Path, infos: list[zipfile.ZipInfo], limit: int) -> None:
     expected = None
     if total > limit:
         expected = f"at most {limit} bytes of arrays"
-    elif total > max(PACKED_BYTES, packed * PACKED_RATIO):
-        expected = f"arrays packed at most {PACKED_RATIO} to 1"
+    elif ratio is not None and total > max(PACKED_BYTES, packed * ratio):
+        expected = f"arrays packed at most {ratio} to 1"
     if expected is not None:
         raise InputError(
             str(path),
@@ -229,24 +204,24 @@ def require_size(path: Path, infos: list[zipfile.ZipInfo], limit: int) -> None:
         )
 
 
-def read_array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.generic]:
-    """Return a member's array; check its header and size first.
+def read_array(
+    path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, form: Member | None = None
+) -> NDArray[Any]:
+    """Return a member's array, in the type of its form; check its header and size first.
 
     Raises:
         InputError: the bytes are damaged.
     """
+    dtype = None if form is None else form.dtype or _READ_AS[form.kind]
     try:
         with file.open(info) as member:
-            return np.ascontiguousarray(read_npy(member))
+            array = read_npy(member)
+            member.read()  # to the end, where the checksum is verified
+        return np.ascontiguousarray(array, dtype)
     except MemoryError:
         raise
-    except Exception as error:  # damaged bytes can raise nearly anything, as in read_header
-        raise npz_error(f"{path}: {info.filename}", "a whole array", _brief(error)) from error
-
-
-def npz_error(where: str, expected: str, found: str) -> InputError:
-    """Return the error about a place of an npz file."""
-    return InputError(where, expected=expected, found=found, todo="Write or export it again.")
+    except Exception as error:  # damaged bytes can raise nearly anything, as in _read_header
+        raise wrong(f"{path}: {info.filename}", "a whole array", _brief(error)) from error
 
 
 def _brief(error: Exception) -> str:

@@ -218,11 +218,11 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
 
 def _read_pickle(file: Path) -> dict[str, Any]:
     """Return the entries of an OpenCap pickle as numbers and lists, width before height."""
-    from worldpose.pickles import plain, read_notes  # late: it imports scipy
+    from worldpose.pickles import read_pickle  # late: it imports scipy
 
     require_file(file, SETTINGS_BYTES)
     try:
-        content = plain(read_notes(file))
+        content = read_pickle(file)
     except (OSError, ValueError) as error:
         raise InputError(
             str(file),

@@ -19,7 +19,7 @@ from worldpose.formats.calibration_files import (
     calibration_error,
     index_by_name,
 )
-from worldpose.formats.files import SETTINGS_BYTES, require_file
+from worldpose.formats.files import SETTINGS_BYTES, parse_xml, require_file
 
 LENS_ERROR_PX: Final = 0.1
 """Maximum error of OpenCV's coefficients fitted to Vicon's lens, within the image [px]: a tenth of
@@ -44,8 +44,8 @@ def read_calibration_xml(path: Path) -> dict[str, CameraCalibration]:
     """
     require_file(path, 16 * SETTINGS_BYTES)
     try:
-        root = ET.fromstring(path.read_bytes(), ET.XMLParser(target=_PlainTree()))
-    except (ET.ParseError, ValueError, LookupError, OSError) as error:
+        root = parse_xml(path.read_bytes())
+    except (ValueError, OSError) as error:
         raise calibration_error(
             str(path), "XML of Qualisys, Vicon or OptiTrack", str(error)
         ) from error
@@ -63,13 +63,6 @@ def read_calibration_xml(path: Path) -> dict[str, CameraCalibration]:
             todo="Export the calibration of the system again.",
         )
     return readers[root.tag](path, root)
-
-
-class _PlainTree(ET.TreeBuilder):
-    """A tree builder that rejects entities, which could expand a small file without limit."""
-
-    def doctype(self, name: str, pubid: str, system: str) -> None:
-        raise ValueError(f"a DOCTYPE ({name}), which no calibration has")
 
 
 def _child(where: str, element: ET.Element, tag: str) -> ET.Element:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
+from xml.etree import ElementTree
 
 import yaml
 
@@ -59,7 +60,8 @@ A full match has 0.1 MB; 5,000 calibrated cameras, as in the load test, take 2.0
 """
 
 NESTING: Final = 32
-"""Maximum levels of lists and mappings in a YAML file; match.yaml has four."""
+"""Maximum levels of lists and mappings in YAML, of which match.yaml has four, and of elements in
+XML, of which annotations and calibrations have five."""
 
 EVENTS: Final = 100_000
 """Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
@@ -204,6 +206,38 @@ def _load_yaml(text: str) -> Any:  # noqa: ANN401
         if depth > NESTING:
             raise yaml.YAMLError(f"more than {NESTING} levels {event.start_mark}")
     return yaml.load(text, Loader=_Loader)
+
+
+class _PlainTree(ElementTree.TreeBuilder):
+    """Tree builder that rejects document types, whose entities can flood or hide files."""
+
+    depth = 0
+
+    def start(self, tag: Any, attrs: dict[Any, Any], /) -> ElementTree.Element:  # noqa: ANN401
+        self.depth += 1
+        if self.depth > NESTING:
+            raise ValueError(f"elements nested more than {NESTING} deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, pubid: str, system: str) -> None:
+        raise ValueError(f"a document type ({name}), which can hide other files and floods")
+
+
+def parse_xml(content: bytes) -> ElementTree.Element:
+    """Return the root element of a document without a document type, and thus without entities.
+
+    Raises:
+        ValueError: the document is not XML, declares a document type, or is nested deeply.
+    """
+    try:
+        return ElementTree.fromstring(content, ElementTree.XMLParser(target=_PlainTree()))
+    # ValueError and LookupError: also an encoding unknown to expat or Python.
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise ValueError(f"no XML: {error}") from error
 
 
 CHUNK: Final = 1 << 20

@@ -51,6 +51,49 @@ class AnimatedBody:
     """Notes of the node about the person."""
 
 
+def people_with_bodies(path: Path, people: Sequence[AnimatedBody]) -> list[AnimatedBody]:
+    """Return the people who have a body in a frame.
+
+    Raises:
+        InputError: no person has one.
+    """
+    present = [person for person in people if person.poses.known.any()]
+    if not present:
+        raise InputError(
+            str(path),
+            expected="a person with a fitted body",
+            found="none",
+            todo="Run the match up to body_fitting, or export joints: --format c3d or csv.",
+        )
+    return present
+
+
+def rest_joints(
+    model: BodyModel, person: AnimatedBody
+) -> tuple[NDArray[np.int64], BodyParameters, Floats]:
+    """Return a person's frames with a body, the poses in them, and the joints in rest (24, 3)."""
+    rows = np.flatnonzero(person.poses.known)
+    poses = person.poses[rows]
+    return rows, poses, model.joint_template + model.joint_directions @ poses.betas[0]
+
+
+def skin_weights(model: BodyModel) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the joints that move each vertex most, and their weights (vertices, INFLUENCES)."""
+    order = np.argsort(-model.weights, axis=1, kind="stable")[:, :INFLUENCES]
+    weights = np.take_along_axis(model.weights, order, axis=1)
+    return order, (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def known_frames(camera: Camera) -> tuple[NDArray[np.int64], Camera]:
+    """Return the frames in which a camera is known, 0 for a single one, and the camera in them."""
+    if not camera.batch_shape:
+        camera = Camera.stack([camera])
+    pose = camera.cam_from_world
+    numbers = [camera.focal, pose.rotation.reshape(-1, 9), pose.translation]
+    rows = np.flatnonzero(np.isfinite(np.concatenate(numbers, axis=-1)).all(axis=-1))
+    return rows, camera[rows]
+
+
 @dataclass
 class _File:
     """A glTF document that grows."""
@@ -139,16 +182,9 @@ def write_gltf(
     Raises:
         InputError: no person has a body.
     """
-    present = [person for person in people if person.poses.known.any()]
-    if not present:
-        raise InputError(
-            str(path),
-            expected="a person with a fitted body",
-            found="none",
-            todo="Run the match up to body_fitting, or export joints: --format c3d or csv.",
-        )
     file = _File()
     writer = _Writer(file, model, fps, surface=surface)
+    present = people_with_bodies(path, people)
     children = [writer.add_person(person, number) for number, person in enumerate(present)]
     children += [writer.add_camera(name, camera) for name, camera in cameras.items()]
     if markings:
@@ -214,10 +250,7 @@ class _Writer:
     def _share_surface(self) -> None:
         """Write triangles, weights, and the normals of the mean body."""
         model = self.model
-        order = np.argsort(-model.weights, axis=1, kind="stable")[:, :INFLUENCES]
-        weights = np.take_along_axis(model.weights, order, axis=1)
-        weights /= weights.sum(axis=1, keepdims=True)
-        weights = weights.astype(np.float32)
+        order, weights = skin_weights(model)
         joints = np.where(weights > 0.0, order, 0).astype(np.uint8)
         corners = model.template[model.faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -237,10 +270,7 @@ class _Writer:
     def add_person(self, person: AnimatedBody, number: int) -> int:
         """Add a person's joints, motion and surface; return the node."""
         there = person.poses.known
-        rows = np.flatnonzero(there)
-        poses = person.poses[rows]
-        betas = poses.betas[0]
-        rest = self.model.joint_template + self.model.joint_directions @ betas
+        rows, poses, rest = rest_joints(self.model, person)
         turns = _quantize_rotations(self.model.articulate(poses).rotations, self.model.parents)
         parents = self.model.parents
         first = len(self.file.content.get("nodes", []))
@@ -254,7 +284,7 @@ class _Writer:
             below = (first + np.flatnonzero(parents == joint)).tolist()
             self.file.add("nodes", node | ({"children": below} if below else {}))
         if self.attributes:
-            self._add_surface(person, number, rest, first)
+            self._add_surface(person, number, poses.betas[0], rest, first)
         node = {"name": person.name, "children": [first], "extras": dict(person.about)}
         root = self.file.add("nodes", node)
         times = self.times(rows)
@@ -270,25 +300,19 @@ class _Writer:
             self.file.animate(root, "scale", self.times(keys), scale, "STEP")
         return root
 
-    def _add_surface(self, person: AnimatedBody, number: int, rest: Floats, first: int) -> None:
+    def _add_surface(
+        self, person: AnimatedBody, number: int, betas: Floats, rest: Floats, first: int
+    ) -> None:
         """Add a surface to the nodes without a parent: its joints alone place it."""
-        betas = person.poses.betas[np.flatnonzero(person.poses.known)[0]]
         surface = (self.model.template + self.model.shape_directions @ betas).astype(np.float32)
         colour = colorsys.hsv_to_rgb(number * 0.618 % 1.0, 0.45, 0.85)
-        material = {
-            "pbrMetallicRoughness": {
-                "baseColorFactor": [*colour, 1.0],
-                "metallicFactor": 0.0,
-                "roughnessFactor": 0.9,
-            }
-        }
         primitive = {
             "attributes": {
                 "POSITION": self.file.accessor(surface, _VERTICES, bounds=True),
                 **self.attributes,
             },
             "indices": self.indices,
-            "material": self.file.add("materials", material),
+            "material": self._add_material(colour, 0.9),
         }
         mesh = self.file.add("meshes", {"name": f"{person.name}_body", "primitives": [primitive]})
         bind = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
@@ -302,16 +326,19 @@ class _Writer:
         node["skin"] = self.file.add("skins", skin)
         self.surfaces.append(self.file.add("nodes", node))
 
+    def _add_material(self, color: Sequence[float], roughness: float) -> int:
+        surface = {
+            "baseColorFactor": [*color, 1.0],
+            "metallicFactor": 0.0,
+            "roughnessFactor": roughness,
+        }
+        return self.file.add("materials", {"pbrMetallicRoughness": surface})
+
     def add_camera(self, name: str, camera: Camera) -> int:
         """Add a single or a moving camera; return the node."""
-        if not camera.batch_shape:
-            camera = Camera.stack([camera])
-        pose = camera.cam_from_world
-        numbers = [camera.focal, pose.rotation.reshape(-1, 9), pose.translation]
-        rows = np.flatnonzero(np.isfinite(np.concatenate(numbers, axis=-1)).all(axis=-1))
+        rows, known = known_frames(camera)
         if not len(rows):
             return self.file.add("nodes", {"name": name})
-        known = camera[rows]
         width, height = (float(n) for n in known.image_size[0])
         focal = np.median(known.focal, axis=0)
         lens = {
@@ -332,7 +359,7 @@ class _Writer:
             "principal_point_px": known.principal_point[0].tolist(),
             "distortion_k1_k2_p1_p2_k3": known.distortion[0].tolist(),
         }
-        if len(camera.focal) > 1:
+        if camera.batch_shape not in ((), (1,)):
             about["focal_px_by_frame"] = [
                 None if np.isnan(one) else round(one, 3) for one in camera.focal[:, 1].tolist()
             ]
@@ -353,17 +380,7 @@ class _Writer:
     def add_pitch(self, markings: Sequence[Floats]) -> int:
         """Add the markings as flat strips, above a lawn; return the node."""
         lawn, white = (
-            self.file.add(
-                "materials",
-                {
-                    "pbrMetallicRoughness": {
-                        "baseColorFactor": [*color, 1.0],
-                        "metallicFactor": 0.0,
-                        "roughnessFactor": 1.0,
-                    }
-                },
-            )
-            for color in ((0.12, 0.35, 0.14), (1.0, 1.0, 1.0))
+            self._add_material(color, 1.0) for color in ((0.12, 0.35, 0.14), (1.0, 1.0, 1.0))
         )
         points = np.concatenate(list(markings))
         low, high = points.min(axis=0), points.max(axis=0)

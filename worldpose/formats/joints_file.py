@@ -97,67 +97,50 @@ class JointTracks:
         )
 
     def __post_init__(self) -> None:
+        parts = [("", ExtraTracks(COCO17, self.joints, self.covariance, self.views))]
         if self.extra is not None:
-            self._check_extra(self.extra)
-        shape = (*self.frames.shape, *self.person_ids.shape, JOINTS)
-        shapes: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
-            "joints": (self.joints, (*shape, 3))
-        }
-        if self.covariance is not None:
-            shapes["covariance"] = (self.covariance, (*shape, 3, 3))
-        if self.views is not None:
-            shapes["views"] = (self.views, shape)
-        for name, (array, expected) in shapes.items():
-            if array.shape != expected:
-                raise wrong(name, f"shape {expected}", f"{array.shape}", "Give all arrays alike.")
+            names = self.extra.points
+            if len(set(names)) < len(names) or set(names) & set(COCO17):
+                todo = "Rename the points."
+                raise wrong("points", "each name once, and none of COCO-17", ", ".join(names), todo)
+            parts.append(("extra_", self.extra))
+        for prefix, part in parts:
+            shape = (*self.frames.shape, *self.person_ids.shape, len(part.points))
+            for name, array, expected in (
+                ("joints", part.joints, (*shape, 3)),
+                ("covariance", part.covariance, (*shape, 3, 3)),
+                ("views", part.views, shape),
+            ):
+                if array is not None and array.shape != expected:
+                    where, todo = f"{prefix}{name}", "Give all arrays alike."
+                    raise wrong(where, f"shape {expected}", f"{array.shape}", todo)
         if np.any(np.diff(self.frames) <= 0):
             raise wrong("frames", "frame numbers that rise", f"{self.frames}", "Sort the frames.")
         if len(np.unique(self.person_ids)) < len(self.person_ids):
             raise wrong(
                 "person_ids", "each id once", f"{self.person_ids}", "Number the people again."
             )
-        missing = np.isnan(self.joints)
-        self._refuse(
-            "joints", np.any(np.isinf(self.joints), axis=-1), "finite metres, NaN where missing"
-        )
-        self._refuse(
-            "joints", np.any(missing, axis=-1) & ~np.all(missing, axis=-1), "all of x, y, z or none"
-        )
-        if self.covariance is not None:
-            self._refuse(
-                "covariance", np.any(np.isinf(self.covariance), axis=(-1, -2)), "finite numbers"
-            )
-        if self.views is not None:
-            self._refuse("views", self.views < 0, "counts from 0")
+        for prefix, part in parts:
+            self._check_values(prefix, part)
 
-    def _check_extra(self, extra: ExtraTracks) -> None:
-        names = extra.points
-        if len(set(names)) < len(names) or set(names) & set(COCO17):
-            todo = "Rename the points."
-            raise wrong("points", "each name once, and none of COCO-17", ", ".join(names), todo)
-        shape = (*self.frames.shape, *self.person_ids.shape, len(names))
-        for name, array, expected in (
-            ("extra_joints", extra.joints, (*shape, 3)),
-            ("extra_covariance", extra.covariance, (*shape, 3, 3)),
-            ("extra_views", extra.views, shape),
-        ):
-            if array is not None and array.shape != expected:
-                raise wrong(name, f"shape {expected}", f"{array.shape}", "Give all arrays alike.")
-        missing = np.isnan(extra.joints)
-        if (missing.any(axis=-1) & ~missing.all(axis=-1)).any() or np.isinf(extra.joints).any():
-            raise wrong("extra_joints", "finite x, y, z or none", "others", "Correct them.")
-
-    def _refuse(self, name: str, bad: NDArray[np.bool_], expected: str) -> None:
-        if not bad.any():
-            return
-        frame, person, joint = (int(i) for i in np.argwhere(bad)[0])
-        place = f"frame {self.frames[frame]}, person {self.person_ids[person]}, {COCO17[joint]}"
-        raise wrong(
-            f"{name}[{place}]",
-            expected,
-            f"{getattr(self, name)[frame, person, joint]}",
-            "Correct it.",
-        )
+    def _check_values(self, prefix: str, part: ExtraTracks) -> None:
+        joints, missing = part.joints, np.isnan(part.joints)
+        some = missing.any(axis=-1) & ~missing.all(axis=-1)
+        checks: list[tuple[str, NDArray[Any], Any, str]] = [
+            ("joints", joints, np.isinf(joints).any(axis=-1), "finite metres, NaN where missing"),
+            ("joints", joints, some, "all of x, y, z or none"),
+        ]
+        if part.covariance is not None:
+            infinite = np.isinf(part.covariance).any(axis=(-1, -2))
+            checks.append(("covariance", part.covariance, infinite, "finite numbers"))
+        if part.views is not None:
+            checks.append(("views", part.views, part.views < 0, "counts from 0"))
+        for name, array, bad, expected in checks:
+            if bad.any():
+                frame, person, joint = (int(i) for i in np.argwhere(bad)[0])
+                place = f"frame {self.frames[frame]}, person {self.person_ids[person]}"
+                where = f"{prefix}{name}[{place}, {part.points[joint]}]"
+                raise wrong(where, expected, f"{array[frame, person, joint]}", "Correct it.")
 
 
 def fill_gaps(tracks: JointTracks) -> JointTracks:

@@ -16,16 +16,13 @@ little-endian order, NaN where missing (`data_contracts.keypoints`). Points besi
 
 from __future__ import annotations
 
-import math
 import os
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags
@@ -36,14 +33,15 @@ from worldpose.errors import InputError
 from worldpose.formats.archives import (
     PACKED_BYTES,
     PACKED_RATIO,
-    npz_error,
+    Member,
+    check_members,
     open_npz,
     read_array,
-    read_header,
     require_size,
+    write_archive,
+    wrong,
 )
 from worldpose.formats.files import JsonItems, require_file
-from worldpose.parsing import Header
 
 JSON_BYTES: Final = 1 << 30
 """Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""
@@ -291,35 +289,33 @@ _BLOCK: Final = 4096
 _BLOCK_PEOPLE: Final = 100_000
 """Maximum detections per block."""
 
-_SHAPES: Final = {
-    "frame": ("frames",),
-    "keypoints": ("frames", "detections", len(COCO17), 2),
-    "confidence": ("frames", "detections", len(COCO17)),
-    "boxes": ("frames", "detections", 4),
-    "score": ("frames", "detections"),
+_MEMBERS: Final = {
+    "frame": Member(("frames",), "int", dtype="<i8"),
+    "keypoints": Member(("frames", "detections", _JOINTS, 2), "float", dtype="<f4"),
+    "confidence": Member(("frames", "detections", _JOINTS), "float", dtype="<f4"),
+    "boxes": Member(("frames", "detections", 4), "float", dtype="<f4"),
+    "score": Member(("frames", "detections"), "float", dtype="<f4"),
+    "point": Member(("points",), "text", required=False),
+    "extra_keypoints": Member(
+        ("frames", "detections", "points", 2), "float", required=False, dtype="<f4"
+    ),
+    "extra_confidence": Member(
+        ("frames", "detections", "points"), "float", required=False, dtype="<f4"
+    ),
 }
-_EXTRA_SHAPES: Final = {
-    "point": ("points",),
-    "extra_keypoints": ("frames", "detections", "points", 2),
-    "extra_confidence": ("frames", "detections", "points"),
-}
-"""Members of points besides COCO-17."""
+_EXTRA: Final = ("point", "extra_keypoints", "extra_confidence")
+"""Members of points besides COCO-17: all or none."""
 POINTS_LIMIT: Final = 1000
 """Maximum number of these points."""
 
 
 def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
-    """Write an npz file; the same arrays give the same bytes on every machine.
-
-    The file has no compression, since a compressor's output changes with its version.
-    """
-    named = {"point": np.array(people.points, dtype=np.str_)} if people.points else {}
-    with zipfile.ZipFile(path, "w") as file:
-        for name, array in {"frame": people.frame, **people.arrays(), **named}.items():
-            dtype = {"frame": "<i8", "point": "<U"}.get(name, "<f4")
-            # A ZipInfo from a name alone has the fixed date 1980-01-01.
-            with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-                npy.write_array(member, np.ascontiguousarray(array, dtype), allow_pickle=False)
+    """Write an npz file; the same arrays give the same bytes on every machine."""
+    arrays = {"frame": people.frame, **people.arrays()}
+    exact = {name: np.asarray(array, _MEMBERS[name].dtype) for name, array in arrays.items()}
+    if people.points:
+        exact["point"] = np.array(people.points, dtype=np.str_)
+    write_archive(path, exact)
 
 
 def read_keypoint_arrays(path: Path) -> KeypointDetections:
@@ -334,73 +330,38 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
     """
     require_file(path)
     with open_npz(path) as file:
-        infos = _members(path, file)
-        headers = {name: read_header(path, file, info) for name, info in infos.items()}
-        _check_headers(path, infos, headers)
-        arrays = {name: read_array(path, file, info) for name, info in infos.items()}
+        infos, sizes = check_members(path, file, _MEMBERS)
+        extra = [name for name in _EXTRA if name in infos]
+        if extra and len(extra) < len(_EXTRA):
+            raise wrong(str(path), f"all of {', '.join(_EXTRA)}, or none", ", ".join(extra))
+        if extra and not 0 < sizes["points"] <= POINTS_LIMIT:
+            found = str(sizes["points"])
+            raise wrong(f"{path}: point", f"1 to {POINTS_LIMIT} names as text", found)
+        if sizes["detections"] > PEOPLE_LIMIT:
+            raise InputError(
+                f"{path}: score",
+                expected=f"at most {PEOPLE_LIMIT} people per frame",
+                found=f"room for {sizes['detections']}",
+                todo="Keep the detections of each frame with the highest scores.",
+            )
+        require_size(path, infos.values(), ARRAY_BYTES, PACKED_RATIO)
+        arrays = {
+            name: read_array(path, file, info, _MEMBERS[name]) for name, info in infos.items()
+        }
     people = KeypointDetections.from_arrays(arrays)
     if len(set(people.points)) < len(people.points) or set(people.points) & set(COCO17):
-        raise npz_error(
-            f"{path}: point", "each point once, and none of COCO-17", f"{people.points}"
-        )
+        raise wrong(f"{path}: point", "each point once, and none of COCO-17", f"{people.points}")
     _check_values(path, people)
     return people
-
-
-def _members(path: Path, file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    names = sorted(info.filename for info in file.infolist())
-    expected = [f"{name}.npy" for name in _SHAPES]
-    more = [f"{name}.npy" for name in _EXTRA_SHAPES]
-    if names not in (sorted(expected), sorted(expected + more)):
-        raise npz_error(
-            str(path),
-            f"the members {', '.join(expected)}, and all or none of {', '.join(more)}",
-            ", ".join(names[:8]) or "nothing",
-        )
-    members = [*_SHAPES, *(_EXTRA_SHAPES if len(names) > len(expected) else ())]
-    return {name: file.getinfo(f"{name}.npy") for name in members}
-
-
-def _check_headers(
-    path: Path, infos: dict[str, zipfile.ZipInfo], headers: dict[str, Header]
-) -> None:
-    sizes: dict[str, int] = {}
-    for name, info in infos.items():
-        dims = {**_SHAPES, **_EXTRA_SHAPES}[name]
-        where = f"{path}: {info.filename}"
-        shape, _, dtype = headers[name]
-        wanted = np.dtype("<i8" if name == "frame" else "<f4")
-        if name == "point":
-            if dtype.kind != "U" or shape == (0,) or math.prod(shape) > POINTS_LIMIT:
-                raise npz_error(where, f"1 to {POINTS_LIMIT} names as text", f"{dtype} {shape}")
-        elif dtype != wanted:
-            raise npz_error(where, f"{wanted.str} ({wanted.name}, little-endian)", dtype.str)
-        fits = len(shape) == len(dims) and all(
-            n >= 0 and n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
-            for n, dim in zip(shape, dims, strict=True)
-        )
-        if not fits:
-            known = tuple(sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in dims)
-            raise npz_error(where, f"shape {known}".replace("'", ""), f"{shape}")
-    if sizes["detections"] > PEOPLE_LIMIT:
-        raise InputError(
-            f"{path}: {infos['score'].filename}",
-            expected=f"at most {PEOPLE_LIMIT} people per frame",
-            found=f"room for {sizes['detections']}",
-            todo="Keep the detections of each frame with the highest scores.",
-        )
-    require_size(path, list(infos.values()), ARRAY_BYTES)
 
 
 def _check_values(path: Path, people: KeypointDetections) -> None:
     steps = np.diff(people.frame)
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0)) + 1
-        raise npz_error(
-            f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}"
-        )
+        raise wrong(f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}")
     if np.any(np.abs(people.frame) > FRAME_LIMIT):
-        raise npz_error(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
+        raise wrong(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
     block = max(1, min(_BLOCK, _BLOCK_PEOPLE // max(1, people.score.shape[1])))
     for start in range(0, len(people.frame), block):
         _check_block(path, start, people[start : start + block])
@@ -439,14 +400,12 @@ def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
                 "points only of a person with a keypoint of COCO-17",
             ),
         ]
-    for name, wrong, rule in checks:
-        if np.any(wrong):
-            place = tuple(int(i) for i in np.argwhere(wrong)[0])
+    for name, bad, rule in checks:
+        if np.any(bad):
+            place = tuple(int(i) for i in np.argwhere(bad)[0])
             value = getattr(people, name)[place]
             where = [place[0] + start, *place[1:]]
-            raise npz_error(
-                f"{path}: {name}{where} (frame {people.frame[place[0]]})", rule, f"{value}"
-            )
+            raise wrong(f"{path}: {name}{where} (frame {people.frame[place[0]]})", rule, f"{value}")
 
 
 def _either(pairs: Flags) -> Flags:

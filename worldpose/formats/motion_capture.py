@@ -18,6 +18,7 @@ from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
+from worldpose.formats.tables import write_rows
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
@@ -141,10 +142,8 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
     first, markers = _rows(tracks, person)
     names = tracks.markers.points
     count = len(names)
-    values = markers.reshape(len(markers), 3 * count)
-    cells = np.char.mod(f"%.{TRC_DECIMALS}f", values)
-    cells[np.isnan(values)] = ""
-    lines = [
+    numbers = np.arange(first, first + len(markers))
+    head = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
         "\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
@@ -153,10 +152,9 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
         "\t\t" + "\t".join(f"X{n}\tY{n}\tZ{n}" for n in range(1, count + 1)),
         "",
     ]
-    for frame, row in enumerate(cells.tolist(), start=first):
-        lines.append("\t".join([str(frame + 1), f"{frame / fps:.6f}", *row]))
-    with whole_file(path) as draft:
-        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    values = markers.reshape(len(markers), 3 * count)
+    form = f"%.{TRC_DECIMALS}f"
+    write_rows(path, head, [(numbers + 1, "%d"), (numbers / fps, "%.6f"), (values, form)])
 
 
 def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
@@ -214,11 +212,9 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     # Depth first, the joint order of the file.
     order = list(_depth_first(model.parents, 0))
     rows = np.concatenate([roots, channels[:, order].reshape(len(roots), -1)], axis=1)
-    lines = ["HIERARCHY", *_joint(rest * CENTIMETRES, model.parents, 0, "")]
-    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1.0 / fps:.9f}"]
-    lines += [" ".join(row) for row in np.char.mod(f"%.{BVH_DECIMALS}f", rows).tolist()]
-    with whole_file(path) as draft:
-        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    head = ["HIERARCHY", *_joint(rest * CENTIMETRES, model.parents, 0, "")]
+    head += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1.0 / fps:.9f}"]
+    write_rows(path, head, [(rows, f"%.{BVH_DECIMALS}f")], " ")
 
 
 def stretches(poses: BodyParameters) -> list[slice]:
@@ -375,7 +371,7 @@ def write_opensim_motion(
             todo="Write a file for each uninterrupted interval.",
         )
     rows = np.column_stack([times, coordinates])
-    lines = [
+    head = [
         "Coordinates",
         "version=1",
         f"nRows={len(rows)}",
@@ -385,9 +381,7 @@ def write_opensim_motion(
         "endheader",
         "\t".join(["time", *OPENSIM_COORDINATES]),
     ]
-    lines += ["\t".join(row) for row in np.char.mod(f"%.{MOT_DECIMALS}f", rows).tolist()]
-    with whole_file(path) as draft:
-        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_rows(path, head, [(rows, f"%.{MOT_DECIMALS}f")])
 
 
 def _angles(rotation: Floats) -> Floats:

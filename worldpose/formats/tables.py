@@ -1,7 +1,7 @@
-"""Tables of people as CSV and Parquet: positions, joints, strides.
+"""Tables: cells of text files, and tables of people as CSV and Parquet.
 
-`write_positions` writes the positions alone, with the standard library. The other tables are pandas
-data frames with one row per observation and the unit in the name of every column.
+Tables of people are pandas data frames with one row per observation and the unit in the name of
+every column.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +25,12 @@ from worldpose.formats.joints_file import JointTracks
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS: Final = (
-    "frame",
-    "time_s",
-    "person",
-    "name",
-    "kind",
-    "x_m",
-    "y_m",
-    "x_std_m",
-    "y_std_m",
-    "xy_correlation",
-    "speed_m_s",
-    "height_m",
-)
+POSITION_COLUMNS: Final = {
+    **{"frame": "%d", "time_s": "%.4f", "person": "%d", "name": "%s", "kind": "%s"},
+    **{"x_m": "%.3f", "y_m": "%.3f", "x_std_m": "%.3f", "y_std_m": "%.3f"},
+    **{"xy_correlation": "%.3f", "speed_m_s": "%.2f", "height_m": "%.2f"},
+}
+"""Columns of a file of positions, of those of `people_table`, and the format of their cells."""
 SPEED_WINDOW_S: Final = 0.4
 """Time between the two positions that give a speed [s]."""
 
@@ -67,6 +59,37 @@ class Positions:
     height: Floats
 
 
+def format_cells(values: NDArray[Any], form: str) -> NDArray[np.str_]:
+    """Return numbers or texts by a format such as `%.3f`; those that are not finite are empty."""
+    cells = np.char.mod(form, values)
+    if values.dtype.kind == "f":
+        cells[~np.isfinite(values)] = ""
+    return np.asarray(cells)
+
+
+def write_rows(
+    path: Path,
+    head: Sequence[str],
+    parts: Sequence[tuple[NDArray[Any], str]],
+    separator: str = "\t",
+) -> None:
+    """Write a text of header lines and a table, whole or not at all.
+
+    Args:
+        path: the file.
+        head: lines before the table.
+        parts: arrays (rows,) or (rows, columns) side by side, each with the format of its cells.
+        separator: text between two cells.
+    """
+    cells = [
+        format_cells(values[:, None] if values.ndim == 1 else values, form)
+        for values, form in parts
+    ]
+    rows = map(separator.join, np.concatenate(cells, axis=1).tolist())
+    with whole_file(path) as draft:
+        draft.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
+
+
 def write_positions(path: Path, positions: Positions, fps: float) -> None:
     """Write a line per person and frame, frame by frame; missing people have none.
 
@@ -75,30 +98,15 @@ def write_positions(path: Path, positions: Positions, fps: float) -> None:
     not known), speed_m_s over `SPEED_WINDOW_S` (empty at a track's ends), height_m of people placed
     by their feet.
     """
-    speed = _speeds(positions.xy, fps)
-    variance = np.diagonal(positions.covariance, axis1=-2, axis2=-1)
-    with np.errstate(invalid="ignore"):
-        std = np.sqrt(variance)
-        correlation = positions.covariance[..., 0, 1] / std.prod(axis=-1)
+    table = people_table(positions, fps)
+    cells = []
+    for name, form in POSITION_COLUMNS.items():
+        values = table[name].to_numpy()
+        cells.append(format_cells(values.astype(str) if form == "%s" else values, form).tolist())
     with whole_file(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(COLUMNS)
-        for row, frame in enumerate(positions.frames.tolist()):
-            for p in np.flatnonzero(np.isfinite(positions.xy[row, :, 0])).tolist():
-                numbers = (*std[row, p], correlation[row, p])
-                table.writerow(
-                    [
-                        frame,
-                        f"{frame / fps:.4f}",
-                        int(positions.person[p]),
-                        positions.names[p],
-                        "plane" if positions.on_plane[row, p] else "triangulated",
-                        *(f"{number:.3f}" for number in positions.xy[row, p]),
-                        *(f"{number:.3f}" if np.isfinite(number) else "" for number in numbers),
-                        f"{speed[row, p]:.2f}" if np.isfinite(speed[row, p]) else "",
-                        f"{positions.height[p]:.2f}" if np.isfinite(positions.height[p]) else "",
-                    ]
-                )
+        lines = csv.writer(file, lineterminator="\n")
+        lines.writerow(POSITION_COLUMNS)
+        lines.writerows(zip(*cells, strict=True))
 
 
 def _speeds(xy: Floats, fps: float) -> Floats:
@@ -159,7 +167,9 @@ def people_table(positions: Positions, fps: float) -> pd.DataFrame:
     there = (row, person)
     steps = np.linalg.norm(np.diff(positions.xy, axis=0, prepend=np.nan), axis=-1)
     steps[1:][np.diff(positions.frames) != 1] = np.nan
-    std = np.sqrt(np.diagonal(positions.covariance[there], axis1=-2, axis2=-1))
+    with np.errstate(invalid="ignore"):
+        std = np.sqrt(np.diagonal(positions.covariance[there], axis1=-2, axis2=-1))
+        correlation = positions.covariance[there][:, 0, 1] / std.prod(axis=-1)
     return pd.DataFrame(
         {
             "frame": positions.frames[row],
@@ -171,7 +181,7 @@ def people_table(positions: Positions, fps: float) -> pd.DataFrame:
             "y_m": positions.xy[there][:, 1],
             "x_std_m": std[:, 0],
             "y_std_m": std[:, 1],
-            "xy_correlation": positions.covariance[there][:, 0, 1] / std.prod(axis=-1),
+            "xy_correlation": correlation,
             "speed_m_s": _speeds(positions.xy, fps)[there],
             "distance_m": np.nancumsum(steps, axis=0)[there],
             "height_m": positions.height[person],

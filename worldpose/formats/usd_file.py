@@ -12,9 +12,17 @@ from scipy.spatial.transform import Rotation
 from data_contracts.arrays import Floats
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyModel
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
-from worldpose.formats.gltf_file import FACING, INFLUENCES, AnimatedBody
+from worldpose.formats.gltf_file import (
+    FACING,
+    INFLUENCES,
+    AnimatedBody,
+    known_frames,
+    people_with_bodies,
+    rest_joints,
+    skin_weights,
+)
 from worldpose.geometry.cameras import Camera
 
 APERTURE_MM: Final = 36.0
@@ -53,14 +61,7 @@ def write_usd(
         InputError: no person has a body.
         UsageError: the library is not installed.
     """
-    present = [person for person in people if person.poses.known.any()]
-    if not present:
-        raise InputError(
-            str(path),
-            expected="a person with a fitted body",
-            found="none",
-            todo="Run the match up to body_fitting, or export joints: --format c3d or csv.",
-        )
+    present = people_with_bodies(path, people)
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
     except ImportError as error:
@@ -115,10 +116,7 @@ class _Writer:
         """Add a person's skeleton, motion and surface."""
         model = self.model
         there = person.poses.known
-        rows = np.flatnonzero(there)
-        poses = person.poses[rows]
-        betas = poses.betas[0]
-        rest = model.joint_template + model.joint_directions @ betas
+        rows, poses, rest = rest_joints(model, person)
         place = f"/world/{person.name}"
         root = self.UsdSkel.Root.Define(self.stage, place)
         root.GetPrim().SetCustomData(dict(person.about))
@@ -140,7 +138,7 @@ class _Writer:
                 shown = self.UsdGeom.Tokens.inherited if there[frame] else "invisible"
                 seen.Set(shown, int(frame))
         if surface:
-            self._add_surface(place, betas, number)
+            self._add_surface(place, poses.betas[0], number)
 
     def _animate(
         self,
@@ -179,9 +177,7 @@ class _Writer:
         hue = number * 0.618 % 1.0
         colour = 0.65 + 0.2 * np.cos(2.0 * np.pi * (hue - np.array([0.0, 1.0, 2.0]) / 3.0))
         mesh.CreateDisplayColorAttr([self.Gf.Vec3f(*(float(n) for n in colour))])
-        order = np.argsort(-model.weights, axis=1, kind="stable")[:, :INFLUENCES]
-        weights = np.take_along_axis(model.weights, order, axis=1)
-        weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+        order, weights = skin_weights(model)
         binding = self.UsdSkel.BindingAPI.Apply(mesh.GetPrim())
         binding.CreateSkeletonRel().SetTargets([self.Sdf.Path(f"{place}/skeleton")])
         binding.CreateJointIndicesPrimvar(False, INFLUENCES).Set(
@@ -195,14 +191,9 @@ class _Writer:
     def add_camera(self, name: str, camera: Camera) -> None:
         """Add a single or a moving camera."""
         prim = self.UsdGeom.Camera.Define(self.stage, f"/world/{_prim_name(name)}")
-        if not camera.batch_shape:
-            camera = Camera.stack([camera])
-        pose = camera.cam_from_world
-        numbers = [camera.focal, pose.rotation.reshape(-1, 9), pose.translation]
-        rows = np.flatnonzero(np.isfinite(np.concatenate(numbers, axis=-1)).all(axis=-1))
+        rows, known = known_frames(camera)
         if not len(rows):
             return
-        known = camera[rows]
         width, height = (float(n) for n in known.image_size[0])
         per_pixel = APERTURE_MM / width
         prim.CreateHorizontalApertureAttr(APERTURE_MM)
@@ -224,7 +215,7 @@ class _Writer:
         focal = prim.CreateFocalLengthAttr()
         turns = known.cam_from_world.rotation.swapaxes(-1, -2) @ FACING
         for row, frame in enumerate(rows.tolist()):
-            time = frame if len(camera.focal) > 1 else self.Usd.TimeCode.Default()
+            time = frame if camera.batch_shape not in ((), (1,)) else self.Usd.TimeCode.Default()
             placed.Set(self._matrix(known.center[row], turns[row]), time)
             focal.Set(float(known.focal[row, 0]) * per_pixel, time)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, Pixel
 from worldpose.errors import InputError
 from worldpose.formats.files import read_json
-from worldpose.ingest.validation import existing_file, validate_record
+from worldpose.ingest.validation import files_by_unit, validate_record
 from worldpose.pitch.template import PitchTemplate
 
 CLICKED_FOLDER: Final = "annotations/static_calibration"
@@ -48,8 +48,10 @@ def read_clicked(
     """
     static = {camera.id: camera for camera in spec.static_cameras}
     clicked = {}
-    for file in _files(folder, CLICKED_FOLDER, "<camera>.json of a static camera", static):
-        clicked[file.stem] = read_clicked_markings(file, static[file.stem], pitch)
+    of_cameras = "<camera>.json of a static camera"
+    files = files_by_unit(folder, CLICKED_FOLDER, (".json",), static, of_cameras, alone=True)
+    for name, file in files.items():
+        clicked[name] = read_clicked_markings(file, static[name], pitch)
     return {name: clicked[name] for name in static if name in clicked}
 
 
@@ -88,8 +90,9 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
     clips = {clip.id: clip for clip in spec.clips if clip.broadcast is not None}
     picked = {}
     of_clips = "<clip>.json of a clip with a broadcast camera"
-    for file in _files(folder, KEY_FRAMES_FOLDER, of_clips, clips):
-        camera = spec.camera(str(clips[file.stem].broadcast))
+    files = files_by_unit(folder, KEY_FRAMES_FOLDER, (".json",), clips, of_clips, alone=True)
+    for name, file in files.items():
+        camera = spec.camera(str(clips[name].broadcast))
         template = _template(file, pitch)
         key_frames = validate_record(KeyFrames, read_json(file), str(file))
         numbers = [key_frame.frame for key_frame in key_frames.key_frames]
@@ -103,22 +106,8 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
         for n, key_frame in enumerate(key_frames.key_frames):
             inside = f"key_frames[{n}].markings"
             _require_markings(str(file), inside, key_frame.markings, camera, template)
-        picked[file.stem] = key_frames
+        picked[name] = key_frames
     return {name: picked[name] for name in clips if name in picked}
-
-
-def _files(folder: Path, place: str, expected: str, known: Collection[str]) -> Iterator[Path]:
-    """Yield the files of a folder of the match, sorted; raise InputError for an unknown name."""
-    for name in sorted(path.name for path in (folder / place).glob("[!.]*")):
-        file = existing_file(folder, f"{place}/{name}", str(folder))
-        if file.suffix.lower() != ".json" or file.stem not in known:
-            raise InputError(
-                str(file),
-                expected=f"{expected}: {', '.join(known) or 'none here'}",
-                found=repr(name),
-                todo="Rename or remove the file, or correct match.yaml.",
-            )
-        yield file
 
 
 def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:

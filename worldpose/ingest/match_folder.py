@@ -24,7 +24,13 @@ from worldpose.ingest.annotations import (
     read_key_frames,
 )
 from worldpose.ingest.pitch_file import read_pitch
-from worldpose.ingest.validation import existing_file, find_file, reachable, validate_record
+from worldpose.ingest.validation import (
+    existing_file,
+    files_by_unit,
+    find_file,
+    reachable,
+    validate_record,
+)
 
 CLICKS_NEEDED: Final = "at least four points of the pitch, better 8 to 12 all over the picture,"
 """Request in messages on cameras without calibration."""
@@ -296,61 +302,26 @@ def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:
 
 
 def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    known = [camera.id for camera in spec.static_cameras]
-    known += [clip.id for clip in spec.clips if clip.broadcast is not None]
-    found: dict[str, Path] = {}
-    files = sorted((folder / "detections").glob("*")) if (folder / "detections").is_dir() else []
-    for file in files:
-        if file.suffix.lower() not in (".json", ".npz") or file.name.startswith("."):
-            continue
-        if file.stem not in known:
-            raise InputError(
-                str(file),
-                expected=f"a static camera or a clip with a broadcast camera: {', '.join(known)}",
-                found=repr(file.stem),
-                todo="Rename or remove the file, or add the camera to match.yaml.",
-            )
-        if file.stem in found:
-            raise InputError(
-                str(file),
-                expected=f"one file for {file.stem}",
-                found=f"{found[file.stem].name} and {file.name}",
-                todo="Remove one of them.",
-            )
-        found[file.stem] = existing_file(folder, f"detections/{file.name}", str(folder))
-    return found
+    known = [*(camera.id for camera in spec.static_cameras), *_broadcast_clips(spec)]
+    units = "a static camera or a clip with a broadcast camera"
+    return files_by_unit(folder, "detections", (".json", ".npz"), known, units)
 
 
 def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    known = [clip.id for clip in spec.clips if clip.broadcast is not None]
-    found = {}
-    for file in sorted((folder / "estimates").glob("*.[nN][pP][zZ]")):
-        if file.stem not in known:
-            raise InputError(
-                str(file),
-                expected=f"a clip with a broadcast camera: {', '.join(known) or '(none)'}",
-                found=repr(file.stem),
-                todo="Rename or remove the file, or add the clip to match.yaml.",
-            )
-        found[file.stem] = existing_file(folder, f"estimates/{file.name}", str(folder))
-    return found
+    known, units = _broadcast_clips(spec), "a clip with a broadcast camera"
+    return files_by_unit(folder, "estimates", (".npz",), known, units)
+
+
+def _broadcast_clips(spec: MatchSpec) -> list[str]:
+    return [clip.id for clip in spec.clips if clip.broadcast is not None]
 
 
 def _boxes(
     folder: Path, videos: Mapping[str, Path], detections: Mapping[str, Path]
 ) -> dict[str, Path]:
-    found = {}
-    for file in sorted((folder / "boxes").glob("*.[tT][xX][tT]")):
-        if file.stem not in videos or file.stem in detections:
-            raise InputError(
-                str(file),
-                expected="a camera or clip with a video and without 2D poses: "
-                + (", ".join(name for name in videos if name not in detections) or "(none)"),
-                found=repr(file.stem),
-                todo="Rename or remove the file, or add the video to match.yaml.",
-            )
-        found[file.stem] = existing_file(folder, f"boxes/{file.name}", str(folder))
-    return found
+    known = [name for name in videos if name not in detections]
+    units = "a camera or clip with a video and without 2D poses"
+    return files_by_unit(folder, "boxes", (".txt",), known, units)
 
 
 def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:

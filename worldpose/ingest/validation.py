@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import unicodedata
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -238,3 +238,49 @@ def existing_file(folder: Path, name: str, where: str, *, folders: bool = False)
             todo="Copy the file into the match folder.",
         )
     return path
+
+
+def files_by_unit(
+    folder: Path,
+    place: str,
+    suffixes: Collection[str],
+    known: Collection[str],
+    units: str,
+    *,
+    alone: bool = False,
+) -> dict[str, Path]:
+    """Return the files of a subfolder of a match folder by unit, without hidden ones.
+
+    Args:
+        folder: the match folder.
+        place: the subfolder, which need not exist.
+        suffixes: endings of the files, in small letters.
+        known: the units that may have a file.
+        units: what these units are, for messages.
+        alone: whether files with other endings are refused, not ignored.
+
+    Raises:
+        InputError: a file belongs to no such unit, or two belong to one; it leads out of the
+            folder.
+    """
+    found: dict[str, Path] = {}
+    for file in sorted((folder / place).glob("[!.]*")):
+        is_of_kind = file.suffix.lower() in suffixes
+        if not is_of_kind and not alone:
+            continue
+        if not is_of_kind or file.stem not in known:
+            raise InputError(
+                str(file),
+                expected=f"{units}: {', '.join(known) or '(none)'}",
+                found=repr(file.name),
+                todo="Rename or remove the file, or correct match.yaml.",
+            )
+        if file.stem in found:
+            raise InputError(
+                str(file),
+                expected=f"one file for {file.stem}",
+                found=f"{found[file.stem].name} and {file.name}",
+                todo="Remove one of them.",
+            )
+        found[file.stem] = existing_file(folder, f"{place}/{file.name}", str(folder))
+    return found

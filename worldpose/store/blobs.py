@@ -5,21 +5,20 @@ The implementation for object storage is `worldpose.store.objects`.
 
 from __future__ import annotations
 
-import bisect
 import ctypes
 import errno
 import hashlib
-import itertools
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from io import FileIO
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeVar
 
 from data_contracts.run import StoredFile
 from worldpose.errors import CorruptionError, StoreError
@@ -170,12 +169,12 @@ def _require_published(
 ) -> None:
     """Raise CorruptionError unless size and SHA-256 of the bytes there are the published ones."""
     if there is None:
-        raise _corruption_error(blobs, path, "the file is missing")
+        raise corruption_error(blobs, path, "the file is missing")
     size, sha256 = there
     if size != file.size:
-        raise _corruption_error(blobs, path, f"the file has {size} bytes, not {file.size}")
+        raise corruption_error(blobs, path, f"the file has {size} bytes, not {file.size}")
     if sha256 != file.sha256:
-        raise _corruption_error(blobs, path, "its SHA-256 differs from the one in the manifest")
+        raise corruption_error(blobs, path, "its SHA-256 differs from the one in the manifest")
 
 
 def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
@@ -188,42 +187,8 @@ def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
     _require_published(blobs, path, file, blobs.digest(path))
 
 
-def read_published_range(
-    blobs: Blobs, result: ResultId, file: StoredFile, start: int, stop: int
-) -> bytes:
-    """Return the bytes of one file from `start` to before `stop`, verified part by part.
-
-    Raises:
-        CorruptionError: the file is missing or these parts have changed.
-    """
-    if not file.parts:
-        return read_published(blobs, result, file)[start:stop]
-    ends = list(itertools.accumulate(size for size, _ in file.parts))
-    first, last = bisect.bisect_right(ends, start), bisect.bisect_left(ends, stop) + 1
-    before = ends[first] - file.parts[first][0]
-    path = f"{result.path}/{file.path}"
-    data = blobs.read_range(path, before, ends[min(last, len(ends)) - 1])
-    if data is None:
-        found = "the file is missing"
-    elif digest_parts(data, [size for size, _ in file.parts[first:last]]) != file.parts[first:last]:
-        found = f"the SHA-256 of its part at byte {before} differs from the one in the manifest"
-    else:
-        return data[start - before : stop - before]
-    raise _corruption_error(blobs, path, found)
-
-
-def digest_parts(data: bytes, sizes: Sequence[int]) -> tuple[tuple[int, str], ...]:
-    """Return size and SHA-256 of the consecutive parts of `data`; a cut part has another size."""
-    parts, start = [], 0
-    with memoryview(data) as view:
-        for size in sizes:
-            part = view[start : start + size]
-            parts.append((len(part), digest(part)))
-            start += size
-    return tuple(parts)
-
-
-def _corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
+def corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
+    """Return the error of a published file that is not as it was."""
     return CorruptionError(
         f"{blobs.url}/{path} has changed since its publication: {found}. Run "
         "`worldpose verify --repair` to find and repair all damage."
@@ -236,6 +201,9 @@ _HERE: Final = -100
 """AT_FDCWD: a relative path starts at the working folder."""
 _NO_REPLACE: Final = 1
 """RENAME_NOREPLACE of Linux."""
+
+
+_Read = TypeVar("_Read")
 
 
 @dataclass(frozen=True)
@@ -251,32 +219,33 @@ class LocalBlobs:
 
     def read(self, path: str) -> bytes | None:
         """See `Blobs`."""
-        target = self._at(path)
-        with storage_errors(str(target)):
-            try:
-                return target.read_bytes()
-            except (FileNotFoundError, NotADirectoryError):
-                return None
+        return self._read(path, lambda file: file.read())
 
     def read_range(self, path: str, start: int, stop: int) -> bytes | None:
         """See `Blobs`."""
-        target = self._at(path)
-        with storage_errors(str(target)):
-            try:
-                with target.open("rb", buffering=0) as file:
-                    file.seek(start)
-                    return file.read(stop - start)
-            except (FileNotFoundError, NotADirectoryError):
-                return None
+
+        def read_part(file: FileIO) -> bytes:
+            file.seek(start)
+            return file.read(stop - start)
+
+        return self._read(path, read_part)
 
     def digest(self, path: str) -> tuple[int, str] | None:
         """See `Blobs`."""
+
+        def digest_file(file: FileIO) -> tuple[int, str]:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            return file.tell(), sha256
+
+        return self._read(path, digest_file)
+
+    def _read(self, path: str, read: Callable[[FileIO], _Read]) -> _Read | None:
+        """Return what `read` returns of the open file; None if there is none."""
         target = self._at(path)
         with storage_errors(str(target)):
             try:
                 with target.open("rb", buffering=0) as file:
-                    sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-                    return file.tell(), sha256
+                    return read(file)
             except (FileNotFoundError, NotADirectoryError):
                 return None
 
@@ -343,12 +312,12 @@ class LocalBlobs:
         with storage_errors(str(top)):
             found = []
             for item in sorted(top.iterdir()) if top.is_dir() else ():
-                there = self._entry(item)
-                if there is None:
-                    continue
-                inside = self.entries(there.path) if item.is_dir() else [there]
-                modified = max(entry.modified for entry in (there, *inside))
-                found.append(Entry(there.path, sum(entry.size for entry in inside), modified))
+                path = f"{STAGING}/{item.name}"
+                there = _entry(item, path)
+                if there is not None:
+                    inside = self.entries(path) if item.is_dir() else [there]
+                    modified = max(entry.modified for entry in (there, *inside))
+                    found.append(Entry(path, sum(entry.size for entry in inside), modified))
             return found
 
     def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
@@ -378,18 +347,6 @@ class LocalBlobs:
 
     def _at(self, path: str) -> Path:
         return self.root / checked_path(path)
-
-    def _entry(self, path: Path) -> Entry | None:
-        """Return the entry; None if it was removed since it was listed."""
-        try:
-            status = path.lstat()
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        return Entry(
-            path.relative_to(self.root).as_posix(),
-            status.st_size,
-            datetime.fromtimestamp(status.st_mtime, UTC),
-        )
 
     @contextmanager
     def _temporary(self, data: bytes) -> Iterator[Path]:
@@ -522,9 +479,15 @@ def _entries_below(folder: str, path: str) -> Iterator[Entry]:
             if not each.is_symlink():
                 yield from _entries_below(each.path, f"{path}/{each.name}")
             continue
-        try:
-            status = each.stat(follow_symlinks=False)
-        except (FileNotFoundError, NotADirectoryError):
-            continue
-        modified = datetime.fromtimestamp(status.st_mtime, UTC)
-        yield Entry(f"{path}/{each.name}", status.st_size, modified)
+        entry = _entry(each, f"{path}/{each.name}")
+        if entry is not None:
+            yield entry
+
+
+def _entry(file: Path | os.DirEntry[str], path: str) -> Entry | None:
+    """Return the entry of a file; None if it was removed since it was listed."""
+    try:
+        status = os.lstat(file)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return Entry(path, status.st_size, datetime.fromtimestamp(status.st_mtime, UTC))

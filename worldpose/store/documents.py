@@ -137,20 +137,6 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
         raise CorruptionError(f"{where} is not a valid {kind.__name__}: {error}") from error
 
 
-def unseal_repairable(kind: type[R], data: bytes, where: str) -> R:
-    """Unseal a record that `worldpose verify --repair` can set aside if it is damaged.
-
-    Raises:
-        CorruptionError, InputError: see `unseal`; the former says how to repair.
-    """
-    try:
-        return unseal(kind, data, where)
-    except CorruptionError as error:
-        raise CorruptionError(
-            f"{error}. Restore it from a copy, or let `worldpose verify --repair` set it aside."
-        ) from error
-
-
 def read_checksum(data: bytes) -> str:
     """Return the checksum in the document `data`, which `unseal` has accepted."""
     found = _SEAL.match(data)

@@ -35,7 +35,7 @@ from data_contracts.arrays import CHUNK_BYTES, ArrayLayout, GroupLayout
 from data_contracts.conventions import CONVENTIONS
 from data_contracts.run import ResultManifest, StoredFile
 from worldpose.errors import InputError, InternalError
-from worldpose.store.blobs import Blobs, LocalBlobs, read_published, read_published_range
+from worldpose.store.blobs import Blobs, LocalBlobs, corruption_error, read_published
 from worldpose.store.documents import canonical_json
 from worldpose.store.paths import ResultId
 
@@ -212,7 +212,8 @@ def _wrong_values(array: ArrayLayout, values: NDArray[Any]) -> NDArray[np.bool_]
 class PublishedFiles(Store):
     """Read-only Zarr store that raises an error for a lost or changed file, never a fill value.
 
-    A read of some chunks of a file reads and verifies these chunks alone.
+    A read of a whole file is verified by its SHA-256. A read of a part, a chunk or the index of all
+    chunks, reads this part alone, and is verified by the CRC-32C at its end.
     """
 
     supports_writes = False
@@ -266,7 +267,14 @@ class PublishedFiles(Store):
     def _read(self, file: StoredFile, start: int, stop: int) -> bytes:
         if start == 0 and stop >= file.size:
             return read_published(self._blobs, self._result, file)
-        return read_published_range(self._blobs, self._result, file, start, stop)
+        path = f"{self._result.path}/{file.path}"
+        data = self._blobs.read_range(path, start, stop)
+        if data is None:
+            raise corruption_error(self._blobs, path, "the file is missing")
+        if len(data) != stop - start or _crc32c(data[:-4]) != data[-4:]:
+            found = f"the CRC-32C of its part at byte {start} does not match"
+            raise corruption_error(self._blobs, path, found)
+        return data
 
     async def get_partial_values(
         self,
@@ -322,7 +330,7 @@ def write_group(
     arrays: Arrays,
     coordinates: Arrays,
     attributes: Mapping[str, Any],
-) -> dict[str, tuple[int, ...]]:
+) -> int:
     """Write the group to `folder`; equal arrays and attributes give equal files.
 
     Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a changed
@@ -337,7 +345,7 @@ def write_group(
         attributes: the attributes that `layout.attributes` requires.
 
     Returns:
-        All files by path, with the sizes of their parts: chunks and index [byte].
+        The number of files.
 
     Raises:
         InternalError: the arrays or attributes do not match the layout.
@@ -356,7 +364,7 @@ def write_group(
             "attributes": given,
         },
     )
-    files: dict[str, tuple[int, ...]] = {"zarr.json": ()}
+    files = 1
     for name, values in checked.items():
         array = layout.layout(name)
         chunks, shards = array.chunks(values.shape), array.shards(values.shape)
@@ -372,7 +380,7 @@ def write_group(
             attributes=array.attributes(),
             config={"write_empty_chunks": True},
         )
-        files[f"{name}/zarr.json"] = ()
+        files += 1
         for number, part in enumerate(array_parts(array, values.shape)):
             place = ["0"] * values.ndim
             if array.chunk_dim is not None:
@@ -380,9 +388,9 @@ def write_group(
             path = "/".join([name, "c", *place])
             if shards == chunks:
                 stored[part] = normalize_nans(values[part])
-                files[path] = ()
             else:
-                files[path] = _write_shard(folder / path, array, values[part], values.shape)
+                _write_shard(folder / path, array, values[part], values.shape)
+            files += 1
             release_memory(values)
     # Zarr warns that other readers may ignore it, as the format allows. Not in `catch_warnings`,
     # whose end in one thread would end it in others, which write at the same time.
@@ -396,8 +404,8 @@ def write_group(
 
 def _write_shard(
     file: Path, array: ArrayLayout, values: NDArray[Any], shape: tuple[int, ...]
-) -> tuple[int, ...]:
-    """Write one file of an array in the format of Zarr's sharding; return the sizes of its parts.
+) -> None:
+    """Write one file of an array in the format of Zarr's sharding.
 
     Zarr itself would hold a file's chunks three times in memory, at twice the time. The file has
     the chunks in order, each with its CRC-32C, then the index of their places with its CRC-32C.
@@ -421,7 +429,7 @@ def _write_shard(
             widths = [(0, missing if dim == axis else 0) for dim in range(values.ndim)]
             chunk = np.pad(chunk, widths, constant_values=_fill_value(array))
         coded = bytes(codec.encode(np.ascontiguousarray(chunk)))
-        return coded + int(google_crc32c.value(coded)).to_bytes(4, "little")
+        return coded + _crc32c(coded)
 
     index = np.full((array.shards(shape)[axis] // length, 2), NO_CHUNK, dtype="<u8")
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -431,9 +439,11 @@ def _write_shard(
             index[number] = out.tell(), len(chunk)
             out.write(chunk)
         coded = index.tobytes()
-        out.write(coded + google_crc32c.value(coded).to_bytes(4, "little"))
-    there = index[:, 1][index[:, 0] != NO_CHUNK]
-    return (*there.tolist(), len(coded) + 4)
+        out.write(coded + _crc32c(coded))
+
+
+def _crc32c(data: bytes) -> bytes:
+    return int(google_crc32c.value(data)).to_bytes(4, "little")
 
 
 def read_group(files: Store) -> xr.Dataset:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,17 +31,18 @@ from worldpose.errors import (
     StoreError,
 )
 from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point, verify_published
-from worldpose.store.documents import seal, unseal, unseal_repairable
-from worldpose.store.paths import MANIFEST, PROJECT, ResultId, is_name, registration_path
-from worldpose.store.recipes import STORE_FORMAT, recipe_key
-from worldpose.store.runs import (
-    LATEST,
-    list_runs,
-    read_record,
-    read_reservation,
-    reserve_run,
-    write_record,
+from worldpose.store.documents import seal, unseal
+from worldpose.store.paths import (
+    MANIFEST,
+    PROJECT,
+    ResultId,
+    is_name,
+    record_path,
+    registration_path,
+    reservation_path,
 )
+from worldpose.store.recipes import STORE_FORMAT, recipe_key
+from worldpose.store.runs import LATEST, read_document, read_pin, run_files, run_order
 from worldpose.store.writer import ResultWriter
 
 if TYPE_CHECKING:
@@ -121,20 +124,14 @@ class Store:
 
     def matches(self) -> tuple[str, ...]:
         """Return the ids of the registered matches, sorted."""
-        files = (entry.path.split("/")[1:] for entry in self.blobs.entries("matches"))
-        names = (
-            parts[0].removesuffix(".json")
-            for parts in files
-            if len(parts) == 1 and parts[0].endswith(".json")
-        )
-        return tuple(filter(is_name, names))  # macOS and others put their own files on shares
+        paths = (entry.path for entry in self.blobs.entries("matches"))
+        names = (path.removeprefix("matches/") for path in paths if path.endswith(".json"))
+        # macOS and others put their own files on shares.
+        return tuple(filter(is_name, (name.removesuffix(".json") for name in names)))
 
     def registration(self, match_id: str) -> Registration | None:
         """Return the registration of a match; None if it is not registered."""
-        path = registration_path(match_id)
-        data = self.blobs.read(path)
-        where = f"{self.url}/{path}"
-        return None if data is None else unseal_repairable(Registration, data, where)
+        return read_document(self.blobs, registration_path(match_id), Registration)
 
     def register(self, registration: Registration) -> None:
         """Register a match or replace its registration."""
@@ -197,7 +194,7 @@ class Store:
                 f"work on {work.recipe.name}",
                 expected=f"key {recipe_key(work.recipe)} of its recipe",
                 found=f"key {work.key}",
-                todo="Compute the key with worldpose.store.recipe_key.",
+                todo="Compute the key with worldpose.store.recipes.recipe_key.",
             )
         folder = self.blobs.create_staging()
         try:
@@ -219,14 +216,8 @@ class Store:
     ) -> xr.Dataset:
         """Open a published result as labelled arrays, with units and conventions in the attributes.
 
-        Values are read on access, and every byte is then verified against the manifest.
-
-        Args:
-            match_id: the match.
-            stage: the stage.
-            unit: the unit of the stage.
-            key: the result's key.
-            verify: verify every file now.
+        Values are read on access, and every byte is then verified against the manifest; with
+        `verify`, every file is verified now.
 
         Raises:
             StoreError: the result is not published.
@@ -254,11 +245,30 @@ class Store:
     ) -> str:
         """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ...
 
-        Args:
-            match_id: the match.
-            overrides: stage to the requested settings, which outlast a killed run.
+        `overrides` are the requested settings by stage, which outlast a killed run.
         """
-        return reserve_run(self.blobs, match_id, overrides)
+        number = 0
+        while True:
+            # A record that was set aside keeps its number: reviews may name the run. A number that
+            # could not be reserved, for any reason, is not tried again.
+            taken = set[str]().union(*run_files(self.blobs, match_id))
+            number = max([number, *(run_order(name)[0] for name in taken)]) + 1
+            run_id = f"{number:04d}"
+            path = reservation_path(match_id, run_id)
+            reservation = Reservation(
+                run_id=run_id,
+                match_id=match_id,
+                started_at=datetime.now(UTC),
+                host=platform.node(),
+                pid=os.getpid(),
+                overrides=overrides,
+            )
+            if not self.blobs.put_new(path, seal(reservation)):
+                continue
+            # Another run may have taken this number, finished and dropped its reservation since.
+            if not self.blobs.exists(record_path(match_id, run_id)):
+                return run_id
+            self.blobs.delete(path)
 
     def finish_run(self, record: RunRecord) -> None:
         """Write the record of a run, only once.
@@ -279,16 +289,28 @@ class Store:
                 f"run {record.run_id} of match {record.match_id} names results that {self.url} "
                 f"does not have: {', '.join(lost)}. Run `worldpose run {record.match_id}` again."
             )
-        write_record(self.blobs, record)
+        path, data = record_path(record.match_id, record.run_id), seal(record)
+        pass_commit_point("before_run_record")
+        if not self.blobs.put_new(path, data) and self.blobs.read(path) != data:
+            raise StoreError(
+                f"{self.url}/{path} exists with other content: run {record.run_id} of match "
+                f"{record.match_id} was finished earlier. Reserve a new run."
+            )
+        pass_commit_point("after_run_record")
+        self.blobs.delete(reservation_path(record.match_id, record.run_id))
 
     def runs(self, match_id: str) -> tuple[str, ...]:
         """Return the ids of a match's finished runs, first to last."""
-        return tuple(list_runs(self.blobs, match_id)[0])
+        return tuple(sorted(run_files(self.blobs, match_id)[0], key=run_order))
 
     def unfinished_runs(self, match_id: str) -> tuple[Reservation, ...]:
         """Return a match's active and killed runs, first to last."""
-        _, reserved = list_runs(self.blobs, match_id)
-        found = (read_reservation(self.blobs, match_id, run_id) for run_id in reserved)
+        finished, reserved, _ = run_files(self.blobs, match_id)
+        paths = (
+            reservation_path(match_id, run_id)
+            for run_id in sorted(reserved - finished, key=run_order)
+        )
+        found = (read_document(self.blobs, path, Reservation) for path in paths)
         return tuple(reservation for reservation in found if reservation)
 
     def run(self, match_id: str, run_id: str = LATEST) -> RunRecord:
@@ -298,7 +320,23 @@ class Store:
             InputError: there is no such run.
             CorruptionError: the record is damaged.
         """
-        return read_record(self.blobs, match_id, run_id)
+        finished, reserved, _ = run_files(self.blobs, match_id)
+        names = sorted(finished, key=run_order)
+        wanted = names[-1] if run_id == LATEST and names else run_id
+        if wanted not in finished:
+            pin = read_pin(self.blobs, match_id, run_id)
+            wanted = run_id if pin is None else pin.run_id
+        record = None
+        if wanted in finished:
+            record = read_document(self.blobs, record_path(match_id, wanted), RunRecord)
+        if record is None:
+            raise InputError(
+                f"run {run_id} of match {match_id} in {self.url}",
+                expected=f"one of {', '.join(names)}" if names else "a finished run",
+                found="an unfinished run" if run_id in reserved else "no such run",
+                todo=f"Run: worldpose run {match_id}",
+            )
+        return record
 
     def _check_same_content(self, result: ResultId, ours: ResultManifest) -> ResultManifest:
         theirs = self.manifest(result.match_id, result.stage, result.unit, result.key)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from data_contracts.arrays import GroupLayout
@@ -16,7 +15,7 @@ from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest, StoredFile
 from data_contracts.work import Work
 from worldpose.errors import InternalError, StoreError
-from worldpose.store.blobs import digest_parts, pass_commit_point, storage_errors
+from worldpose.store.blobs import pass_commit_point, storage_errors
 from worldpose.store.documents import canonical_json, digest, record_checksum
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ class ResultWriter:
         self.manifest: ResultManifest | None = None
         self._work, self._folder = work, folder
         self._started = time.monotonic()
-        self._files: dict[str, tuple[int, ...]] = {}
+        self._files = 0
 
     def write(
         self,
@@ -102,10 +101,10 @@ class ResultWriter:
                     f"metric {metric} of {name}", f"expected a finite number, found {value}"
                 )
         with storage_errors(str(self._folder)):
-            files = stored_files(self._folder, self._files)
-        if len(files) != len(self._files):
+            files = stored_files(self._folder)
+        if len(files) != self._files:
             raise StoreError(
-                f"{self._folder}: {name} has {len(self._files)} files, but only {len(files)} of "
+                f"{self._folder}: {name} has {self._files} files, but only {len(files)} of "
                 "them exist, so nothing was published. Another program removed the others. Run "
                 "again."
             )
@@ -126,21 +125,13 @@ class ResultWriter:
         return manifest.model_copy(update={"checksum": record_checksum(manifest)})
 
 
-def stored_files(
-    folder: Path, sizes: Mapping[str, Sequence[int]] = MappingProxyType({})
-) -> tuple[StoredFile, ...]:
-    """Return size and checksum of every file below `folder`, sorted by path.
-
-    Args:
-        folder: the folder.
-        sizes: sizes of the parts of files that consist of some [byte], by path.
-    """
+def stored_files(folder: Path) -> tuple[StoredFile, ...]:
+    """Return size and checksum of every file below `folder`, sorted by path."""
 
     def describe(path: Path) -> StoredFile:
         data = path.read_bytes()
         name = path.relative_to(folder).as_posix()
-        parts = digest_parts(data, sizes.get(name, ()))
-        return StoredFile(path=name, size=len(data), sha256=digest(data), parts=parts)
+        return StoredFile(path=name, size=len(data), sha256=digest(data))
 
     # Hashing leaves the interpreter to other threads.
     with ThreadPoolExecutor(DIGEST_THREADS) as threads:

@@ -3,9 +3,6 @@
 In two correctly calibrated cameras, two detections of one person lie on each other's epipolar
 lines. The residual is an angle relative to the person's apparent size, so it needs no unit of
 length, no smallest angle between rays, and no gate.
-
-If cameras agree on their people, a quantity outside the limits of the settings is the cause; if
-not, clock offsets, camera positions or poses are.
 """
 
 from __future__ import annotations
@@ -27,13 +24,6 @@ from worldpose.tracking.settings import TrackingSettings
 
 SAMPLES: Final = 24
 """Most frames in which detections are compared."""
-TOLERANCE: Final = 0.15
-"""Largest mean epipolar angle of two detections of one person, in spreads of a body's joints [1]:
-7 cm on an adult, whose joints have a spread of 0.5 m."""
-MIN_SHARE: Final = 0.5
-"""Share of detections with a partner from which two cameras agree [1]."""
-MIN_MATCHES: Final = 4
-"""Least number of matches for a conclusion."""
 
 
 @dataclass(frozen=True)
@@ -43,30 +33,35 @@ class PairMatches:
     Attributes:
         cameras: indices of the two.
         possible: largest possible number of matches.
-        angle: (matches,) angle between the lines of the rays of one joint, up to a right one [rad].
-        distance: (matches,) distance between those rays [m].
-        size: (matches,) limb lengths relative to an adult's [1]; NaN where unknown.
-        height: (matches,) mean height of the joints over z = 0 [m].
-        depth: (matches,) distance from the first camera [m].
+        table: (matches, 5): angle between the lines of the rays of one joint, up to a right one
+            [rad]; distance between those rays [m]; limb lengths relative to an adult's [1], NaN
+            where unknown; mean height of the joints over z = 0 [m]; distance from the first camera
+            [m].
     """
 
     cameras: tuple[int, int]
     possible: int
-    angle: Floats
-    distance: Floats
-    size: Floats
-    height: Floats
-    depth: Floats
+    table: Floats
+
+    @property
+    def count(self) -> int:
+        """Number of matches."""
+        return len(self.table)
 
     @property
     def share(self) -> float:
         """Share of matches among the possible ones [1]."""
-        return len(self.angle) / max(self.possible, 1)
+        return self.count / max(self.possible, 1)
 
     @property
     def agrees(self) -> bool:
-        """Whether most detections have a partner."""
-        return len(self.angle) >= MIN_MATCHES and self.share >= MIN_SHARE
+        """Whether most detections have a partner, and enough of them."""
+        return self.count >= 4 and self.share >= 0.5
+
+    @property
+    def angle(self) -> float:
+        """Median angle between rays [rad]."""
+        return float(np.median(self.table[:, 0]))
 
 
 def match_pair(
@@ -92,27 +87,11 @@ def match_pair(
         p, q = p[np.isfinite(p[..., 0]).any(-1)], q[np.isfinite(q[..., 0]).any(-1)]
         possible += min(len(p), len(q))
         rows.append(_match_detections(origins[a], p, origins[b], q, least))
-    table = np.concatenate(rows) if rows else np.empty((0, 5))
-    angle, distance, size, height, depth = table.T
-    return PairMatches(pair, possible, angle, distance, size, height, depth)
+    return PairMatches(pair, possible, np.concatenate([np.empty((0, 5)), *rows]))
 
 
-def _match_detections(
-    origin: Floats,
-    p: Floats,
-    other: Floats,
-    q: Floats,
-    least: int,
-) -> Floats:
-    """Return angle, distance, size, height and depth (matches, 5) of detections that are partners.
-
-    Args:
-        origin: (3,) [m], of the first camera.
-        p: (n, 17, 3) unit rays of its detections.
-        other: (3,) [m], of the second camera.
-        q: (m, 17, 3) unit rays of its detections.
-        least: least number of joints in both.
-    """
+def _match_detections(origin: Floats, p: Floats, other: Floats, q: Floats, least: int) -> Floats:
+    """Return the table of partners, by unit rays (n, 17, 3) and (m, 17, 3) of two cameras."""
     baseline = other - origin
     length = float(np.linalg.norm(baseline))
     if not length > 0.0:
@@ -127,7 +106,8 @@ def _match_detections(
     mean = np.where(known, off, 0.0).sum(axis=-1) / np.maximum(count, 1)
     mean = np.where(count >= least, mean, np.inf)
     found = []
-    for n, m in zip(*np.nonzero(mean <= TOLERANCE), strict=True):
+    # In spreads of a body's joints: 7 cm on an adult, whose joints have a spread of 0.5 m.
+    for n, m in zip(*np.nonzero(mean <= 0.15), strict=True):
         if mean[n, m] <= mean[n].min() and mean[n, m] <= mean[:, m].min():
             row = _locate_match(origin, p[n], baseline, q[m])
             if row is not None:
@@ -149,13 +129,8 @@ def _joint_spreads(rays: Floats) -> Floats:
     return np.asarray(np.sqrt(np.nanmean(((rays - middle) ** 2).sum(axis=-1), axis=1)))
 
 
-def _locate_match(
-    origin: Floats,
-    p: Floats,
-    baseline: Floats,
-    q: Floats,
-) -> tuple[float, float, float, float, float] | None:
-    """Return angle, distance, size, height and depth of one match; None behind a camera."""
+def _locate_match(origin: Floats, p: Floats, baseline: Floats, q: Floats) -> list[float] | None:
+    """Return the row of one match; None behind a camera."""
     cosine = (p * q).sum(axis=-1)
     sine = np.linalg.norm(np.cross(p, q), axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -168,21 +143,13 @@ def _locate_match(
         return None
     limbs = size_ratios(joints)
     size = float(np.nanmedian(limbs)) if np.isfinite(limbs).any() else math.nan
-    return (
-        float(np.nanmedian(np.arctan2(sine, np.abs(cosine)))),
-        float(np.nanmean(np.linalg.norm(near - far, axis=-1))),
-        size,
-        float(np.nanmean(joints[:, 2])),
-        float(np.nanmedian(s)),
-    )
+    angle = float(np.nanmedian(np.arctan2(sine, np.abs(cosine))))
+    distance = float(np.nanmean(np.linalg.norm(near - far, axis=-1)))
+    return [angle, distance, size, float(np.nanmean(joints[:, 2])), float(np.nanmedian(s))]
 
 
 WINDOW: Final = 400
 """Most frames that the diagnosis uses."""
-SAME_PLACE: Final = 1e-3
-"""Cameras nearer to each other than this are at one position [m]."""
-UNITS: Final = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
-"""Units that translations have by mistake, by their number per metre."""
 
 
 @dataclass(frozen=True)
@@ -231,56 +198,51 @@ def diagnose_no_people(
     frames = _common_window(present)
     rays = _usable_rays(cameras, detections[frames], settings.min_joints)
     extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
-    if extent < SAME_PLACE:
+    if extent < 1e-3:  # [m]
         together = " and ".join(name for name, count in detected.items() if count > 0)
         return NoPeople(
-            cause="same_place",
-            message=f"{together} are at the same place ({extent:.3g} m apart): their rays meet "
-            "nowhere but there. Two cameras must stand apart; is one of them given twice?",
-            evidence={"cameras_apart_m": extent},
+            "same_place",
+            f"{together} are at the same place ({extent:.3g} m apart): their rays meet nowhere but "
+            "there. Two cameras must stand apart; is one of them given twice?",
+            {"cameras_apart_m": extent},
         )
-    pairs = [
-        pair
+    matches = [
+        match_pair(cameras, rays, pair, 0, settings.min_joints)
         for pair in combinations(range(len(camera_ids)), 2)
         if present[:, pair].all(axis=1).any()
     ]
-    matched_pairs = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in pairs]
-    matched_pairs.sort(key=lambda each: (each.agrees, len(each.angle) * each.share), reverse=True)
-    agreeing = [each for each in matched_pairs if each.agrees]
-    if agreeing:
-        if not births and _all_pairs_have_rivals(cameras, rays, ground, settings):
-            return NoPeople(
-                cause="ambiguous_pairs",
-                message=f"detections of {' and '.join(camera_ids[n] for n in agreeing[0].cameras)} "
-                "fit each other in several ways, and in no frame one way is clearly likelier: two "
-                "cameras at the height of people see all of them on one line. Add a camera, or "
-                "mount one higher.",
-                evidence={"matches": float(len(agreeing[0].angle))},
-            )
-        return _explain_limit(cameras, camera_ids, agreeing, settings, ground, births)
-    matched = [each for each in matched_pairs if len(each.angle)]
-    if matched and max(np.median(each.angle) for each in matched) < settings.min_angle_rad:
-        # Cameras at nearly one position share few people if they look in different directions.
-        return _explain_limit(cameras, camera_ids, matched, settings, ground, births)
-    found = _explain_clock_offset(cameras, camera_ids, rays, matched_pairs, fps, settings)
+    matches.sort(key=lambda each: (each.agrees, each.count * each.share), reverse=True)
+    best = matches[0]
+    a, b = (camera_ids[n] for n in best.cameras)
+    if best.agrees and not births and _all_pairs_have_rivals(cameras, rays, ground, settings):
+        return NoPeople(
+            "ambiguous_pairs",
+            f"detections of {a} and {b} fit each other in several ways, and in no frame one way is "
+            "clearly likelier: two cameras at the height of people see all of them on one line. "
+            "Add a camera, or mount one higher.",
+            {"matches": float(best.count)},
+        )
+    # Cameras at nearly one position share few people if they look in different directions.
+    some = [each for each in matches if (each.agrees if best.agrees else each.count)]
+    if best.agrees or (some and max(each.angle for each in some) < settings.min_angle_rad):
+        return _explain_limit(cameras, camera_ids, some, settings, ground, births)
+    found = _explain_clock_offset(cameras, camera_ids, rays, matches, fps, settings)
     if found is not None:
         return found
     if not _views_overlap(cameras, rays, ground, settings):
         return NoPeople(
-            cause="one_camera_each",
-            message="no place where the people of one camera may be is in the image of another: "
-            "every person is seen by one camera. Two cameras must show the same people.",
-            evidence=detected,
+            "one_camera_each",
+            "no place where the people of one camera may be is in the image of another: every "
+            "person is seen by one camera. Two cameras must show the same people.",
+            detected,
         )
-    best = matched_pairs[0]
-    a, b = (camera_ids[n] for n in best.cameras)
     return NoPeople(
-        cause="cameras_contradict",
-        message=f"no two cameras agree on their people: of the best pair, {a} and {b}, "
-        f"{len(best.angle)} of {best.possible} detections have a partner on their epipolar lines. "
-        "Camera poses or lenses are wrong, files belong to other cameras, or the cameras show "
-        "different people: compare each camera's projection of the scene with its image.",
-        evidence={"matches": float(len(best.angle)), "possible": float(best.possible)},
+        "cameras_contradict",
+        f"no two cameras agree on their people: of the best pair, {a} and {b}, {best.count} of "
+        f"{best.possible} detections have a partner on their epipolar lines. Camera poses or "
+        "lenses are wrong, files belong to other cameras, or the cameras show different people: "
+        "compare each camera's projection of the scene with its image.",
+        {"matches": float(best.count), "possible": float(best.possible)},
     )
 
 
@@ -321,14 +283,7 @@ def _explain_missing_detections(
     detections: KeypointDetections[ClipArray],
     settings: TrackingSettings,
 ) -> NoPeople | None:
-    """Return the reason if detections cannot be compared at all, else None.
-
-    Args:
-        present: (frames, cameras), whether the camera has a usable detection.
-        detected: usable detections by camera.
-        detections: detections as given.
-        settings: settings of tracking.
-    """
+    """Return the reason if detections cannot be compared at all, else None."""
     seeing = [name for name, count in detected.items() if count > 0]
     counts = ", ".join(f"{name} {count:.0f}" for name, count in detected.items())
     if not seeing:
@@ -337,22 +292,22 @@ def _explain_missing_detections(
             most += 1
         if any_:
             return NoPeople(
-                cause="too_few_keypoints",
-                message=f"the most complete of {any_} detections has {most} keypoints; "
+                "too_few_keypoints",
+                f"the most complete of {any_} detections has {most} keypoints; "
                 f"tracking.min_joints asks for {settings.min_joints}.",
-                evidence={"detections": float(any_), "keypoints": float(most)},
+                {"detections": float(any_), "keypoints": float(most)},
             )
         return NoPeople(
-            cause="no_detections",
-            message="no camera has a detection in this clip. Look at the detections, at the "
-            "clip's frames in match.yaml, and at what the pitch filter removed.",
-            evidence=detected,
+            "no_detections",
+            "no camera has a detection in this clip. Look at the detections, at the clip's frames "
+            "in match.yaml, and at what the pitch filter removed.",
+            detected,
         )
     if len(seeing) == 1:
         return NoPeople(
-            cause="one_camera",
-            message=f"one camera alone has detections ({counts}). A person needs two.",
-            evidence=detected,
+            "one_camera",
+            f"one camera alone has detections ({counts}). A person needs two.",
+            detected,
         )
     if not (np.count_nonzero(present, axis=1) >= 2).any():
         spans = ", ".join(
@@ -361,10 +316,10 @@ def _explain_missing_detections(
             if len(frames := np.flatnonzero(column))
         )
         return NoPeople(
-            cause="never_together",
-            message="no two cameras have detections in the same frame; frames of the clip with "
+            "never_together",
+            "no two cameras have detections in the same frame; frames of the clip with "
             f"detections: {spans}. Look at offset_frames and at the clip's frames in match.yaml.",
-            evidence=detected,
+            detected,
         )
     return None
 
@@ -394,28 +349,18 @@ def _explain_limit(
     ground: bool,
     births: int,
 ) -> NoPeople:
-    """Return the limit that rejects people seen by two cameras.
-
-    Args:
-        cameras: batch (cameras,).
-        names: names of these.
-        agreeing: pairs with matches, the best first.
-        settings: settings of tracking.
-        ground: whether people stand on z = 0.
-        births: tracks that began and were dropped again.
-    """
+    """Return the limit that rejects people seen by two cameras."""
     best = agreeing[0]
     a, b = (names[n] for n in best.cameras)
-    count = len(best.angle)
     apart = float(np.linalg.norm(np.subtract(*cameras.center[list(best.cameras)])))
-    angle, distance = float(np.median(best.angle)), float(np.median(best.distance))
-    height, depth = float(np.median(best.height)), float(np.median(best.depth))
-    size = float(np.nanmedian(best.size)) if np.isfinite(best.size).any() else math.nan
-    seen = f"{a} and {b} agree on their people ({count} of {best.possible} detections)"
-    if not best.agrees:
-        seen = f"{count} of {best.possible} detections of {a} and {b} match"
+    angle, distance, _, height, depth = np.median(best.table, axis=0).tolist()
+    known = best.table[np.isfinite(best.table[:, 2]), 2]
+    size = float(np.median(known)) if len(known) else math.nan
+    seen = f"{best.count} of {best.possible} detections of {a} and {b} match"
+    if best.agrees:
+        seen = f"{a} and {b} agree on their people ({best.count} of {best.possible} detections)"
     evidence = {
-        "matches": float(count),
+        "matches": float(best.count),
         "angle_deg": math.degrees(angle),
         "cameras_apart_m": apart,
         "depth_m": depth,
@@ -423,66 +368,73 @@ def _explain_limit(
         "height_m": height,
         **({"size": size} if math.isfinite(size) else {}),
     }
-    widest = max(float(np.median(each.angle)) for each in agreeing)
-    if widest < settings.min_angle_rad:
-        return NoPeople(
-            cause="narrow_angle",
-            message=f"{seen}, but the rays of one person meet at "
-            f"{math.degrees(angle):.2g} degrees and tracking.min_angle_rad asks for "
-            f"{math.degrees(settings.min_angle_rad):.2g} ({settings.min_angle_rad:g} rad): "
-            f"the cameras are {apart:.2f} m apart and people {depth:.0f} m away, so an error of "
-            f"one centimetre across the rays is {0.01 / max(angle, 1e-9):.1f} m along them. "
-            "Add a camera that sees them from another side.",
-            evidence=evidence,
-        )
-    low, high = settings.size_range
-    if math.isfinite(size) and not low <= size <= high:
-        unit, factor = min(
-            ((name, factor) for factor, name in UNITS.items()),
-            key=lambda each: abs(math.log(size / each[1])),
-        )
-        near = abs(math.log(size / factor)) < 0.3
-        guess = f"translations seem to be in {unit}" if near else "is the unit the metre?"
-        return NoPeople(
-            cause="wrong_size",
-            message=f"{seen}, but these are {size:.3g} times as large as adults "
-            f"(tracking.size_range accepts {low:g} to {high:g}): {guess}. Camera translations "
-            f"are read as metres; {a} and {b} are {apart:.4g} apart.",
-            evidence=evidence,
-        )
-    low, high = settings.body_heights_m
-    if ground and not low <= height <= high:
-        return NoPeople(
-            cause="wrong_height",
-            message=f"{seen}, but the middle of their bodies is at z = {height:.2f} m "
-            f"(tracking.body_heights_m accepts {low:g} to {high:g}). On a pitch people stand at "
-            "z = 0 and z points up: look at the world frame of the cameras, or write pitch: none.",
-            evidence=evidence,
-        )
-    if distance > settings.epipolar_gate_m:
-        return NoPeople(
-            cause="rays_miss",
-            message=f"{seen}, but the rays of one joint pass {distance:.2f} m apart and "
-            f"tracking.epipolar_gate_m accepts {settings.epipolar_gate_m:g}: the cameras are not "
-            "known well enough.",
-            evidence=evidence,
-        )
+    widest, least = max(each.angle for each in agreeing), settings.min_angle_rad
+    (small, large), (low, high) = settings.size_range, settings.body_heights_m
+    limits = (
+        (
+            widest < least,
+            "narrow_angle",
+            f"the rays of one person meet at {math.degrees(angle):.2g} degrees and "
+            f"tracking.min_angle_rad asks for {math.degrees(least):.2g} ({least:g} rad): the "
+            f"cameras are {apart:.2f} m apart and people {depth:.0f} m away, so an error of one "
+            f"centimetre across the rays is {0.01 / max(angle, 1e-9):.1f} m along them. Add a "
+            "camera that sees them from another side.",
+        ),
+        (
+            math.isfinite(size) and not small <= size <= large,
+            "wrong_size",
+            f"these are {size:.3g} times as large as adults (tracking.size_range accepts "
+            f"{small:g} to {large:g}): {_guess_unit(size)}. Camera translations are read as "
+            f"metres; {a} and {b} are {apart:.4g} apart.",
+        ),
+        (
+            ground and not low <= height <= high,
+            "wrong_height",
+            f"the middle of their bodies is at z = {height:.2f} m (tracking.body_heights_m accepts "
+            f"{low:g} to {high:g}). On a pitch people stand at z = 0 and z points up: look at the "
+            "world frame of the cameras, or write pitch: none.",
+        ),
+        (
+            distance > settings.epipolar_gate_m,
+            "rays_miss",
+            f"the rays of one joint pass {distance:.2f} m apart and tracking.epipolar_gate_m "
+            f"accepts {settings.epipolar_gate_m:g}: the cameras are not known well enough.",
+        ),
+    )
+    for exceeded, cause, reason in limits:
+        if exceeded:
+            return NoPeople(cause, f"{seen}, but {reason}", evidence)
+    return _explain_drop(seen, evidence, math.degrees(widest), settings, births)
+
+
+def _guess_unit(size: float) -> str:
+    """Return what translations that make people `size` times as large may be in."""
+    units = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
+    off, unit = min((abs(math.log(size / factor)), name) for factor, name in units.items())
+    return f"translations seem to be in {unit}" if off < 0.3 else "is the unit the metre?"
+
+
+def _explain_drop(
+    seen: str, evidence: dict[str, float], widest: float, settings: TrackingSettings, births: int
+) -> NoPeople:
+    """Return why people within each limit, by rays of `widest` [degrees], have no track."""
     if not births:
         return NoPeople(
-            cause="limits_together",
-            message=f"{seen}, and no limit of tracking alone refuses them (angle "
-            f"{math.degrees(widest):.2g} degrees, {distance:.2f} m between rays, {size:.2g} times "
-            "an adult's size), but no group of detections passes all of them. Loosen "
-            "tracking.min_angle_rad, epipolar_gate_m or size_range.",
-            evidence=evidence,
+            "limits_together",
+            f"{seen}, and no limit of tracking alone refuses them (angle {widest:.2g} degrees, "
+            f"{evidence['ray_distance_m']:.2f} m between rays, "
+            f"{evidence.get('size', math.nan):.2g} times an adult's size), but no group of "
+            "detections passes all of them. Loosen tracking.min_angle_rad, epipolar_gate_m or "
+            "size_range.",
+            evidence,
         )
     return NoPeople(
-        cause="too_short",
-        message=f"{seen}, but none was seen for long enough: {births} tracks were started and "
-        f"dropped; tracking.min_track_s asks for {settings.min_track_s:g} s, and frames with fewer "
-        f"than {settings.birth_views} cameras count at most {settings.pair_evidence:g} where "
-        f"the odds that two detections are one person are below {settings.pair_odds:g}.",
-        evidence={**evidence, "tracks": float(births)},
+        "too_short",
+        f"{seen}, but none was seen for long enough: {births} tracks were started and dropped; "
+        f"tracking.min_track_s asks for {settings.min_track_s:g} s, and frames with fewer than "
+        f"{settings.birth_views} cameras count at most {settings.pair_evidence:g} where the odds "
+        f"that two detections are one person are below {settings.pair_odds:g}.",
+        {**evidence, "tracks": float(births)},
     )
 
 
@@ -513,11 +465,11 @@ def _explain_clock_offset(
     a, b = (names[n] for n in then.cameras)
     now = next(each for each in matched_pairs if each.cameras == then.cameras)
     return NoPeople(
-        cause="clock",
-        message=f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
+        "clock",
+        f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
         f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
         f"% as match.yaml has them: correct offset_frames of one of them by {abs(shift)}.",
-        evidence={"shift_frames": float(shift), "share": share, "share_now": now.share},
+        {"shift_frames": float(shift), "share": share, "share_now": now.share},
     )
 
 

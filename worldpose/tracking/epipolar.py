@@ -18,8 +18,6 @@ LIMBS = np.array(COCO17_BODY_BONES)
 ADULT_LENGTHS = np.array([0.36, 0.30, 0.30, 0.25, 0.25, 0.51, 0.51, 0.42, 0.42, 0.42, 0.42])
 """Lengths of `LIMBS` in an adult of 1.75 m [m]: Drillis and Contini's segment ratios, with the
 torso and shoulders measured between joint centres."""
-ERROR_TIME = 0.3
-"""Correlation time of a detector's errors [s]: frames nearer to each other add no information."""
 
 
 def size_ratios(joints: Floats) -> Floats:
@@ -54,7 +52,9 @@ def limb_lengths(joints: Floats, fps: float) -> tuple[Floats, Floats]:
             median[limb] = np.median(known)
             # 5 cm for a single frame, else the scatter between frames if larger.
             spread = max(0.05, 1.4826 * float(np.median(np.abs(known - median[limb]))))
-            variance[limb] = spread**2 / max(1.0, len(known) / (ERROR_TIME * fps))
+            # Correlation time of a detector's errors [s]: frames nearer to each other add no
+            # information.
+            variance[limb] = spread**2 / max(1.0, len(known) / (0.3 * fps))
     return median, variance
 
 

@@ -35,18 +35,6 @@ from worldpose.tracking.ray_matching import (
 )
 from worldpose.tracking.settings import TrackingSettings
 
-MIN_AREA = 25.0
-"""Least ground area on which strangers may appear [m^2]: a room."""
-MAX_DEVIATION = 3.0
-"""Largest distance of the rays of two views of one person, in standard deviations."""
-CLEAR_GATE = 0.15
-"""Mean distance of rays within which three views of a new person agree without doubt, at least [m]:
-three standard deviations of `RAY_NOISE` while unknown."""
-CLEAR_ODDS = 10.0
-"""Odds of two views of a new person that rule out three views far from each other [1]."""
-LEARN_EVERY = 5
-"""Interval between frames in which visibility statistics use known people."""
-
 
 class FrameTracker:
     """A clip's tracker state, updated frame by frame.
@@ -88,7 +76,8 @@ class FrameTracker:
     @property
     def area(self) -> float:
         """Ground area on which people were seen so far [m^2]."""
-        return max(MIN_AREA, float(np.prod(self.high - self.low)) if self.born else 0.0)
+        # Least ground area on which strangers may appear [m^2]: a room.
+        return max(25.0, float(np.prod(self.high - self.low)) if self.born else 0.0)
 
     @property
     def is_idle(self) -> bool:
@@ -124,7 +113,8 @@ class FrameTracker:
                 everything=weights,
             )
             # A clear pair explains its detections better than three views far from each other.
-            clear = group_pairs(pairs, left, self.settings, CLEAR_ODDS)
+            # Odds of two views of a new person that rule out three views far from each other [1].
+            clear = group_pairs(pairs, left, self.settings, 10.0)
             left = _drop_matched(left, _stack_matches(clear, len(self.centers)))
             wide = associate(self.centers, directions, left, self.ground, self.settings)
             left = _drop_matched(left, _stack_matches(wide, len(self.centers)))
@@ -142,7 +132,9 @@ class FrameTracker:
         widest = self.settings.epipolar_gate_m
         usual = self.gates.usual[np.isfinite(self.gates.usual)]
         gate = self.settings.gate_factor * float(np.median(usual)) if len(usual) else 0.0
-        return min(max(gate, CLEAR_GATE), widest)
+        # Mean distance of rays within which three views of a new person agree without doubt, at
+        # least [m].
+        return min(max(gate, 0.15), widest)
 
     def _learn(
         self,
@@ -156,7 +148,8 @@ class FrameTracker:
     ) -> None:
         """Update visibility statistics with new groups, and every few frames with known people."""
         seen = [(joints[n], index[:, n] >= 0) for n in np.flatnonzero(known).tolist()]
-        seen = seen if frame % LEARN_EVERY == 0 else []
+        # Interval between frames in which visibility statistics use known people.
+        seen = seen if frame % 5 == 0 else []
         seen += [(group.joints, group.index >= 0) for group in groups]
         seen = [each for each in seen if np.isfinite(each[0]).any()]
         if seen:
@@ -174,11 +167,7 @@ class FrameTracker:
     def _match(
         self, frame: int, directions: Floats, weights: Floats
     ) -> tuple[Integers, Floats, Floats]:
-        """Match the known people.
-
-        Returns:
-            detections (cameras, persons), their distances [m], and joints (persons, 17, 3) [m].
-        """
+        """Match the known people."""
         settings = self.settings
         taken = np.zeros(directions.shape[:2], dtype=np.bool_)
         if not self.active:
@@ -238,7 +227,8 @@ class FrameTracker:
             apart = ray_distance(
                 self.centers[b] - self.centers[a], directions[a, i], directions[b, j]
             )
-            limit = MAX_DEVIATION * float(self.gates.pair_noise(np.array([a]), np.array([b]))[0])
+            # Largest distance of the rays of two views of one person, in standard deviations.
+            limit = 3.0 * float(self.gates.pair_noise(np.array([a]), np.array([b]))[0])
             if apart > max(limit, self.settings.gate_growth * self.active[n].misfit):
                 index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -16,17 +15,6 @@ from data_contracts.tracking import Join
 from worldpose.tracking.epipolar import limb_lengths
 from worldpose.tracking.person import Person
 from worldpose.tracking.settings import TrackingSettings
-
-PLACE_NOISE = 0.1
-"""Standard deviation of a position from few frames [m]."""
-VELOCITY_NOISE = 0.5
-"""Standard deviation of a velocity from few frames [m/s]."""
-TOP_SPEED = 9.5
-"""Highest speed of a person [m/s]."""
-GROSS_SHARE = 0.1
-"""Share of a track's limb lengths that are gross errors [1]."""
-GROSS_LIMB = 0.3
-"""Standard deviation of these gross errors [m]."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +111,7 @@ def join_costs(
 
     Between two sightings a person's velocity is a random walk: the expected start of the second
     track follows from the mean of both velocities, or from the first's if the second's is unknown,
-    and its uncertainty grows with the gap. A stranger may appear anywhere on the area, at any speed
-    and of any size.
+    and its uncertainty grows with the gap.
 
     Args:
         before: n tracks that end.
@@ -148,7 +135,9 @@ def join_costs(
 def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSettings) -> float:
     """Return minus the log odds that two ends `gap` [s] apart are one person."""
     offset = new.place - old.place
-    if np.linalg.norm(offset) > TOP_SPEED * gap + 3.0 * PLACE_NOISE:
+    place_noise = 0.1  # Standard deviation of a position from few frames [m].
+    # Highest speed of a person [m/s].
+    if np.linalg.norm(offset) > 9.5 * gap + 3.0 * place_noise:
         return math.inf
     first = np.nan_to_num(old.velocity)
     both = bool(np.isfinite(new.velocity).all())
@@ -158,18 +147,19 @@ def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSe
     mean = 0.5 * (first + new.velocity) if both else first
     offset = offset - mean * memory * (1.0 - math.exp(-gap / memory))
     prior, likelihood = [], []
+    velocity_noise = 0.5  # Standard deviation of a velocity from few frames [m/s].
     for share, pace in settings.paces:
         agility, speed = pace * settings.velocity_change_std_m_s, pace * settings.rms_speed_m_s
-        variance = PLACE_NOISE**2 + agility**2 * short**3 / (12.0 if both else 3.0)
+        variance = place_noise**2 + agility**2 * short**3 / (12.0 if both else 3.0)
         variance += 2.0 * speed**2 * memory * (gap - short)
-        prior.append(math.log(share) + _log_normal_density(first, speed**2 + VELOCITY_NOISE**2))
+        prior.append(math.log(share) + _log_normal_density(first, speed**2 + velocity_noise**2))
         likelihood.append(prior[-1] + _log_normal_density(offset, variance))
         if both:
-            spread = VELOCITY_NOISE**2 + agility**2 * short
+            spread = velocity_noise**2 + agility**2 * short
             likelihood[-1] += _log_normal_density(change, spread)
     cost = float(np.logaddexp.reduce(prior) - np.logaddexp.reduce(likelihood)) - math.log(area)
     if both:
-        cost += _log_normal_density(change, VELOCITY_NOISE**2 + 2.0 * settings.rms_speed_m_s**2)
+        cost += _log_normal_density(change, velocity_noise**2 + 2.0 * settings.rms_speed_m_s**2)
     difference = new.limbs - old.limbs
     known = np.isfinite(difference)
     own = settings.limb_noise_m**2 + old.limb_variance[known] + new.limb_variance[known]
@@ -186,9 +176,11 @@ def _log_limb_density(difference: Floats, variance: Floats) -> Floats:
 
     If two views place an elbow at another person's arm, a limb becomes a metre longer.
     """
-    wide = variance + GROSS_LIMB**2
-    usual = math.log1p(-GROSS_SHARE) - 0.5 * (difference**2 / variance + np.log(variance))
-    gross = math.log(GROSS_SHARE) - 0.5 * (difference**2 / wide + np.log(wide))
+    # Standard deviation of these gross errors [m].
+    wide = variance + 0.3**2
+    gross_share = 0.1  # Share of a track's limb lengths that are gross errors [1].
+    usual = math.log1p(-gross_share) - 0.5 * (difference**2 / variance + np.log(variance))
+    gross = math.log(gross_share) - 0.5 * (difference**2 / wide + np.log(wide))
     return np.asarray(np.logaddexp(usual, gross))
 
 
@@ -243,13 +235,6 @@ def _cheapest_assignment(gain: Floats) -> tuple[list[tuple[int, int]], float]:
     return pairs, float(gain[row, column].sum())
 
 
-UNDECIDED_SHARE: Final = 0.2
-"""Undecided joins per person [1] up to which a run does not warn: in most clips a person leaves the
-view and comes back, and an undecided join leaves two tracks, which mixes up no identities."""
-MAX_NAMED: Final = 3
-"""Most doubts that the warning names one by one."""
-
-
 @dataclass(frozen=True)
 class Takeover:
     """A frame in which a track may have passed from one person to another.
@@ -296,13 +281,7 @@ def find_takeovers(
 def lasting_takeovers(
     takeovers: Iterable[Takeover], lasting: Sequence[Person], chains: Sequence[Sequence[Person]]
 ) -> tuple[Takeover, ...]:
-    """Return takeovers after which a real person was never located again, by final numbers.
-
-    Args:
-        takeovers: takeovers, by numbers of tracks.
-        lasting: tracks with enough evidence.
-        chains: each final person's tracks.
-    """
+    """Return takeovers after which a real person was never located again, by final numbers."""
     tracks = {person.number: person for person in lasting}
     final = {person.number: n for n, chain in enumerate(chains) for person in chain}
     found: dict[tuple[int, int], Takeover] = {}
@@ -331,23 +310,25 @@ def describe_doubts(
         joins: joins of the clip, decided or not.
     """
     parts = []
+    max_named = 3  # Most doubts that the warning names one by one.
     if takeovers:
         named = [
             f"person {each.person}"
             + (f" and person {each.other}" if each.other >= 0 else "")
             + f" in frame {frames[each.frame]}"
-            for each in takeovers[:MAX_NAMED]
+            for each in takeovers[:max_named]
         ]
         parts.append(
             f"{_count_noun(len(takeovers), 'track')} may have passed from one person to another "
             f"where one of them is hidden from a camera ({_list_named(named, len(takeovers))})"
         )
     undecided = [join for join in joins if not join.decided]
-    if len(undecided) > UNDECIDED_SHARE * people:
+    # Undecided joins per person [1] up to which a run does not warn.
+    if len(undecided) > 0.2 * people:
         named = [
             f"person {join.before} until frame {frames[join.last_frame]} and person {join.after} "
             f"from frame {frames[join.first_frame]}"
-            for join in undecided[:MAX_NAMED]
+            for join in undecided[:max_named]
         ]
         parts.append(
             f"{_count_noun(len(undecided), 'pair')} of tracks may each be one person "

@@ -4,10 +4,6 @@ Two rays nearly meet wherever two cameras look at people of one height, so a sma
 rays is not enough. The odds of a pair weigh its rays' distance, the size and proportions of the
 triangulated skeleton, cameras that should see a person there and have no detection, and all other
 pairs that could contain one of the two detections.
-
-What cameras should see comes from their statistics. If a camera misses a person, a fixed gate wide
-enough for badly calibrated cameras would admit a neighbour's detection: the distances of matched
-detections give each camera's gate.
 """
 
 from __future__ import annotations
@@ -27,21 +23,10 @@ from worldpose.tracking.person import Sighting, separations
 from worldpose.tracking.ray_matching import intersect_people
 from worldpose.tracking.settings import TrackingSettings
 
-MIN_COVERED_JOINTS: Final = 4
-"""Keypoints on a body's image from which on a camera has a detection there [1]."""
-BODY_WIDTH: Final = 0.2
-"""A ray that passes a joint within this distance is on the body [m]."""
-MIN_INSIDE: Final = 0.8
-"""Share of a body's joints in the image from which a camera should see it [1]."""
-FARTHER: Final = 1.25
-"""Range of a camera over the largest distance of people it has shown [1]."""
 MAX_HISTORY: Final = 300
 """Most matched detections of a camera that its median distance uses."""
 MIN_HISTORY: Final = 10
 """Least number of matches for a median."""
-RAY_NOISE: Final = (0.03, 0.05, 0.13)
-"""Standard deviation of the distance between two rays of one joint: least, while unknown, and
-greatest [m]. MVOR's median is 0.05 m, Shelf's 0.02 m."""
 
 
 class CameraVisibility:
@@ -73,12 +58,12 @@ class CameraVisibility:
         with np.errstate(invalid="ignore"):
             inside = ((image >= 0.0) & (image <= size)).all(axis=-1).sum(axis=-1)
         known = np.isfinite(joints[..., 0]).sum(axis=1)
-        return np.asarray((inside >= MIN_INSIDE * known) & (known > 0) & self._in_reach(joints))
+        return np.asarray((inside >= 0.8 * known) & (known > 0) & self._in_reach(joints))
 
     def _in_reach(self, joints: Floats) -> Flags:
         """Return whether bodies (n, 17, 3) are within each camera's range (cameras, n)."""
         away = np.linalg.norm(np.nanmean(joints, axis=1) - self.centers[:, None], axis=-1)
-        return np.asarray(away <= FARTHER * self.reach[:, None])
+        return np.asarray(away <= 1.25 * self.reach[:, None])
 
     def learn(
         self,
@@ -167,10 +152,12 @@ def find_uncovered_bodies(
                         y = joints[body, joint, 1] - centers[c, 1]
                         z = joints[body, joint, 2] - centers[c, 2]
                         along = x * u + y * v + z * w
-                        if along > 0.0 and x * x + y * y + z * z - along**2 <= BODY_WIDTH**2:
+                        # A ray that passes a joint within this distance is on the body [m].
+                        if along > 0.0 and x * x + y * y + z * z - along**2 <= 0.2**2:
                             on += 1
                             break
-                if on >= MIN_COVERED_JOINTS:
+                # Keypoints on a body's image from which on a camera has a detection there [1].
+                if on >= 4:
                     uncovered[c, body] = False
                     break
     return uncovered
@@ -212,7 +199,7 @@ class CameraGates:
 
     def pair_noise(self, first: Integers, second: Integers) -> Floats:
         """Return the standard deviation of the distance of two cameras' rays (n,) [m]."""
-        low, unknown, high = RAY_NOISE
+        low, unknown, high = 0.03, 0.05, 0.13  # MVOR's median is 0.05 m, Shelf's 0.02 m
         usual = 1.4 * np.hypot(self.usual[first], self.usual[second])
         usual = np.where(np.isfinite(usual), usual, self.usual_pair)
         # The median of Rayleigh's distribution is 1.18 times its scale.
@@ -233,16 +220,6 @@ def _append(distance: Floats, known: Floats, count: Integers) -> None:
             if np.isfinite(distance[camera, person]):
                 known[camera, count[camera] % known.shape[1]] = distance[camera, person]
                 count[camera] += 1
-
-
-SIZE_SPREAD: Final = 0.15
-"""Standard deviation of the logarithm of a person's size from one frame [1]."""
-LIMB_SCATTER: Final = 0.2
-"""Standard deviation of the logarithms of limb lengths of one person in one frame [1]."""
-SAME_PLACE: Final = 0.3
-"""Two skeletons with a smaller mean joint distance are one body [m]."""
-NO_PARTNER: Final = -6.3
-"""Score of a detection without partner [nat]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,8 +264,7 @@ def judge_pairs(
 
     Args:
         directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
-        weights: (cameras, detections, 17), of the squared angle; 0 where not seen, or where other
-            views explain the detection.
+        weights: (cameras, detections, 17), of the squared angle.
         visibility: visibility statistics of the cameras.
         gates: distances between rays of one person; updated here.
         ground: whether people stand on z = 0.
@@ -339,7 +315,8 @@ def judge_pairs(
         np.stack([detection[first], detection[second]], axis=-1),
         joints,
         distance,
-        likelihood / (math.exp(NO_PARTNER) + rivals),
+        # Score of a detection without partner [nat].
+        likelihood / (math.exp(-6.3) + rivals),
         likelihood >= rivals,
     )
 
@@ -390,7 +367,8 @@ def _body_scores(joints: Floats) -> Floats:
     size = np.log(size_ratios(joints))
     middle = np.nanmedian(size, axis=1)
     scatter = np.nanmean(np.square(size - middle[:, None]), axis=1)
-    return np.asarray(-0.5 * (middle / SIZE_SPREAD) ** 2 - 0.5 * scatter / LIMB_SCATTER**2)
+    # Standard deviations of the logarithms of a person's size and limb lengths in one frame.
+    return np.asarray(-0.5 * (middle / 0.15) ** 2 - 0.5 * scatter / 0.2**2)
 
 
 def _rival_likelihoods(
@@ -407,5 +385,6 @@ def _rival_likelihoods(
     shared = (first[:, None] == first) | (second[:, None] == second)
     shared |= (first[:, None] == second) | (second[:, None] == first)
     np.fill_diagonal(shared, False)
-    rival = shared & (separations(joints, joints) > SAME_PLACE)
+    # Two skeletons with a smaller mean joint distance are one body [m].
+    rival = shared & (separations(joints, joints) > 0.3)
     return np.asarray(np.where(rival, np.exp(score)[None], 0.0).sum(axis=1))

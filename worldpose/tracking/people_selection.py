@@ -32,8 +32,6 @@ from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.joins import Candidate, choose_joins, join_costs
 from worldpose.tracking.person import Person
 
-MAX_VIEW_SHARE: Final = 0.4
-"""A shadow is seen by at most this share of the cameras that see the other person [1]."""
 MIN_SHADOW_SHARE: Final = 0.7
 """In at least this share of its frames, a shadow has another person so near [1]."""
 
@@ -82,14 +80,7 @@ def join_people(
 def _select_whole(
     chains: Chains, sure: list[Person], pairs: list[tuple[int, int]], distance: float
 ) -> list[Person]:
-    """Return the accepted tracks, and the others of the chains that pass as a whole.
-
-    Args:
-        chains: chains of all tracks.
-        sure: accepted tracks, which always stay.
-        pairs: numbers of accepted tracks that are joined in the absence of others.
-        distance: distance of shadows [m].
-    """
+    """Return the accepted tracks, and the others of the chains that pass as a whole."""
     place = {track.number: n for n, chain in enumerate(chains) for track in chain}
     ends = [(place.get(before), place.get(after)) for before, after in pairs]
     torn = {n for pair in ends for n in pair if pair[0] != pair[1]}
@@ -217,7 +208,8 @@ def _near_better_seen(track: LocatedFrames, others: list[LocatedFrames], distanc
     views = track.views
     for other in others:
         mine, theirs, apart = _common_distances(track, other)
-        fewer = views[mine] <= MAX_VIEW_SHARE * other.views[theirs]
+        # A shadow is seen by at most this share of the cameras that see the other person [1].
+        fewer = views[mine] <= 0.4 * other.views[theirs]
         beside[mine] |= fewer & (apart < distance)
     return beside
 

@@ -10,12 +10,6 @@ from scipy.optimize import linear_sum_assignment
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.compiled import compile_kernel
 
-ITERATIONS = 5
-MAX_LAST_STEP = 1e-3
-"""Length of a step that ends the iteration [m]: a tenth of the rays' accuracy."""
-MIN_DETERMINANT = 1e-9
-"""Determinant of a system with a diagonal of about 1 that counts as singular [1]."""
-
 Point = tuple[float, float, float]
 
 
@@ -218,12 +212,13 @@ def intersect_people(
             if math.isnan(x):
                 x, y, z = _nearest_point(origin, ray, weight, count, (x, y, z), math.inf)
                 scale *= 4.0
-            for _ in range(ITERATIONS):
+            for _ in range(5):
                 u, v, w = x, y, z
                 x, y, z = _nearest_point(origin, ray, weight, count, (x, y, z), scale)
                 settled = scale <= 0.5 * gate
                 scale = max(0.5 * gate, 0.5 * scale)
-                if settled and (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= MAX_LAST_STEP**2:
+                # Length of a step that ends the iteration [m]: a tenth of the rays' accuracy.
+                if settled and (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= 1e-3**2:
                     break
             if _have_wide_angle(origin, ray, count, (x, y, z), gate, min_sine):
                 joints[person, joint, 0] = x
@@ -261,7 +256,8 @@ def _nearest_point(
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * p + b * q + c * r
-    if not determinant > MIN_DETERMINANT * total**3:
+    # Determinant of a system with a diagonal of about 1 that counts as singular [1].
+    if not determinant > 1e-9 * total**3:
         return (math.nan, math.nan, math.nan)
     return (
         (p * g0 + q * g1 + r * g2) / determinant,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,22 +18,16 @@ from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
-from worldpose.tracking.feet import PIXEL_SHARE, PIXEL_STD
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.joins import Candidate, Takeover, lasting_takeovers
 from worldpose.tracking.people_selection import join_people
 from worldpose.tracking.person import Person
+from worldpose.tracking.plane.feet import PIXEL_SHARE, PIXEL_STD
 from worldpose.tracking.settings import TrackingSettings
 
 JOINTS = len(COCO17)
-BLOCK = 64
-"""Frames read and converted to rays at a time: bounds memory, not the result."""
 ADULT_HEIGHT, MIDDLE_HEIGHT = 1.75, 1.0
 """Height of an adult, and of the middle of a body, over the pitch [m]."""
-FARTHEST: Final = 150.0
-"""Distance of a person in a pixel whose ray does not meet that height before [m]."""
-CELLS: Final = (32, 18)
-"""Columns and rows of the parts of an image with one weight."""
 
 
 class TrackingReport(Record):
@@ -107,10 +100,7 @@ def track_people(
     """Return the person to which every camera's detections belong, in all frames.
 
     In every frame, known people take detections by ray distance, confirmed people before new ones
-    (T1); remaining detections are associated across views and start people (T2). A track ends when
-    its person is unseen for longer than a moment; afterwards the tracks of the whole clip are
-    joined by motion and size if the odds are clear. In causal mode that happens when a person
-    appears.
+    (T1); remaining detections are associated across views and start people (T2).
 
     Args:
         cameras: batch (cameras,).
@@ -147,17 +137,19 @@ def track_people(
     if camera_covariance is not None and pitch_size is not None:
         precision = precision * pixel_weights(cameras, camera_covariance)
 
+    block = 64  # Frames read and converted to rays at a time: bounds memory, not the result.
+
     def read(start: int) -> tuple[int, Floats, Floats]:
         """Return the first frame of a block, and its rays and their weights."""
-        image = np.array(keypoints[start : start + BLOCK], dtype=np.float64, order="C")
-        weights = np.array(confidence[start : start + BLOCK], dtype=np.float64, order="C")
+        image = np.array(keypoints[start : start + block], dtype=np.float64, order="C")
+        weights = np.array(confidence[start : start + block], dtype=np.float64, order="C")
         directions = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
         directions = np.array(directions.reshape(*image.shape[:-1], 3))
         _weigh(weights, directions, image, cameras.image_size, precision)
         return start, directions, weights
 
     # The next blocks are read while the frames of one are tracked.
-    for start, directions, weights in map_in_threads(read, range(0, frames, BLOCK)):
+    for start, directions, weights in map_in_threads(read, range(0, frames, block)):
         is_empty = ~np.asarray((weights > 0.0).any(axis=(1, 2, 3)))
         for offset in range(len(weights)):
             if not (is_empty[offset] and tracker.is_idle):
@@ -209,23 +201,24 @@ def pixel_weights(cameras: Camera, covariance: Floats) -> Floats:
     """Return the weight (cameras, rows, columns) of people's keypoints in parts of the images [1].
 
     It is the inverse of a keypoint's variance: its own (`feet.PIXEL_STD`, `feet.PIXEL_SHARE`) and
-    the calibration's. A camera whose clicks lie in one half of its image can be wrong by tens of
-    pixels in the other, and people there are often near: with the same weight per pixel as in other
-    cameras, it alone places them.
+    the calibration's.
 
     Args:
         cameras: batch (cameras,).
         covariance: (cameras, 12, 12), by `static_calibration.parameters.PARAMETERS`.
     """
-    columns, rows = CELLS
+    cells = (32, 18)  # Columns and rows of the parts of an image with one weight.
+    columns, rows = cells
     grid = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1)
     weights = np.empty((len(covariance), rows, columns))
+    # Distance of a person in a pixel whose ray does not meet that height before [m].
+    farthest = 150.0
     for c in range(len(covariance)):
         camera = cameras[c]
-        rays = camera.unproject((grid / CELLS * camera.image_size).reshape(-1, 2))
+        rays = camera.unproject((grid / cells * camera.image_size).reshape(-1, 2))
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (MIDDLE_HEIGHT - rays.origins[:, 2]) / rays.directions[:, 2]
-        along = np.where((along > 0.0) & (along < FARTHEST), along, FARTHEST)
+        along = np.where((along > 0.0) & (along < farthest), along, farthest)
         _, by_step = project_with_jacobian(camera, rays.origins + along[:, None] * rays.directions)
         # The mean over both axes of the image.
         moved = 0.5 * np.einsum("nij,jk,nik->n", by_step, covariance[c], by_step)

@@ -13,8 +13,9 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -36,20 +37,17 @@ from worldpose.training.keypoint_training import (
     labelled_people,
 )
 from worldpose.training.labels import LabelledPicture, PictureCache
-from worldpose.training.metrics import detect_labelled, score_keypoints, score_people
+from worldpose.training.metrics import average_precision, detect_labelled, score_keypoints
 from worldpose.training.people_training import PeopleWindows, people_batch, people_loss
 from worldpose.training.settings import FineTuningSettings, TrainingSettings
 
 Net = TypeVar("Net", bound=nn.Module)
+AnyNet = PeopleNet | KeypointNet
 Batch = TypeVar("Batch")
 Tensors = dict[str, Tensor]
 Pictures = Sequence[LabelledPicture]
 Progress = Callable[[str], None]
 
-WARM_UP: Final = 0.04
-"""Share of the steps in which the learning rate rises to its full value [1]."""
-LAST_RATE: Final = 0.02
-"""Share of the full rate at the end [1]."""
 MIN_HEIGHT: Final = 34.0
 """Shortest person for training and scoring of the keypoint net [px]: limbs are 2 px wide."""
 
@@ -148,9 +146,11 @@ def train(
 def _step(training: Training[Net, Batch], optimizer: torch.optim.Optimizer, step: int) -> float:
     settings = training.settings
     planned = settings.planned or settings.steps
-    rising = min((step + 1) / max(WARM_UP * planned, 1.0), 1.0)
+    # Share of the steps in which the learning rate rises to its full value [1].
+    rising = min((step + 1) / max(0.04 * planned, 1.0), 1.0)
     done = min(step / planned, 1.0)
-    falling = LAST_RATE + (1.0 - LAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * done))
+    last_rate = 0.02  # Share of the full rate at the end [1].
+    falling = last_rate + (1.0 - last_rate) * 0.5 * (1.0 + math.cos(math.pi * done))
     for group in optimizer.param_groups:
         group["lr"] = settings.rate * rising * falling
     batch = training.batch(np.random.default_rng([settings.seed, step]))
@@ -269,63 +269,46 @@ def _read(
         raise refusal(f"{type(error).__name__}: {error}") from error
 
 
-def people_score(net: PeopleNet, pictures: Pictures, cache: PictureCache) -> float:
-    """Return AP50 [1] of a detector."""
-    found = detect_labelled(BundledDetector(copy.deepcopy(net)), pictures, cache)
-    return score_people(found, pictures)[0]
+def score_net(net: AnyNet, pictures: Pictures, cache: PictureCache) -> float:
+    """Return AP50 [1] of a detector, or a pose net's share of visible keypoints within 0.2 torsos.
+
+    Keypoints are those of people in their true boxes.
+    """
+    copied = copy.deepcopy(net)
+    if isinstance(copied, PeopleNet):
+        found = detect_labelled(BundledDetector(copied), pictures, cache)
+        return average_precision(found, pictures)
+    estimator = BundledPoseEstimator(copied)
+    return score_keypoints(estimator, pictures, cache, (MIN_HEIGHT, math.inf)).pck
 
 
-def keypoint_score(net: KeypointNet, pictures: Pictures, cache: PictureCache) -> float:
-    """Return the share of visible keypoints [1] that a pose estimator puts within 0.2 torsos."""
-    estimator = BundledPoseEstimator(copy.deepcopy(net))
-    return score_keypoints(estimator, pictures, cache, (MIN_HEIGHT, float("inf"))).pck
-
-
-def train_people_net(
-    net: PeopleNet,
+def train_net(
+    net: AnyNet,
     learned: Pictures,
     checked: Pictures,
     cache: PictureCache,
     settings: TrainingSettings,
+    cut: PeopleWindows | KeypointCrops | None = None,
     *,
-    windows: PeopleWindows | None = None,
     checkpoint: Path | None = None,
     progress: Progress = lambda line: None,
 ) -> tuple[Check, ...]:
-    """Train a detector in place; arguments and result are those of `loop.train`."""
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    cut = windows or PeopleWindows()
-    training = Training(
-        net,
-        lambda rng: people_batch(learned, cache, cut, rng),
-        people_loss,
-        lambda net: people_score(net, checked, cache),
-        settings,
-    )
-    return train(training, checkpoint, progress)
+    """Train a detector or a pose net in place on the windows or crops that `cut` describes.
 
-
-def train_keypoint_net(
-    net: KeypointNet,
-    learned: Pictures,
-    checked: Pictures,
-    cache: PictureCache,
-    settings: TrainingSettings,
-    *,
-    crops: KeypointCrops | None = None,
-    checkpoint: Path | None = None,
-    progress: Progress = lambda line: None,
-) -> tuple[Check, ...]:
-    """Train a pose estimator in place; arguments and result are those of `loop.train`."""
+    Arguments and result are otherwise those of `train`.
+    """
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    cut, people = crops or KeypointCrops(), labelled_people(learned, MIN_HEIGHT)
-    training = Training(
-        net,
-        lambda rng: keypoint_batch(people, cache, cut, rng),
-        keypoint_loss,
-        lambda net: keypoint_score(net, checked, cache),
-        settings,
-    )
+    batch: Callable[[np.random.Generator], Any]
+    loss: Callable[[Any, Any], Tensor]
+    if isinstance(net, PeopleNet):
+        windows = cut if isinstance(cut, PeopleWindows) else PeopleWindows()
+        batch, loss = lambda rng: people_batch(learned, cache, windows, rng), people_loss
+    else:
+        crops = cut if isinstance(cut, KeypointCrops) else KeypointCrops()
+        people = labelled_people(learned, MIN_HEIGHT)
+        batch, loss = lambda rng: keypoint_batch(people, cache, crops, rng), keypoint_loss
+    score = partial(score_net, pictures=checked, cache=cache)
+    training = Training[Any, Any](net, batch, loss, score, settings)
     return train(training, checkpoint, progress)
 
 
@@ -336,8 +319,6 @@ MILD = AugmentationSettings(
 )
 """Augmentation for fine-tuning, mild: the labelled frames already show the footage that a version
 is for, so air, light and kits of other footage are not needed."""
-BLOCKS = 20
-"""Blocks of consecutive frames that stay together: neighbours in a video are almost the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,36 +369,16 @@ def fine_tune(
     cache, training = PictureCache(), settings.training
     checkpoint = weights.with_suffix(".checkpoint")
     torch.manual_seed(training.seed)
-    if kind == "people":
-        people = load_weights(start or BUNDLED_WEIGHTS[0], PeopleNet())
-        before = people_score(people, held_out, cache)
-        checks = train_people_net(
-            people,
-            learned,
-            checked,
-            cache,
-            training,
-            windows=PeopleWindows(looks=MILD),
-            checkpoint=checkpoint,
-            progress=progress,
-        )
-        after = people_score(people, held_out, cache)
-        save_weights(weights, people)
-    else:
-        keypoints = load_weights(start or BUNDLED_WEIGHTS[1], KeypointNet())
-        before = keypoint_score(keypoints, held_out, cache)
-        checks = train_keypoint_net(
-            keypoints,
-            learned,
-            checked,
-            cache,
-            training,
-            crops=KeypointCrops(looks=MILD),
-            checkpoint=checkpoint,
-            progress=progress,
-        )
-        after = keypoint_score(keypoints, held_out, cache)
-        save_weights(weights, keypoints)
+    net: AnyNet = PeopleNet() if kind == "people" else KeypointNet()
+    shipped = BUNDLED_WEIGHTS[0 if kind == "people" else 1]
+    cut = PeopleWindows(looks=MILD) if kind == "people" else KeypointCrops(looks=MILD)
+    load_weights(start or shipped, net)
+    before = score_net(net, held_out, cache)
+    checks = train_net(
+        net, learned, checked, cache, training, cut, checkpoint=checkpoint, progress=progress
+    )
+    after = score_net(net, held_out, cache)
+    save_weights(weights, net)
     checkpoint.unlink(missing_ok=True)
     better = after >= before + settings.gain and after > before
     return FineTuned(learned, held_out, before, after, checks[-1].step, better)
@@ -431,7 +392,8 @@ def split(
     Raises:
         InputError: a subset without people.
     """
-    count = min(BLOCKS, len(pictures))
+    # Blocks of consecutive frames that stay together: neighbours in a video are almost the same.
+    count = min(20, len(pictures))
     blocks = np.array_split(np.arange(len(pictures)), max(count, 1))
     order = np.random.default_rng([settings.training.seed, 0x5B1]).permutation(len(blocks))
     held = max(round(settings.held_out * count), 1)

@@ -33,7 +33,7 @@ from worldpose.detection.bundled_pose import (
     surroundings,
 )
 from worldpose.geometry.boxes import box_iou
-from worldpose.training.augmentation import AugmentationSettings, augment
+from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.labels import LabelledPicture, PictureCache
 from worldpose.training.metrics import MAX_ERROR_SHARE
 from worldpose.training.people_training import box_overlap
@@ -42,10 +42,6 @@ SPREAD: Final = 2.0
 """Standard deviation of the target around a joint [px of the crop]."""
 HIDDEN_WEIGHT: Final = 0.4
 """Weight of an occluded joint [1]: only the rest of the body tells its position."""
-BOX_WEIGHT: Final = 2.0
-"""Weight of the box loss, relative to that of the joints [1]."""
-MAX_NEIGHBOURS: Final = 24
-"""Most people per crop that its box is compared with, the nearest."""
 CROP_CENTER: Final = 0.5 * (np.array(CROP) - 1.0)
 """The centre of a crop [px of the crop]."""
 
@@ -149,8 +145,9 @@ def keypoint_batch(
     visible = np.empty((count, len(flip)), dtype=np.int8)
     tolerance = np.empty(count, dtype=np.float32)
     boxes = np.full((count, 4), np.nan, dtype=np.float32)
-    all_boxes = np.full((count, MAX_NEIGHBOURS, 4), np.nan, dtype=np.float32)
-    ignored = np.zeros((count, MAX_NEIGHBOURS), dtype=np.bool_)
+    max_neighbours = 24  # Most people per crop that its box is compared with, the nearest.
+    all_boxes = np.full((count, max_neighbours, 4), np.nan, dtype=np.float32)
+    ignored = np.zeros((count, max_neighbours), dtype=np.bool_)
     for index in range(count):
         labelled, person = people[int(rng.integers(len(people)))]
         box = labelled.boxes[person]
@@ -187,13 +184,13 @@ def keypoint_batch(
             near = np.argsort(
                 np.abs(there.reshape(-1, 2, 2).mean(axis=1) - CROP_CENTER).sum(axis=1)
             )
-            near = near[:MAX_NEIGHBOURS]
+            near = near[:max_neighbours]
             all_boxes[index, : len(near)] = there[near]
             ignored[index, : len(near)] = labelled.ignored[near]
             boxes[index] = np.nan if elsewhere else there[person]
         if index and rng.random() < settings.hidden:
             _cover(seen, crops[index - 1], pixels, sight, rng)
-        crops[index] = augment(seen, settings.looks, rng)
+        crops[index] = settings.looks.augment(seen, rng)
         keypoints[index], visible[index] = pixels, sight
         tolerance[index] = MAX_ERROR_SHARE * tall / crop[2]
     return KeypointBatch(crops, around, keypoints, visible, tolerance, boxes, all_boxes, ignored)
@@ -326,4 +323,5 @@ def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
         counted = there.any(dim=1) & ~ignored.gather(1, best)[:, 0]
         share = overlap.gather(1, best)[:, 0].clamp(0.0, 1.0)
     expected = functional.binary_cross_entropy_with_logits(fit, share, reduction="none")
-    return BOX_WEIGHT * off + (counted * expected).sum() / counted.sum().clamp(min=1)
+    # Weight of the box loss, relative to that of the joints [1].
+    return 2.0 * off + (counted * expected).sum() / counted.sum().clamp(min=1)

@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -17,15 +17,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17
-from worldpose.detection.interfaces import People
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.errors import InputError, UsageError
 from worldpose.video.folder import open_video
-
-VISIBLE_CONFIDENCE: Final = 0.5
-"""Keypoints from this confidence on are proposed as visible, others as occluded [1]."""
 
 
 class _Given(BaseModel):
@@ -113,69 +109,6 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
         if not picture.path.resolve().is_relative_to(folder.resolve()):
             raise refusal("images within the folder of the data set", str(picture.path))
     return read
-
-
-def read_yolo_labels(picture: Path, person: int = 0) -> LabelledPicture:
-    """Return the people of an image with labels in a YOLO text file of the same name.
-
-    A line is `class x_center y_center width height`, or `class x y x y ...` for a polygon, all
-    relative to the image's sides. Objects of other classes are left out.
-
-    Args:
-        picture: the image.
-        person: class of people.
-
-    Raises:
-        InputError: the image or its labels cannot be read.
-    """
-    height, width = read_picture(picture).shape[:2]
-    file, boxes = picture.with_suffix(".txt"), []
-    try:
-        lines = [line.split() for line in file.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise _no_yolo_labels(file, f"{type(error).__name__}: {error}") from error
-    for number, (kind, *values) in enumerate((line for line in lines if line), start=1):
-        try:
-            numbers, is_person = np.array(values, dtype=np.float64), int(kind) == person
-        except ValueError as error:
-            raise _no_yolo_labels(file, f"line {number}: {error}") from error
-        if len(numbers) != 4 and (len(numbers) < 6 or len(numbers) % 2):
-            raise _no_yolo_labels(file, f"line {number}: {len(numbers)} numbers after the class")
-        if is_person and len(numbers) == 4:
-            boxes.append([*(numbers[:2] - 0.5 * numbers[2:]), *(numbers[:2] + 0.5 * numbers[2:])])
-        elif is_person:
-            corners = numbers.reshape(-1, 2)
-            boxes.append([*corners.min(axis=0), *corners.max(axis=0)])
-    # Labels count from the corner of the first pixel, boxes from its centre.
-    scaled = np.array(boxes).reshape(-1, 4) * [width, height, width, height] - 0.5
-    return label_boxes(picture, scaled, np.zeros(len(boxes), dtype=np.bool_))
-
-
-def _no_yolo_labels(file: Path, found: str) -> InputError:
-    return InputError(
-        str(file),
-        expected="YOLO labels: a class, then 4 numbers of a box or 6 and more of a polygon",
-        found=found,
-        todo="Export the labels again in YOLO's text form, one file next to each image.",
-    )
-
-
-def label_boxes(picture: Path, boxes: Floats, ignored: Flags) -> LabelledPicture:
-    """Return labels without keypoints.
-
-    Args:
-        picture: the image.
-        boxes: (people, 4) x0, y0, x1, y1 [px].
-        ignored: (people,) see `LabelledPicture`.
-    """
-    people = len(boxes)
-    return LabelledPicture(
-        path=picture,
-        boxes=boxes,
-        keypoints=np.full((people, 17, 2), np.nan),
-        visible=np.zeros((people, 17), dtype=np.int8),
-        ignored=ignored,
-    )
 
 
 def write_labels(
@@ -284,12 +217,6 @@ def propose_labels(
     keypoints and for `read_labels`. The write is atomic: a failure leaves nothing that prevents a
     retry.
 
-    Args:
-        videos: video files or folders of images, all of one image size.
-        every: step between frames.
-        folder: absent or empty.
-        settings: detectors and thresholds; several detectors' boxes of one person become one.
-
     Raises:
         UsageError: the folder is not empty.
         InputError: two videos have the same name or different sizes, or one is damaged.
@@ -345,12 +272,13 @@ def _write_detections(
     for name, picture in frames:
         people = fuse([each.detect([picture])[0] for each in detectors], settings.nms_iou)
         sure = people.scores >= settings.high_score_threshold
-        kept = People(people.boxes[sure], people.scores[sure])
+        kept = people.select(sure)
         poses = combine_boxes(kept, pose.estimate(picture, kept.boxes))
         found = poses.confidence >= settings.min_keypoint_confidence
         path = folder / "pictures" / f"{name}.png"
         cv2.imwrite(str(path), picture[..., ::-1])
-        visible = np.where(poses.confidence >= VISIBLE_CONFIDENCE, 2, 1) * found
+        # Keypoints from this confidence on are proposed as visible, others as occluded [1].
+        visible = np.where(poses.confidence >= 0.5, 2, 1) * found
         proposed.append(
             LabelledPicture(
                 path=path,

@@ -16,14 +16,10 @@ from worldpose.detection.suppression import suppress_poses
 from worldpose.geometry.boxes import box_iou
 from worldpose.training.labels import LabelledPicture, PictureCache
 
-HEIGHTS = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
-"""Classes of people's heights [px]: of about 40, of about 60, and taller."""
 MIN_TRUE_IOU: Final = 0.5
 """Least intersection over union of a true positive [1]."""
 MAX_ERROR_SHARE: Final = 0.05
 """A keypoint is correct within this share of the box's longer side [1], a fifth of a torso."""
-TORSO_SHARE: Final = 0.2
-"""Share of the torso within which a keypoint is correct [1]."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +57,6 @@ def detect_labelled(
     ]
 
 
-def score_people(found: Sequence[People], pictures: Sequence[LabelledPicture]) -> tuple[float, ...]:
-    """Return AP50 of all detections, and in each class of heights [px]."""
-    classes = [(0.0, np.inf), *HEIGHTS]
-    return tuple(average_precision(found, pictures, each) for each in classes)
-
-
 def stored_people(
     people: People,
     picture: Image,
@@ -79,7 +69,7 @@ def stored_people(
     """
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
-    people = People(people.boxes[kept], people.scores[kept])
+    people = people.select(kept)
     found = find_poses(estimator, picture, people, chosen)
     distinct = suppress_poses(found, chosen.min_keypoint_confidence, chosen.oks_nms)
     return People.from_detections(distinct)
@@ -133,8 +123,7 @@ def average_precision(
 
     As in COCO, the best boxes choose first, and each chooses the person that it overlaps most.
     Ignored people, people of other heights, and boxes on them count neither as true nor as false
-    positives. The same applies to boxes of other heights that match no person. Precision is made to
-    fall with recall, and integrated at every step of recall instead of at COCO's 101 points.
+    positives. The same applies to boxes of other heights that match no person.
 
     Args:
         found: detections in each image.
@@ -179,53 +168,31 @@ def _match_boxes(boxes: Floats, true: Floats, wanted: Flags) -> Integers:
     return verdict
 
 
-def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags, Flags]:
-    """Return scores and verdicts of boxes that count, best first, and which people were found.
+def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags]:
+    """Return scores (boxes,) of the boxes that count, best first, and which are right.
 
-    A box is right if it overlaps a person by `MIN_TRUE_IOU` whom no better box has. Boxes on
-    ignored people do not count.
-
-    Args:
-        people: detections in an image.
-        picture: the truth of the image.
+    A box is right if it overlaps a person whom no better box has. Boxes on ignored people do not
+    count.
     """
     order = np.argsort(-people.scores, kind="stable")
-    overlap = box_iou(people.boxes[order], picture.boxes)
-    free = ~picture.ignored
-    scores, right = [], []
-    for row, score in zip(overlap, people.scores[order], strict=True):
-        best = int(np.where(free, row, -1.0).argmax()) if len(row) else 0
-        hit = bool(len(row)) and bool(free[best]) and row[best] >= MIN_TRUE_IOU
-        if hit:
-            free[best] = False
-        elif np.any(row[picture.ignored] >= MIN_TRUE_IOU):
-            continue
-        scores.append(score)
-        right.append(hit)
-    return np.array(scores), np.array(right, dtype=np.bool_), ~picture.ignored & ~free
-
-
-def torso_sizes(keypoints: Floats) -> Floats:
-    """Return the longer diagonal from a shoulder to the other side's hip (people,) [px].
-
-    Args:
-        keypoints: (people, 17, 2) COCO-17 [px].
-    """
-    diagonals = keypoints[:, (5, 6)] - keypoints[:, (12, 11)]
-    return np.asarray(np.linalg.norm(diagonals, axis=-1).max(axis=-1))
+    verdict = _match_boxes(people.boxes[order], picture.boxes, ~picture.ignored)
+    counted = verdict >= 0
+    return people.scores[order][counted], verdict[counted] == 1
 
 
 def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
-    """Return 1 for keypoints within `TORSO_SHARE`, else 0 (people, 17); NaN without truth.
+    """Return 1 for keypoints within a fifth of the torso, else 0 (people, 17); NaN without truth.
+
+    A torso is as long as the longer diagonal from a shoulder to the other side's hip.
 
     Args:
         found: (people, 17, 2) [px]; a missing one is not correct.
         true: (people, 17, 2) [px]; NaN where unknown.
     """
     error = np.linalg.norm(found - true, axis=-1)
-    torso = torso_sizes(true)
+    torso = np.linalg.norm(true[:, (5, 6)] - true[:, (12, 11)], axis=-1).max(axis=-1)
     known = np.isfinite(true).all(axis=-1) & np.isfinite(torso)[:, None]
-    return np.where(known, error <= TORSO_SHARE * torso[:, None], np.nan)
+    return np.where(known, error <= 0.2 * torso[:, None], np.nan)
 
 
 def calibration_error(confidence: Floats, right: Flags, classes: int = 10) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import torch
@@ -15,17 +14,8 @@ from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
 from worldpose.detection.bundled_nets import STRIDE, PeopleNet, cell_centres, normalize
 from worldpose.detection.bundled_pose import cut_crop, frame_from_crop
-from worldpose.training.augmentation import AugmentationSettings, augment, draw_clutter
+from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.labels import LabelledPicture, PictureCache
-
-SPREAD: Final = 0.12
-"""Standard deviation of the target around a centre, as a share of the box's sides [1]."""
-MIN_TARGET: Final = 0.5
-"""Cells with a target from this value on learn the box's sides [1]."""
-BOX_WEIGHT: Final = 4.0
-"""Weight of the box loss, relative to that of the centres [1]: centres are learned sooner."""
-MIN_SEEN: Final = 0.3
-"""Share of a box within a window from which on the person is a target [1]."""
 
 
 class PeopleWindows(Record):
@@ -65,14 +55,7 @@ def people_batch(
     settings: PeopleWindows,
     rng: np.random.Generator,
 ) -> PeopleBatch:
-    """Return a batch; the same generator gives the same one.
-
-    Args:
-        pictures: drawn with equal probability.
-        cache: reads them.
-        settings: number, size and augmentation of the windows.
-        rng: draws images, positions, scales and augmentations.
-    """
+    """Return a batch; the same generator gives the same one."""
     side, cells = settings.side, settings.side // STRIDE
     seen = np.empty((settings.windows, side, side, 3), dtype=np.uint8)
     target = np.zeros((settings.windows, cells, cells), dtype=np.float32)
@@ -85,10 +68,8 @@ def people_batch(
         mapping = frame_from_crop(crop, (side, side), 0.0, bool(rng.random() < 0.5))
         inside, ignored = boxes_in_window(labelled, picture.shape, mapping, side)
         cut = cut_crop(picture, mapping, (side, side))
-        cluttered = settings.looks.cluttered
-        if cluttered > 0.0 and rng.random() < cluttered:
-            cut = draw_clutter(cut, np.concatenate([inside, ignored]), rng)
-        seen[index] = augment(cut, settings.looks, rng)
+        cut = settings.looks.add_things(cut, np.concatenate([inside, ignored]), rng)
+        seen[index] = settings.looks.augment(cut, rng)
         draw_targets(inside, ignored, target[index], weight[index], boxes[index])
     return PeopleBatch(seen, target, weight, boxes)
 
@@ -131,7 +112,8 @@ def boxes_in_window(
     area = np.prod(whole[:, 2:] - whole[:, :2], axis=1)
     share = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1) / np.maximum(area, 1e-9)
     there = share > 0.0
-    wanted = (share >= MIN_SEEN) & ~labelled.ignored
+    # Share of a box within a window from which on the person is a target [1].
+    wanted = (share >= 0.3) & ~labelled.ignored
     return clipped[there & wanted], clipped[there & ~wanted]
 
 
@@ -149,7 +131,8 @@ def draw_targets(
         weight[np.ix_(rows, columns)] = 0.0
     for box in boxes:
         x, y = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
-        spread = np.maximum(SPREAD * (box[2:] - box[:2]), 0.5 * STRIDE)
+        # Standard deviation of the target around a centre, as a share of the box's sides [1].
+        spread = np.maximum(0.12 * (box[2:] - box[:2]), 0.5 * STRIDE)
         across = np.exp(-0.5 * ((middles - x) / spread[0]) ** 2)
         down = np.exp(-0.5 * ((middles - y) / spread[1]) ** 2)
         bump = np.asarray(down[:, None] * across[None, :], dtype=np.float32)
@@ -178,12 +161,14 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
     middle = target == 1.0
     people = middle.sum().clamp(min=1)
     focal = -(weight * torch.where(middle, found, empty)).sum() / people
-    near = torch.where(target >= MIN_TARGET, target, 0.0)
+    # Cells with a target from this value on learn the box's sides [1].
+    near = torch.where(target >= 0.5, target, 0.0)
     x = cell_centres(sides.shape[3], sides.device)[None, None, :]
     y = cell_centres(sides.shape[2], sides.device)[None, :, None]
     said = torch.stack([x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3]], dim=-1)
     _, overlap = box_overlap(said, boxes.movedim(1, -1))
-    return focal + BOX_WEIGHT * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
+    # Weight of the box loss, relative to that of the centres [1]: centres are learned sooner.
+    return focal + 4.0 * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
 
 
 def box_overlap(said: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:

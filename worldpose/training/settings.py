@@ -17,7 +17,8 @@ class TrainingSettings(Record):
     planned: int | None = Field(default=None, ge=1, le=1_000_000)
     """Batches over which the rate rises and falls; `steps` if None. A training may end earlier."""
     rate: float = Field(default=1e-3, ge=1e-12, le=0.1)
-    """Highest learning rate of AdamW [1]; it falls as a cosine."""
+    """Highest learning rate of AdamW [1]; it falls as a cosine. The nets' initial training had half
+    as much again."""
     decay: float = Field(default=0.02, ge=0, le=10)
     """Weight decay of AdamW [1]."""
     memory: float = Field(default=0.998, ge=0, lt=1)
@@ -25,7 +26,8 @@ class TrainingSettings(Record):
     clip: float = Field(default=5.0, ge=1e-6, le=1000)
     """Largest norm of the gradient [1]."""
     check_every: int = Field(default=250, ge=1, le=100_000)
-    """Steps between checks on held-out frames, each with a checkpoint."""
+    """Steps between checks on held-out frames, each with a checkpoint: a check takes as long as
+    dozens of steps."""
     patience: int = Field(default=6, ge=1, le=1000)
     """Checks without improvement after which training stops."""
     keep: Literal["best", "last"] = "best"
@@ -34,18 +36,6 @@ class TrainingSettings(Record):
     seed: int = Field(default=0, ge=0, le=2_147_483_647)
     bfloat16: bool = False
     """Compute in bfloat16 where that is safe: twice as fast on processors that support it."""
-
-
-class Refinement(TrainingSettings):
-    """Settings of the further training of a trained net."""
-
-    steps: int = Field(default=1500, ge=1, le=1_000_000)
-    """Number of batches."""
-    rate: float = Field(default=1e-3, ge=1e-12, le=0.1)
-    """Highest learning rate of AdamW [1]: two thirds of the rate of the nets' initial training."""
-    check_every: int = Field(default=250, ge=1, le=100_000)
-    """Steps between checks on held-out frames, each with a checkpoint: a check takes as long as
-    dozens of steps."""
 
 
 class FineTuningSettings(Record):
@@ -58,5 +48,5 @@ class FineTuningSettings(Record):
     gain: float = Field(default=0.005, ge=0, le=1)
     """Least gain of the metric on the held-out frames for a version to be adopted [1]: less can be
     chance."""
-    training: Refinement = Refinement()
+    training: TrainingSettings = TrainingSettings()
     """Steps, rate and seed."""

@@ -3,9 +3,6 @@
 A tile is one flat array per camera: `ROWS` rows of `LANES` numbers. Each observation is linearised
 at its own pixel: with X = (x, y, z, 1) and depth p X, its error is (a X, b X) / (p X) [px]. The
 state of a tile is one flat array of `STATE` rows.
-
-Loops run over `LANES` with constant bounds and offsets within one flat array, without branches:
-compilers then need no proof that rows do not overlap and use vector instructions.
 """
 
 from __future__ import annotations
@@ -55,9 +52,6 @@ WORST: Final = 16 * LANES
 CHANGED: Final = 17 * LANES
 """Number of views whose inlier state changed, written by `select`."""
 STATE: Final = 18
-
-SINGULAR: Final = 1e-14
-"""Determinant over product of the diagonal below which rounding dominates the result [1]."""
 
 
 @compile_kernel
@@ -141,7 +135,8 @@ def invert(state: Floats) -> None:
         e, f = state[MATRIX + 4 * LANES + j], state[MATRIX + 5 * LANES + j]
         p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
         determinant = a * p + b * q + c * r
-        over = 1.0 / determinant if determinant > SINGULAR * a * d * f else np.nan
+        # Determinant over product of the diagonal below which rounding dominates the result [1].
+        over = 1.0 / determinant if determinant > 1e-14 * a * d * f else np.nan
         state[MATRIX + j] = p * over
         state[MATRIX + LANES + j] = q * over
         state[MATRIX + 2 * LANES + j] = r * over

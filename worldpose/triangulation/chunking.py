@@ -195,13 +195,7 @@ def reconstruct_chunks(
 def _join_halves(
     parts: list[slice], halves: list[slice], found: Iterator[Triangulation]
 ) -> Iterator[Triangulation]:
-    """Yield the triangulation of each chunk from those of its parts of frames.
-
-    Args:
-        parts: frames of each chunk.
-        halves: frames of each part of chunks, in order.
-        found: its triangulation.
-    """
+    """Yield the triangulation of each chunk from those of its parts of frames."""
     for part in parts:
         own = [next(found) for half in halves if part.start <= half.start < max(part.stop, 1)]
         yield own[0] if len(own) == 1 else concatenate_frames(own)

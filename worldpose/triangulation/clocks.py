@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Floats, Integers
+from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.compiled import map_in_threads
@@ -29,18 +29,10 @@ GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
 apart."""
 SETTLED: Final = 0.005
 """Change that ends the passes [frame]."""
-SAMPLE: Final = 3000
-"""Person-frames in the sample."""
-WINDOW: Final = 1.0
-"""Length of an interval [s]; errors within an interval count as one."""
-VELOCITY_TIME: Final = 0.06
-"""Half the time over which velocity is computed [s]."""
 ALIKE: Final = 0.025
 """Share of a detector's error along the motion that all people in a camera have in common [1]: the
 detector shifts bodies seen from one side, and no number of people averages that out. Simulated
 matches and penalty boxes showed 0.027 and 0.021."""
-UNKNOWN: Final = 10.0
-"""Standard deviation of an undetermined offset [frame]."""
 
 
 class ClockReport(Record):
@@ -97,8 +89,10 @@ def estimate_clocks(
     """
     rig = Rig.from_cameras(cameras)
     count = len(rig.cameras)
-    late, error = np.zeros(count), np.full(count, UNKNOWN)
-    parts = choose_intervals(detections.detection_index.shape, max(3, round(WINDOW * fps)))
+    unknown = 10.0  # Standard deviation of an undetermined offset [frame].
+    late, error = np.zeros(count), np.full(count, unknown)
+    # Length of an interval [s]; errors within an interval count as one.
+    parts = choose_intervals(detections.detection_index.shape, max(3, round(1.0 * fps)))
     # By person, which takes a fraction of the memory of all detections.
     seen = [shift_in_time(detections[part], late) for part in parts]
     for gate in GATES if parts else ():
@@ -109,16 +103,18 @@ def estimate_clocks(
             late: Floats = late,
             loose: TriangulationSettings = loose,
         ) -> _Sums:
-            return _sum_equations(rig, part, late, fps, loose)
+            common = shift_in_time(part, late)
+            moving = MovingJoints.find(rig, common, fps, loose)
+            return _sum_equations(moving, common.detection_index.shape[2], count)
 
         sums = list(map_in_threads(sum_up, seen))
         information = np.concatenate([each.information for each in sums])
         score = np.concatenate([each.score for each in sums])
         # A common offset moves people along their path and changes no residual.
-        inverse = np.linalg.inv(information.sum(axis=0) + np.eye(count) / UNKNOWN**2)
+        inverse = np.linalg.inv(information.sum(axis=0) + np.eye(count) / unknown**2)
         step = inverse @ score.sum(axis=0)
         # Cameras without information are not part of the mean.
-        telling = np.diagonal(information.sum(axis=0)) > 1.0 / UNKNOWN**2
+        telling = np.diagonal(information.sum(axis=0)) > 1.0 / unknown**2
         centered = inverse - telling @ inverse / max(1, telling.sum())
         # Intervals of a person are independent, frames are not: the error is the scatter of
         # interval scores. Each interval has influenced the solution, hence the division
@@ -129,7 +125,7 @@ def estimate_clocks(
         stated = np.einsum("cd,de,ce->c", centered, information.sum(axis=0), centered)
         alike = ALIKE * _common_score(sums)
         error = np.sqrt(np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2)
-        error = np.minimum(error, UNKNOWN)
+        error = np.minimum(error, unknown)
         known = error < settings.max_clock_error_frames
         late = np.where(known, late + step, 0.0)
         if known.any():
@@ -144,7 +140,8 @@ def choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:
     """Return intervals of frames spread over the clip, with enough person-frames in total."""
     frames, _, persons = shape
     starts = np.arange(0, max(1, frames - length + 1), length)
-    wanted = max(1, SAMPLE // max(1, length * persons))
+    # Person-frames in the sample.
+    wanted = max(1, 3000 // max(1, length * persons))
     chosen = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), wanted)).astype(int))
     return [slice(int(starts[n]), int(starts[n]) + length) for n in chosen if persons]
 
@@ -178,51 +175,86 @@ def _common_score(sums: list[_Sums]) -> Floats:
     return np.asarray(along * usual)
 
 
-def _sum_equations(
-    rig: Rig,
-    detections: KeypointDetections,
-    late: Floats,
-    fps: float,
-    settings: TriangulationSettings,
-) -> _Sums:
+@dataclass(frozen=True, eq=False)
+class MovingJoints:
+    """Triangulated joints of an interval of frames, and what each camera sees of them.
+
+    Attributes:
+        at: (n, 3) [m], world.
+        velocity: (n, 3) [m/frame].
+        person: (n,).
+    """
+
+    at: Floats
+    velocity: Floats
+    person: Integers
+    _known: NDArray[np.bool_]
+    _pixels: AnyFloats
+    _precision: Floats
+    _rig: Rig
+    _settings: TriangulationSettings
+
+    @classmethod
+    def find(
+        cls, rig: Rig, people: KeypointDetections, fps: float, settings: TriangulationSettings
+    ) -> MovingJoints:
+        """Return the joints with a velocity, of detections by person on the common clock."""
+        pixels, index = people.keypoints, people.detection_index
+        precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
+        observations = Observations.from_rig(rig, pixels, precision, index)
+        joints = solve_joints(observations, settings).joints
+        # Half the time over which velocity is computed is 0.06 s.
+        half = max(1, round(0.06 * fps))
+        velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
+        here = slice(half, len(joints) - half)
+        at = joints[here]
+        known = np.asarray(np.isfinite(at + velocity).all(axis=-1))
+        seen = pixels[here], precision[here]
+        return cls(at[known], velocity[known], np.nonzero(known)[1], known, *seen, rig, settings)
+
+    def look(self, camera: int) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return what a camera sees, all 0 where it does not see the joint.
+
+        Derivatives (n, 2, 18) of pixels by points and cameras, misses (n, 2) [px], their weights
+        (n,) [1/px^2] and scales (n,) [px/m].
+        """
+        n, row = len(self.at), self._rig.cameras[camera]
+        image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, 18))
+        given, status = np.ascontiguousarray(self.at[None]), np.empty((1, n), np.uint8)
+        projection.project_with_jacobians(row[None], given, image, jacobian, status)
+        miss = self._pixels[:, camera][self._known] - image[0]
+        depth = self.at @ self._rig.depths[camera, :3] + self._rig.depths[camera, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = row[0] / depth
+            variance = self._settings.pixel_noise_px**2 + (size * self._settings.joint_noise_m) ** 2
+            weight = self._precision[:, camera][self._known] / variance
+            squared = weight * (miss**2).sum(axis=-1)
+            weight = weight / (1.0 + squared / self._settings.max_deviation**2) ** 2
+        usable = np.isfinite(weight * squared)
+        return (
+            np.where(usable[:, None, None], jacobian[0], 0.0),
+            np.where(usable[:, None], miss, 0.0),
+            np.where(usable, weight, 0.0),
+            np.where(usable, size, 0.0),
+        )
+
+
+def _sum_equations(moving: MovingJoints, persons: int, count: int) -> _Sums:
     """Return the normal equations from the residuals of an interval of frames."""
-    common = shift_in_time(detections, late)
-    pixels, index = common.keypoints, common.detection_index
-    precision = NoiseModel.nominal(pixels.shape[-2]).precision(common.confidence)
-    joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
-    half = max(1, round(VELOCITY_TIME * fps))
-    velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
-    here = slice(half, len(joints) - half)
-    at = joints[here]
-    known = np.isfinite(at + velocity).all(axis=-1)
-    at, velocity = at[known], velocity[known]
-    person = np.nonzero(known)[1]
-    persons, count = index.shape[2], len(rig.cameras)
+    n, person = len(moving.at), moving.person
     # Point block: matrix (n, 3, 3) and right side; mixed block; clock block.
-    matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
-    mixed = np.zeros((count, len(at), 3))
+    matrix, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    mixed = np.zeros((count, n, 3))
     information, score = np.zeros((persons, count, count)), np.zeros((persons, count))
     aside, misses, scale = np.zeros(count), np.zeros(count), np.zeros(count)
     for camera in range(count):
-        image, jacobian = _project_with_jacobian(rig.cameras[camera], at)
-        miss = pixels[here, camera][known] - image
-        depth = at @ rig.depths[camera, :3] + rig.depths[camera, 3]
-        with np.errstate(divide="ignore"):
-            size = rig.cameras[camera, 0] / depth
-        variance = settings.pixel_noise_px**2 + (size * settings.joint_noise_m) ** 2
-        weight = precision[here, camera][known] / variance
-        squared = weight * (miss**2).sum(axis=-1)
-        weight = weight / (1.0 + squared / settings.max_deviation**2) ** 2
-        usable = np.isfinite(weight * squared)
-        weight = np.where(usable, weight, 0.0)
-        miss = np.where(usable[:, None], miss, 0.0)
-        jacobian = np.where(usable[:, None, None], jacobian, 0.0)
-        way = (jacobian @ velocity[..., None])[..., 0]
+        derivatives, miss, weight, size = moving.look(camera)
+        jacobian = np.ascontiguousarray(derivatives[..., :3])
+        way = (jacobian @ moving.velocity[..., None])[..., 0]
         weighed = (weight[:, None, None] * jacobian).swapaxes(-1, -2)
         matrix += weighed @ jacobian
         right += (weighed @ miss[..., None])[..., 0]
         mixed[camera] = (weighed @ way[..., None])[..., 0]
-        size = np.where(usable, size, 0.0)
         aside[camera] = (weight * np.sqrt((way**2).sum(axis=-1)) * size).sum()
         misses[camera] = (weight * (miss**2).sum(axis=-1)).sum()
         scale[camera] = (weight * size**2).sum()
@@ -237,15 +269,6 @@ def _sum_equations(
         information[one] -= follows @ own.reshape(count, -1).T
         score[one] -= follows @ right[its].ravel()
     return _Sums(information, score, aside, misses, scale)
-
-
-def _project_with_jacobian(camera: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Return pixels (n, 2) of points and their derivatives (n, 2, 3)."""
-    image, jacobian = np.empty((1, len(points), 2)), np.empty((1, len(points), 2, 18))
-    status = np.empty((1, len(points)), np.uint8)
-    given = np.ascontiguousarray(points[None])
-    projection.project_with_jacobians(camera[None], given, image, jacobian, status)
-    return image[0], jacobian[0, ..., :3]
 
 
 def read_frames(

@@ -207,8 +207,6 @@ SLACK: Final = 0.03
 point from behind than from the side."""
 STRANGE: Final = 4.0
 """Squared deviation of a length from which other pairs are tried [variances]."""
-RARE: Final = 6.6
-"""The same, from which an end with only two views is dropped: one correct end in a hundred."""
 
 
 def limb_lengths(found: Solution) -> Floats:
@@ -216,9 +214,6 @@ def limb_lengths(found: Solution) -> Floats:
 
     A length is the median over the frames with three inlier views of both ends, or over all frames
     if those are too few. The length is unknown if it varies too much.
-
-    Args:
-        found: joints of frames sampled over the clip.
     """
     persons, joints = found.joints.shape[1:3]
     lengths = np.full((persons, len(COCO17_LIMBS)), np.nan)
@@ -293,14 +288,7 @@ class _Points:
 def _select_end(
     observations: Observations, found: Solution, end: tuple[int, int, int], doubtful: bool
 ) -> Observations:
-    """Return one limb end's observations: one frame, one detection per camera, one joint.
-
-    Args:
-        observations: observations of all tracked people.
-        found: joints.
-        end: frame, person, joint.
-        doubtful: whether the end may move; otherwise it has no observations.
-    """
+    """Return one limb end's observations: one frame, one detection per camera, one joint."""
     frame, person, joint = end
     which = np.maximum(observations.detection_index[frame, :, person], 0)
     place = (frame, np.arange(len(which)), which, joint)
@@ -336,14 +324,7 @@ def _list_choices(
     found: Solution,
     end: tuple[int, int, int],
 ) -> _Choices:
-    """Return the positions of an end from pairs of views and their inliers.
-
-    Args:
-        observations: observations of the end (`_select_end`); an end without observations stays.
-        settings: noise, inlier limit and minimum views.
-        found: joints.
-        end: frame, person, joint.
-    """
+    """Return the positions of an end from pairs of views and their inliers."""
     weights = observations.precision[0, :, 0, 0]
     pairs = np.array(list(combinations(np.flatnonzero(weights > 0.0), 2)))
     if not len(pairs):
@@ -381,16 +362,7 @@ def _choose(
     found: Solution,
     chain: tuple[int, int, int, int],
 ) -> None:
-    """Set the two ends of an arm or a leg to their best candidates, in place.
-
-    Args:
-        root: its first joint.
-        choices: candidates for its middle and its end.
-        long: (2,) lengths of its limbs [m].
-        limit: largest squared deviation of a correct length [variances].
-        found: joints; changed.
-        chain: frame, person, middle and end.
-    """
+    """Set the two ends of an arm or a leg to their best candidates, in place."""
     middle, end = choices
     first, sure = _deviation(root, middle.points, long[0])
     each_middle = _Points(middle.points.position[:, None], middle.points.covariance[:, None])
@@ -410,7 +382,8 @@ def _choose(
         if choice.tried is None:
             continue
         alone = choice.tried.views[best, 0, 0] < SURE
-        if off > (RARE if alone else limit):
+        # The same, from which an end with only two views is dropped: one correct end in a hundred.
+        if off > (6.6 if alone else limit):
             found.joints[here], found.covariance[here] = np.nan, np.nan
             found.views[here], found.inliers[views] = 0, False
             found.spread[here] = found.reprojection_error[here] = np.nan
@@ -425,17 +398,7 @@ def _choose(
 
 
 def _deviation(upper: _Points, lower: _Points, long: Floats | float) -> tuple[Floats, Floats]:
-    """Return deviations of limbs from their lengths, and their variances.
-
-    Args:
-        upper: one end.
-        lower: the other end.
-        long: length [m].
-
-    Returns:
-        Squares (...) [variances] and logarithms of variances over the least one (...); both 0 where
-        unknown.
-    """
+    """Return deviations of limbs from their lengths, and their variances."""
     limb = lower.position - upper.position
     now = np.linalg.norm(limb, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -32,15 +32,6 @@ from worldpose.triangulation.batched_gauss_newton import (
 from worldpose.triangulation.observations import Observations, Rig, gather, linearize
 from worldpose.triangulation.solving import consensus
 
-BINS: Final = 8
-"""Confidence classes with equally many observations."""
-ROUNDS: Final = 4
-"""Iterations; weights, inliers and variances settle after three."""
-PRIOR: Final = 60.0
-"""Degrees of freedom of the stated noise as a prior: few observations change little."""
-LEAST: Final = 0.01
-"""Smallest factor on a variance: perfect agreement of views does not imply certainty."""
-
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
@@ -103,11 +94,12 @@ def learn_noise(
     usable = (certain > 0.0) & np.isfinite(certain)
     if not usable.any():
         return model
-    edges = np.quantile(certain[usable], np.linspace(0.0, 1.0, BINS + 1))
+    bins = 8  # Confidence classes with equally many observations.
+    edges = np.quantile(certain[usable], np.linspace(0.0, 1.0, bins + 1))
     logarithm = np.log(np.where(usable, certain, 1.0))
-    bin_of = np.clip(np.searchsorted(edges, certain, side="right") - 1, 0, BINS - 1)
-    sums = np.bincount(bin_of[usable], logarithm[usable], BINS)
-    members = np.bincount(bin_of[usable], minlength=BINS).astype(np.float64)
+    bin_of = np.clip(np.searchsorted(edges, certain, side="right") - 1, 0, bins - 1)
+    sums = np.bincount(bin_of[usable], logarithm[usable], bins)
+    members = np.bincount(bin_of[usable], minlength=bins).astype(np.float64)
     filled = members > 0
     knots = np.divide(sums[filled], members[filled])
     bin_of = (np.cumsum(filled) - 1)[bin_of]
@@ -116,7 +108,8 @@ def learn_noise(
     joint_of = np.broadcast_to(np.arange(joints)[:, None], certain.shape)
     shape = certain.shape
     squares, known, freedom = np.empty(shape), np.empty(shape), np.empty(shape)
-    for _ in range(ROUNDS):
+    # Weights, inliers and variances settle after three iterations.
+    for _ in range(4):
         precision = model.precision(confidence)
         _residuals(
             Observations.from_rig(rig, detections.keypoints, precision, index, shift),
@@ -132,7 +125,8 @@ def learn_noise(
         excess = np.maximum(squares[used] - known[used] * freedom[used], 0.0)
         expected = excess / factor[by_bin] / joint[by_joint]
         ratio = _variance_ratio(by_bin, len(factor), expected, freedom[used])
-        factor = np.maximum(factor * ratio, LEAST)
+        # Perfect agreement of views does not imply certainty.
+        factor = np.maximum(factor * ratio, 0.01)
         expected = excess / factor[by_bin] / joint[by_joint]
         joint = joint * _variance_ratio(by_joint, joints, expected, freedom[used])
         # The factor must not rise with confidence: take the running minimum.
@@ -145,9 +139,11 @@ def _variance_ratio(
     group: NDArray[np.int64], groups: int, squares: Floats, freedom: Floats
 ) -> Floats:
     """Return variance over assumed variance, (groups,), shrunk towards the overall ratio."""
-    overall = (squares.sum() + PRIOR) / (freedom.sum() + PRIOR)
-    total = np.bincount(group, squares, groups) + PRIOR * overall
-    ratio: Floats = total / (np.bincount(group, freedom, groups) + PRIOR)
+    # Degrees of freedom of the stated noise as a prior: few observations change little.
+    prior = 60.0
+    overall = (squares.sum() + prior) / (freedom.sum() + prior)
+    total = np.bincount(group, squares, groups) + prior * overall
+    ratio: Floats = total / (np.bincount(group, freedom, groups) + prior)
     return ratio
 
 
@@ -285,11 +281,6 @@ STATURE: Final = (1.72, 0.12)
 """Stature of people, mean and standard deviation per clip [m]: men, women or children."""
 PERSONAL: Final = 0.035
 """Standard deviation of a person's proportion relative to the mean [1] (Drillis, Contini 1966)."""
-PRIOR_DEGREES_OF_FREEDOM: Final = 8.0
-"""Degrees of freedom of the inverse chi-square prior of the bias variance [1]. Proportions that fit
-by chance barely lower the estimate, proportions that do not fit raise it."""
-MIN_FRAMES: Final = 5
-"""Frames needed to estimate the length of a person's bone."""
 
 
 def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float:
@@ -308,7 +299,8 @@ def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float
     measured = [_length(joints, covariance, each) for each in PROPORTIONS]
     known = [index for index, (length, _, _) in enumerate(measured) if length > 0.0]
     factors = np.geomspace(0.2, 5.0, 121)
-    posterior = -PRIOR_DEGREES_OF_FREEDOM * (np.log(factors) + 0.5 / factors**2)
+    # The prior of the bias variance is inverse chi-square with eight degrees of freedom.
+    posterior = -8.0 * (np.log(factors) + 0.5 / factors**2)
     if known:
         length, variance, people = np.array([measured[index] for index in known]).T
         some = [PROPORTIONS[index] for index in known]
@@ -342,7 +334,7 @@ def _length(joints: Floats, covariance: Floats, what: Proportion) -> tuple[float
     lengths, noises = [], []
     for person in range(square.shape[1]):
         there = np.isfinite(square[:, person])
-        middle = float(np.median(square[there, person])) if there.sum() >= MIN_FRAMES else 0.0
+        middle = float(np.median(square[there, person])) if there.sum() >= 5 else 0.0
         if middle > 0.0:
             lengths.append(np.sqrt(middle))
             # Detector errors persist over many frames, so all frames count as one observation.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,6 @@ from worldpose.triangulation.batched_gauss_newton import (
     A,
     B,
 )
-
-NEWTON_STEPS: Final = 2
-"""Newton steps that invert most lens models to rounding; the others are inverted one by one."""
-MISFIT: Final = 1e-13
-"""Largest accepted misfit of an inverse on the plane z = 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +220,8 @@ def linearize(tile: Floats, c: Floats) -> None:
         square = xd * xd + yd * yd
         over = 1.0 / (1.0 + square * (c[4] + square * c[5]))
         x, y = xd * over, yd * over
-        for _ in range(NEWTON_STEPS):
+        # Newton steps that invert most lens models to rounding; the others are inverted one by one.
+        for _ in range(2):
             fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
             over = 1.0 / (dxx * dyy - dxy * dxy)
             fx, fy = fx - xd, fy - yd
@@ -233,7 +229,8 @@ def linearize(tile: Floats, c: Floats) -> None:
             y -= (dxx * fy - dxy * fx) * over
         fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
         misfit = max(abs(fx - xd), abs(fy - yd))
-        inside = misfit <= MISFIT and x * x + y * y < c[21] * c[21]
+        # Largest accepted misfit of an inverse on the plane z = 1.
+        inside = misfit <= 1e-13 and x * x + y * y < c[21] * c[21]
         # Mark the joints that need the scalar inverse.
         tile[SQUARED + j] = 0.0 if inside else 1.0
         tile[A + LANES + j], tile[B + LANES + j] = x, y

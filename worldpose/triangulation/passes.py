@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +37,6 @@ from worldpose.triangulation.person_offsets import (
 from worldpose.triangulation.reports import Agreement, Histogram, TriangulationReport
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution, solve_joints
-
-SAMPLE: Final = 6000
-"""Joints in the sample for detector and calibration errors: a confidence class then has thousands
-of observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,24 +157,22 @@ class Triangulation:
         return self.agreement.report(self.noise.factor)
 
 
-BY_FRAME: Final = (
-    "joints",
-    "covariance",
-    "views",
-    "spread",
-    "reprojection_error",
-    "inliers",
-    "exchanged",
-    "offsets",
-    "calibration_covariance",
-)
-"""Attributes of `Triangulation` with a dimension of frames."""
-
-
 def concatenate_frames(parts: Sequence[Triangulation]) -> Triangulation:
     """Return the triangulation of consecutive parts of a clip, which have one model."""
+    # Attributes of `Triangulation` with a dimension of frames.
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in BY_FRAME
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in (
+            "joints",
+            "covariance",
+            "views",
+            "spread",
+            "reprojection_error",
+            "inliers",
+            "exchanged",
+            "offsets",
+            "calibration_covariance",
+        )
     }
     extra = [part.extra for part in parts if part.extra is not None]
     return replace(
@@ -262,7 +256,8 @@ def triangulate_joints(
 def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
     """Return frames all over a clip of `shape` (frames, cameras, persons) to learn from."""
     frames, _, persons = shape
-    number = min(frames, 1 + SAMPLE // max(1, persons * joints))
+    # A confidence class then has thousands of observations.
+    number = min(frames, 1 + 6000 // max(1, persons * joints))
     return np.unique(np.linspace(0, frames - 1, number).astype(np.int64))
 
 
@@ -342,8 +337,9 @@ def _run_passes(
         if known is None and camera_covariance is None:
             factor = learn_factor(observations, settings.noise, solution, stated.variance)
         variance = factor * stated.variance
-        found = estimate_offsets(observations, settings.noise, solution, variance)
-        shift, offset_covariance = found.shift, found.covariance
+        shift, offset_covariance = estimate_offsets(
+            observations, settings.noise, solution, variance
+        )
         misplaced = stated.position_std(factor)
         observations = observe_in_next_pass(shift)
         solution = solve_joints(observations, settings)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +44,6 @@ from worldpose.triangulation.solving import Solution, solve_joints
 RADIAL = [0, 1, 4]
 """k1, k2, k3 among the five coefficients."""
 HIPS = [COCO17.index("left_hip"), COCO17.index("right_hip")]
-ROUNDS: Final = 6
-"""Updates of the variance factor; the last changes it by a few percent."""
-DAMPING: Final = 4.0
-"""Weight of the factor before an update, in degrees of freedom."""
-LEAST: Final = 1e-3
-"""Smallest variance factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,20 +106,6 @@ def stated_errors(
     return StatedErrors(variance, scale)
 
 
-@dataclass(frozen=True, eq=False)
-class Offsets:
-    """Offsets of people in the images.
-
-    Attributes:
-        shift: (frames, cameras, persons, 3), the offsets [px] and a zero.
-        covariance: (frames, persons, joints, 3, 3) [m^2], their contribution to the joints'
-            covariance.
-    """
-
-    shift: Floats
-    covariance: Floats
-
-
 def learn_factor(
     observations: Observations,
     noise: tuple[float, float],
@@ -140,7 +119,9 @@ def learn_factor(
     """
     factor, known = 1.0, first.inliers.any(axis=-1) & (stated > 0.0)
     scale = np.where(known, stated, 1.0)
-    for _ in range(ROUNDS if known.any() else 0):
+    damping = 4.0  # Weight of the factor before an update, in degrees of freedom.
+    # The last update changes it by a few percent.
+    for _ in range(6 if known.any() else 0):
         offsets, variance = np.zeros((*stated.shape, 2)), np.zeros(stated.shape)
         _body_offsets(
             observations._replace(shift=no_shift()),
@@ -155,7 +136,7 @@ def learn_factor(
         squares = np.where(known, (offsets**2).sum(axis=-1) / scale, 0.0).sum()
         # Degrees of freedom that the observations determine (MacKay 1992).
         freedom = np.where(known, 2.0 * (1.0 - variance / (factor * scale)), 0.0).sum()
-        factor = max(LEAST, float((squares + DAMPING * factor) / (freedom + DAMPING)))
+        factor = max(1e-3, float((squares + damping * factor) / (freedom + damping)))
     return factor
 
 
@@ -164,8 +145,8 @@ def estimate_offsets(
     noise: tuple[float, float],
     first: Solution,
     variance: Floats,
-) -> Offsets:
-    """Return the most probable offsets, estimated together with the joints.
+) -> tuple[Floats, Floats]:
+    """Return the most probable offsets of people in the images, estimated with the joints.
 
     T4 of the paper uses the mid-hip residual in each image as the offset, which adds the detector's
     hip error to every joint. All joints together determine the offset more accurately, and cameras
@@ -176,6 +157,10 @@ def estimate_offsets(
         noise: [px], [m].
         first: the joints without offsets.
         variance: (frames, cameras, persons) calibration variance per axis [px^2].
+
+    Returns:
+        Offsets (frames, cameras, persons, 3) [px] with a zero, and their contribution to the
+        covariance of joints (frames, persons, joints, 3, 3) [m^2].
     """
     offsets, unknown = np.zeros((*variance.shape, 2)), np.zeros(variance.shape)
     further = np.zeros((*first.joints.shape, 3))
@@ -189,7 +174,7 @@ def estimate_offsets(
         unknown,
         further,
     )
-    return Offsets(np.concatenate([offsets, np.zeros((*variance.shape, 1))], axis=-1), further)
+    return np.concatenate([offsets, np.zeros((*variance.shape, 1))], axis=-1), further
 
 
 def estimate_midhip_shift(
@@ -200,11 +185,6 @@ def estimate_midhip_shift(
     With the shift subtracted, reprojection residuals are those of the paper's second stage,
     relative to the mid-hip. The shift is 0 in an image without both hips, and for a person without
     a mid-hip.
-
-    Args:
-        rig: the cameras.
-        detections: detections of all tracked people.
-        settings: settings of triangulation.
 
     Returns:
         (frames, cameras, persons, 3) [px].

@@ -15,8 +15,6 @@ from data_contracts.records import Record
 LEAST: Final = 1e-7
 WIDTH: Final = 0.005
 """Relative width of a histogram bin: the accuracy of the median."""
-CLASSES: Final = 5000
-"""Bins from `LEAST` to 7000."""
 
 
 class TriangulationReport(Record):
@@ -75,8 +73,9 @@ class Histogram:
     def of(cls, values: NDArray[np.floating]) -> Self:
         """Return the histogram of values of any shape, without NaN."""
         place = np.log(np.maximum(values, LEAST) / LEAST) / math.log1p(WIDTH)
-        place = np.clip(place, 0, CLASSES - 1).astype(np.int64)
-        return cls(np.bincount(place.ravel(), minlength=CLASSES))
+        classes = 5000  # Bins from `LEAST` to 7000.
+        place = np.clip(place, 0, classes - 1).astype(np.int64)
+        return cls(np.bincount(place.ravel(), minlength=classes))
 
     def __add__(self, other: Self) -> Self:
         return type(self)(self.counts + other.counts)
@@ -122,19 +121,9 @@ class Agreement:
     misplaced: tuple[Histogram, ...]
 
     def __add__(self, other: Self) -> Self:
-        return type(self)(
-            self.found + other.found,
-            self.undetermined + other.undetermined,
-            self.seen + other.seen,
-            self.views + other.views,
-            self.used + other.used,
-            self.agreed + other.agreed,
-            self.people + other.people,
-            self.exchanged + other.exchanged,
-            self.error + other.error,
-            self.deviation + other.deviation,
-            tuple(a + b for a, b in zip(self.misplaced, other.misplaced, strict=True)),
-        )
+        sums = {name: value + getattr(other, name) for name, value in vars(self).items()}
+        pairs = zip(self.misplaced, other.misplaced, strict=True)
+        return type(self)(**{**sums, "misplaced": tuple(a + b for a, b in pairs)})
 
     def report(self, noise_factor: float) -> TriangulationReport:
         """Return the metrics."""

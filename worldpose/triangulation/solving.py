@@ -6,7 +6,7 @@ Tiles, states and their rows are those of `batched_gauss_newton`.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +37,6 @@ from worldpose.triangulation.batched_gauss_newton import (
 )
 from worldpose.triangulation.observations import Observations, gather, linearize
 from worldpose.triangulation.settings import TriangulationSettings
-
-MAX_STEPS: Final = 8
-CONVERGED: Final = 1e-6
-"""Length of a step that ends the iteration [m]."""
-MAX_REVISIONS: Final = 5
-"""Updates of the inlier set; it settles after one or two."""
-SHRINK: Final = 0.1
-"""Factor on the scale of the loss from step to step [1]."""
 
 
 @compile_kernel
@@ -85,15 +77,17 @@ def consensus(
                 if inside < 3 or 2 * inside <= state[SEEN + j]:
                     _take_best_pair(tiles, depths, noise, limit, j, state)
         state[SHARPNESS : SHARPNESS + LANES] = 0.0
-    for _ in range(MAX_REVISIONS):
+    # Updates of the inlier set; it settles after one or two.
+    for _ in range(5):
         select(tiles, limit, state)
         if not largest(state, CHANGED) > 0.0:
             break
         step(tiles, depths, noise, state)
         step(tiles, depths, noise, state)
-    for _ in range(MAX_STEPS):
+    for _ in range(8):
         step(tiles, depths, noise, state)
-        if not largest(state, STEP) > CONVERGED**2:
+        # Length of a step that ends the iteration [m].
+        if not largest(state, STEP) > 1e-6**2:
             break
 
 
@@ -114,13 +108,14 @@ def _graduate(
             most = max(most, worst)
     if most == 0.0:
         return False
+    shrink = 0.1  # Factor on the scale of the loss from step to step [1].
     while True:
         step(tiles, depths, noise, state)
         if most <= limit:
             break
-        most *= SHRINK
+        most *= shrink
         for j in range(LANES):
-            state[SHARPNESS + j] = min(1.0 / limit, state[SHARPNESS + j] / SHRINK)
+            state[SHARPNESS + j] = min(1.0 / limit, state[SHARPNESS + j] / shrink)
     # Errors refer to the state before a step: one more step updates them.
     step(tiles, depths, noise, state)
     return True
@@ -195,12 +190,7 @@ class Solution(NamedTuple):
 
 
 def solve_joints(observations: Observations, settings: TriangulationSettings) -> Solution:
-    """Return the joints of all frames, with covariance from `precision` and the stated noise.
-
-    Args:
-        observations: observations of all tracked people.
-        settings: noise, inlier limit and minimum views.
-    """
+    """Return the joints of all frames, with covariance from `precision` and the stated noise."""
     frames, count, persons = observations.detection_index.shape
     shape = (frames, persons, observations.precision.shape[-1])
     solution = Solution(

@@ -20,64 +20,26 @@ from worldpose.camera_consistency.consistency import select_busiest_frames
 from worldpose.camera_consistency.hypotheses import STATED
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
-from worldpose.geometry import projection
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.tracking.feet import GroundPositions, locate_feet
-from worldpose.tracking.ground_tracks import track_on_plane
-from worldpose.tracking.plane_clocks import MIN_RUNNERS, estimate_plane_clocks
+from worldpose.tracking.plane.clocks import estimate_plane_clocks
+from worldpose.tracking.plane.feet import locate_feet
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.clocks import (
     ALIKE,
     GATES,
     SETTLED,
-    VELOCITY_TIME,
+    MovingJoints,
     choose_intervals,
     shift_in_time,
 )
-from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import solve_joints
 
-SAMPLES: Final = 60
-"""Frames of a camera that are compared with every shift of another."""
-LONGEST_S: Final = 30.0
-"""Longest part of a clip that is compared, the one with the most people [s]."""
-MIN_COMMON: Final = 0.3
-"""Least share of these frames that a shift leaves within the other camera's clip [1]."""
-JOINT_NOISE: Final = 0.025
-"""Standard deviation of a detector's joint on the body [m]: less than usual, so that people who
-move slowly stop to match soon."""
-BLOCK_S: Final = 0.25
-"""Frames nearer to each other count as one observation [s]."""
-DRAWS: Final = 200
-"""Repetitions with other observations (bootstrap)."""
-LIKELY: Final = 2.0
-"""A shift is excluded if it is worse than the best by this many standard errors."""
-MIN_CONTRAST: Final = 3.0
-"""Least peak of a camera's matches above the median shift, in standard errors [1]."""
 MAX_SPAN: Final = 30
 """Largest distance from the best to another likely shift [frame]: the people's motion leads from
 there to the right one."""
-MAX_ERROR: Final = 0.25
-"""Largest standard error of a determined offset [frame]: twice of it is half a frame."""
-MAX_PLACE_ERROR: Final = 0.5
-"""The same by places on the pitch, which are less accurate [frame]."""
-ROUNDS: Final = 6
-"""Most rounds of whole and remaining offsets."""
-RUNNING_M_S: Final = 1.0
-"""Least speed of people whose places tell clocks [m/s]."""
-GROUPS: Final = 6
-"""Most groups of cameras that are left out in turn; more cost more time than they tell."""
-SEED: Final = 0
-UNCLEAR: Final = "no offset stands out: its people move too little, or no other camera shows them"
-UNSURE: Final = "its people move too little, or other cameras contradict each other about it"
-WINDOW_S: Final = 0.5
-"""Length of an interval [s]; a person's errors within an interval count as one."""
-UNKNOWN_CLOCK: Final = 10.0
-"""Standard deviation of a clock offset beyond whole frames [frame]."""
 COLUMNS: Final = 5
 """Unknowns of a camera: clock, rotation, logarithm of the focal length."""
 PRIOR: Final = (*(1.0 / 0.003**2,) * 3, 1.0 / 0.005**2)
@@ -90,8 +52,7 @@ class Synchronization:
     """Clock offsets of a clip's cameras.
 
     Attributes:
-        late: (cameras,) [frame]: frame t shows the time t + late; relative to the median camera.
-            NaN where not determined.
+        late: (cameras,) [frame]: frame t shows the time t + late; NaN where not determined.
         std: (cameras,) standard deviation [frame]; infinite where not determined.
         reasons: why the offset of each camera is not determined; empty where it is.
         shifts: (n,) compared offsets [frame].
@@ -141,7 +102,8 @@ def synchronize(
             found=f"{cameras.batch_shape}, {keypoints.shape}",
             todo="Give the detections of all cameras of a clip.",
         )
-    longest = round((LONGEST_S + 2.0 * max_offset_s) * fps)
+    # Longest part of a clip that is compared, the one with the most people [s].
+    longest = round((30.0 + 2.0 * max_offset_s) * fps)
     detections = detections[select_busiest_frames(confidence, longest)]
     keypoints, confidence = detections.keypoints, detections.confidence
     points = np.where((confidence > 0.0)[..., None], keypoints, np.nan).astype(np.float64)
@@ -155,10 +117,13 @@ def synchronize(
         late[chosen], std[chosen] = _refine(
             cameras[chosen], detections, fps, chosen, whole[chosen], pitch
         )
-        known &= std <= MAX_ERROR
+        # Largest standard error of a determined offset [frame]: twice of it is half a frame.
+        known &= std <= 0.25
         known &= np.abs(late - whole) <= MAX_SPAN
     for camera in np.flatnonzero(~known & np.isfinite(span)):
-        reasons[camera] = UNSURE
+        reasons[camera] = (
+            "its people move too little, or other cameras contradict each other about it"
+        )
     std[~known] = np.inf
     if not known.any() and pitch is not None:
         late, std = _compare_places(cameras, detections, fps, pitch, max_offset_s)
@@ -176,28 +141,15 @@ def _compare_places(
     pitch: PitchTemplate,
     max_offset_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return offsets and standard deviations [frame] by the places of runners on the pitch.
-
-    Standing people have the same places at all offsets: a camera without `MIN_RUNNERS` runners
-    tells nothing.
-    """
-    positions = locate_feet(cameras, detections, pitch)
-    size = (pitch.length, pitch.width)
-    clocks = estimate_plane_clocks(positions, fps, pitch_size=size, max_offset_s=max_offset_s)
-    runs = np.zeros(int(cameras.batch_shape[0]), dtype=np.bool_)
-    for camera in range(len(runs)):
-        one = slice(camera, camera + 1)
-        alone = GroundPositions(
-            positions.xy[:, one],
-            positions.noise[:, one],
-            positions.calibration[:, one],
-            positions.height[:, one],
-        )
-        velocity = track_on_plane(alone, fps, pitch_size=size).velocity
-        seen = np.isfinite(velocity[..., 0]).any(axis=0)
-        speed = np.sqrt(np.nanmean((velocity[:, seen] ** 2).sum(axis=-1), axis=0))
-        runs[camera] = (speed > RUNNING_M_S).sum() >= MIN_RUNNERS
-    known = runs & (clocks.std * fps <= MAX_PLACE_ERROR)
+    """Return offsets and standard deviations [frame] by the places of runners on the pitch."""
+    clocks = estimate_plane_clocks(
+        locate_feet(cameras, detections, pitch),
+        fps,
+        pitch_size=(pitch.length, pitch.width),
+        max_offset_s=max_offset_s,
+    )
+    # Largest standard error; places on the pitch are less accurate than joints.
+    known = clocks.runs & (clocks.std * fps <= 0.5)
     if np.count_nonzero(known) < 2:
         known[:] = False
     return clocks.seconds * fps, np.where(known, clocks.std * fps, np.inf)
@@ -214,7 +166,7 @@ def _refine(
     """Return the offsets of the chosen cameras with their fraction, and standard errors [frame]."""
     late, error = whole.astype(np.float64), np.full(len(chosen), np.inf)
     pitch_size = None if pitch is None else (pitch.length, pitch.width)
-    for _ in range(ROUNDS):
+    for _ in range(6):
         steps = np.rint(late).astype(np.int64)
         shifted = shift_frames(detections, chosen, steps)
         tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
@@ -235,19 +187,10 @@ def _disagreement(
     camera that is not where the calibration has it, and no scatter shows them. But they are not
     the same towards all other cameras. The standard error is that of the jackknife over groups of
     cameras, of the part of each change that the smaller number of cameras does not explain.
-
-    Args:
-        cameras: batch (cameras,).
-        people: detections of tracked people, shifted by whole frames.
-        fps: frames per second [1/s].
-        late: (cameras,) offsets found with all cameras [frame].
-        error: (cameras,) their standard errors [frame].
-
-    Returns:
-        (cameras,), 0 where fewer than two groups of other cameras tell the offset.
     """
     count = len(late)
-    group = np.arange(count) % min(count, GROUPS)
+    # Most groups of cameras that are left out in turn; more cost more time than they tell.
+    group = np.arange(count) % min(count, 6)
     changes = np.full((int(group.max()) + 1, count), np.nan)
     for one in range(len(changes)):
         rest = np.flatnonzero(group != one)
@@ -281,7 +224,9 @@ def _estimate_fractions(
     settings = TriangulationSettings()
     count, frames = int(cameras.batch_shape[0]), len(people.keypoints)
     late, error = np.zeros(count), np.full(count, np.inf)
-    length = max(3, round(WINDOW_S * fps))
+    # Length of an interval [s]; a person's errors within an interval count as one.
+    length = max(3, round(0.5 * fps))
+    unknown_clock = 10.0  # Standard deviation of a clock offset beyond whole frames [frame].
     for gate in GATES:
         loose = settings.model_copy(update={"max_deviation": gate})
         common = shift_in_time(people, late)
@@ -291,14 +236,14 @@ def _estimate_fractions(
         parts = [each for found, _ in sums for each in found]
         if not parts:
             break
-        prior = np.tile([1.0 / UNKNOWN_CLOCK**2, *PRIOR], count)
+        prior = np.tile([1.0 / unknown_clock**2, *PRIOR], count)
         information = np.stack([matrix for matrix, _ in parts])
         score = np.stack([right for _, right in parts])
         inverse = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
         step = inverse @ score.sum(axis=0)
         clock = slice(None, None, COLUMNS)
         # A common offset moves people along their path and changes no residual.
-        told = np.diagonal(information.sum(axis=0))[clock] > 1.0 / UNKNOWN_CLOCK**2
+        told = np.diagonal(information.sum(axis=0))[clock] > 1.0 / unknown_clock**2
         rows = inverse[clock] - told @ inverse[clock] / max(1, told.sum())
         left = (score - information @ step) @ rows.T
         groups = len(parts)
@@ -327,54 +272,22 @@ def _sum_part(
 
     The unknowns of a camera are its clock offset [frame], its rotation [rad] and the logarithm of
     its focal length.
-
-    Returns:
-        The equations, and (3, cameras) sums of weight x image motion x image scale, of weighted
-        squared residuals, and of weight x squared image scale, as `estimate_clocks` has them.
     """
-    pixels, index = people.keypoints, people.detection_index
-    precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
-    joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
-    half = max(1, round(VELOCITY_TIME * fps))
     count = len(rig.cameras)
     shared = np.zeros((3, count))
-    if len(joints) <= 2 * half:
-        return [], shared
-    here = slice(half, len(joints) - half)
-    velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
-    at = joints[here]
-    known = np.isfinite(at + velocity).all(axis=-1)
-    person = np.nonzero(known)[1]
-    at, velocity = at[known], velocity[known]
-    n = len(at)
+    moving = MovingJoints.find(rig, people, fps, settings)
+    person, n = moving.person, len(moving.at)
     if not n:
         return [], shared
     point, columns = np.zeros((n, count, 2, 3)), np.zeros((n, count, 2, COLUMNS))
     miss, weight = np.zeros((n, count, 2)), np.zeros((n, count))
     for camera in range(count):
-        image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, 18))
-        status = np.empty((1, n), np.uint8)
-        row = rig.cameras[camera : camera + 1]
-        projection.project_with_jacobians(
-            row, np.ascontiguousarray(at[None]), image, jacobian, status
-        )
-        off = pixels[here, camera][known] - image[0]
-        depth = at @ rig.depths[camera, :3] + rig.depths[camera, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            size = rig.cameras[camera, 0] / depth
-            variance = settings.pixel_noise_px**2 + (size * settings.joint_noise_m) ** 2
-            own = precision[here, camera][known] / variance
-            squared = own * (off**2).sum(axis=-1)
-            own = own / (1.0 + squared / settings.max_deviation**2) ** 2
-        usable = np.isfinite(own * squared)
-        derivatives = np.where(usable[:, None, None], jacobian[0], 0.0)
+        derivatives, miss[:, camera], weight[:, camera], size = moving.look(camera)
         point[:, camera] = derivatives[..., :3]
-        columns[:, camera, :, 0] = (derivatives[..., :3] @ velocity[..., None])[..., 0]
+        columns[:, camera, :, 0] = (derivatives[..., :3] @ moving.velocity[..., None])[..., 0]
         columns[:, camera, :, 1:4] = derivatives[..., 3:6]
-        columns[:, camera, :, 4] = (derivatives[..., 9:11] * row[0, :2]).sum(axis=-1)
-        miss[:, camera] = np.where(usable[:, None], off, 0.0)
-        weight[:, camera] = np.where(usable, own, 0.0)
-        size = np.where(usable, size, 0.0)
+        focal = rig.cameras[camera, :2]
+        columns[:, camera, :, 4] = (derivatives[..., 9:11] * focal).sum(axis=-1)
         motion = np.linalg.norm(columns[:, camera, :, 0], axis=-1)
         shared[0, camera] = (weight[:, camera] * motion * size).sum()
         shared[1, camera] = (weight[:, camera, None] * miss[:, camera] ** 2).sum()
@@ -431,18 +344,23 @@ class _Table:
     def __init__(
         self, cameras: Camera, points: Floats, fps: float, most: int, *, ground: bool
     ) -> None:
-        settings = ConsistencySettings(sample_frames=SAMPLES)
+        # Frames of a camera that are compared with every shift of another.
+        settings = ConsistencySettings(sample_frames=60)
         noise = np.full(int(cameras.batch_shape[0]), settings.pixel_noise_px)
-        comparison = Comparison(cameras, noise, points, ground, settings, JOINT_NOISE)
+        # Standard deviation of a detector's joint on the body [m]: less than usual, so that people
+        # who move slowly stop to match soon.
+        comparison = Comparison(cameras, noise, points, ground, settings, 0.025)
         self.count, self.most = comparison.count, most
         self.shifts = np.arange(-most, most + 1)
         moments = comparison.sample
-        blocks = np.maximum(1, round(BLOCK_S * fps))
+        # Frames nearer to each other count as one observation [s].
+        blocks = np.maximum(1, round(0.25 * fps))
         self._block = np.unique(moments // blocks, return_inverse=True)[1]
         frames = np.arange(comparison.frames)
         there = moments[None] + self.shifts[:, None]
         inside = (there >= 0) & (there < comparison.frames)
-        inside[inside.mean(axis=1) < MIN_COMMON] = False
+        # Least share of these frames that a shift leaves within the other camera's clip [1].
+        inside[inside.mean(axis=1) < 0.3] = False
         at = np.broadcast_to(np.arange(len(moments)), there.shape)[inside]
         every = [comparison.view(c, STATED, frames) for c in range(self.count)]
         self.scores: dict[tuple[int, int], Floats] = {}
@@ -458,8 +376,9 @@ class _Table:
         The distance is infinite where no offset is known [frame].
         """
         blocks = int(self._block.max()) + 1
-        rng = np.random.default_rng(SEED)
-        draws = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), DRAWS)
+        rng = np.random.default_rng(0)
+        # Repetitions with other observations (bootstrap).
+        draws = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), 200)
         curves = self._means(np.ones((1, blocks)))
         drawn = self._means(draws.astype(np.float64))
         order, late, reasons = self._join(curves, drawn)
@@ -473,7 +392,8 @@ class _Table:
             drawn_once = np.isfinite(change).any(axis=0)  # other shifts are no candidates
             error = np.full(len(self.shifts), np.nan)
             error[drawn_once] = np.nanstd(change[:, drawn_once], axis=0)
-            likely = self.shifts[own[best] - own <= LIKELY * error + 1e-9]
+            # A shift is excluded if it is worse than the best by this many standard errors.
+            likely = self.shifts[own[best] - own <= 2.0 * error + 1e-9]
             span[camera] = float(np.abs(likely - self.shifts[best]).max(initial=0))
             if span[camera] > MAX_SPAN:
                 ends = f"{likely.min():+d} to {likely.max():+d}"
@@ -532,16 +452,20 @@ class _Table:
     ) -> tuple[list[int], Integers, list[str]]:
         """Return the cameras in the order of their clearness, and their offsets."""
         late = np.zeros(self.count, dtype=np.int64)
-        reasons = [UNCLEAR] * self.count
+        reasons = [
+            "no offset stands out: its people move too little, or no other camera shows them"
+        ] * self.count
         clearness = {pair: _contrast(curves[pair][0], drawn[pair]) for pair in curves}
         best = max(clearness, key=lambda pair: clearness[pair])
-        order = [best[0]] if clearness[best] >= MIN_CONTRAST else []
+        # Least peak of a camera's matches above the median shift, in standard errors [1].
+        min_contrast = 3.0
+        order = [best[0]] if clearness[best] >= min_contrast else []
         while order and len(order) < self.count:
             rest = [c for c in range(self.count) if c not in order]
             totals = {c: self._total(curves, c, late, order)[0] for c in rest}
             clear = {c: _contrast(totals[c], self._total(drawn, c, late, order)) for c in rest}
             chosen = max(clear, key=lambda c: clear[c])
-            if clear[chosen] < MIN_CONTRAST:
+            if clear[chosen] < min_contrast:
                 break
             late[chosen] = self.shifts[int(np.nanargmax(totals[chosen]))]
             order.append(chosen)

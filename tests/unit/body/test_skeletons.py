@@ -1,15 +1,10 @@
 import numpy as np
-import pytest
 
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import (
-    BODY25,
-    CHALLENGE15,
-    EVALUATED14,
     JOINT_NAMES,
     JOINT_OF_POINT,
     LANDMARKS,
-    SKELETONS,
     VERTEX_OF_POINT,
     point_segments,
 )
@@ -18,42 +13,12 @@ ENDS = ("wrist", "hand", "foot")
 """Segments without landmarks."""
 
 
-def test_the_skeletons_have_their_number_of_points():
-    counts = {name: len(points) for name, points in SKELETONS.items()}
-    assert counts == {
-        "coco17": 17,
-        "body25": 25,
-        "evaluated14": 14,
-        "challenge15": 15,
-        "smpl24": 24,
-    }
-
-
-@pytest.mark.parametrize("name", list(SKELETONS))
-def test_every_point_is_a_joint_or_a_vertex_and_appears_once(name):
-    points = SKELETONS[name]
-    assert len(set(points)) == len(points)
-    for point in points:
-        assert (point in JOINT_OF_POINT) != (point in VERTEX_OF_POINT)
-
-
 def test_joints_keep_the_order_of_smpl():
     # Public documentation of SMPL: elbows are 18 and 19, wrists 20 and 21, knees 4 and 5.
     assert [JOINT_OF_POINT[f"{side}_elbow"] for side in ("left", "right")] == [18, 19]
     assert [JOINT_OF_POINT[f"{side}_wrist"] for side in ("left", "right")] == [20, 21]
     assert [JOINT_OF_POINT[f"{side}_knee"] for side in ("left", "right")] == [4, 5]
     assert JOINT_OF_POINT["mid_hip"] == JOINT_NAMES.index("pelvis") == 0
-
-
-def test_the_challenge_picks_its_points_out_of_body25():
-    picked = [0, 2, 5, 3, 6, 4, 7, 9, 12, 10, 13, 11, 14, 22, 19]
-    assert [BODY25.index(point) for point in CHALLENGE15] == picked
-
-
-def test_the_evaluated_joints_are_those_of_the_paper():
-    limbs = {"shoulder", "elbow", "wrist", "hip", "knee", "ankle"}
-    sided = {f"{side}_{limb}" for side in ("left", "right") for limb in limbs}
-    assert set(EVALUATED14) == {"nose", "neck"} | sided
 
 
 def test_left_points_are_on_the_left_of_the_open_body(open_body):

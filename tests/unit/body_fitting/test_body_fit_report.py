@@ -38,13 +38,6 @@ def test_figures_of_every_person_are_those_of_his_joints():
     assert report.jerk_m_s3[0] < 0.1 * np.sqrt(60.0) * 0.01 * 50.0**3
 
 
-def test_without_pictures_there_is_no_reprojection():
-    rng = np.random.default_rng(3)
-    joints, covariance = seen(walker(5, rng), 0.01, rng)
-    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), BodyFittingSettings())
-    assert report_fit(fit, joints, 50.0).reprojection_px == (None,)
-
-
 def test_jerk_is_the_root_mean_square_of_third_derivatives():
     joints, covariance = seen(walker(6, np.random.default_rng(3)), 0.01, np.random.default_rng(3))
     fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), BodyFittingSettings())

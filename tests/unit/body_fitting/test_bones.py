@@ -39,16 +39,6 @@ def test_noise_lengthens_bones_and_the_lengths_here_are_without_it():
     assert np.sqrt(measured.variance[0]) == pytest.approx(0.0011, rel=0.3)
 
 
-def test_gross_errors_of_some_frames_do_not_count():
-    joints = np.zeros((100, 17, 3))
-    joints[:, 7] = [0.0, 0.28, 0.0]
-    joints[::10, 7] = [0.0, 3.0, 0.0]
-    joints[:, 7, 1] += 0.001 * np.random.default_rng(0).standard_normal(100)
-    covariance = np.broadcast_to(1e-6 * np.eye(3), (*joints.shape, 3))
-    # 1 mm over 90 frames is 0.1 mm.
-    assert measure_bones(joints, covariance, 1.0).length[0] == pytest.approx(0.28, abs=5e-4)
-
-
 def test_the_shortened_bone_of_a_negative_beta_is_short():
     # The printed formula would add the length of the direction: longer for either sign.
     for beta in (-2.0, 2.0):
@@ -58,12 +48,6 @@ def test_the_shortened_bone_of_a_negative_beta_is_short():
         # The prior and 2 cm of definition hold back; height follows to a tenth of beta's 0.2 m.
         assert shape.betas[0] == pytest.approx(beta, abs=0.5)
         assert np.abs(bones_of(shape.betas) - lengths).max() < 0.01
-
-
-def test_without_bones_betas_are_those_of_anybody():
-    shape = fit_shape(MODEL, BoneLengths(np.full(len(BONES), np.nan), np.full(len(BONES), np.inf)))
-    np.testing.assert_array_equal(shape.betas, 0.0)
-    np.testing.assert_array_equal(shape.covariance, np.eye(10))
 
 
 def test_limbs_that_noise_lengthened_are_shortened_joint_by_joint():
@@ -84,15 +68,6 @@ def test_limbs_that_noise_lengthened_are_shortened_joint_by_joint():
         assert after == pytest.approx(length, abs=0.003)
 
 
-def test_joints_that_are_missing_shorten_nothing():
-    joints = np.zeros((2, 17, 3))
-    joints[:, 15, 2] = -0.4
-    joints[:, 13] = np.nan
-    covariance = np.broadcast_to(1e-3 * np.eye(3), (*joints.shape, 3)).copy()
-    covariance[:, 13] = np.nan
-    np.testing.assert_array_equal(shorten_limbs(joints, covariance), joints)
-
-
 def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counted_once():
     # Each clip knows the first component to 0.5 besides the prior: 1 / (1 + 4) of variance.
     covariance = np.diag([0.2, 1.0])
@@ -101,35 +76,3 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
     # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
     np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
-
-
-def test_one_clip_alone_stays_what_it_is():
-    rng = np.random.default_rng(1)
-    root = rng.standard_normal((10, 10))
-    shape = Shape(rng.standard_normal(10), np.linalg.inv(np.eye(10) + root @ root.T))
-    pooled = pool_shapes([shape], 1.0)
-    np.testing.assert_allclose(pooled.betas, shape.betas, atol=1e-9)
-    np.testing.assert_allclose(pooled.covariance, shape.covariance, atol=1e-9)
-
-
-@pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])
-def test_clips_that_say_nothing_leave_the_betas_of_anybody_whatever_these_weigh(weight):
-    silent = Shape(np.zeros(3), np.eye(3) / weight)
-    # Additional information of one clip on the first component: precision 4, at 2.
-    told = Shape(
-        np.array([8.0 / (weight + 4.0), 0.0, 0.0]), np.diag(1.0 / (weight + np.r_[4.0, 0.0, 0.0]))
-    )
-    for clips in ([silent] * 3, [told, silent, silent]):
-        pooled = pool_shapes(clips, weight)
-        np.testing.assert_allclose(pooled.betas, clips[0].betas, atol=1e-12)
-        np.testing.assert_allclose(pooled.covariance, clips[0].covariance, atol=1e-12)
-
-
-def test_limbs_are_never_shortened_by_more_than_a_small_part():
-    joints = np.zeros((1, 17, 3))
-    joints[:, 13, 2], joints[:, 15, 2] = -0.4, -0.8
-    # Two joints of 0.5 m along two axes across: 0.5 m^2 over 0.4 m would be longer than the limb.
-    covariance = np.broadcast_to(0.25 * np.eye(3), (1, 17, 3, 3))
-    shortened = shorten_limbs(joints, covariance)
-    # 15 % of 0.4 m each; the ankle goes with the knee.
-    np.testing.assert_allclose(shortened[0, [13, 15], 2], [-0.34, -0.68])

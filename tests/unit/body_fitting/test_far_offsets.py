@@ -12,7 +12,3 @@ def test_offsets_that_no_detector_usually_has_are_named_once_for_both_sides():
     found = far_offsets(offsets, np.full(17, 0.03))
     assert list(found) == ["wrist"]
     np.testing.assert_allclose(found["wrist"], [0.10, 0.09])
-
-
-def test_without_a_known_common_bias_nothing_is_far():
-    assert far_offsets(np.ones((17, 3)), np.zeros(17)) == {}

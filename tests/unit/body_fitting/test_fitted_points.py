@@ -8,10 +8,8 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.conventions import FEET
 from worldpose.body.keypoints import LANDMARKS, fold_keypoints, point_segments
-from worldpose.body_fitting import extra_points
 from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.extra_points import KEPT_BIAS_M, perceived_points
-from worldpose.body_fitting.pose_space import SIZE, SPREADS
+from worldpose.body_fitting.extra_points import perceived_points
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.triangulation.passes import ExtraJoints
 
@@ -79,19 +77,6 @@ def test_rolling_feet_are_fitted(walk):
     np.testing.assert_array_equal(without.betas, with_feet.betas)  # they determine no shape
 
 
-def test_other_points_and_missing_ones_change_nothing(walk):
-    _, evidence = walk
-    plain = fit_bodies(MODEL, replace(evidence, extra=None), SETTINGS)
-    strange = replace(evidence.extra, points=tuple(f"left_screw_{n}" for n in range(6)))
-    missing = replace(evidence.extra, joints=np.full_like(evidence.extra.joints, np.nan))
-    for extra in (strange, missing):
-        fit = fit_bodies(MODEL, replace(evidence, extra=extra), SETTINGS)
-        assert fit.extra is None
-        np.testing.assert_array_equal(fit.joints, plain.joints)
-        np.testing.assert_array_equal(fit.parameters.body_pose, plain.parameters.body_pose)
-        np.testing.assert_array_equal(fit.covariance, plain.covariance)
-
-
 def test_offsets_of_shoes_are_learned_and_do_not_move_the_ankles():
     bodies, evidence = people(3, 60, 2, offsets=OFFSETS)
     fit = fit_bodies(MODEL, evidence, SETTINGS)
@@ -103,15 +88,6 @@ def test_offsets_of_shoes_are_learned_and_do_not_move_the_ankles():
     )
     feet, ankles = errors(fit, bodies)
     assert feet < 0.02 and ankles < 0.015
-
-
-def test_their_regions_contain_the_truth(walk):
-    bodies, evidence = walk
-    fit = fit_bodies(MODEL, evidence, SETTINGS)
-    truth = np.stack([POINTS(body) for body in bodies], axis=1)
-    away = fit.extra.joints - truth
-    square = np.einsum("fpka,fpkab,fpkb->fpk", away, np.linalg.inv(fit.extra.covariance), away)
-    assert (square < 7.815).mean() > 0.95
 
 
 def test_a_foot_without_points_stands_as_before(walk):
@@ -133,12 +109,6 @@ def test_a_foot_without_points_stands_as_before(walk):
     assert apart[0] > 0.1 and apart[1] < 0.02
     truth = bodies[0].body_pose[:, left]
     assert np.abs(poses[0][:, 0, left] - truth).mean() < 0.12
-
-
-def test_coordinates_of_feet_come_after_all_others():
-    plain, whole = SPREADS[SIZE], SPREADS[SIZE + 8]
-    np.testing.assert_array_equal(whole[:, :SIZE], plain)
-    assert (whole[:, SIZE:].sum(axis=0) == 1.0).all() and (whole.sum(axis=1)[18:24] == 1.0).all()
 
 
 LANDMARK_POINTS = tuple(LANDMARKS)
@@ -175,32 +145,3 @@ def test_accurate_landmarks_make_bodies_better(walk):
     plain = joint_error(fit_bodies(MODEL, replace(evidence, extra=None), SETTINGS), bodies)
     better = joint_error(fit_bodies(MODEL, landmarks(bodies, evidence, 0.0), SETTINGS), bodies)
     assert better < 0.9 * plain
-
-
-def test_landmarks_of_a_segment_that_err_alike_count_as_one(walk, monkeypatch):
-    bodies, evidence = walk
-    given = landmarks(bodies, evidence, 0.05)
-    careful = joint_error(fit_bodies(MODEL, given, SETTINGS), bodies)
-    monkeypatch.setattr(
-        extra_points,
-        "_kept_variance",
-        lambda model, points, varying, bias: np.full_like(varying, KEPT_BIAS_M**2),
-    )
-    careless = joint_error(fit_bodies(MODEL, given, SETTINGS), bodies)
-    # Landmarks err by 35 mm (root mean square).
-    assert careful < 0.7 * careless
-    assert careful < 0.009
-
-
-def test_the_part_of_the_bias_that_stays_is_that_of_residuals_times_the_points_of_a_segment():
-    points = ("left_thigh_1", "left_thigh_2", "left_shank_1")
-    varying = np.array([[4e-4, 1e-6, 4e-4], [9e-4, 9e-4, 9e-4], [1e-6, 4e-4, 1e-6]])
-    kept = extra_points._kept_variance(MODEL, points, varying, np.full(3, BIAS))
-    np.testing.assert_allclose(
-        kept, [[8e-4, 2e-4, 8e-4], [18e-4, 18e-4, 18e-4], [1e-4, 4e-4, 1e-4]]
-    )
-    # Heels and toes alone keep what they had: a centimetre, or less if that is stated.
-    feet = extra_points._kept_variance(
-        MODEL, FEET[:2], np.full((2, 3), 9e-4), np.array([BIAS, 0.005])
-    )
-    np.testing.assert_allclose(feet, [[1e-4] * 3, [25e-6] * 3])

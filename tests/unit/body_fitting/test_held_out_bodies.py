@@ -96,20 +96,6 @@ def test_a_body_whose_shanks_are_wrong_is_named_at_knees_or_ankles(clip, fit):
     assert 0.01 < wrong.certain_excess[GROUPS.index("ankle")] < 0.08
 
 
-def test_where_a_group_is_seen_too_little_nothing_is_said_of_it(clip, fit):
-    keypoints = clip.detections.keypoints.copy()
-    keypoints[..., 9:11, :] = np.nan
-    blind = KeypointDetections.from_keypoints(
-        keypoints,
-        np.where(np.isfinite(keypoints[..., 0]), 0.8, np.nan),
-        clip.detections.detection_index,
-    )
-    found = compare_held_out(MODEL, SETTINGS, None, replace(clip, detections=blind), fit)
-    unknown = np.isnan(found.fitted)
-    assert [GROUPS[group] for group in np.flatnonzero(unknown)] == ["wrist"]
-    assert "held_out_fitted_m.wrist" not in found.figures()
-
-
 def test_two_cameras_leave_none_to_hold_out(fit, clip):
     two = KeypointDetections.from_keypoints(
         clip.detections.keypoints[:, :2],

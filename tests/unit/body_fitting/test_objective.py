@@ -70,17 +70,6 @@ def test_gradient_by_offsets_agrees_with_finite_differences(track):
     assert at.border_gradient[MODEL.shapes :] @ unknowns == pytest.approx(slope, rel=1e-5)
 
 
-def test_the_gradient_by_frames_is_exact_without_offsets(track):
-    made, pose = track
-    at = made.equations(pose, np.zeros((17, 3)), bordered=False)
-    step = np.random.default_rng(3).standard_normal((5, 36))
-    costs = [
-        made.equations(pose.apply_step(sign * 1e-6 * step), np.zeros((17, 3)), bordered=False).cost
-        for sign in (1.0, -1.0)
-    ]
-    assert (at.gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-5)
-
-
 def test_a_track_of_two_intervals_has_the_equations_of_both(track):
     made, pose = track
     # Contacts found in the joined intervals do not tie them either: the second is 5 cm off.
@@ -118,22 +107,3 @@ def test_a_track_of_two_intervals_has_the_equations_of_both(track):
         np.testing.assert_allclose(getattr(joined, name), expected, rtol=1e-9, atol=1e-9)
     tied = equations([pose, moved], both)
     assert np.abs(tied.gradient - joined.gradient).max() > 1e-3 * np.abs(joined.gradient).max()
-
-
-def test_the_pose_prior_counts_by_time_and_not_by_frames():
-    settings = BodyFittingSettings(pose_time_s=0.5)
-    # Two poses per second, in 25 or in 100 frames; no frame is more than one pose.
-    assert 25 * settings.pose_weight(25.0) == pytest.approx(2.0)
-    assert 100 * settings.pose_weight(100.0) == pytest.approx(2.0)
-    assert settings.pose_weight(1.0) == 1.0
-
-
-def test_information_is_the_inverse_of_the_covariance():
-    settings = BodyFittingSettings(noise_scale=1.0, noise_time_s=0.0, min_joint_std_m=1e-3)
-    rng = np.random.default_rng(2)
-    # Ten points, as of hands: their spread has no scale by joint. Depth is a hundred times worse.
-    root = rng.normal(size=(4, 10, 3, 3)) * [[0.01], [0.01], [1.0]]
-    covariance = root @ root.swapaxes(-1, -2)
-    evidence = Evidence.of(rng.normal(size=(4, 10, 3)), covariance, 50.0, settings)
-    product = evidence.information @ (covariance + 1e-6 * np.eye(3))
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-8)

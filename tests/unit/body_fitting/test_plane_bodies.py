@@ -13,7 +13,6 @@ from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.monocular import MonocularEstimates, parse_monocular
 from worldpose.body_fitting.objective import ankle_height
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
@@ -177,14 +176,6 @@ def test_a_person_without_estimates_has_no_body_and_changes_no_other():
     assert not bodies.views[:, 1].any()
 
 
-def test_no_estimate_at_all_leaves_all_people_without_bodies():
-    clip = Clip(9)
-    bodies = clip.fit(some_rows(clip.estimates, np.zeros(len(clip.estimates.frame), bool)))
-    assert all("no monocular estimate" in reason for reason in bodies.missing)
-    assert np.isnan(bodies.fit.joints).all()
-    assert bodies.fit.offsets.shape == (17, 3)
-
-
 @pytest.mark.parametrize("case", ["upside down", "turned round"])
 def test_estimates_that_contradict_the_keypoints_are_refused_with_the_reason(case):
     clip = Clip(10)
@@ -200,14 +191,6 @@ def test_estimates_that_contradict_the_keypoints_are_refused_with_the_reason(cas
     assert np.isnan(bodies.fit.joints[:, 1]).all()
     assert np.isnan(bodies.fit.betas_covariance[1]).all()
     assert np.isfinite(bodies.fit.joints[:, 0]).all()
-
-
-def test_one_frame_gives_a_body():
-    clip = Clip(11, frames=1, errors=MonocularErrors(missed=0.0))
-    bodies = clip.fit()
-    assert bodies.missing == (None, None)
-    assert np.isfinite(bodies.fit.covariance).all()
-    assert np.mean(centred(clip, bodies.fit.joints)) < np.mean(centred(clip, bodies.placed))
 
 
 def test_missing_values_leave_gaps_and_no_failure():
@@ -234,26 +217,3 @@ def test_missing_values_leave_gaps_and_no_failure():
     assert not bodies.views[5:8, 0].any()
     assert not bodies.views[:, 1, 9:11].any()
     assert np.nanmean(centred(clip, bodies.fit.joints)) < 0.08
-
-
-def test_frames_far_from_any_estimate_have_no_body():
-    clip = Clip(13, errors=MonocularErrors(missed=0.0))
-    bodies = clip.fit(some_rows(clip.estimates, clip.estimates.frame < 10))
-    assert np.isfinite(bodies.fit.joints[:22]).all()  # half a second after the last estimate
-    assert np.isnan(bodies.fit.joints[22:]).all()
-    assert not bodies.fit.guided[10:].any()
-
-
-def test_a_calibration_that_all_frames_share_is_not_averaged_away():
-    clip = Clip(14)
-    sure = clip.fit().fit.covariance
-    calibration = np.zeros_like(clip.covariance)
-    calibration[..., 0, 0] = 0.2**2
-    unsure = clip.fit(calibration=calibration).fit.covariance
-    np.testing.assert_allclose(unsure[..., 0, 0] - sure[..., 0, 0], 0.04, rtol=1e-6)
-
-
-def test_arrays_of_different_people_are_refused():
-    clip = Clip(15)
-    with pytest.raises(InputError, match="the same frames and persons"):
-        clip.evidence(keypoints=clip.keypoints[:, :1])

@@ -38,7 +38,7 @@ def fit(joints, known=None, solver=SOLVER):
     return fit_shapes(solver, sampled, known or {}, 50.0)
 
 
-@pytest.mark.parametrize("frames", [100, 500, 1500])
+@pytest.mark.parametrize("frames", [100, 1500])
 def test_neither_people_nor_offsets_grow_with_the_length_of_a_clip(frames):
     truths, joints = people(3, frames, 0.02)
     shapes = fit(joints)
@@ -47,18 +47,6 @@ def test_neither_people_nor_offsets_grow_with_the_length_of_a_clip(frames):
     # the poses' own weight of the prior and all frames, 1500 of them make it 128 mm and 24 mm.
     assert np.abs(off).max() < 0.02
     assert np.sqrt((shapes.offsets**2).mean()) < 0.005
-
-
-def test_a_clip_is_looked_at_for_no_longer_than_is_asked():
-    _, joints = people(1, 1000, 0.02)
-    broken = {p: (j.copy(), c) for p, (j, c) in joints.items()}
-    # Nothing is used between the two parts of a second each, at both ends.
-    broken[0][0][60:940] += 100.0
-    settings = SETTINGS.model_copy(update={"shape_time_s": 2.0})
-    solver = Solver(SOLVER.chained, SOLVER.prior, settings, None)
-    one = fit(joints, solver=solver)
-    two = fit(broken, solver=solver)
-    np.testing.assert_array_equal(one.people[0].betas, two.people[0].betas)
 
 
 def test_what_other_clips_know_of_a_person_counts():
@@ -71,32 +59,7 @@ def test_what_other_clips_know_of_a_person_counts():
     assert np.trace(known.covariance) < 1e-2 * np.trace(alone.covariance)
 
 
-def test_offsets_are_the_less_sure_the_fewer_frames_tell_them():
-    spreads = []
-    for frames in (25, 400):
-        _, joints = people(2, frames, 0.02)
-        shapes = fit(joints)
-        spreads.append(np.trace(shapes.offsets_covariance, axis1=-2, axis2=-1))
-    assert (spreads[1] <= spreads[0]).all() and (spreads[1] > 0.0).all()
-
-
 def test_without_people_there_are_no_offsets():
     shapes = fit({})
     assert shapes.people == {}
     np.testing.assert_array_equal(shapes.offsets, 0.0)
-
-
-def test_what_few_seconds_say_of_offsets_is_held_back_by_how_often_errors_repeat():
-    _, joints = people(1, 100, 0.01)
-    for _, (places, _) in joints.items():
-        places[:, [15, 16], 2] += 0.06
-    sizes, spreads = [], []
-    for repeat in (1e6, 40.0, 0.02):
-        settings = SETTINGS.model_copy(update={"bias_time_s": repeat})
-        shapes = fit(joints, solver=Solver(SOLVER.chained, SOLVER.prior, settings, None))
-        sizes.append(np.linalg.norm(shapes.offsets[15]))
-        spreads.append(np.trace(shapes.offsets_covariance[15]))
-    # The prior counts once for the two seconds, and a hundred times where errors repeat as often.
-    assert sizes[0] == sizes[1] > 0.01
-    assert sizes[2] < 0.1 * sizes[1]
-    assert spreads[2] < 0.02 * spreads[1]

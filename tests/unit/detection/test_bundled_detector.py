@@ -8,8 +8,6 @@ from worldpose.detection.enlargement import (
     expect_parts,
     find_groups,
     find_small,
-    resize,
-    restore_size,
 )
 from worldpose.detection.interfaces import People
 from worldpose.geometry.cameras import Camera
@@ -33,30 +31,6 @@ def test_neighbours_make_a_group_and_others_none():
         np.testing.assert_allclose(group.inner, [87.5, 87.5, 142.5, 164.5])
     assert find_groups(people(near, beside, score=0.2), SHAPE) == []
     assert find_groups(people(), SHAPE) == []
-
-
-def test_a_group_that_fills_the_picture_is_not_worth_a_second_look():
-    row = [(x, 10.0, x + 20.0, 50.0) for x in np.arange(0.0, 1900.0, 10.0)]
-    # The part is 1920 x 70 px; enlarged it has at most as many pixels as the image.
-    (group,) = find_groups(people(*row), (280, 1920, 3))
-    np.testing.assert_allclose(group.zoom, 2.0)
-    assert find_groups(people(*row), (60, 1920, 3)) == []
-
-
-def test_a_box_seen_from_nearer_lies_where_it_is_in_the_picture():
-    group, _ = find_groups(
-        people((30.0, 31.0, 60.0, 92.0), (40.0, 31.0, 70.0, 92.0)), (300, 411, 3)
-    )
-    picture = np.zeros((300, 411, 3), dtype=np.uint8)
-    picture[40:90, 35:55] = 255
-    shown = group.crop(picture)[..., 0]
-    rows, columns = np.nonzero(shown > 127)
-    seen = (columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5)
-    back = group.to_frame(people(seen))
-    # A pixel of the enlarged part is half a pixel of the image; edges are known to half of one.
-    np.testing.assert_allclose(back.boxes, [[34.5, 39.5, 54.5, 89.5]], atol=0.3)
-    # People outside of the group, or of another size, come from the view of the whole frame.
-    assert len(group.to_frame(people((0.0, 0.0, 400.0, 500.0), (5.0, 5.0, 9.0, 9.0))).scores) == 0
 
 
 def test_small_people_are_seen_in_enlarged_tiles_and_tall_ones_are_not():
@@ -122,16 +96,6 @@ def test_a_calibrated_camera_tells_where_people_are_small():
         assert found == wanted
 
 
-def test_a_reduced_view_replaces_large_people_and_keeps_others():
-    near = looking(3200.0)
-    (view,) = expect_parts(near, PitchTemplate.standard(), 2.5)
-    small, large = (300.0, 300.0, 320.0, 360.0), (500.0, 300.0, 560.0, 480.0)
-    half = (500.0, 300.0, 560.0, 390.0)  # the upper body of the large person
-    whole = (501.0, 301.0, 561.0, 481.0)
-    merged = view.merge(people(small, half, large), seen(view, small, whole))
-    np.testing.assert_allclose(merged.boxes, [small, half, whole], atol=1e-9)
-
-
 def test_a_frame_of_large_people_is_seen_reduced():
     for height, zoom in ((99.0, 1.0), (101.0, 0.5), (199.0, 0.5), (201.0, 0.25)):
         boxes = [(x, 100.0, x + 30.0, 100.0 + height) for x in (100.0, 300.0, 500.0)]
@@ -144,15 +108,6 @@ def test_a_frame_of_large_people_is_seen_reduced():
     )
     assert choose_reduction(both) == 0.25
     assert choose_reduction(people()) == 1.0
-
-
-def test_boxes_of_a_reduced_frame_lie_where_people_are():
-    picture = np.zeros((301, 411, 3), dtype=np.uint8)
-    picture[40:90, 36:56] = 255
-    rows, columns = np.nonzero(resize(picture, 0.5)[..., 0] > 127)
-    seen_at = (columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5)
-    back = restore_size(people(seen_at), (411, 301), 0.5)
-    np.testing.assert_allclose(back.boxes, [[35.5, 39.5, 55.5, 89.5]], atol=0.7)
 
 
 class SizesSeen(BundledDetector):
@@ -204,9 +159,3 @@ def test_a_close_up_is_seen_at_the_size_of_its_surest_person():
         usual.detect([frame])
         assert 1920 in usual.seen
     assert 240 not in usual.seen
-
-
-def test_where_a_camera_tells_the_size_no_close_up_is_sought():
-    told = Scripted({240: 0.95})
-    told.detect_parts([np.zeros((1080, 1920, 3), dtype=np.uint8)], [])
-    assert set(told.seen) == {1920}

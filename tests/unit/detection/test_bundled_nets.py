@@ -17,14 +17,12 @@ from worldpose.detection.bundled_nets import (
 )
 from worldpose.detection.bundled_pose import (
     BundledPoseEstimator,
-    CropEstimates,
     crops_around,
     cut_crop,
     frame_from_crop,
 )
 from worldpose.detection.models import (
     BUNDLED_WEIGHTS,
-    QUANTIZED_WEIGHTS,
     load_bundled_detector,
     load_bundled_pose,
 )
@@ -63,18 +61,6 @@ def test_a_crop_shows_its_box_and_goes_back_to_the_picture():
         # Its outline of 280 px is known to a quarter of a pixel.
         assert len(rows) * area == pytest.approx(40 * 100, abs=140)
         assert np.sqrt(area) == pytest.approx(1.25 * 100 / CROP[1])
-
-
-def test_a_crop_of_a_large_box_is_smooth_and_in_its_place():
-    picture = np.zeros((900, 900, 3), dtype=np.uint8)
-    picture[:, ::2] = 200  # stripes that every second pixel alone would make white or black
-    picture[400:, :] = 100
-    mapping = frame_from_crop(np.array([450.0, 450.0, 7.3]), CROP)
-    crop = cut_crop(picture, mapping, CROP)
-    edge = (399.5 - mapping[1, 2]) / mapping[1, 1]
-    # Rows at both ends are outside of the image; a crop pixel covers 7 stripes, one more or less.
-    assert np.all(np.abs(crop[3 : int(edge) - 1, :, 0].astype(int) - 100) < 15)
-    assert np.all(crop[int(edge) + 2 : -3, :, 0] == 100)
 
 
 def test_the_peak_of_a_bump_is_found_within_a_cell():
@@ -137,7 +123,7 @@ def test_people_and_poses_do_not_depend_on_the_batch():
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_nets_in_integers_are_of_the_shipped_weights(which):
-    net = QuantizedNet(QUANTIZED_WEIGHTS[which])
+    net = QuantizedNet(BUNDLED_WEIGHTS[which].with_suffix(".onnx"))
     assert net.weights_sha256 == digest_of_files(BUNDLED_WEIGHTS[which])
 
 
@@ -160,48 +146,6 @@ def test_nets_in_integers_see_what_they_see_in_floating_point(tmp_path):
     tall = sure[0][:, 3] - sure[0][:, 1]
     assert known.sum() > 30 and np.median(moved) < 0.005 * np.median(tall)
     assert np.abs(poses[1].confidence - poses[0].confidence)[known].mean() < 0.03
-
-
-def looks(monkeypatch, seen_of):
-    """A pose estimator that returns `seen_of(boxes)` as boxes, and a list of what it received."""
-    pose, asked = BundledPoseEstimator(shaken(KeypointNet())), []
-
-    def look(picture, boxes, others):
-        asked.append((boxes, others))
-        places = np.full((len(boxes), 17, 4, 2), float(len(asked)))
-        mass = np.tile([0.9, 0.0, 0.0, 0.0], (len(boxes), 17, 1))
-        return CropEstimates(
-            places, mass, np.full(mass.shape, 0.9), seen_of(boxes), np.ones(len(boxes))
-        )
-
-    monkeypatch.setattr(pose, "_estimate_crops", look)
-    return pose, asked
-
-
-def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch):
-    # Everybody fills his box from 40 px on; the keypoints tell how often it was estimates at.
-    pose, asked = looks(
-        monkeypatch, lambda b: np.concatenate([np.maximum(b[:, :1], 40.0), b[:, 1:]], axis=1)
-    )
-    boxes = np.array([[45.0, 5.0, 80.0, 80.0], [0.0, 100.0, 80.0, 180.0], [0.0, 5.0, 30.0, 80.0]])
-    poses = pose.estimate(np.zeros((190, 130, 3), dtype=np.uint8), boxes)
-    # The first is as given; of the third nothing is left in which to look.
-    np.testing.assert_array_equal(asked[1][0], [[40.0, 100.0, 80.0, 180.0]])
-    assert poses.keypoints[:, 0, 0].tolist() == [1.0, 2.0, 1.0]
-
-
-def test_who_has_a_neighbour_is_looked_at_again_and_told_of_him(monkeypatch):
-    pose, asked = looks(monkeypatch, lambda boxes: boxes)
-    # Two people who overlap by a third, a second box of the first, and a separate person.
-    boxes = np.array(
-        [[0.0, 0.0, 40.0, 80.0], [20.0, 0.0, 60.0, 80.0], [2.0, 0.0, 42.0, 80.0], [90, 0, 130, 80]]
-    )
-    pose.estimate(np.zeros((90, 130, 3), dtype=np.uint8), boxes)
-    np.testing.assert_array_equal(asked[1][0], boxes[:3])
-    first, second, double = (others.tolist() for others in asked[1][1])
-    assert boxes[1].tolist() in first and boxes[0].tolist() not in first
-    assert boxes[0].tolist() in second and boxes[1].tolist() not in second
-    assert double == first
 
 
 def test_weights_come_back_and_give_equal_bytes(tmp_path):

@@ -14,11 +14,9 @@ from worldpose.detection.bundled_pose import (
     find_occluded_people,
     surroundings,
 )
-from worldpose.detection.interfaces import FindsOccludedPeople, People
-from worldpose.detection.models import load_bundled_pose
+from worldpose.detection.interfaces import People
 from worldpose.detection.pipeline import PeopleFinder, Place
 from worldpose.detection.settings import DetectionSettings
-from worldpose.detection.views import FlipTest
 from worldpose.geometry.boxes import box_iou
 
 FRONT = np.array([100.0, 50.0, 140.0, 150.0])
@@ -73,21 +71,6 @@ def test_where_all_are_known_nobody_is_found(people):
     assert others.confidence.shape == (0, 17)
 
 
-def test_nobody_is_asked_for_where_somebody_is_known():
-    beside = FRONT + [14.0, 0.0, 14.0, 0.0]
-    look = Told(FRONT, beside)
-    find_occluded_people(look, found(FRONT, beside))
-    # Left of the first and right of the second.
-    assert_allclose(look.asked[0][:, 0], [86.0, 128.0])
-
-
-def test_beside_whom_the_detector_doubts_nobody_is_asked_for():
-    look = Told(FRONT, HIDDEN)
-    people = find_occluded_people(look, found(FRONT, score=0.2))
-    assert len(people.boxes) == 0
-    assert len(look.asked[0]) == 0
-
-
 def test_an_answer_that_is_not_sure_is_none():
     assert len(find_occluded_people(Told(FRONT, HIDDEN, fit=0.51), found(FRONT)).boxes) == 1
     assert len(find_occluded_people(Told(FRONT, HIDDEN, fit=0.49), found(FRONT)).boxes) == 0
@@ -119,11 +102,6 @@ def people_of(settings, place=None):
     return np.isfinite(stretch.score[0]).sum(), finder.report.beside
 
 
-def test_they_are_kept_as_people_of_the_picture():
-    assert people_of(DetectionSettings(find_occluded=True)) == (2, 2)
-    assert people_of(DetectionSettings()) == (1, 0)
-
-
 def test_a_bystander_whom_a_player_hides_is_crowd(monkeypatch):
     monkeypatch.setattr(
         "worldpose.detection.pipeline.on_pitch", lambda boxes, *_: boxes[:, 0] <= FRONT[0]
@@ -143,14 +121,6 @@ def test_another_pose_net_does_not_search_for_occluded_people(pose):
     assert DetectionSettings(find_occluded=True, pose="embedded:net.safetensors").find_occluded
 
 
-def test_the_embedded_net_looks_beside_and_means_of_two_looks_do_not():
-    pose = load_bundled_pose()
-    assert isinstance(pose, FindsOccludedPeople)
-    assert not isinstance(FlipTest(pose), FindsOccludedPeople)
-    people = pose.find_occluded(np.zeros((240, 320, 3), np.uint8), found(FRONT))
-    assert len(people.boxes) == len(people.keypoints) == 0  # no person in the dark
-
-
 AS_IS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -168,14 +138,6 @@ def test_cells_are_as_full_as_boxes_cover_them():
     assert not alone[1:].any()
 
 
-def test_a_mirrored_crop_shows_mirrored_surroundings():
-    mirrored = np.array([[-1.0, 0.0, 7.0], [0.0, 1.0, 0.0]])
-    box, others = np.array([0.0, 0.0, 3.0, 9.0]), np.array([[2.0, 1.0, 6.0, 12.0]])
-    one, other = (surroundings(box, others, crop, (8, 12)) for crop in (AS_IS, mirrored))
-    # The map is exact in halves of pixels.
-    np.testing.assert_allclose(one[:, :, ::-1], other, atol=1e-6)
-
-
 def test_places_come_with_their_probability_and_the_likeliest_first():
     maps = torch.full((1, 1, 32, 24), -40.0)
     # A sharp peak of a quarter, and one of three quarters spread over two cells of a row as 2 : 1.
@@ -185,14 +147,6 @@ def test_places_come_with_their_probability_and_the_likeliest_first():
     torch.testing.assert_close(places[0, 0, :2], torch.tensor([[21.5 - 1 / 3, 40.5], [10.5, 10.5]]))
     # Of whatever is as likely, nothing is left but the rounding of e^-40.
     torch.testing.assert_close(mass[0, 0], torch.tensor([0.75, 0.25, 0.0]), atol=1e-6, rtol=0)
-
-
-def test_a_peak_at_the_border_is_read_from_what_there_is():
-    maps = torch.full((1, 1, 32, 24), -40.0)
-    maps[0, 0, 0, 0], maps[0, 0, 0, 1], maps[0, 0, 31, 23] = float(np.log(2.0)), 0.0, 0.0
-    places, mass = decode_candidates(maps, 2)
-    torch.testing.assert_close(places[0, 0], torch.tensor([[0.5 + 2 / 3, 0.5], [46.5, 62.5]]))
-    torch.testing.assert_close(mass[0, 0], torch.tensor([0.75, 0.25]))
 
 
 def rivals(first, second, boxes=((0, 0, 40, 100), (20, 0, 60, 100))):
@@ -226,15 +180,3 @@ def test_a_joint_is_not_put_where_a_neighbour_has_that_of_the_other_side():
         places, mass, np.array([[0.0, 0.0, 40.0, 100.0], [20.0, 0.0, 60.0, 100.0]])
     )
     assert np.argwhere(taken).tolist() == [[1, right]]
-
-
-def test_people_apart_have_no_say_in_each_others_joints():
-    apart = ((0, 0, 40, 100), (41, 0, 81, 100))
-    assert rivals([0.1, 0.9, 0.0], [0.0, 0.5, 0.4], apart) == [30.0, 30.0]
-
-
-def test_nobody_and_somebody_alone_take_the_likeliest():
-    assert assign_joints(np.empty((0, 17, 3, 2)), np.empty((0, 17, 3)), np.empty((0, 4))).size == 0
-    mass = np.tile([0.5, 0.3], (1, 17, 1))
-    taken = assign_joints(np.zeros((1, 17, 2, 2)), mass, np.array([[0.0, 0.0, 9.0, 9.0]]))
-    assert not taken.any()

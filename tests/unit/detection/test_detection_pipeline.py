@@ -7,7 +7,7 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import People, ScoreMap
-from worldpose.detection.models import SHIPPED_SCORE_MAP, load_score_map
+from worldpose.detection.models import SHIPPED_SCORE_MAP
 from worldpose.detection.pipeline import PeopleFinder, Place, on_pitch
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import object_keypoint_similarity, suppress_poses
@@ -140,17 +140,6 @@ class LookingCloser(Knowing):
         return replace(poses, boxes=wider, score=np.full(len(boxes), 0.4))
 
 
-def test_boxes_are_those_of_who_looked_closer():
-    boxes = np.array([[10.0, 10.0, 30.0, 60.0], [100.0, 10.0, 120.0, 60.0]])
-    truth = LookingCloser([boxes] * 3, np.full((3, 2), 0.9))
-    finder = PeopleFinder([truth], truth, DetectionSettings())
-    blank = np.zeros((80, 160, 3), dtype=np.uint8)
-    (stretch,) = finder.find((n, blank) for n in range(3))
-    wanted = [[8.0, 10.0, 32.0, 60.0], [100.0, 10.0, 120.0, 60.0]]
-    np.testing.assert_allclose(stretch.boxes[1, :2], wanted)
-    np.testing.assert_allclose(stretch.score[1, :2], np.cbrt(0.9 * 0.4 * 0.8), rtol=1e-6)
-
-
 def test_a_score_map_changes_logits_linearly():
     score = np.array([0.2, 0.5, 0.9, np.nan])
     found = ScoreMap(slope=2.0, offset=1.0).probability(score)
@@ -180,28 +169,6 @@ def test_a_score_map_changes_scores_alone_and_not_who_is_kept():
     wanted = SHIPPED_SCORE_MAP.probability(plain.score.astype(np.float64))
     np.testing.assert_allclose(mapped.score, wanted, rtol=1e-4)
     assert mapped.score[1, 0] > plain.score[1, 0] > 0.5 > mapped.score[1, 1]
-
-
-def test_only_the_shipped_pair_of_nets_has_a_known_score_map():
-    assert load_score_map(DetectionSettings()) == SHIPPED_SCORE_MAP
-    for other in (
-        {"detector": "embedded:other.safetensors"},
-        {"detector": ("embedded", "onnx:other.onnx")},
-        {"pose": "onnx:other.onnx"},
-    ):
-        assert load_score_map(DetectionSettings(**other)) is None
-
-
-def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():
-    person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
-    missing = np.full((17, 2), np.nan)
-    area = np.full(4, 2400.0)
-    alike = object_keypoint_similarity(
-        np.stack([person, person + 1.0, person + [30.0, 0.0], missing]), area
-    )
-    assert alike[0, 1] > 0.9
-    assert alike[0, 2] < 0.3
-    assert alike[0, 3] == alike[3, 3] == 0.0
 
 
 def test_of_two_boxes_with_one_pose_the_better_stays_and_who_is_close_to_one_comes_last():

@@ -17,10 +17,9 @@ from worldpose.detection.landmark_net import (
     POINTS,
     LandmarkEstimator,
     LandmarkNet,
-    SeenLandmarks,
     locate,
 )
-from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks, weights_of
+from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks
 from worldpose.detection.net_inference import QuantizedNet
 from worldpose.detection.pipeline import PeopleFinder
 from worldpose.detection.settings import DetectionSettings
@@ -136,13 +135,6 @@ def test_detections_carry_landmarks_and_joints_stay_the_same_to_the_last_bit():
     assert not seen[1].any() and not seen[:, 1:].any()
 
 
-def test_by_default_no_landmarks_are_asked_for_and_weights_are_the_same():
-    assert load_landmarks(DetectionSettings()) is None
-    assert "torch" in weights_of(
-        DetectionSettings(detector="onnx:" + __file__, pose="onnx:" + __file__, landmarks=True)
-    )
-
-
 @pytest.fixture(scope="module")
 def shot():
     """One rendered image of a stadium that no training had, with the truth of its landmarks."""
@@ -159,8 +151,8 @@ def test_the_net_in_integers_was_made_from_the_shipped_weights():
     assert net.weights_sha256 == digest_of_files(LANDMARK_WEIGHTS)
 
 
-@pytest.mark.parametrize("integers", [False, True])
-def test_the_shipped_net_finds_landmarks_of_unknown_people(shot, integers):
+def test_the_shipped_net_finds_landmarks_of_unknown_people(shot):
+    integers = True
     rendered, truth = shot
     device = (
         load_landmarks(DetectionSettings(landmarks=True))
@@ -179,35 +171,3 @@ def test_the_shipped_net_finds_landmarks_of_unknown_people(shot, integers):
     assert ((found.visible[kept] > 0.5) == shown).mean() > 0.8
     inside = off[kept] ** 2 < 5.99 * found.std[kept] ** 2
     assert 0.85 < inside[shown].mean() <= 1.0
-
-
-def test_visible_landmarks_are_a_part_and_none_of_them_lies_outside_of_the_image(shot):
-    rendered, truth = shot
-    height, width = rendered.rendered.image.shape[:2]
-    shown = truth.visible == 2
-    assert 0.15 < shown[~truth.ignored].mean() < 0.6
-    inside = ((truth.keypoints > -2.0) & (truth.keypoints < [width + 1.0, height + 1.0])).all(-1)
-    assert inside[shown].all()
-    # Nobody shows front and back at once.
-    assert not shown.all(axis=1).any()
-
-
-def test_a_triangle_covers_what_lies_behind_it():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(RECIPE)
-        labels = importlib.import_module("landmark_labels")
-    pixels = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [40.0, 40.0]])
-    depth = np.array([2.0, 4.0, 2.0, 1.0])
-    faces = np.array([[0, 1, 2], [0, 2, 1]], dtype=np.int32)
-    at = np.array([[0.0, 5.0], [5.0, 0.0], [2.5, 2.5], [6.0, 6.0], [-1.0, 1.0]])
-    nearest = labels._nearest_depth(at, pixels, depth, faces)
-    assert_allclose(nearest, [2.0, 3.0, 2.5, np.inf, np.inf])
-
-
-def test_outputs_have_the_shapes_of_the_points():
-    torch.manual_seed(0)
-    seen = LandmarkNet().eval()(torch.zeros(2, 3, CROP[1], CROP[0]), torch.zeros(2, 3, 32, 24))
-    assert isinstance(seen, SeenLandmarks)
-    assert seen.maps.shape == (2, len(POINTS), ROWS, COLUMNS)
-    places, std = seen.decode()
-    assert places.shape == (2, len(POINTS), 2) and bool((std > 0.0).all())

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.bundled_nets import CROP, KeypointNet, Seen, decode_boxes, load_weights
-from worldpose.detection.models import BUNDLED_WEIGHTS, QUANTIZED_WEIGHTS, load_bundled_pose
+from worldpose.detection.bundled_nets import CROP, KeypointNet, Seen, load_weights
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_pose
 from worldpose.detection.net_inference import CROPS, FloatNet, QuantizedNet
 from worldpose.detection.pipeline import detect_people
 from worldpose.detection.settings import DetectionSettings
@@ -35,15 +35,15 @@ def still(tmp_path_factory):
     return read_picture(sorted((folder / "stills").iterdir())[0])
 
 
-@pytest.mark.parametrize("count", [1, 5, 7, CROPS])
+@pytest.mark.parametrize("count", [5, CROPS])
 def test_integers_give_equal_bytes_in_every_batch(crops, count):
-    net = QuantizedNet(QUANTIZED_WEIGHTS[1])
+    net = QuantizedNet(BUNDLED_WEIGHTS[1].with_suffix(".onnx"))
     some, whole = (Seen._make(net(crops[0][:n], crops[1][:n])) for n in (count, CROPS))
     for name in ("maps", "doubt", "boxes", "fit"):
         np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[:count])
 
 
-@pytest.mark.parametrize("count", range(1, 9))
+@pytest.mark.parametrize("count", [3, 8])
 def test_a_person_has_the_same_pose_whoever_else_is_asked_for(still, count):
     pose = load_bundled_pose()
     x = 20.0 + 90.0 * np.arange(8)  # apart: neighbours may change a pose
@@ -51,19 +51,6 @@ def test_a_person_has_the_same_pose_whoever_else_is_asked_for(still, count):
     together, alone = pose.estimate(still, boxes), pose.estimate(still, boxes[:count])
     for name, values in alone.arrays().items():
         np.testing.assert_array_equal(together.arrays()[name][:count], values)
-
-
-def test_boxes_stand_at_the_cells_that_none_of_their_neighbours_exceeds():
-    rng = np.random.default_rng(0)
-    # Levels, so that neighbours are often equal.
-    logits = torch.from_numpy(rng.integers(-4, 3, (23, 31)).astype(np.float32))
-    _, scores = decode_boxes(logits, torch.ones(4, 23, 31), 0.1, 1000)
-    score = torch.sigmoid(logits).numpy()
-    padded = np.pad(score, 1)
-    near = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).max(axis=(2, 3))
-    expected = np.sort(score[(score == near) & (score >= 0.1)])[::-1]
-    assert len(expected) > 20
-    np.testing.assert_array_equal(scores, expected)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -146,13 +146,6 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     assert _class_names({"names": "__import__('os')"}) == _class_names({}) == {}
 
 
-def test_several_classes_of_people_share_their_best_score():
-    output = np.zeros((8, CELLS))
-    output[:4, 7], output[4:, 7] = PERSON, [0.9, 0.2, 0.6, 0.3]
-    found = FORMS["yolov8"].decode([output], SIZE, (1, 2))
-    assert found.scores.tolist() == [0.6]
-
-
 def test_a_pose_net_of_one_class_is_a_detector():
     output = np.zeros((56, CELLS))
     output[:4, 7], output[4, 7], output[5:, 7] = PERSON, 0.8, 90.0

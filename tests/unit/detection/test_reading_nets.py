@@ -42,14 +42,6 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
         np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, frames[0, 2]))
 
 
-def test_a_crop_beyond_the_border_is_filled():
-    picture = np.full((50, 60, 3), 200, dtype=np.uint8)
-    frames = fit_crops(np.array([[500.0, 500, 540, 580], [-20.0, 10, 20, 40]]), (48, 64), 1.25)
-    crops = cut_crops(picture, frames, (48, 64), fill=7)
-    assert (crops[0] == 7).all()
-    assert {7, 200} <= set(np.unique(crops[1]))
-
-
 def test_the_forms_of_pose_nets_give_the_same_point():
     size = (48, 64)
     single = np.zeros((1, 1, 17, 3))

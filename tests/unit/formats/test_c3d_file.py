@@ -5,7 +5,6 @@ import pytest
 
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
-from worldpose.evaluation.marker_reference import map_marker_names, marker_joints, read_markers
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.joints_file import JointTracks
 
@@ -52,16 +51,6 @@ def test_ezc3d_finds_the_joints_within_a_tenth_of_a_millimetre(tracks, tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore:No analog data")
-def test_the_reader_of_markers_finds_them_too(tracks, tmp_path):
-    pytest.importorskip("c3d")
-    write_c3d(tmp_path / "p.c3d", tracks, 1, 50.0, NOTES)
-    markers = read_markers(tmp_path / "p.c3d")
-    assert (markers.rate, markers.names) == (50.0, COCO17)
-    joints = marker_joints(markers, map_marker_names(markers.names))[:, 0]
-    np.testing.assert_allclose(joints, expected(tracks, 1), atol=1e-4)
-
-
-@pytest.mark.filterwarnings("ignore:No analog data")
 def test_residuals_are_standard_deviations_or_flags(tracks, tmp_path):
     # By c3d: ezc3d takes the two halves of the fourth number apart, also in files of floats.
     c3d = pytest.importorskip("c3d")
@@ -88,13 +77,3 @@ def test_what_the_format_cannot_hold_is_refused(tracks, tmp_path):
     with pytest.raises(InputError, match="found 0"):
         write_c3d(path, none, 0, 50.0, {})
     assert not path.exists()
-
-
-def test_a_long_clip_keeps_its_number_of_frames(tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
-    joints = np.zeros((2, 1, 17, 3)) + [1.0, 2.0, 3.0]
-    long = JointTracks(np.array([0, 39999]), np.array([4]), joints)
-    write_c3d(tmp_path / "p.c3d", long, 0, 50.0, {})
-    points = ezc3d.c3d(str(tmp_path / "p.c3d"))["data"]["points"]
-    assert points.shape[2] == 40000
-    np.testing.assert_allclose(points[:3, 0, -1], [1000.0, 2000.0, 3000.0])

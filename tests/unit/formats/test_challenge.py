@@ -19,7 +19,6 @@ from worldpose.formats.challenge import (
     submission_clips,
     write_challenge,
     write_challenge_camera,
-    write_pitch_points,
     write_submission,
 )
 from worldpose.geometry.cameras import Camera
@@ -64,14 +63,6 @@ def poses():
 @pytest.fixture(scope="module")
 def truth(model, poses, camera):
     return challenge_truth(model, poses, camera)
-
-
-def test_only_people_who_are_ever_in_the_picture_have_rows(truth):
-    assert truth.persons.tolist() == [0, 2]
-    assert truth.clip.boxes.shape == (FRAMES, 2, 4)
-    assert truth.clip.skel_2d.shape == (FRAMES, 2, 25, 2)
-    assert truth.clip.skel_3d.shape == (FRAMES, 2, 25, 3)
-    assert truth.submission.shape == (2, FRAMES, 15, 3)
 
 
 def test_absent_is_nan_everywhere(truth):
@@ -217,14 +208,6 @@ def _bare(folder, joints):
     return folder / "mine.npz"
 
 
-def test_fifteen_points_are_read_as_well(truth, tmp_path):
-    for kind, width in (("boxes", None), ("skel_2d", 2), ("skel_3d", 3)):
-        shape = (4, 2, 4) if width is None else (4, 2, 15, width)
-        (tmp_path / kind).mkdir()
-        np.save(tmp_path / kind / "A_1.npy", np.ones(shape))
-    assert read_challenge(tmp_path)["A_1"].skel_2d.shape == (4, 2, 15, 2)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -245,10 +228,3 @@ def test_what_is_no_challenge_is_refused_by_file(tmp_path, name, content, messag
         np.save(tmp_path / kind / "A_1.npy", array, allow_pickle=True)
     with pytest.raises(InputError, match=message):
         read_challenge(tmp_path)
-
-
-def test_pitch_points_load_as_rows_of_three(tmp_path):
-    points = np.array([[52.5, -34.0, -0.2], [0.0, 9.15, -0.0145]])
-    write_pitch_points(tmp_path / "pitch_points.txt", points)
-    # Written to a tenth of a millimetre.
-    np.testing.assert_allclose(np.loadtxt(tmp_path / "pitch_points.txt"), points, atol=5.1e-5)

@@ -62,7 +62,7 @@ def people():
     ]
 
 
-def cameras():
+def cameras(principal=(959.5, 539.5)):
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # looks along +y
     turns = Rotation.from_rotvec(np.outer(np.linspace(0, 0.5, FRAMES), [0, 1, 0])).as_matrix()
     size = np.array([1920, 1080])
@@ -70,7 +70,6 @@ def cameras():
     focal[7] = np.nan
 
     def camera(focal, rotation):
-        principal = np.array([959.5, 539.5])
         place = -rotation @ np.array([1.0, -70.0, 12.0])
         return Camera.from_matrices(
             np.stack([intrinsics(f, principal) for f in focal.reshape(-1, 2)]).reshape(
@@ -157,19 +156,6 @@ def test_the_surface_is_skinned_as_the_models(model, tmp_path):
         # largest weights.
         expected = model.vertices(body.poses[40])[0]
         assert np.linalg.norm(found["surfaces"][f"{body.name}_surface"] - expected) < 1e-3
-
-
-@IN_NODE
-def test_thirty_seconds_of_22_people_take_at_most_10_mb(model, tmp_path):
-    moving = [AnimatedBody(f"person_{n:03d}", motion(n, 1500), {"person": n}) for n in range(22)]
-    write(tmp_path / "a.glb", model, people=moving)
-    assert (tmp_path / "a.glb").stat().st_size <= 10_000_000
-    found = pose_in_three(tmp_path / "a.glb", [700])
-    assert found["issues"]["messages"] == []
-    for body in moving:
-        nodes = [found["frames"][0]["nodes"][f"{body.name}_{j}"] for j in SKELETONS["smpl24"]]
-        places = np.array([node["place"] for node in nodes])
-        assert np.abs(places - model.joints(body.poses[700])).max() < 1e-4
 
 
 def test_markings_are_strips_of_their_painted_width_that_face_up():

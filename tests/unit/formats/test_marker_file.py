@@ -51,9 +51,3 @@ def test_missing_joints_are_empty_cells(tracks, tmp_path):
     assert rows[2].split("\t")[2 + 15 : 2 + 18] == ["", "", ""]
     assert rows[3].split("\t")[2:] == [""] * 51
     assert "nan" not in (tmp_path / "p.trc").read_text()
-
-
-def test_a_person_without_joints_has_no_rows(tracks, tmp_path):
-    absent = JointTracks(tracks.frames, tracks.person_ids, np.full_like(tracks.joints, np.nan))
-    write_markers(tmp_path / "p.trc", absent, 0, 50.0)
-    assert (tmp_path / "p.trc").read_text().split("\n")[2].split("\t")[2] == "0"

@@ -72,7 +72,7 @@ def test_arrays_beyond_the_limit_are_not_unpacked(tmp_path):
 
 def test_no_archive_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"no archive")
-    with pytest.raises(InputError, match="expected an npz file"):
+    with pytest.raises(InputError, match="expected a whole npz file"):
         read_npz(tmp_path / "a.npz", 1000)
 
 

@@ -166,17 +166,6 @@ def test_the_file_comes_back_from_pandas(model, tmp_path):
     np.testing.assert_allclose(np.diff(table.pelvis_rotation), 700.0 / 59, atol=1e-4)
 
 
-def test_opensim_reads_the_file(model, tmp_path):
-    opensim = pytest.importorskip("opensim")
-    coordinates = opensim_coordinates(model, body(FACING_X, **lowered(right_knee=(LEFT, 70.0))))
-    write_opensim_motion(tmp_path / "p.mot", coordinates, np.array([0.5]), {"licence": "a b"})
-    table = opensim.TimeSeriesTable(str(tmp_path / "p.mot"))
-    assert list(table.getColumnLabels()) == list(OPENSIM_COORDINATES)
-    assert table.getDependentColumn("knee_angle_r")[0] == pytest.approx(70.0, abs=1e-4)
-    assert table.getTableMetaDataString("inDegrees") == "yes"
-    assert table.getTableMetaDataString("licence") == "a b"
-
-
 def test_thighs_and_shanks_of_the_open_body_point_where_its_joints_are():
     body_model = load_open_body()
     rng = np.random.default_rng(0)

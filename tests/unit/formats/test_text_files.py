@@ -1,5 +1,3 @@
-import json
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,20 +22,13 @@ def refused(tmp_path):
 
 def test_plain_yaml_is_read(tmp_path):
     path = tmp_path / "a.yaml"
-    path.write_text("a: [1, 2.5, x]\nb: {c: true}\n")
-    assert read_yaml(path) == {"a": [1, 2.5, "x"], "b": {"c": True}}
-
-
-def test_a_date_stays_text(tmp_path):
-    path = tmp_path / "a.yaml"
-    path.write_text("match_id: 2024-05-01\n")
-    assert read_yaml(path) == {"match_id": "2024-05-01"}
-
-
-def test_a_byte_order_mark_is_no_content(tmp_path):
-    path = tmp_path / "a.yaml"
-    path.write_bytes(b"\xef\xbb\xbfa: 1\n")
-    assert read_yaml(path) == {"a": 1}
+    path.write_bytes(b"\xef\xbb\xbfa: [1, 2.5, x]\nb: {c: true}\nmatch_id: 2024-05-01\n")
+    assert read_yaml(path) == {"a": [1, 2.5, "x"], "b": {"c": True}, "match_id": "2024-05-01"}
+    for read in (read_yaml, read_json, read_toml):
+        with pytest.raises(InputError, match="found nothing"):
+            read(tmp_path / "absent")
+        with pytest.raises(InputError, match="found something else"):
+            read(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -53,6 +44,7 @@ def test_a_byte_order_mark_is_no_content(tmp_path):
         ("a: 1\n--- \nb: 2\n", "but found another document"),
         ("!!python/object/apply:os.system [x]", "python/object"),
         ("a: b: c\n", "line 1, column 5"),
+        *((f"fps: {text}\n", "") for text in ('!!int ""', "!!bool maybe", "!!timestamp soon")),
         ("a: " + "9" * 5000, "digits"),
         (b"a: \xff\n", "UTF-8"),
         (b"a: \x00\n", "YAML"),
@@ -60,14 +52,6 @@ def test_a_byte_order_mark_is_no_content(tmp_path):
 )
 def test_hostile_or_broken_yaml_is_refused(refused, content, words):
     refused(read_yaml, content, words)
-
-
-@pytest.mark.parametrize("text", ['!!int ""', '!!float ""', "!!bool maybe", "!!timestamp soon"])
-def test_a_tag_before_text_that_is_none_is_refused(tmp_path, text):
-    file = tmp_path / "match.yaml"
-    file.write_text(f"fps: {text}\n")
-    with pytest.raises(InputError, match=r"match.yaml"):
-        read_yaml(file)
 
 
 def test_a_flood_of_entries_is_refused_before_it_is_built(refused, monkeypatch):
@@ -80,14 +64,6 @@ def test_a_file_beyond_the_limit_is_refused_unread(refused, read):
     refused(read, b"#" * (files.SETTINGS_BYTES + 1), "2097153 bytes")
 
 
-@pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
-def test_a_missing_file_and_a_folder_are_refused(tmp_path, read):
-    with pytest.raises(InputError, match="found nothing"):
-        read(tmp_path / "absent")
-    with pytest.raises(InputError, match="found something else"):
-        read(tmp_path)
-
-
 @pytest.mark.parametrize("content", ["[" * 100_000, '{"a": ', "", "[" + "9" * 5000 + "]"])
 def test_broken_json_is_refused(refused, content):
     refused(read_json, content, "expected JSON")
@@ -95,12 +71,6 @@ def test_broken_json_is_refused(refused, content):
 
 def test_a_key_that_would_take_hours_is_refused(refused):
     refused(read_toml, "a" + ".a" * 300_000 + " = 1", "lines of at most 4096")
-
-
-def test_json_numbers_that_json_does_not_have_are_let_through_to_the_contract(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_text(json.dumps([float("inf")]))
-    assert read_json(path) == [float("inf")]
 
 
 @pytest.mark.parametrize("content", ["a = ", "a = 1\na = 2", "a = " + "[" * 4000, "x = 2024-99-99"])

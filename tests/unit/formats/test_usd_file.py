@@ -5,63 +5,16 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from test_gltf_file import FPS, FRAMES, NOTES, cameras, people
 
 from worldpose.body.body_file import load_open_body
-from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError, UsageError
-from worldpose.formats.gltf_file import AnimatedBody
 from worldpose.formats.usd_file import write_usd
-from worldpose.geometry.cameras import Camera
-
-FPS, FRAMES = 50.0, 30
-NOTES = {"software": "worldpose", "licence": "For tests alone.", "clip": "a"}
 
 
 @pytest.fixture(scope="module")
 def model():
     return load_open_body()
-
-
-def motion(seed):
-    """A person with a random pose that changes from frame to frame."""
-    rng = np.random.default_rng(seed)
-
-    def wander(size, step):
-        return np.cumsum(rng.normal(0.0, step, (FRAMES, size)), axis=0)
-
-    return BodyParameters(
-        rng.standard_normal((1, 10)),
-        rng.uniform(-3.0, 3.0, 3) + wander(3, 0.05),
-        rng.uniform(-1.0, 1.0, 69) + wander(69, 0.02),
-        rng.uniform(-50.0, 50.0, 3) + wander(3, 0.1),
-    )
-
-
-def people():
-    second = motion(1)
-    transl = second.transl.copy()
-    transl[:5] = transl[20:25] = np.nan
-    gappy = BodyParameters(second.betas, second.global_orient, second.body_pose, transl)
-    return [
-        AnimatedBody("person_003", motion(0), {"person": 3, "kind": "triangulated"}),
-        AnimatedBody("person_007", gappy, {"person": 7, "kind": "mixed"}),
-    ]
-
-
-def cameras():
-    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # looks along +y
-    turns = Rotation.from_rotvec(np.outer(np.linspace(0, 0.5, FRAMES), [0, 1, 0])).as_matrix()
-    matrix = np.array([[2000.0, 0, 940.0], [0, 2000.0, 560.0], [0, 0, 1.0]])
-    size = np.array([1920, 1080])
-
-    def camera(rotation):
-        place = -rotation @ np.array([1.0, -70.0, 12.0])
-        matrices = np.broadcast_to(matrix, (*rotation.shape[:-2], 3, 3))
-        return Camera.from_matrices(
-            matrices, np.zeros((*rotation.shape[:-2], 5)), rotation, place, size
-        )
-
-    return {"1 north": camera(turn), "main": camera(turns @ turn)}
 
 
 LINE = np.array([[-52.5, -34.0, 0.0], [52.5, -34.0, 0.1], [52.5, 34.0, 0.0]])
@@ -72,7 +25,8 @@ def test_bodies_cameras_and_units_are_read_back(model, tmp_path):
     from pxr import Gf, Usd, UsdGeom, UsdSkel
 
     path = tmp_path / "a.usdc"
-    write_usd(path, model, people(), FPS, cameras=cameras(), markings=[LINE], notes=NOTES)
+    seen_by = {f"1 {name}": each for name, each in cameras((940.0, 560.0)).items()}
+    write_usd(path, model, people(), FPS, cameras=seen_by, markings=[LINE], notes=NOTES)
     stage = Usd.Stage.Open(str(path))
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
@@ -108,8 +62,8 @@ def test_bodies_cameras_and_units_are_read_back(model, tmp_path):
         # The surface stands where the joints do, without the correctives of the pose.
         away = np.asarray(points) - model.vertices(body.poses[FRAMES - 1])
         assert np.linalg.norm(away, axis=1).max() < 0.2
-    assert checked == 2 * FRAMES - 10
-    for name, camera in cameras().items():
+    assert checked == 2 * FRAMES - 15
+    for name, camera in seen_by.items():
         prim = UsdGeom.Camera(stage.GetPrimAtPath(f"/world/{name.replace('1 ', 'camera_1_')}"))
         for frame in (0, FRAMES - 1):
             one = camera[frame] if camera.batch_shape else camera

@@ -25,10 +25,3 @@ def test_nothing_is_at_the_place_before_the_block_ends(tmp_path):
         assert not path.exists()
     assert path.read_text() == "whole"
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_the_file_has_the_rights_of_any_other(tmp_path):
-    (tmp_path / "plain").write_text("")
-    with whole_file(tmp_path / "made") as draft:
-        draft.write_text("")
-    assert (tmp_path / "made").stat().st_mode == (tmp_path / "plain").stat().st_mode

@@ -3,8 +3,6 @@ import tomllib
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from data_contracts.cameras import CameraCalibration
@@ -98,16 +96,11 @@ def test_anipose_camera_is_called_by_its_name(read):
     assert camera.principal_point_px == (511.7, 350.1)
     assert camera.distortion == (-0.1, 0.02, 0.001, -0.002, 0.003)
     assert camera.translation == (-0.5, 0.9, 2.6)
-
-
-def test_rotation_vector_is_opencvs(read):
     expected, _ = cv2.Rodrigues(np.array([1.5, -0.6, 0.7]))
     # Two ways to the same matrix of entries up to 1, in float64.
-    np.testing.assert_allclose(read(ANIPOSE)["left"].rotation, expected, rtol=0, atol=1e-15)
-
-
-def test_pose2sim_has_four_coefficients_and_sizes_with_a_point(read):
-    camera = read(POSE2SIM)["cam_01"]
+    np.testing.assert_allclose(camera.rotation, expected, rtol=0, atol=1e-15)
+    assert read(ANIPOSE.replace("0.003]", "0.003, 0.0, 0, 0.0]")) == cameras
+    camera = read(POSE2SIM)["cam_01"]  # four coefficients, and sizes with a point
     assert camera.image_size == (1088, 1920)
     assert camera.distortion == (-0.1, 0.02, 9.5e-06, 1.1e-05, 0.0)
 
@@ -119,11 +112,6 @@ def test_caliscope_camera_is_called_by_its_number_and_may_give_a_matrix(read):
     assert camera.rotation == ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
     assert camera.distortion == (-0.1, 0.02, 0.0, 0.0, 0.0)
     assert camera.translation == (0.1, 0.2, 3.0)
-
-
-def test_further_coefficients_may_be_there_when_they_are_zero(read):
-    text = ANIPOSE.replace("0.003]", "0.003, 0.0, 0, 0.0]")
-    assert read(text)["left"].distortion[4] == 0.003
 
 
 def test_a_rotation_that_was_rounded_becomes_a_rotation(read):
@@ -160,6 +148,11 @@ def test_a_rotation_that_was_rounded_becomes_a_rotation(read):
         ('"left"', '"../left"', "cam_0: name", "letters"),
         ("[metadata]", "fisheye = true\n[metadata]", "cam_0.fisheye", "standard model"),
         ("[cam_0]", "title = 1\n[cam_0]", "title", "a table for each camera"),
+        ("1063.5", "6.2", "cam_0: focal length", "in pixels"),
+        ("511.7", "1e6", "cam_0: principal point", "in pixels"),
+        ("[1.5, -0.6, 0.7]", "[90.0, 10.0, -45.0]", "cam_0.rotation", "degrees"),
+        ("[-0.5, 0.9, 2.6]", "[1e8, 0.9, 2.6]", "cam_0: translation", "metres"),
+        ("[1032, 776]", "[1000000, 776]", "cam_0: size", "pixels"),
     ],
 )
 def test_wrong_entry_is_refused_with_its_key(refusal, old, new, place, words):
@@ -169,20 +162,20 @@ def test_wrong_entry_is_refused_with_its_key(refusal, old, new, place, words):
     assert words in str(error)
 
 
-def test_a_file_without_cameras_and_two_of_one_name_are_refused(refusal):
+def test_no_camera_two_of_one_name_and_other_kinds_of_file_are_refused(refusal):
     assert refusal("[metadata]\nerror = 0.0\n").expected == "at least one camera"
     twice = ANIPOSE + ANIPOSE.replace("[cam_0]", "[cam_1]").split("[metadata]")[0]
     assert "'left' a second time" in refusal(twice).found
-
-
-def test_another_kind_of_file_is_refused(refusal):
     assert "'.yaml'" in refusal("", "calibration.yaml").found
 
 
 def test_written_cameras_come_back(tmp_path, make_camera):
-    cameras = {f"cam{i}": make_camera(f"cam{i}", angle=0.7 * i) for i in range(5)}
+    angles = (0.7, 1.4, 0.0, 1e-9, np.pi - 1e-9, np.pi)
+    cameras = {f"cam{i}": make_camera(f"cam{i}", angle) for i, angle in enumerate(angles)}
     write_calibration_toml(tmp_path / "c.toml", cameras)
     back = read_calibration(tmp_path / "c.toml")
+    tables = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert list(tables) == [*(f"cam_{i}" for i in range(6)), "metadata"]
     assert list(back) == list(cameras)
     for name, camera in cameras.items():
         exact = back[name].model_copy(update={"rotation": camera.rotation})
@@ -191,31 +184,12 @@ def test_written_cameras_come_back(tmp_path, make_camera):
         np.testing.assert_allclose(back[name].rotation, camera.rotation, rtol=0, atol=2e-15)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, np.pi - 1e-9, np.pi])
-def test_rotations_at_zero_and_half_a_turn_come_back(tmp_path, make_camera, angle):
-    camera = make_camera("cam1", angle=angle)
-    write_calibration_toml(tmp_path / "c.toml", {"cam1": camera})
-    back = read_calibration(tmp_path / "c.toml")["cam1"]
-    np.testing.assert_allclose(back.rotation, camera.rotation, rtol=0, atol=2e-15)
-
-
-def test_written_file_has_the_keys_that_anipose_and_pose2sim_read(tmp_path, make_camera):
-    write_calibration_toml(tmp_path / "c.toml", {"left": make_camera("left")})
-    tables = tomllib.loads((tmp_path / "c.toml").read_text())
-    assert list(tables) == ["cam_0", "metadata"]
-    camera = tables["cam_0"]
-    assert camera["name"] == "left"
-    assert camera["fisheye"] is False
-    assert np.shape(camera["matrix"]) == (3, 3)
-    assert len(camera["rotation"]) == len(camera["translation"]) == 3
-    assert len(camera["distortions"]) == 5
-
-
 def test_qualisys_camera_projects_as_it_stands(read):
     camera = read(QUALISYS, "rig.qca.txt")["26580"]
     assert camera.image_size == (1920, 1080)
     assert camera.focal_px == (1000.0, 1100.0)  # 64000 / 64, 70400 / 64
     assert camera.principal_point_px == (960.0, 540.0)
+    assert camera.distortion == (-0.05, 0.14, 0.0006, -0.0004, 0.01)
     rotation, t = np.array(camera.rotation), np.array(camera.translation)
     np.testing.assert_array_equal(-rotation.T @ t, [1.0, 2.0, 10.0])  # whole numbers throughout
 
@@ -233,11 +207,6 @@ def test_qualisys_camera_projects_as_it_stands(read):
 def _matrix(camera: CameraCalibration):
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def test_qualisys_distortion_has_no_unit(read):
-    camera = read(QUALISYS, "rig.qca.txt")["26580"]
-    assert camera.distortion == (-0.05, 0.14, 0.0006, -0.0004, 0.01)
 
 
 def test_qualisys_video_that_shows_a_part_of_the_sensor_moves_the_centre(read):
@@ -273,51 +242,5 @@ def test_entities_are_refused_in_any_encoding(tmp_path):
     path = tmp_path / "rig.xml"
     text = "<?xml version='1.0' encoding='UTF-16'?><!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>"
     path.write_bytes(text.encode("utf-16"))
-    with pytest.raises(InputError, match="a DOCTYPE"):
+    with pytest.raises(InputError, match="a document type"):
         read_calibration(path)
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
-    lambda inner: st.lists(inner, max_size=4),
-    max_leaves=12,
-)
-
-
-@settings(max_examples=150)
-@given(
-    st.sampled_from(
-        ["size", "matrix", "distortions", "rotation", "translation", "name", "fisheye"]
-    ),
-    VALUES,
-)
-def test_any_value_in_any_entry_is_read_or_refused(tmp_path_factory, key, value):
-    path = tmp_path_factory.getbasetemp() / "fuzzed.toml"
-    lines = [line for line in ANIPOSE.splitlines() if not line.startswith(key)]
-    lines.insert(2, f"{key} = {_toml(value)}")
-    path.write_text("\n".join(lines))
-    try:
-        (camera,) = read_calibration(path).values()
-        assert np.all(np.isfinite(camera.rotation))
-    except InputError as error:
-        assert str(path) in error.where
-
-
-def _toml(value):
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value) if isinstance(value, int | float) else f"'{str(value).encode().hex()}'"
-
-
-@settings(max_examples=100)
-@given(st.integers(0, len(QUALISYS) - 1), st.integers(0, 40), st.text(max_size=6))
-def test_a_spoilt_qualisys_file_is_read_or_refused(tmp_path_factory, start, length, insert):
-    path = tmp_path_factory.getbasetemp() / "fuzzed.qca.txt"
-    spoilt = QUALISYS[:start] + insert + QUALISYS[start + length :]
-    path.write_bytes(spoilt.encode("utf-8", "replace"))
-    try:
-        assert read_calibration(path)
-    except InputError as error:
-        assert str(path) in error.where

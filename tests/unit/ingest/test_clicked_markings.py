@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.errors import InputError
 from worldpose.ingest.footage import read_still
@@ -134,14 +133,6 @@ def test_clicks_without_a_pitch_are_refused(clicked_folder):
     assert "pitch: none" in refusal(folder).expected
 
 
-def test_the_names_are_those_of_the_surveyed_pitch(clicked_folder):
-    clicked = ClickedMarkings(points=(ClickedPoint(name="dug_out", xy=(5.0, 6.0)),))
-    with pytest.raises(InputError, match="dug_out"):
-        clicked_folder(clicked)
-    folder = clicked_folder(clicked, pitch=PitchSpec(points={"dug_out": (0.0, -36.0, -0.2)}))
-    assert read_match(folder).clicked == {"cam2": clicked}
-
-
 def test_a_camera_neither_given_nor_clicked_is_named_with_what_to_do(clicked_folder):
     folder = clicked_folder()
     file_of(folder).unlink()
@@ -180,12 +171,3 @@ def test_a_small_file_that_declares_a_huge_still_is_refused_unread(tmp_path):
         read_still(path, (1920, 1080))
     with pytest.raises(InputError, match="bytes that are none"):
         read_still(path, (60_000, 60_000))
-
-
-def test_a_jpeg_still_is_read(tmp_path):
-    path = tmp_path / "cam.png"
-    _, content = cv2.imencode(".jpg", np.full((20, 30, 3), 120, np.uint8))
-    path.write_bytes(content.tobytes())
-    assert read_still(path, (30, 20)).shape == (20, 30, 3)
-    with pytest.raises(InputError, match="found 30 x 20"):
-        read_still(path, (1920, 1080))

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from test_pose2sim_import import person, write_frame
 
-from data_contracts.conventions import COCO17, FEET
+from data_contracts.conventions import FEET
 from data_contracts.ingest import INGEST
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import StoredArray, _align_points
@@ -73,13 +73,6 @@ def test_feet_alone_are_no_person(tmp_path):
     found = read_openpose_folder(tmp_path / "a_json").people
     assert np.isnan(found.extra_confidence[0, 0]).all()
     assert np.isfinite(found.extra_confidence[0, 1]).all()
-
-
-def test_a_set_without_feet_has_no_further_arrays(tmp_path):
-    write_frame(tmp_path / "a_json", 0, [person(17, 1)[0]])
-    found = read_openpose_folder(tmp_path / "a_json").people
-    assert found.points == () and found.extra_keypoints is None
-    assert set(found.arrays()) == {"keypoints", "confidence", "boxes", "score"}
 
 
 def test_files_keep_them(tmp_path):
@@ -177,7 +170,3 @@ def test_a_clip_aligns_the_points_of_its_cameras():
     assert np.isnan(read[:, 1, :, 3:]).all() and np.isnan(read[:, 2]).all()
     clips, points = _align_points([stored(plain)])
     assert points == () and "extra_keypoints" not in clips[0]
-
-
-def test_the_names_are_no_keypoints_of_coco():
-    assert not set(FEET) & set(COCO17)

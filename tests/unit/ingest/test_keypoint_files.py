@@ -6,7 +6,6 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.formats.keypoint_files import (
-    on_frames,
     read_observations,
     seen_frames,
     write_keypoint_arrays,
@@ -39,35 +38,6 @@ def test_a_range_leaves_out_and_pads(npz):
     assert np.all(np.isnan(read.boxes[[1, 2, 4, 5]]))
 
 
-def test_a_range_may_begin_before_frame_zero(npz):
-    read = read_observations(npz[0], [(-2, 14)])
-    assert (read.frame[0], read.frame[-1]) == (-2, 11)
-    assert np.isfinite(read.score).sum() == 4
-
-
-def test_both_forms_of_the_same_people_read_alike(tmp_path, npz):
-    path, people = npz
-    results = [
-        {
-            "image_id": int(frame),
-            "keypoints": np.nan_to_num(
-                np.concatenate([people.keypoints[f, d], people.confidence[f, d, :, None]], axis=-1)
-            )
-            .astype(float)
-            .ravel()
-            .tolist(),
-            "score": float(people.score[f, d]),
-        }
-        for f, frame in enumerate(people.frame)
-        for d in range(2)
-    ]
-    (tmp_path / "cam2.json").write_text(json.dumps(results))
-    a, b = read_observations(path), read_observations(tmp_path / "cam2.json")
-    np.testing.assert_array_equal(a.frame, b.frame)
-    for name in a.arrays():
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
 @pytest.mark.parametrize("first_frame", [0, 15, 2**40, -(10**30)])
 def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
     with pytest.raises(InputError, match="found frames 10 to 14") as caught:
@@ -97,9 +67,3 @@ def test_seen_frames_are_those_with_a_joint(make_people):
     people.confidence[:] = np.nan
     assert seen_frames(people) is None
     assert seen_frames(make_people(0, 0, 0)) is None
-
-
-def test_nobody_is_nobody_on_any_frames(tmp_path, make_people):
-    read = on_frames(tmp_path, make_people(0, 0, 0), [(5, 3)])
-    np.testing.assert_array_equal(read.frame, [5, 6, 7])
-    assert read.keypoints.shape == (3, 0, 17, 2)

@@ -7,7 +7,6 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
-from worldpose.formats.keypoint_files import write_keypoint_arrays
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated
@@ -59,24 +58,13 @@ def test_frames_keep_their_numbers_in_one_clip_over_all_cameras(tmp_path, source
         np.testing.assert_array_equal(people.keypoints[found, 0, 0, 0], seen)
 
 
-def test_arrays_are_imported_too(tmp_path, source, make_people):
-    (source / "detections" / "left.json").unlink()
-    write_keypoint_arrays(source / "detections" / "left.npz", make_people(299, 2))
-    assert run(source, tmp_path / "m").clips[0].first_frame == 299
-
-
 def test_a_camera_that_saw_nobody_is_kept(tmp_path, source):
     (source / "detections" / "left.json").write_text("[]")
-    spec = run(source, tmp_path / "m")
+    spec = run(source, tmp_path / "m", match_id="final", pitch=None)
+    assert (spec.match_id, read_match(tmp_path / "m").pitch) == ("final", PitchSpec())
     assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (300, 3)
     people, _ = read_unit(read_match(tmp_path / "m"), "left")
     assert people.keypoints.shape == (3, 0, 17, 2)
-
-
-def test_id_and_pitch_can_be_given(tmp_path, source):
-    spec = run(source, tmp_path / "m", match_id="final", pitch=None)
-    assert spec.match_id == "final"
-    assert read_match(tmp_path / "m").pitch == PitchSpec()
 
 
 @pytest.mark.parametrize(
@@ -113,25 +101,6 @@ def test_a_broken_source_leaves_nothing(tmp_path, source, change, where):
         run(source, tmp_path / "m")
     assert caught.value.where.endswith(where)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
-
-
-@pytest.mark.parametrize("fps", [0.0, -25.0, float("nan"), float("inf")])
-def test_a_frame_rate_must_be_one(tmp_path, source, fps):
-    with pytest.raises(InputError, match=r"match\.yaml: fps"):
-        import_match(source / "calibration.toml", source / "detections", fps, tmp_path / "m")
-
-
-def test_an_unfit_id_is_refused(tmp_path, source):
-    with pytest.raises(InputError, match="match_id"):
-        run(source, tmp_path / "m", match_id="a/b")
-
-
-def test_an_existing_match_is_left_as_it_was(tmp_path, source):
-    run(source, tmp_path / "m")
-    (source / "detections" / "left.json").write_text(json.dumps(results(1)))
-    with pytest.raises(InputError, match="left as it was"):
-        run(source, tmp_path / "m")
-    assert read_match(tmp_path / "m").spec.clips[0].first_frame == 300
 
 
 def film(path):

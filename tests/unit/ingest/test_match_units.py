@@ -28,18 +28,6 @@ def test_clips_that_touch_or_overlap_are_one_range(spec):
     assert (frames.first, frames.count) == (0, 52)
 
 
-def test_frames_between_clips_that_are_far_apart_take_no_memory(match_folder, make_people):
-    path = match_folder / "match.yaml"
-    content = yaml.safe_load(path.read_text())
-    content["clips"][1]["first_frame"] = 2_000_000_000
-    path.write_text(yaml.safe_dump(content))
-    people, _ = read_unit(read_match(match_folder), "cam1")
-    count = content["clips"][1]["frame_count"]
-    np.testing.assert_array_equal(people.frame[:3], [5, 6, 7])
-    np.testing.assert_array_equal(people.frame[3:], 2_000_000_000 + np.arange(count))
-    np.testing.assert_array_equal(people.keypoints[:3], make_people(5, 3, seed=1).keypoints)
-
-
 def test_a_static_camera_covers_all_clips_in_match_frames(match_folder, make_people):
     people, calibration = read_unit(read_match(match_folder), "cam1")
     np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
@@ -73,14 +61,6 @@ def test_a_broken_broadcast_offset_is_taken_to_the_nearest_frame(match_folder, m
     people, _ = read_unit(read_match(match_folder), "goal")
     np.testing.assert_array_equal(people.keypoints[0], make_people(0, 3, seed=3).keypoints[1])
     assert np.all(np.isnan(people.keypoints[2]))
-
-
-def test_frames_that_a_camera_lacks_have_no_people(match_folder, make_people):
-    write_keypoint_arrays(match_folder / "detections" / "cam1.npz", make_people(6, 2))
-    people, _ = read_unit(read_match(match_folder), "cam1")
-    np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
-    seen = np.isfinite(people.score).any(axis=1)
-    np.testing.assert_array_equal(seen, [False, True, True, False, False])
 
 
 def test_a_wrong_offset_is_noticed(match_folder, make_people):

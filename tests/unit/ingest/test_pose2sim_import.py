@@ -1,9 +1,7 @@
 """A trial of Pose2Sim becomes a match folder, or is refused with a message that can be followed."""
 
 import json
-import os
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +14,8 @@ from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.ingest.footage import read_unit
-from worldpose.ingest.importing import import_pose2sim
 from worldpose.ingest.match_folder import read_match
+from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.video.files import write_video
 
 CAMERAS = ("cam01", "cam02")
@@ -101,16 +99,6 @@ def test_synchronised_poses_and_the_frame_range_have_precedence(trial, tmp_path)
     (trial / "Config.toml").write_text("[project]\nframe_range = [11, 13]\nframe_rate = 50\n")
     spec, _ = import_pose2sim(trial, tmp_path / "m", fps=25.0)
     assert (spec.fps, spec.clips[0].first_frame, spec.clips[0].frame_count) == (25.0, 11, 2)
-
-
-def test_a_trial_of_a_batch_uses_the_files_above_it(trial, tmp_path):
-    batch = tmp_path / "batch"
-    shutil.copytree(trial / "pose", batch / "Trial_1" / "pose")
-    shutil.copytree(trial / "calibration", batch / "calibration")
-    (batch / "Config.toml").write_text("[project]\nframe_rate = 120\n")
-    (batch / "Trial_1" / "Config.toml").write_text("[project]\nframe_range = [10, 12]\n")
-    spec, _ = import_pose2sim(batch / "Trial_1", tmp_path / "m")
-    assert (spec.fps, spec.clips[0].frame_count) == (120.0, 2)
 
 
 def test_other_names_belong_to_the_cameras_in_order_and_it_says_so(trial, tmp_path):
@@ -265,17 +253,3 @@ def test_a_bad_trial_is_refused_with_one_error(trial, tmp_path, what, message):
         import_pose2sim(trial, tmp_path / "m")
     assert caught.value.todo
     assert not (tmp_path / "m").exists()
-
-
-DEMO = Path(os.environ.get("WORLDPOSE_POSE2SIM_DEMO", "nowhere"))
-
-
-@pytest.mark.skipif(not DEMO.is_dir(), reason="WORLDPOSE_POSE2SIM_DEMO names no demo of Pose2Sim")
-def test_the_demo_of_pose2sim_is_imported(tmp_path):
-    spec, notes = import_pose2sim(DEMO, tmp_path / "m")
-    assert [one.id for one in spec.static_cameras] == ["cam01", "cam02", "cam03", "cam04"]
-    assert (spec.fps, spec.clips[0].frame_count) == (60.0, 100)
-    assert any("the run detects people in the videos" in note for note in notes)
-    assert set(read_calibration(tmp_path / "m" / "calibration.toml")) == {
-        one.id for one in spec.static_cameras
-    }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import data_contracts.arrays
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
 from data_contracts.run import RunRecord
 from data_contracts.work import Recipe, Work
@@ -29,60 +29,19 @@ are 1 MiB and more."""
 LAYOUT = GroupLayout(
     stage="tracking",
     about="Sample.",
-    coordinates=(
-        ArrayLayout(
-            name="frame", dims=("frame",), dtype="int64", unit="frame", missing="none", about="f"
-        ),
-    ),
+    coordinates=(array_layout("frame", "(frame) int64 [frame]", "f"),),
     arrays=(
-        ArrayLayout(
-            name="joints",
-            dims=("frame", "person", "coordinate"),
-            dtype="float64",
-            unit="m",
-            missing="nan",
-            about="joints, world",
-            chunk_dim="frame",
+        array_layout(
+            "joints", "(*frame, person, coordinate) float64 [m], missing nan", "joints, world"
         ),
-        ArrayLayout(
-            name="detection_index",
-            dims=("frame", "camera"),
-            dtype="int16",
-            unit="1",
-            missing="-1",
-            about="which detection",
-            chunk_dim="frame",
+        array_layout(
+            "detection_index", "(*frame, camera) int16 [1], missing -1", "which detection"
         ),
-        ArrayLayout(
-            name="views",
-            dims=("frame",),
-            dtype="uint8",
-            unit="1",
-            missing="0",
-            about="how many cameras",
-        ),
-        ArrayLayout(
-            name="inliers",
-            dims=("frame", "person"),
-            dtype="bool",
-            unit="1",
-            missing="none",
-            about="is it good",
-        ),
-        ArrayLayout(
-            name="height", dims=(), dtype="float32", unit="m", missing="none", about="one number"
-        ),
-        ArrayLayout(
-            name="nothing",
-            dims=("detection",),
-            dtype="float32",
-            unit="px",
-            missing="nan",
-            about="no detections at all",
-        ),
-        ArrayLayout(
-            name="extra", dims=("frame",), dtype="int32", unit="1", missing="none", about="rare"
-        ),
+        array_layout("views", "(frame) uint8 [1], missing 0", "how many cameras"),
+        array_layout("inliers", "(frame, person) bool [1]", "is it good"),
+        array_layout("height", "() float32 [m]", "one number"),
+        array_layout("nothing", "(detection) float32 [px], missing nan", "no detections at all"),
+        array_layout("extra", "(frame) int32 [1]", "rare"),
     ),
     labels={"coordinate": ("x", "y", "z")},
     attributes={"camera": "camera ids", "detector": "who detected"},

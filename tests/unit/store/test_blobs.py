@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -56,29 +54,6 @@ def test_entries_are_those_below_a_folder(store: Store) -> None:
     assert [(entry.path, entry.size) for entry in found] == [("a/b", 3), ("a/c/d", 5)]
     assert all(entry.modified.tzinfo is not None for entry in found)
     assert store.blobs.entries("nothing") == []
-
-
-def test_what_goes_while_it_is_listed_is_not_there(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    blobs = folder_store.blobs
-    blobs.put("a/1", b"1")
-    blobs.put("a/2", b"2")
-    staged = blobs.create_staging()
-    (staged / "half").write_bytes(b"half")
-    scan = os.scandir
-
-    @contextmanager
-    def scan_and_delete(folder: str) -> Iterator[list[os.DirEntry[str]]]:
-        with scan(folder) as found:
-            inside = list(found)
-        blobs.delete("a/1")
-        (staged / "half").unlink(missing_ok=True)
-        yield inside
-
-    monkeypatch.setattr(os, "scandir", scan_and_delete)
-    assert [entry.path for entry in blobs.entries("a")] == ["a/2"]
-    assert [entry.size for entry in blobs.staged_entries()] == [0]
 
 
 def test_tree_is_removed_with_the_first_file_first(store: Store) -> None:

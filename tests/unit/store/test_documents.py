@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from store_samples import sample_recipe, sample_record, sample_registration
 
@@ -16,11 +16,6 @@ from worldpose.store.documents import canonical_json, digest, seal, unseal
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]))
 NUMBERS = st.integers() | st.floats(allow_nan=False, allow_infinity=False)
-FEW = st.recursive(
-    st.sampled_from([None, False, True, 0, 1, 1.5, "", "0", "null"]),
-    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from("ab"), inner),
-    max_leaves=3,
-)
 """So few that two of them are often the same."""
 VALUES = st.recursive(
     st.none() | st.booleans() | NUMBERS | TEXT,
@@ -34,18 +29,6 @@ def test_value_comes_back_and_is_written_the_same_again(value: object) -> None:
     data = canonical_json(value)
     assert json.loads(data) == value
     assert canonical_json(json.loads(data)) == data
-
-
-@settings(max_examples=50)
-@given(st.dictionaries(TEXT, VALUES, max_size=5))
-def test_order_of_keys_does_not_matter(value: dict[str, object]) -> None:
-    assert canonical_json(dict(reversed(value.items()))) == canonical_json(value)
-
-
-@given(FEW | VALUES, FEW | VALUES)
-def test_equal_bytes_mean_equal_values(one: object, other: object) -> None:
-    if canonical_json(one) == canonical_json(other):
-        assert one == other
 
 
 @pytest.mark.parametrize(
@@ -72,9 +55,8 @@ def test_values_that_are_nearly_the_same_have_bytes_of_their_own(
     assert canonical_json(one) != canonical_json(other)
 
 
-def test_form_is_sorted_and_without_spaces() -> None:
-    value = {"b": [1, 2.5, None, True], "a": {"é": "x"}}
-    assert canonical_json(value) == '{"a":{"é":"x"},"b":[1,2.5,null,true]}'.encode()
+ENDLESS: list[object] = []
+ENDLESS.append(ENDLESS)
 
 
 @pytest.mark.parametrize(
@@ -88,23 +70,12 @@ def test_form_is_sorted_and_without_spaces() -> None:
         np.zeros(2),
         "\ud800",
         {"a": object()},
+        ENDLESS,
     ],
 )
 def test_value_that_json_cannot_say_exactly_is_refused(value: object) -> None:
     with pytest.raises(InputError, match="plain JSON"):
         canonical_json(value)
-
-
-def test_value_nested_without_end_is_refused() -> None:
-    endless: list[object] = []
-    endless.append(endless)
-    with pytest.raises(InputError, match="plain JSON"):
-        canonical_json(endless)
-
-
-def test_digest_is_sha256() -> None:
-    # FIPS 180-2, appendix B.1.
-    assert digest(b"abc").startswith("ba7816bf8f01cfea414140de5dae2223")
 
 
 DOCUMENT = seal(sample_record("0001", sample_recipe()))
@@ -113,7 +84,8 @@ DOCUMENT = seal(sample_record("0001", sample_recipe()))
 def test_record_comes_back() -> None:
     record = sample_record("0001", sample_recipe())
     assert unseal(RunRecord, seal(record), "run") == record
-    assert seal(unseal(RunRecord, seal(record), "run")) == seal(record)
+    value = {"b": [1, 2.5, None, True], "a": {"é": "x"}}
+    assert canonical_json(value) == '{"a":{"é":"x"},"b":[1,2.5,null,true]}'.encode()
 
 
 @given(st.integers(0, len(DOCUMENT) - 1), st.integers(0, 7))
@@ -130,13 +102,9 @@ def test_every_truncation_is_corruption(length: int) -> None:
         unseal(RunRecord, DOCUMENT[:length], "the place")
 
 
-@given(st.binary(max_size=200))
-def test_noise_is_corruption(noise: bytes) -> None:
-    with pytest.raises(CorruptionError):
-        unseal(RunRecord, noise, "the place")
-
-
-@pytest.mark.parametrize("data", [b"[]", b"1", b"null", b"{}", b"[" * 100_000, DOCUMENT + b" "])
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff", b"[]", b"1", b"null", b"{}", b"[" * 100_000, DOCUMENT + b" "]
+)
 def test_other_json_is_corruption(data: bytes) -> None:
     with pytest.raises(CorruptionError):
         unseal(RunRecord, data, "the place")

@@ -40,14 +40,6 @@ def die(store: Store) -> None:
     assert process.exitcode == 9
 
 
-def test_what_a_run_names_is_never_garbage(store: Store) -> None:
-    run_once(store, sample_recipe())
-    run_once(store, sample_recipe("late"))
-    plan = plan_gc(store, older_than=NOW)
-    assert plan.garbage == ()
-    assert collect(store, plan) == 0
-
-
 def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) -> None:
     run_once(store)
     publish(store, sample_recipe("unused"))
@@ -78,17 +70,6 @@ def test_young_results_and_leftovers_are_spared(store: Store) -> None:
     publish(store)
     store.blobs.create_staging()
     assert plan_gc(store, older_than=timedelta(hours=1)).garbage == ()
-
-
-def test_orphan_staging_is_removed(tmp_path: object) -> None:
-    store = Store.create(f"{tmp_path}/project")
-    folder = store.blobs.create_staging()
-    (folder / "chunk").write_bytes(b"12345")
-    store.blobs.create_staging()
-    plan = plan_gc(store, older_than=NOW)
-    assert sorted(item.size for item in plan.garbage) == [0, 5]
-    collect(store, plan)
-    assert store.blobs.staged_entries() == []
 
 
 def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
@@ -160,14 +141,6 @@ def test_dead_run_keeps_its_number_until_a_later_one_is_there(folder_store: Stor
     collect(folder_store, plan)
     assert folder_store.unfinished_runs("final") == ()
     assert run_once(folder_store) == "0004"
-
-
-def test_dead_run_does_not_hold_its_match(folder_store: Store) -> None:
-    publish(folder_store)
-    die(folder_store)
-    plan = plan_gc(folder_store, older_than=NOW)
-    assert [item.path for item in plan.garbage] == [ResultId(*place()).path]
-    assert plan.held == ()
 
 
 def test_forgotten_runs_go_with_what_only_they_reach(folder_store: Store) -> None:

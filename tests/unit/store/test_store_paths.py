@@ -3,12 +3,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from store_samples import place
 
 from worldpose.errors import InputError
-from worldpose.store.paths import ResultId, checked_path
+from worldpose.store.paths import ResultId
 from worldpose.store.store import Store
 
 BAD = ["", "/", "/etc/passwd", "..", "a/../b", "a/..", "./a", "a//b", "a/", "a\0b", "a\nb", "a\\b"]
@@ -32,19 +30,6 @@ def test_path_that_could_leave_the_project_is_refused_by_every_method(
             with pytest.raises(InputError, match="path inside a project"):
                 call()
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@given(st.text())
-def test_accepted_path_stays_inside(path: str) -> None:
-    try:
-        checked_path(path)
-    except InputError:
-        return
-    root = Path("/projects/one")
-    joined = root / path
-    assert ".." not in joined.parts
-    assert joined.is_relative_to(root)
-    assert joined != root
 
 
 def test_result_is_known_from_its_files() -> None:

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
 import pytest
 from store_samples import (
     PROCESSES,
-    publish,
     run_once,
     run_process,
     sample_recipe,
@@ -15,7 +13,7 @@ from store_samples import (
 )
 
 from data_contracts.pin import Pin
-from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.errors import InputError, StoreError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import verify
 from worldpose.store.runs import list_pins, may_be_running, pin_run, unpin_run
@@ -28,6 +26,8 @@ def test_runs_are_numbered_from_one(store: Store) -> None:
     assert store.run("final").run_id == "0003"
     assert store.run("final", "0001").run_id == "0001"
     assert store.unfinished_runs("final") == ()
+    with pytest.raises(InputError, match="worldpose run semi"):
+        store.run("semi")
 
 
 def test_latest_is_the_highest_number_and_not_the_last_text(folder_store: Store) -> None:
@@ -55,11 +55,6 @@ def test_number_with_a_folder_in_its_place_is_passed_over(folder_store: Store, t
     assert folder_store.reserve_run("final") == "0003"
 
 
-def test_match_without_runs_says_what_to_run(folder_store: Store) -> None:
-    with pytest.raises(InputError, match="worldpose run final"):
-        folder_store.run("final")
-
-
 def test_record_is_written_once(store: Store) -> None:
     record = sample_record(store.reserve_run("final"))
     store.finish_run(record)
@@ -67,13 +62,6 @@ def test_record_is_written_once(store: Store) -> None:
     with pytest.raises(StoreError, match="was finished earlier"):
         store.finish_run(record.model_copy(update={"state": "failed"}))
     assert store.run("final") == record
-
-
-def test_damaged_record_is_corruption(folder_store: Store) -> None:
-    run_once(folder_store)
-    folder_store.blobs.put("runs/final/0001.json", b"{}")
-    with pytest.raises(CorruptionError, match=r"runs/final/0001\.json"):
-        folder_store.run("final")
 
 
 def test_number_that_another_run_took_and_finished_is_not_given_again(
@@ -96,12 +84,6 @@ def test_number_that_another_run_took_and_finished_is_not_given_again(
     assert [run.run_id for run in store.unfinished_runs("final")] == ["0002"]
 
 
-def test_threads_get_different_numbers(store: Store) -> None:
-    with ThreadPoolExecutor(4) as pool:
-        numbers = list(pool.map(lambda _: store.reserve_run("final"), range(12)))
-    assert sorted(numbers) == [f"{number:04d}" for number in range(1, 13)]
-
-
 def reserve_some(url: str, outcome: object) -> None:
     store = Store.open(url)
     outcome.put([store.reserve_run("final") for _ in range(4)])  # type: ignore[attr-defined]
@@ -114,28 +96,14 @@ def test_processes_get_different_numbers(store: Store) -> None:
     for process in processes:
         process.join(60)
     assert sorted(numbers) == [f"{number:04d}" for number in range(1, 13)]
-    assert len(store.unfinished_runs("final")) == 12
-
-
-def test_run_of_a_dead_process_is_known_to_be_dead(store: Store) -> None:
-    outcome = PROCESSES.Queue()
-    process = run_process(reserve_some, store.url, outcome)
-    outcome.get(timeout=60)
-    process.join(60)
-    assert [may_be_running(run) for run in store.unfinished_runs("final")] == [False] * 4
+    unfinished = store.unfinished_runs("final")
+    assert [may_be_running(run) for run in unfinished] == [False] * 12
 
 
 def test_run_on_another_machine_may_be_alive(folder_store: Store) -> None:
     folder_store.reserve_run("final")
     (run,) = folder_store.unfinished_runs("final")
     assert may_be_running(run.model_copy(update={"host": "elsewhere", "pid": 2**22 + 1}))
-
-
-def test_results_can_be_reused_by_a_later_run(folder_store: Store) -> None:
-    publish(folder_store)
-    run_once(folder_store)
-    run_once(folder_store)
-    assert folder_store.run("final", "0001").results == folder_store.run("final", "0002").results
 
 
 NOW = timedelta(0)

@@ -53,29 +53,6 @@ def test_person_who_takes_the_detection_that_another_loses_is_a_takeover(hidden)
     assert result.report.takeovers == 1
 
 
-def test_person_who_is_seen_again_beside_the_other_is_no_takeover(hidden):
-    result = track_people(hidden[0], detections(*hidden[1:]), FPS, TrackingSettings())
-    assert len(result.person) == 2
-    assert result.takeovers == ()
-
-
-def test_other_who_is_placed_again_makes_it_no_takeover(hidden):
-    cameras, keypoints, confidence = hidden
-    keypoints[BACK : BACK + 3, 0, 1] = np.nan
-    result = track_people(cameras, detections(keypoints, confidence), FPS, TrackingSettings())
-    assert len(result.person) == 2
-    assert result.takeovers == ()
-
-
-def test_takeover_of_a_track_too_short_to_be_a_person_is_left_out(hidden):
-    cameras, keypoints, confidence = hidden
-    keypoints[BACK:, 0, 1] = np.nan
-    keypoints[: LOST - 4, :, 1] = np.nan  # 4 frames of 0.02 s; min_track_s is 0.2 s
-    result = track_people(cameras, detections(keypoints, confidence), FPS, TrackingSettings())
-    assert len(result.person) == 1
-    assert result.takeovers == ()
-
-
 def test_takeovers_are_named_by_person_and_frame_of_the_clip():
     text = describe_doubts(FRAMES, 4, [Takeover(25, 0, 2), Takeover(99, 3, -1)], [])
     assert text == (
@@ -92,15 +69,3 @@ def test_undecided_joins_are_named_where_they_are_many_for_the_people():
         "1 pair of tracks may each be one person (person 0 until frame 310 and person 3 from frame "
         "340). Look at these frames on the review pages, and split or join the tracks there"
     )
-
-
-def test_warning_names_three_doubts_and_counts_the_others():
-    text = describe_doubts(FRAMES, 9, [Takeover(n, n, 8) for n in range(5)], [])
-    assert text.startswith("5 tracks may have passed")
-    assert "person 2 and person 8 in frame 302; and 2 more)" in text
-    assert "person 3" not in text
-
-
-def test_clip_without_doubts_says_nothing():
-    assert describe_doubts(FRAMES, 0, [], []) is None
-    assert describe_doubts(FRAMES, 3, [], [join(0, 0, 1, 9, decided=True)]) is None

@@ -1,7 +1,6 @@
 import numpy as np
-import pytest
 
-from worldpose.tracking.epipolar import associate, footprints, has_adult_size, pair_distances
+from worldpose.tracking.epipolar import associate, footprints, pair_distances
 from worldpose.tracking.settings import TrackingSettings
 
 SETTINGS = TrackingSettings(pair_evidence=0.0)
@@ -26,27 +25,10 @@ def test_crossing_rays_are_as_far_apart_as_their_common_perpendicular():
     np.testing.assert_allclose(distances, [[np.inf, 2.0], [np.inf, np.inf]], rtol=1e-15)
 
 
-def test_mean_runs_over_joints_seen_by_both():
-    centers = np.array([[-5.0, 0.0, 0.0], [0.0, -5.0, 2.0]])
-    directions = np.array([[[1.0, 0.0, 0.0]] * 2, [[0.0, 1.0, 0.0], [np.nan] * 3]])
-    assert pair_distances(centers, directions, TWO, ANYWHERE, 1, 0.1, 9.0)[0, 1] == pytest.approx(
-        2.0
-    )
-    assert pair_distances(centers, directions, TWO, ANYWHERE, 2, 0.1, 9.0)[0, 1] == np.inf
-
-
 def test_parallel_rays_start_nothing():
     centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
     directions = np.array([[[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]])
     assert np.isinf(pair_distances(centers, directions, TWO, ANYWHERE, 1, 0.1, 9.0)).all()
-
-
-def test_detections_of_one_camera_are_not_a_pair():
-    centers = np.array([[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]])
-    directions = np.array([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]])
-    assert np.isinf(
-        pair_distances(centers, directions, np.array([0, 0]), ANYWHERE, 1, 0.1, 9.0)
-    ).all()
 
 
 def test_people_are_found_with_all_their_detections(ring, people):
@@ -62,74 +44,11 @@ def test_people_are_found_with_all_their_detections(ring, people):
         assert group.ray_distance.max() < 0.06
 
 
-def test_no_detection_gives_nobody(ring):
-    camera = ring(3)
-    assert (
-        associate(camera.center, np.empty((3, 0, 17, 3)), np.empty((3, 0, 17)), False, SETTINGS)
-        == []
-    )
-    blank = np.full((3, 2, 17, 3), np.nan)
-    assert associate(camera.center, blank, np.zeros((3, 2, 17)), False, SETTINGS) == []
-
-
-def test_two_views_are_not_enough_for_a_birth_among_more_cameras(ring, people):
-    camera = ring(5)
-    directions, weights = rays_of(camera, people([[0.0, 0.0]]))
-    directions[2:] = np.nan
-    weights[2:] = 0.0
-    assert associate(camera.center, directions, weights, False, SETTINGS) == []
-    two = SETTINGS.model_copy(update={"birth_views": 2})
-    assert len(associate(camera.center, directions, weights, False, two)) == 1
-
-
-def test_third_camera_leaves_no_ghost_when_detections_are_missing(ring, people):
-    # Each camera misses one of three people: each person still has two views, and any ghost
-    # two as well. Nobody is born from two views.
-    camera = ring(3)
-    directions, weights = rays_of(camera, people([[-1.5, 0.5], [1.5, 1.0], [0.0, -2.0]]))
-    for n in range(3):
-        directions[n, n] = np.nan
-        weights[n, n] = 0.0
-    assert associate(camera.center, directions, weights, False, SETTINGS) == []
-
-
-def test_second_detection_of_a_person_stays_out_of_the_group(ring, people):
-    camera = ring(4)
-    directions, weights = rays_of(camera, people([[0.0, 0.0], [0.0, 0.0]]), 1e-3)
-    directions[1:, 1] = np.nan
-    weights[1:, 1] = 0.0
-    groups = associate(camera.center, directions, weights, False, SETTINGS)
-    assert len(groups) == 1
-    assert groups[0].index[1:].tolist() == [0, 0, 0]
-    assert groups[0].index[0] in (0, 1)
-
-
-@pytest.mark.parametrize(("size", "expected"), [(1.0, True), (0.5, False), (1.6, False)])
-def test_only_the_size_of_a_person_is_plausible(people, size, expected):
-    assert has_adult_size(size * people([0.0, 0.0]), SETTINGS.size_range) is expected
-
-
-def test_pose_without_limbs_is_not_plausible():
-    assert not has_adult_size(np.full((17, 3), np.nan), SETTINGS.size_range)
-
-
-def test_giant_is_nobody(ring, people):
-    camera = ring(4)
-    giant = 2.0 * people([[0.0, 0.0]])
-    assert associate(camera.center, *rays_of(camera, giant), False, SETTINGS) == []
-
-
 def test_footprint_is_where_the_ray_is_at_the_height_of_a_body():
     # From 10 m up, 45 degrees down: at 1 m after 9 m, and 0.5 m to either side for 0.5 m of height.
     down = np.array([[[0.0, 1.0, -1.0]]]) / np.sqrt(2.0)
     place = footprints(np.array([[2.0, 3.0, 10.0]]), down, (1.0, 0.5))
     np.testing.assert_allclose(place, [[2.0, 12.0, 0.5]], rtol=1e-14)
-
-
-@pytest.mark.parametrize("direction", [[0.0, 1.0, 0.0], [0.0, 0.6, 0.8], [np.nan] * 3])
-def test_ray_that_never_comes_down_may_stand_anywhere(direction):
-    place = footprints(np.array([[2.0, 3.0, 10.0]]), np.array([[direction]]), (1.0, 0.5))
-    assert place[0, 2] == np.inf
 
 
 def test_people_far_apart_on_the_ground_are_no_pair_even_where_rays_meet():
@@ -140,14 +59,3 @@ def test_people_far_apart_on_the_ground_are_no_pair_even_where_rays_meet():
     assert np.isinf(pair_distances(centers, directions, TWO, apart, 1, 0.1, gate)).all()
     apart[1, 0] = 2.9
     assert pair_distances(centers, directions, TWO, apart, 1, 0.1, gate)[0, 1] == 0.0
-
-
-def test_ground_changes_nothing_for_people_on_it_and_refuses_those_above(ring, people):
-    camera = ring(6)
-    joints = people([[0.0, 0.0], [0.8, 0.3], [-3.0, 2.0]])
-    seen = rays_of(camera, joints, 1e-3)
-    on_ground = associate(camera.center, *seen, True, SETTINGS)
-    anywhere = associate(camera.center, *seen, False, SETTINGS)
-    assert [g.index.tolist() for g in on_ground] == [g.index.tolist() for g in anywhere]
-    above = rays_of(camera, joints + [0.0, 0.0, 3.0])
-    assert associate(camera.center, *above, True, SETTINGS) == []

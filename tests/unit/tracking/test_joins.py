@@ -36,22 +36,6 @@ def test_ends_are_where_the_torso_is_and_as_fast_as_it_moves(people):
     np.testing.assert_allclose(start.limbs[0], 0.36, atol=1e-12)
 
 
-def test_single_frame_has_no_velocity(people):
-    start, stop = fit_track_ends(0, np.array([7]), people(np.zeros((1, 2))), FPS, SETTINGS)
-    assert np.isnan(start.velocity).all()
-    assert start.frame == stop.frame == 7
-
-
-@pytest.mark.parametrize(("first", "possible"), [(150, True), (100, False), (90, False)])
-def test_only_what_comes_later_can_go_on(first, possible):
-    assert math.isfinite(cost(end(0, 100, (0, 0)), end(1, first, (0, 0)))) is possible
-
-
-def test_nobody_outruns_the_fastest_or_stays_away_longer_than_the_gap():
-    assert cost(end(0, 0, (0.0, 0.0)), end(1, 50, (10.0, 0.0))) == np.inf
-    assert cost(end(0, 0, (0.0, 0.0)), end(1, 3001, (0.0, 0.0))) == np.inf
-
-
 def test_who_goes_on_as_expected_costs_less_than_who_turned_and_than_who_is_elsewhere():
     runner = end(0, 0, (0.0, 0.0), (5.0, 0.0))
     # Half the way that both velocities would take, with the memory of one second.
@@ -62,19 +46,6 @@ def test_who_goes_on_as_expected_costs_less_than_who_turned_and_than_who_is_else
     assert on < 0.0
     assert turned > on + 3.0
     assert elsewhere > on + 3.0
-
-
-def test_longer_gap_tells_less():
-    still = [cost(end(0, 0, (0, 0)), end(1, frames, (0, 0))) for frames in (5, 50, 500, 2500)]
-    assert (np.diff(still) > 0.0).all()
-
-
-def test_other_limbs_are_another_person():
-    limbs = np.full(11, 0.4)
-    same = cost(end(0, 0, (0, 0), limbs=limbs), end(1, 100, (0, 0), limbs=limbs))
-    taller = cost(end(0, 0, (0, 0), limbs=limbs), end(1, 100, (0, 0), limbs=limbs + 0.1))
-    nothing = cost(end(0, 0, (0, 0)), end(1, 100, (0, 0)))
-    assert same < nothing < taller
 
 
 def decided(costs, odds=1.0):
@@ -92,53 +63,12 @@ def test_likeliest_way_is_taken_and_told_by_its_margin():
     assert decided([[-8.0, -2.0], [-2.0, -6.0]]) == [(0, 10, True, 8.0), (1, 11, True, 6.0)]
 
 
-def test_even_chances_decide_nothing():
-    joins = decided([[-8.0, -8.0], [-8.0, -8.0]])
-    assert [(join[2], join[3]) for join in joins] == [(False, 0.0)] * 2
-
-
 def test_odds_beforehand_tell_newcomers_from_who_was_lost():
     assert decided([[4.0]], odds=0.05) == []
     (join,) = decided([[4.0]], odds=0.001)
     assert join[:3] == (0, 10, True)
     # Odds of 1000 to 1 beforehand, of e^-4 after looking.
     assert join[3] == pytest.approx(math.log(1000.0) - 4.0)
-
-
-def test_nobody_to_join_is_no_join():
-    assert choose_joins([], [], np.empty((0, 0)), SETTINGS) == []
-    assert decided([[np.inf]]) == []
-
-
-@pytest.mark.parametrize(
-    ("frames", "velocity", "variance"),
-    [
-        # 1 dm of the position, and 2.5 m/s in a velocity that lasts 1 s: a third of its square
-        # times the cube of 0.5 s, or of that second.
-        (25, (np.nan, np.nan), 0.01 + 6.25 * 0.125 / 3.0),
-        # Then 2 m/s either way, twice its square for each second more.
-        (100, (np.nan, np.nan), 0.01 + 6.25 / 3.0 + 8.0),
-        # A quarter of the first where the velocity is known again.
-        (100, (0.0, 0.0), 0.01 + 6.25 / 12.0 + 8.0),
-    ],
-)
-def test_doubt_where_somebody_goes_on_is_that_of_a_velocity_that_wanders(
-    frames, velocity, variance
-):
-    motion = {
-        "paces": ((1.0, 1.0),),
-        "velocity_change_std_m_s": 2.5,
-        "rms_speed_m_s": 2.0,
-        "velocity_memory_s": 1.0,
-    }
-    settings = SETTINGS.model_copy(update=motion)
-    here, aside = (
-        cost(end(0, 0, (0, 0)), end(1, frames, (x, 0), velocity), settings) for x in (0.0, 1.5)
-    )
-    assert aside - here == pytest.approx(0.5 * 1.5**2 / variance)
-    # Velocities that are the same: variances of 0.5 m/s and the agility, and of two strangers.
-    alike = math.log((0.25 + 6.25) / (0.25 + 8.0)) if velocity[0] == 0.0 else 0.0
-    assert here == pytest.approx(math.log(2.0 * math.pi * variance / AREA) + alike)
 
 
 def test_a_limb_is_the_surer_the_longer_it_was_seen_and_the_steadier_it_was(people):

@@ -7,7 +7,6 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.diagnosis import diagnose_no_people
-from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.pair_births import (
     CameraGates,
     CameraVisibility,
@@ -16,7 +15,6 @@ from worldpose.tracking.pair_births import (
     judge_pairs,
 )
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 
@@ -93,47 +91,6 @@ def test_cameras_at_eye_level_cannot_tell_people_from_ghosts(people):
     assert group_pairs(pairs, weights, SETTINGS) == []
 
 
-def test_one_person_at_eye_level_has_no_rival(people):
-    cameras = rig(*LOW)
-    directions, weights = rays_of(cameras, people([[-0.8, -0.8]]))
-    pairs = judge(cameras, directions, weights)
-    assert pairs.unique.tolist() == [True]
-    assert pairs.odds[0] > SETTINGS.pair_odds
-
-
-def test_second_detection_of_the_same_body_is_no_rival(people):
-    cameras = rig(*LOW)
-    body = people([[0.0, 0.0]])
-    directions, weights = rays_of(cameras, np.concatenate([body, body + [0.0, 0.05, 0.0]]))
-    pairs = judge(cameras, directions, weights)
-    assert len(pairs.odds) == 4 and pairs.unique.all()
-    assert len(group_pairs(pairs, weights, SETTINGS)) == 2
-
-
-def test_rays_that_miss_by_much_lower_the_odds(people):
-    # Raised by 0.1 m in one camera, two scales of the unknown noise: odds fall by exp(2) or less.
-    cameras = rig(*LOW)
-    body = people([[0.0, 0.0]])
-    directions, weights = rays_of(cameras, body)
-    moved = directions.copy()
-    moved[1] = rays_of(cameras, body + [0.0, 0.0, 0.1])[0][1]
-    exact, off = judge(cameras, directions, weights), judge(cameras, moved, weights)
-    assert off.distance[0] == pytest.approx(0.1, abs=0.002)
-    ratio = np.log(exact.odds[0] / off.odds[0])
-    assert ratio == pytest.approx(0.5 * (off.distance[0] / 0.05) ** 2, abs=0.1)
-
-
-def test_people_out_of_proportion_have_lower_odds(people):
-    cameras = rig(*HIGH)
-    adult = people([[0.0, 0.0]])
-    stretched = adult.copy()
-    stretched[:, [9, 10]] += 0.5 * np.sign(adult[:, [9, 10]]) * [0.0, 1.0, 0.0]
-    odds = [judge(cameras, *rays_of(cameras, each)).odds[0] for each in (adult, stretched)]
-    assert odds[1] < 0.5 * odds[0]
-    # A giant of three metres is no pair at all.
-    assert len(judge(cameras, *rays_of(cameras, 1.8 * adult)).odds) == 0
-
-
 def known_sight(cameras, frames=98):
     """Statistics of cameras that detected a person everywhere in view, in every frame."""
     visibility = CameraVisibility(cameras)
@@ -153,16 +110,6 @@ def test_camera_that_should_see_a_person_and_shows_nothing_is_evidence_against(p
     assert judged.odds[0] == pytest.approx(free / 100.0, rel=1e-6)
     # A camera of which nothing is known, or that showed people only nearer, says nothing.
     assert judge(cameras, *missed).odds[0] == pytest.approx(free, rel=1e-6)
-
-
-def test_camera_that_looks_elsewhere_says_nothing(people):
-    # The person is 6 m beside the place that the third camera's narrow image shows.
-    cameras = Camera.stack([*rig(*HIGH), rig(THIRD, focal=4500.0)[0]])
-    aside = people([[-4.0, 3.0]])
-    assert known_sight(cameras).should_see(aside)[:, 0].tolist() == [True, True, False]
-    judged = judge(cameras, *rays_of(cameras, aside, [[1], [1], [0]]), known_sight(cameras))
-    two = rig(*HIGH)
-    assert judged.odds[0] == pytest.approx(judge(two, *rays_of(two, aside)).odds[0], rel=1e-6)
 
 
 def test_detection_that_lies_on_the_person_excuses_a_camera(people):
@@ -209,31 +156,6 @@ def picture(cameras, joints, show):
     return keypoints, np.full(keypoints.shape[:-1], 0.9)
 
 
-def test_single_frame_of_two_cameras_is_enough_where_the_pair_is_clear(people):
-    cameras = rig(*HIGH)
-    seen = picture(cameras, people([[[-1.5, 0.5], [1.5, 1.0]]]), np.ones((2, 2)))
-    found = track_people(cameras, detections(*seen), FPS, SETTINGS)
-    assert sorted(map(tuple, found.detection_index[0].T)) == [(0, 0), (1, 1)]
-
-
-def test_person_whom_two_of_three_cameras_can_see_is_found_in_a_single_frame(people):
-    # The third camera sees the other person alone: its image ends before the place.
-    cameras = Camera.stack([*rig(*HIGH), rig(THIRD, focal=4500.0)[0]])
-    joints = people([[[0.0, 0.0], [-4.0, 3.0]]])
-    image = cameras.project(joints.reshape(1, 1, -1, 3)).reshape(1, 3, 2, 17, 2)
-    inside = ((image >= 0.0) & (image <= [1920.0, 1080.0])).all(axis=(-1, -2))[0]
-    assert inside.tolist() == [[True, True], [True, True], [True, False]]
-    found = track_people(cameras, detections(*picture(cameras, joints, inside)), FPS, SETTINGS)
-    assert sorted(map(tuple, found.detection_index[0].T)) == [(0, 0, 0), (1, 1, -1)]
-
-
-def test_single_frame_at_eye_level_gives_nobody_rather_than_ghosts(people):
-    cameras = rig(*LOW)
-    seen = picture(cameras, people([[[-0.8, -0.8], [0.8, 0.8]]]), np.ones((2, 2)))
-    found = track_people(cameras, detections(*seen), FPS, SETTINGS)
-    assert len(found.person) == 0 and found.report.births == 0
-
-
 def test_people_whom_two_cameras_cannot_tell_apart_are_the_stated_reason(people):
     cameras = rig(*LOW)
     joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (4, 2, 2)))
@@ -242,35 +164,3 @@ def test_people_whom_two_cameras_cannot_tell_apart_are_the_stated_reason(people)
     reason = diagnose_no_people(*given, ground=True, births=0)
     assert reason.cause == "ambiguous_pairs"
     assert "detections of left and right fit each other in several ways" in reason.message
-
-
-def test_people_at_eye_level_are_found_once_they_stand_apart(people):
-    # The second person comes into view after 1 s, when the first is known.
-    cameras = rig(*LOW)
-    joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (60, 2, 2)))
-    keypoints, confidence = picture(cameras, joints, np.ones((2, 2)))
-    keypoints[:25, :, 1] = np.nan
-    found = track_people(cameras, detections(keypoints, confidence), FPS, SETTINGS)
-    assert sorted(map(tuple, found.detection_index[-1].T)) == [(0, 0), (1, 1)]
-
-
-def test_second_detections_of_a_person_start_no_second_person_in_one_frame(people):
-    cameras = rig(*HIGH)
-    body = people([[[0.0, 0.0], [0.03, 0.0]]])
-    found = track_people(
-        cameras, detections(*picture(cameras, body, np.ones((2, 2)))), FPS, SETTINGS
-    )
-    assert len(found.person) == 1
-
-
-def test_detections_that_three_cameras_explain_are_left_to_them(people):
-    # Three cameras see one person, two of them another: of the pairs that the two cameras could
-    # form, only the one without the first person's detections is judged.
-    cameras = rig(*HIGH, THIRD)
-    joints = people([[0.0, 0.0], [2.0, 1.0]])
-    show = [[1, 1], [1, 1], [1, 0]]
-    directions, weights = rays_of(cameras, joints, show)
-    tracker = FrameTracker(cameras, FPS, True, None, SETTINGS)
-    tracker.step(0, directions, weights)
-    found = sorted(tuple(person.sightings[0].index.tolist()) for person in tracker.active)
-    assert found == [(0, 0, 0), (1, 1, -1)]

@@ -16,7 +16,6 @@ from worldpose.tracking.people_selection import (
 )
 from worldpose.tracking.person import Person, Sighting
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 
@@ -47,35 +46,11 @@ def test_a_person_who_waits_behind_the_lines_is_a_bystander(side):
     assert not stays(standing(0.0, side * 35.9), margin=1.5)
 
 
-def test_beside_a_corner_both_lines_count():
-    assert stays(standing(52.5 + 1.4, 34.0 + 1.4))
-    assert not stays(standing(52.5 + 1.5, 34.0 + 1.5))
-
-
 def test_a_player_who_runs_over_the_line_stays():
     assert stays(standing(0.0, np.linspace(33.0, 40.0, FRAMES)))
     out = np.full(FRAMES, 40.0)
     out[-1] = 34.0
     assert stays(standing(0.0, out))
-
-
-def test_frames_without_a_position_do_not_count():
-    nowhere = np.where(np.arange(FRAMES) < 10, np.nan, 40.0)
-    assert not stays(standing(nowhere, nowhere))
-    assert stays(standing(np.full(FRAMES, np.nan), np.full(FRAMES, np.nan)))
-
-
-def test_joints_that_are_not_determined_do_not_count():
-    person = standing(0.0, 36.5)
-    for frame, sighting in list(person.sightings.items()):
-        joints = sighting.joints.copy()
-        joints[5:] = np.nan
-        person.sightings[frame] = Sighting(sighting.index, sighting.ray_distance, joints)
-    assert not stays(person)
-
-
-def test_all_people_stay_without_a_pitch():
-    assert stays(standing(0.0, 80.0), pitch=None)
 
 
 CAMERAS = 10
@@ -115,25 +90,6 @@ def test_a_track_in_few_cameras_stays_if_it_stands_apart():
 def test_seven_tenths_of_the_time_decide(near, left):
     way = np.where(np.arange(FRAMES) < near, 0.1, 3.0)
     assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, way)) == left
-
-
-def test_a_shadow_that_changes_from_one_person_to_another_goes():
-    way = np.where(np.arange(FRAMES) < 10, 0.1, 1.9)
-    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, way), shadow_track(2, 10, 2.0)) == [
-        0,
-        2,
-    ]
-
-
-def test_only_frames_and_joints_of_both_are_compared():
-    late = shadow_track(1, 2, 0.1, range(15, 20), joints=9)
-    assert kept(shadow_track(0, 10, 0.0, range(10)), late) == [0, 1]
-    assert kept(shadow_track(0, 10, 0.0), late) == [0]
-
-
-def test_a_track_without_positions_is_no_shadow():
-    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 1, 0.0, joints=0)) == [0, 1]
-    assert kept() == []
 
 
 def person(number, first, last, evidence):
@@ -202,15 +158,6 @@ def test_a_player_who_fetches_the_ball_keeps_all_tracks():
     assert found(*fetching()) == [[0, 1, 2]]
 
 
-def test_a_player_off_the_pitch_at_the_end_of_the_clip_stays():
-    assert found(*fetching(back=False)) == [[0, 1]]
-
-
-def test_a_person_never_on_the_pitch_goes_with_all_tracks():
-    away = [track(n, (2 * n, 2 * n + 1), -8.0, 12.5) for n in (3, 4, 5)]
-    assert found(*fetching(), *away) == [[0, 1, 2]]
-
-
 def duel():
     """Return two people together for two seconds, in which few cameras see the second one."""
     come, go = np.linspace(2.5, 0.4, 50), np.linspace(0.4, 2.5, 50)
@@ -222,46 +169,12 @@ def test_a_duel_that_few_cameras_see_is_the_players():
     assert found(*duel()) == [[0], [1, 2, 3]]
 
 
-def test_a_shadow_in_several_tracks_goes():
-    person = track(0, (0, 6), 0.0)
-    shadows = [track(n, (2 * n - 2, 2 * n - 1), 0.2, views=2) for n in (1, 2, 3)]
-    assert found(person, *shadows) == [[0]]
-    assert len(found(person, *shadows, shadow_distance_m=0.0)) > 1
-
-
-def test_a_track_apart_does_not_save_a_shadow():
-    # In seven tenths of all frames a person is next to it.
-    apart = track(1, (0, 0.5), np.linspace(1.4, 0.6, 25), views=2)
-    assert found(track(0, (0, 6), 0.0), apart, track(2, (0.6, 3.6), 0.3, views=2)) == [[0], [1]]
-
-
 def test_a_shadow_breaks_no_join_of_accepted_tracks():
     person, after = track(0, (0, 7), 0.0), track(3, (5.8, 6.8), np.linspace(0.4, 2.5, 50))
     before = track(1, (0, 3), np.interp(np.arange(150), [0, 130], [4.0, 0.4]))
     # It begins where the other stopped, and is still there when the player is back.
     shadow = track(2, (3.1, 6.2), 0.4, views=3)
     assert found(person, before, shadow, after) == [[0], [1, 3]]
-
-
-def test_a_roster_counts_whole_people():
-    assert found(*duel(), people=2) == [[0], [1, 2, 3]]
-
-
-@pytest.mark.parametrize("margin", [2.0, 1e3])
-def test_tracking_keeps_a_player_who_fetches_the_ball(ring, people, seen, margin):
-    seconds = np.arange(0.0, 6.0, 1.0 / FPS)
-    y = np.interp(seconds, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [8.0, 10.0, 12.2, 13.4, 12.2, 10.0])
-    places = np.stack([np.zeros_like(y), y], axis=-1)[:, None]
-    keypoints, confidence = seen(ring(5), people(places))
-    unseen = ((seconds > 1.0) & (seconds < 2.0)) | ((seconds > 4.0) & (seconds < 5.0))
-    keypoints[unseen] = np.nan
-    settings = TrackingSettings(pitch_margin_m=margin)
-    result = track_people(
-        ring(5), detections(keypoints, confidence), FPS, settings, pitch_size=PITCH
-    )
-    assert len(result.tracks) == 1
-    assert result.tracks[0].frames_seen == np.count_nonzero(~unseen)
-    assert result.report.dropped == 0
 
 
 def in_cameras(person, cameras):
@@ -298,19 +211,3 @@ def test_two_people_whom_a_camera_shows_at_once_are_no_duplicates():
     second = in_cameras(second, np.append(RIGHT, LEFT[0]))
     tracks = [in_cameras(first, LEFT), second]
     assert merge_duplicates(tracks, distance=0.2) == (tracks, 0)
-
-
-def test_people_side_by_side_and_tracks_of_other_times_are_no_duplicates():
-    tracks = [track(0, (0, 3), 0.0), track(1, (0, 3), 0.25), track(2, (3, 4), 0.0)]
-    tracks = [in_cameras(tracks[0], LEFT), in_cameras(tracks[1], RIGHT), tracks[2]]
-    assert merge_duplicates(tracks, distance=0.2) == (tracks, 0)
-    assert merge_duplicates([], distance=0.2) == ([], 0)
-
-
-def test_a_duplicate_in_half_of_the_cameras_is_no_person():
-    def tracks():
-        first, second = track(0, (0, 5), 0.0), track(1, (1, 1.4), 0.1)
-        return in_cameras(first, LEFT), in_cameras(second, RIGHT)
-
-    assert found(*tracks()) == [[0]]
-    assert found(*tracks(), merge_distance_m=0.0) == [[0], [1]]

@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-from worldpose.tracking.feet import GroundPositions
-from worldpose.tracking.ground_tracks import track_on_plane
-from worldpose.tracking.shirts import ShirtMemory, ShirtModel, measure_shirts
+from worldpose.tracking.plane.feet import GroundPositions
+from worldpose.tracking.plane.shirts import ShirtMemory, ShirtModel, measure_shirts
+from worldpose.tracking.plane.tracker import track_on_plane
 
 RED, BLUE, GRASS = (200, 20, 30), (20, 40, 180), (60, 120, 50)
 FPS = 25.0

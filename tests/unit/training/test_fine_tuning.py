@@ -5,10 +5,9 @@ import torch
 
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.errors import InputError
-from worldpose.training import fine_tuning
-from worldpose.training.fine_tuning import MILD, fine_tune, split
+from worldpose.training.fine_tuning import fine_tune, split
 from worldpose.training.labels import LabelledPicture
-from worldpose.training.settings import FineTuningSettings, Refinement
+from worldpose.training.settings import FineTuningSettings, TrainingSettings
 
 
 def pictures(folder, count, people=1):
@@ -51,7 +50,7 @@ def test_a_version_that_is_no_better_is_told_apart(tmp_path, kind, net):
     start, weights = tmp_path / "start.safetensors", tmp_path / "new.safetensors"
     save_weights(start, net())
     # A rate this small changes no detection.
-    training = Refinement(steps=1, rate=1e-9, check_every=1)
+    training = TrainingSettings(steps=1, rate=1e-9, check_every=1)
     lines = []
     result = fine_tune(
         kind,
@@ -65,22 +64,3 @@ def test_a_version_that_is_no_better_is_told_apart(tmp_path, kind, net):
     assert result.steps == 1 and len(lines) == 1
     assert load_weights(weights, net()) is not None
     assert not weights.with_suffix(".checkpoint").exists()
-
-
-@pytest.mark.parametrize(("kind", "cut"), [("people", "windows"), ("keypoints", "crops")])
-def test_both_nets_learn_from_the_footage_nearly_as_it_is(tmp_path, monkeypatch, kind, cut):
-    looks = []
-
-    def recorded(training):
-        def train(*given, **named):
-            looks.append(named[cut].looks)
-            return training(*given, **named)
-
-        return train
-
-    name = f"train_{'people' if kind == 'people' else 'keypoint'}_net"
-    monkeypatch.setattr(fine_tuning, name, recorded(getattr(fine_tuning, name)))
-    settings = FineTuningSettings(training=Refinement(steps=1))
-    fine_tune(kind, pictures(tmp_path, 8), tmp_path / "new.safetensors", settings)
-    # Fog, grey images and strong colours would replace this footage.
-    assert looks == [MILD] and MILD.fog == MILD.grey == 0.0 and MILD.strength < 0.5

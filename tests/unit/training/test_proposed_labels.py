@@ -53,9 +53,3 @@ def test_a_failed_labelling_leaves_nothing_that_blocks_its_repetition(tmp_path):
         labels.propose_labels(videos, 2, tmp_path / "labels", DetectionSettings())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cam00", "cam01"]
     assert labels.propose_labels(videos[:1], 2, tmp_path / "labels", DetectionSettings()) == 3
-
-
-def test_pictures_of_another_size_are_refused(tmp_path):
-    videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
-    with pytest.raises(InputError, match="24 x 30"):
-        labels.propose_labels(videos, 2, tmp_path / "labels", DetectionSettings())

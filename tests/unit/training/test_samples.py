@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,6 @@ from worldpose.geometry.boxes import box_iou
 from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.keypoint_training import (
     KeypointCrops,
-    box_loss,
     keypoint_batch,
     keypoint_loss,
     labelled_people,
@@ -44,6 +42,11 @@ def labelled(tmp_path_factory):
     visible = np.where(np.isfinite(keypoints[..., 0]), 2, 0).astype(np.int8)
     box = np.array([[180.0, 90.0, 240.0, 210.0]])
     return LabelledPicture(path, box, keypoints, visible, np.array([False]))
+
+
+def test_an_image_without_augmentation_stays(labelled):
+    picture = PictureCache()[labelled.path]
+    np.testing.assert_array_equal(AS_IS.augment(picture, np.random.default_rng(0)), picture)
 
 
 def test_labels_lie_on_what_they_name_in_turned_mirrored_and_distant_crops(labelled):
@@ -129,50 +132,6 @@ def test_the_box_is_learned_in_upright_crops_and_nothing_else_beside_people(labe
         people, cache, KeypointCrops(crops=8, turned=1, looks=AS_IS), np.random.default_rng(3)
     )
     assert np.isnan(turned.boxes).all() and np.isnan(turned.people).all()
-
-
-def test_the_fit_is_what_the_box_shares_with_anybody(labelled):
-    crops = KeypointCrops(crops=2, elsewhere=0, turned=0, looks=AS_IS)
-    batch = keypoint_batch(
-        labelled_people([labelled]), PictureCache(), crops, np.random.default_rng(3)
-    )
-    said = torch.from_numpy(batch.boxes)
-    sure, denied = (box_loss(batch, said, torch.full((2,), logit)) for logit in (12.0, -12.0))
-    # The true box has no error, and a fit of all but 6e-6 costs as much.
-    assert float(sure) < 1e-4 < 11.0 < float(denied)
-
-
-def test_the_net_is_told_of_the_box_given_and_of_others_where_they_are(labelled):
-    boxes = np.array([[180.0, 90.0, 240.0, 210.0], [230.0, 100.0, 290.0, 220.0]])
-    keypoints = np.concatenate([labelled.keypoints, np.full((1, 17, 2), np.nan)])
-    visible = np.concatenate([labelled.visible, np.zeros((1, 17), np.int8)])
-    two = replace(
-        labelled, boxes=boxes, keypoints=keypoints, visible=visible, ignored=np.zeros(2, bool)
-    )
-    exact = {"shift": 0, "scale": 0, "misplaced": 0, "overlooked": 0, "imagined": 0, "elsewhere": 0}
-    crops = KeypointCrops(crops=8, turned=0, hidden=0, untold=0.5, looks=AS_IS, **exact)
-    people = labelled_people([two])
-    batch = keypoint_batch(people, PictureCache(), crops, np.random.default_rng(3))
-    told = batch.surroundings[:, 1].any(axis=(1, 2))
-    assert {True, False} == set(told.tolist())
-    assert not batch.surroundings[:, 2].any()
-    # Cells whose middle is in the box asked for, which is the true one; the net sees a mirror too.
-    middles = 4.0 * np.arange(32) + 1.5
-    for maps, box in zip(batch.surroundings[told], batch.boxes[told], strict=True):
-        rows, columns = ((middles > box[k]) & (middles < box[k + 2]) for k in (1, 0))
-        np.testing.assert_array_equal(maps[0] > 0.5, np.outer(rows, columns[:24]))
-        # The other has the same size and stands 50 px away, in a box of 60: a sixth is common.
-        assert 0.1 < (maps[1] * maps[0]).sum() / maps[0].sum() < 0.25
-
-
-def test_batches_depend_on_their_generator_alone(labelled):
-    windows = PeopleWindows(windows=2, side=64)
-    one, other = (
-        people_batch([labelled], PictureCache(), windows, np.random.default_rng(7))
-        for _ in range(2)
-    )
-    np.testing.assert_array_equal(one.pictures, other.pictures)
-    np.testing.assert_array_equal(one.target, other.target)
 
 
 def test_a_few_steps_on_one_batch_lower_both_losses(labelled):

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -56,23 +54,6 @@ def test_a_resumed_training_gives_the_weights_of_an_undisturbed_one(tmp_path):
         assert torch.equal(value, theirs[name]), name
 
 
-def test_a_training_that_ends_early_has_the_weights_of_the_whole_at_that_step():
-    # Without memory the mean is the weights of the step; the last check is the best.
-    settings = SETTINGS.model_copy(update={"memory": 0.0})
-    whole, then = line_fit(settings, scores=[0.0, 1.0, 2.0, 3.0]), {}
-
-    def say(line):
-        if line.startswith("step 4 "):
-            then.update({k: v.clone() for k, v in whole.net.state_dict().items()})
-
-    train(whole, progress=say)
-    settings = settings.model_copy(update={"steps": 4, "planned": 12})
-    early = line_fit(settings, scores=[0.0, 1.0])
-    train(early)
-    for name, value in early.net.state_dict().items():
-        assert torch.equal(value, then[name]), name
-
-
 def test_the_best_weights_are_kept_and_training_stops_early():
     # Without memory the mean is the weights of the step.
     changes = {"steps": 100, "check_every": 1, "patience": 2, "memory": 0.0}
@@ -90,40 +71,6 @@ def test_the_best_weights_are_kept_and_training_stops_early():
         assert torch.equal(value, best[name]), name
 
 
-def test_the_last_weights_are_kept_where_asked():
-    changes = {"steps": 4, "check_every": 1, "patience": 1, "memory": 0.0, "keep": "last"}
-    training = line_fit(SETTINGS.model_copy(update=changes), scores=[0.9, 0.5, 0.4, 0.3, 0.1])
-    last = {}
-
-    def say(line):
-        last.update({k: v.clone() for k, v in training.net.state_dict().items()})
-
-    assert [check.step for check in train(training, progress=say)] == [0, 1, 2, 3, 4]
-    for name, value in training.net.state_dict().items():
-        assert torch.equal(value, last[name]), name
-
-
-def test_the_mean_of_weights_remembers_more_and_more():
-    training = line_fit(SETTINGS.model_copy(update={"steps": 1, "check_every": 1, "memory": 0.5}))
-    before = training.net[1].bias.detach().clone()
-    taken = []
-    whole = training.loss
-
-    def loss(net, x):
-        taken.append(net[1].bias.detach().clone())
-        return whole(net, x)
-
-    train(replace(training, loss=loss, settings=training.settings.model_copy(update={"steps": 2})))
-    # After the first step the mean keeps 1/10 of what was there before; after the second 2/11.
-    first = before / 10 + taken[1] * 9 / 10
-    assert not torch.equal(taken[0], taken[1])
-    kept = training.net[1].bias
-    # The third weights are not seen; the mean lies 2/11 of the way from them to the first mean.
-    after = (kept - first * 2 / 11) * 11 / 9
-    step = (after - taken[1]).abs().max()
-    assert 0.0 < step <= 1.001 * SETTINGS.rate  # no step of Adam is longer than its rate
-
-
 def test_training_that_makes_a_net_worse_changes_nothing():
     training = line_fit(scores=[0.9, 0.5, 0.4, 0.3])
     before = {name: value.clone() for name, value in training.net.state_dict().items()}
@@ -132,16 +79,12 @@ def test_training_that_makes_a_net_worse_changes_nothing():
         assert torch.equal(value, before[name]), name
 
 
-@pytest.mark.parametrize("content", [b"", b"\x80\x04cos\nsystem\n", b"{}"])
-def test_what_is_no_checkpoint_is_refused(tmp_path, content):
-    checkpoint = tmp_path / "training.checkpoint"
-    checkpoint.write_bytes(content)
-    with pytest.raises(InputError, match="checkpoint"):
-        train(line_fit(), checkpoint)
-
-
-def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+def test_what_is_no_checkpoint_of_this_training_is_refused(tmp_path):
     checkpoint = tmp_path / "training.checkpoint"
     train(line_fit(), checkpoint)
     with pytest.raises(InputError, match="settings"):
         train(line_fit(SETTINGS.model_copy(update={"rate": 0.1})), checkpoint)
+    for content in (b"", b"\x80\x04cos\nsystem\n", b"{}"):
+        checkpoint.write_bytes(content)
+        with pytest.raises(InputError, match="checkpoint"):
+            train(line_fit(), checkpoint)

@@ -15,6 +15,8 @@ from worldpose.triangulation.chunking import (
 from worldpose.triangulation.reports import Histogram
 from worldpose.triangulation.settings import TriangulationSettings
 
+as_detections = KeypointDetections.from_keypoints
+
 SETTINGS = TriangulationSettings()
 FRAMES = 330
 
@@ -45,8 +47,8 @@ def clip(ring):
 
 def test_parts_give_what_the_whole_clip_gives(clip):
     camera, arrays = clip
-    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
-    seen = KeypointDetections.from_keypoints(*arrays)
+    whole = reconstruct_joints(camera, as_detections(*arrays), FPS, SETTINGS)
+    seen = as_detections(*arrays)
     model = learn_clip(camera, seen, FPS, SETTINGS)
     parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
     assert [(part.frames.start, part.frames.stop) for part in parts] == [
@@ -71,7 +73,7 @@ def test_parts_give_what_the_whole_clip_gives(clip):
 
 def test_every_third_frame_alone(clip):
     camera, arrays = clip
-    seen = KeypointDetections.from_keypoints(*arrays)
+    seen = as_detections(*arrays)
     model = learn_clip(camera, seen, FPS, SETTINGS)
     every = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS))
     third = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=64, stride=3))
@@ -92,8 +94,8 @@ def test_frames_of_a_match_share_the_maximum():
 
 def test_reports_of_parts_add_up_to_the_clip_s(clip):
     camera, arrays = clip
-    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
-    seen = KeypointDetections.from_keypoints(*arrays)
+    whole = reconstruct_joints(camera, as_detections(*arrays), FPS, SETTINGS)
+    seen = as_detections(*arrays)
     model = learn_clip(camera, seen, FPS, SETTINGS)
     parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
     agreement = reduce(add, [part.triangulation.agreement for part in parts])
@@ -107,7 +109,7 @@ def test_reports_of_parts_add_up_to_the_clip_s(clip):
 
 def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
     camera, arrays = clip
-    plain = KeypointDetections.from_keypoints(*arrays)
+    plain = as_detections(*arrays)
     watched = [Watched(values) for values in plain.arrays().values()]
     seen = KeypointDetections(*watched, detection_index=plain.detection_index)
     settings = SETTINGS.model_copy(update={"correct_clocks": True})
@@ -119,25 +121,12 @@ def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
     assert max(values.most for values in watched) <= 128 + 2 * MARGIN * FPS + 2
 
 
-def test_parts_with_corrected_clocks_are_those_of_the_whole_clip(clip):
-    camera, arrays = clip
-    settings = SETTINGS.model_copy(update={"correct_clocks": True, "max_clock_error_frames": 10.0})
-    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, settings)
-    seen = KeypointDetections.from_keypoints(*arrays)
-    model = learn_clip(camera, seen, FPS, settings)
-    assert model.clocks.determined.all()
-    parts = list(reconstruct_chunks(camera, seen, model, FPS, settings, length=128))
-    joined = np.concatenate([part.triangulation.joints for part in parts])
-    # Shares of a frame are rounded by where a part begins.
-    np.testing.assert_allclose(joined, whole.triangulation.joints, rtol=0, atol=1e-9)
-
-
 def test_clip_without_frames_or_people_has_one_empty_part(ring):
     camera = ring(3)
     for frames, persons in ((0, 2), (5, 0)):
         keypoints, confidence, index = detections(camera, runner(5), 1.0)
         arrays = keypoints[:frames], confidence[:frames], index[:frames, :, :persons]
-        seen = KeypointDetections.from_keypoints(*arrays)
+        seen = as_detections(*arrays)
         model = learn_clip(camera, seen, FPS, SETTINGS)
         (part,) = reconstruct_chunks(camera, seen, model, FPS, SETTINGS)
         assert part.smoothing.joints.shape == (frames, persons, 17, 3)

@@ -10,6 +10,8 @@ from worldpose.triangulation.clocks import estimate_clocks
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
+as_detections = KeypointDetections.from_keypoints
+
 # Standard deviations of steps in the order of PARAMETERS; together some 9 cm at a player.
 CALIBRATION = np.array([3e-4] * 3 + [0.05] * 3 + [7e-4, 2.0, 2.0, 0.0, 0.0, 0.0])
 INSIDE = 7.815
@@ -64,18 +66,16 @@ def coverage(seeds):
         cameras, (keypoints, confidence, index), truth = simulated(seed)
         rng = np.random.default_rng(seed)
         arrays = keypoints, confidence, index
-        exact = triangulate_joints(cameras, KeypointDetections.from_keypoints(*arrays), settings)
+        exact = triangulate_joints(cameras, as_detections(*arrays), settings)
         squared["exact"].append(squared_deviations(exact, truth))
         count = len(cameras.focal)
         steps = CALIBRATION * rng.normal(size=(count, 12))
         given = Camera.stack([step_camera(cameras[c], steps[c]) for c in range(count)])
         covariance = np.broadcast_to(np.diag(CALIBRATION**2), (count, 12, 12)).copy()
-        calibrated = triangulate_joints(
-            given, KeypointDetections.from_keypoints(*arrays), settings, covariance
-        )
+        calibrated = triangulate_joints(given, as_detections(*arrays), settings, covariance)
         squared["calibrated"].append(squared_deviations(calibrated, truth))
         few = keypoints, confidence, two_views_each(index, rng)
-        two = triangulate_joints(cameras, KeypointDetections.from_keypoints(*few), settings)
+        two = triangulate_joints(cameras, as_detections(*few), settings)
         squared["two views"].append(squared_deviations(two, truth))
     joined = {case: np.concatenate(values) for case, values in squared.items()}
     return {case: ((values < INSIDE).mean(), len(values)) for case, values in joined.items()}
@@ -108,9 +108,7 @@ def test_95_percent_of_clocks_lie_within_two_standard_errors(name):
     for seed in range(20, 30):
         scene = simulate_scene(scenario, seed)
         cameras, arrays, _ = arrays_of(scene, scenario.crowd.people)
-        found = estimate_clocks(
-            cameras, KeypointDetections.from_keypoints(*arrays), scenario.fps, settings
-        )
+        found = estimate_clocks(cameras, as_detections(*arrays), scenario.fps, settings)
         true = np.array(list(scene.clocks.values()))[found.determined]
         error = found.late[found.determined] - true + true.mean()
         deviations.append(error / found.standard_error[found.determined])

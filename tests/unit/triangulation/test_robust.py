@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
+
+as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings()
 # Noise as stated, cameras as given: one joint is then a textbook least-squares problem.
@@ -21,29 +21,10 @@ def some_joints(persons=2, count=17, frames=1):
     return rng.uniform([-4, -4, 0], [4, 4, 2], (frames, persons, count, 3))
 
 
-def test_no_frames_gives_empty_arrays(ring, seen):
-    none = [array[:0] for array in seen(ring(3), some_joints())]
-    result = triangulate_joints(ring(3), KeypointDetections.from_keypoints(*none), SETTINGS)
-    assert result.joints.shape == (0, 2, 17, 3)
-    assert result.report.joints == 0
-    assert result.report.reprojection_error_px is None
-
-
-def test_no_detection_and_no_person_give_empty_arrays(ring):
-    index = np.empty((2, 3, 0), np.int16)
-    keypoints = np.empty((2, 3, 0, 17, 2))
-    result = triangulate_joints(
-        ring(3), KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index), SETTINGS
-    )
-    assert result.inliers.shape == (2, 3, 0, 17)
-
-
 def test_one_view_determines_nothing(ring, seen):
     keypoints, confidence, index = seen(ring(3), some_joints())
     index[:, 1:] = -1
-    result = triangulate_joints(
-        ring(3), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    result = triangulate_joints(ring(3), as_detections(keypoints, confidence, index), SETTINGS)
     assert np.isnan(result.joints).all()
     assert np.isnan(result.covariance).all()
     assert np.isnan(result.reprojection_error).all()
@@ -55,36 +36,12 @@ def test_one_view_determines_nothing(ring, seen):
 def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
     # Two cameras 0.06 rad apart on the ring, less than the 0.1 rad asked for.
     narrow = ring(2, arc=0.12)
-    result = triangulate_joints(
-        narrow, KeypointDetections.from_keypoints(*seen(narrow, some_joints())), SETTINGS
-    )
+    result = triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), SETTINGS)
     assert np.isnan(result.joints).all()
     wide = SETTINGS.model_copy(update={"min_angle_rad": 0.03})
     assert np.isfinite(
-        triangulate_joints(
-            narrow, KeypointDetections.from_keypoints(*seen(narrow, some_joints())), wide
-        ).joints
+        triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), wide).joints
     ).all()
-
-
-def test_two_cameras_that_face_each_other_determine_nothing_between_them(ring, seen):
-    opposite = ring(2)
-    middle = np.linspace(opposite.center[0], opposite.center[1], 7)[1:-1].reshape(1, 1, 5, 3)
-    result = triangulate_joints(
-        opposite, KeypointDetections.from_keypoints(*seen(opposite, middle)), SETTINGS
-    )
-    assert np.isnan(result.joints).all()
-
-
-def test_point_between_two_views_that_disagree_is_missing(ring, seen):
-    cameras = ring(4)[np.array([0, 1])]
-    keypoints, confidence, index = seen(cameras, some_joints(1, 1))
-    keypoints[0, 1, 0, 0, 1] += 100.0
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    assert np.isnan(result.joints).all()
-    assert result.views.item() == 0
 
 
 def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, seen):
@@ -94,22 +51,18 @@ def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, se
     confidence[:, 1] = 0.0
     confidence[:, 2] = np.nan
     confidence[:, 2, 0] = -0.5
-    result = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    result = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), SETTINGS)
     np.testing.assert_array_equal(result.views, 2)
     np.testing.assert_array_equal(result.inliers.any(axis=(0, 2, 3)), [0, 0, 0, 1, 1])
     np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 8, 16])
+@pytest.mark.parametrize("count", [2, 4, 16])
 def test_noise_free_views_give_the_joint(ring, seen, count):
     # Two cameras of four, so that they do not face each other.
     cameras = ring(4)[np.array([0, 1])] if count == 2 else ring(count)
     joints = some_joints(frames=3)
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(*seen(cameras, joints)), SETTINGS
-    )
+    result = triangulate_joints(cameras, as_detections(*seen(cameras, joints)), SETTINGS)
     # Undistortion is exact to 1e-13 of the focal length; seen 2e-13 m.
     np.testing.assert_allclose(result.joints, joints, atol=1e-10)
     np.testing.assert_array_equal(result.views, count)
@@ -121,14 +74,12 @@ def test_noise_free_views_give_the_joint(ring, seen, count):
     assert result.report.rejected_share == (0.0,) * count
 
 
-@pytest.mark.parametrize("count", [3, 4, 5, 8])
-@pytest.mark.parametrize("offset", [20.0, 60.0, 500.0])
+@pytest.mark.parametrize("count", [3, 8])
+@pytest.mark.parametrize("offset", [20.0, 500.0])
 def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
     keypoints, confidence, index = seen(ring(count), some_joints())
     keypoints[:, 1] += offset / np.sqrt(2)
-    result = triangulate_joints(
-        ring(count), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    result = triangulate_joints(ring(count), as_detections(keypoints, confidence, index), SETTINGS)
     expected = np.arange(count) != 1
     np.testing.assert_array_equal(
         result.inliers, np.broadcast_to(expected[:, None, None], result.inliers.shape)
@@ -138,41 +89,10 @@ def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
     assert result.report.rejected_share[1] == 1.0
 
 
-def test_three_outliers_of_eight_are_rejected(ring, seen):
-    keypoints, confidence, index = seen(ring(8), some_joints())
-    rng = np.random.default_rng(1)
-    keypoints[:, :3] += rng.choice([-1, 1], (1, 3, 2, 17, 2)) * rng.uniform(
-        30, 200, (1, 3, 2, 17, 2)
-    )
-    result = triangulate_joints(
-        ring(8), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
-    np.testing.assert_array_equal(result.views, 5)
-
-
-def test_two_agreeing_views_of_four_win_over_two_that_do_not(ring, seen):
-    cameras = ring(5)[np.arange(4)]
-    keypoints, confidence, index = seen(cameras, some_joints())
-    rng = np.random.default_rng(2)
-    keypoints[:, 2:] += (
-        rng.uniform(80, 200, (1, 2, 2, 17, 2)) * np.array([1, -1])[:, None, None, None]
-    )
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    good = np.linalg.norm(result.joints - some_joints(), axis=-1) < 1e-6
-    # An outlier may meet another ray by chance: within the gate of 7 px on a line of some
-    # 1000 px, a few of 34 joints; seen 0.
-    assert good.mean() > 0.9
-
-
 def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring, seen):
     keypoints, confidence, index = seen(ring(6), some_joints(1, 17))
     keypoints += np.random.default_rng(3).normal(0, 1.0, keypoints.shape)
-    result = triangulate_joints(
-        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
-    )
+    result = triangulate_joints(ring(6), as_detections(keypoints, confidence, index), STATED)
     image = ring(6).project(result.joints[0, 0])
     lengths = np.linalg.norm(image - keypoints[0, :, 0], axis=-1)
     inliers = result.inliers[0, :, 0]
@@ -186,9 +106,7 @@ def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
     rng = np.random.default_rng(4)
     keypoints += rng.normal(0, 1.0, keypoints.shape)
     confidence[...] = rng.uniform(0.3, 1.0, confidence.shape)
-    result = triangulate_joints(
-        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), WHITE
-    )
+    result = triangulate_joints(ring(4), as_detections(keypoints, confidence, index), WHITE)
     assert result.inliers.all()
 
     def cost(points):
@@ -214,9 +132,7 @@ def monte_carlo(cameras: Camera, seen, scale):
         keypoints + scale * rng.normal(size=keypoints.shape) / np.sqrt(confidence)[..., None]
     )
     loose = WHITE.model_copy(update={"pixel_noise_px": scale, "max_deviation": 6.0})
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), loose
-    )
+    result = triangulate_joints(cameras, as_detections(keypoints, confidence, index), loose)
     return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
 
 
@@ -232,27 +148,13 @@ def test_covariance_is_the_spread_of_a_monte_carlo(ring, seen):
     assert np.abs(whiten @ errors.mean(axis=0)).max() < 4 / np.sqrt(4000)
 
 
-def test_twice_the_pixel_noise_is_four_times_the_covariance(ring, seen):
-    joints = some_joints()
-    views = seen(ring(5), joints)
-    once = triangulate_joints(ring(5), KeypointDetections.from_keypoints(*views), WHITE)
-    twice = triangulate_joints(
-        ring(5),
-        KeypointDetections.from_keypoints(*views),
-        WHITE.model_copy(update={"pixel_noise_px": 2.0}),
-    )
-    np.testing.assert_allclose(twice.covariance, 4 * once.covariance, rtol=1e-9)
-
-
 def test_joint_noise_is_in_metres(ring, seen):
     # Noise that grows with the image of a person has the same effect near and far: two
     # crossing rays with 5 cm across each give 5 cm in the plane of both.
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
     metric = STATED.model_copy(update={"pixel_noise_px": 1e-6, "joint_noise_m": 0.05})
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(*seen(cameras, joint)), metric
-    )
+    result = triangulate_joints(cameras, as_detections(*seen(cameras, joint)), metric)
     # x and y by one ray each, z by both. The point is 13 degrees off axis, where the image is
     # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
     np.testing.assert_allclose(
@@ -260,117 +162,37 @@ def test_joint_noise_is_in_metres(ring, seen):
     )
 
 
-def test_confidence_weighs_like_variance(ring, seen):
-    keypoints, confidence, index = seen(ring(5), some_joints())
-    full = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), WHITE
-    )
-    quarter = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence / 4, index), WHITE
-    )
-    np.testing.assert_allclose(quarter.covariance, 4 * full.covariance, rtol=1e-9)
-
-
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(seed=st.integers(0, 10_000))
-def test_camera_order_does_not_matter(ring, seen, seed):
-    rng = np.random.default_rng(seed)
-    keypoints, confidence, index = seen(ring(6), some_joints())
-    keypoints = keypoints + rng.normal(0, 1.5, keypoints.shape)
-    keypoints[:, 0] += rng.uniform(-200, 200, 2)
-    order = rng.permutation(6)
-    straight = triangulate_joints(
-        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    shuffled = triangulate_joints(
-        ring(6)[order],
-        KeypointDetections.from_keypoints(
-            keypoints[:, order], confidence[:, order], index[:, order]
-        ),
-        SETTINGS,
-    )
-    np.testing.assert_array_equal(straight.inliers[:, order], shuffled.inliers)
-    # Sums in another order, and steps that end below 1e-9 m.
-    np.testing.assert_allclose(straight.joints, shuffled.joints, atol=1e-8)
-
-
-def test_same_input_gives_the_same_bytes(ring, seen):
-    keypoints, confidence, index = seen(ring(6), some_joints(frames=3))
-    keypoints += np.random.default_rng(6).normal(0, 3.0, keypoints.shape)
-    runs = [
-        triangulate_joints(
-            ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-        )
-        for _ in range(2)
-    ]
-    for name in ("joints", "covariance", "views", "reprojection_error", "inliers"):
-        assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes()
-
-
-def test_frames_do_not_depend_on_each_other(ring, seen):
-    joints = some_joints(1, 2, frames=300)
-    keypoints, confidence, index = seen(ring(4), joints)
-    whole = triangulate_joints(
-        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
-    )
-    tail = triangulate_joints(
-        ring(4),
-        KeypointDetections.from_keypoints(keypoints[250:], confidence[250:], index[250:]),
-        STATED,
-    )
-    # Joints that share a tile share its number of steps; a step more changes under 1e-9 m.
-    np.testing.assert_allclose(whole.joints[250:], tail.joints, atol=1e-9)
-
-
-def test_arrays_of_different_clips_are_refused(ring, seen):
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"cameras": 3}, "expected keypoints"),
+        ({"frames": 0}, "same clip"),
+        ({"detection": 2}, "one of 2 detections"),
+        ({"covariances": 3}, "camera_covariance"),
+    ],
+)
+def test_arrays_of_different_clips_are_refused(ring, seen, changed, expected):
     keypoints, confidence, index = seen(ring(4), some_joints())
-    with pytest.raises(InputError, match="expected keypoints"):
-        triangulate_joints(
-            ring(3), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-        )
-    with pytest.raises(InputError, match="same clip"):
-        triangulate_joints(
-            ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index[:0]), SETTINGS
-        )
-
-
-def test_index_of_a_detection_that_does_not_exist_is_refused(ring, seen):
-    keypoints, confidence, index = seen(ring(4), some_joints())
-    index[0, 2, 1] = 2
-    with pytest.raises(InputError, match="one of 2 detections"):
-        triangulate_joints(
-            ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-        )
+    index = index[: changed.get("frames", 1)]
+    index[:, 2, 1] = changed.get("detection", 1)
+    detections = as_detections(keypoints, confidence, index)
+    covariance = np.zeros((changed.get("covariances", 4), 12, 12))
+    with pytest.raises(InputError, match=expected):
+        triangulate_joints(ring(changed.get("cameras", 4)), detections, SETTINGS, covariance)
 
 
 def test_spread_is_the_widest_angle_between_rays(ring, seen):
     # Two cameras a quarter turn apart and 8 m up: rays to a point 8 m up cross at a right angle.
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(*seen(cameras, joint)), STATED
-    )
+    result = triangulate_joints(cameras, as_detections(*seen(cameras, joint)), STATED)
     np.testing.assert_allclose(result.spread, np.pi / 2, rtol=1e-6)
 
 
 def test_shared_bias_is_in_the_covariance(ring, seen):
     keypoints, confidence, index = seen(ring(5), some_joints())
-    without = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
-    )
+    without = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), STATED)
     biased = STATED.model_copy(update={"common_bias_m": 0.03})
-    result = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), biased
-    )
+    result = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), biased)
     added = result.covariance - without.covariance
     np.testing.assert_allclose(added, np.broadcast_to(9e-4 * np.eye(3), added.shape), atol=1e-15)
-
-
-def test_camera_covariance_of_another_rig_is_refused(ring, seen):
-    with pytest.raises(InputError, match="camera_covariance"):
-        triangulate_joints(
-            ring(4),
-            KeypointDetections.from_keypoints(*seen(ring(4), some_joints())),
-            SETTINGS,
-            np.zeros((3, 12, 12)),
-        )

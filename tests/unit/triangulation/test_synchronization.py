@@ -12,7 +12,6 @@ from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.triangulation import synchronization
 from worldpose.triangulation.synchronization import shift_frames, synchronize
 
 LATE = np.array([-12.0, -3.5, 0.0, 2.25, 20.0])
@@ -67,8 +66,8 @@ def errors(found, late=LATE):
     return off - np.nanmedian(off)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-3])
-def test_offsets_are_found_without_a_hint_and_with_wrong_cameras(scene, pitch, angle):
+def test_offsets_are_found_without_a_hint_and_with_wrong_cameras(scene, pitch):
+    angle = 1e-3
     found = synchronize(turned(scene, angle), shifted(scene), FPS, pitch=pitch)
     assert found.reasons == ("",) * 5
     assert np.abs(errors(found)).max() < 0.2
@@ -77,13 +76,8 @@ def test_offsets_are_found_without_a_hint_and_with_wrong_cameras(scene, pitch, a
     assert np.abs(peaks - found.late).max() < 4.0
 
 
-def test_without_a_pitch_people_may_be_anywhere(scene):
-    found = synchronize(turned(scene, 0.0), shifted(scene), FPS)
-    assert np.abs(errors(found)).max() < 0.2
-
-
-@pytest.mark.parametrize("noise", [0.0, 2.0])
-def test_where_nothing_moves_no_offset_is_told(scene, pitch, noise):
+def test_where_nothing_moves_no_offset_is_told(scene, pitch):
+    noise = 2.0
     still = with_rows(scene.static_views().detections, np.full((FRAMES, 5), 60))
     rng = np.random.default_rng(1)
     moved = still.keypoints + rng.normal(0.0, noise, still.keypoints.shape)
@@ -118,38 +112,3 @@ def test_one_camera_has_nothing_to_be_compared_with(scene):
         synchronize(turned(scene, 0.0)[:1], alone, FPS)
     with pytest.raises(InputError, match="expected two cameras or more"):
         synchronize(turned(scene, 0.0)[:3], one, FPS)
-
-
-def test_offsets_that_depend_on_the_other_cameras_are_uncertain(scene, monkeypatch):
-    """The jackknife by hand, of offsets that change only where camera 3 is left out."""
-    cameras = turned(scene, 0.0)[np.arange(4)]
-    people = shifted(scene)
-    arrays = {name: array[:, :4] for name, array in people.arrays().items()}
-    people = people.with_arrays(arrays, people.frame).assign_people(
-        np.zeros(arrays["score"].shape, np.int64)[:, :, :1]
-    )
-    stated = 0.1
-
-    def estimate(cameras, people, fps):
-        found = np.zeros(int(cameras.batch_shape[0]))
-        without_the_last = np.array_equal(cameras.cam_from_world.translation, kept)
-        change = np.array([0.3, 0.0, 0.0]) if without_the_last else 0.0
-        return found + change, np.full(3, stated)
-
-    kept = cameras.cam_from_world.translation[:3]
-    monkeypatch.setattr(synchronization, "_estimate_fractions", estimate)
-    late, error = np.zeros(4), np.full(4, 0.1)
-    # 0.3, 0, 0 are 0.2, -0.1, -0.1 about their mean; each camera has three such changes.
-    expected = np.sqrt(2.0 / 3.0 * np.array([0.2, 0.1, 0.1, 0.0]) ** 2)
-    found = synchronization._disagreement(cameras, people, FPS, late, error)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    stated = 0.15  # less is known without a camera, which explains a part
-    explained = 0.15**2 - 0.1**2
-    expected = np.sqrt(2.0 / 3.0 * max(0.2**2 - explained, 0.0))
-    found = synchronization._disagreement(cameras, people, FPS, late, error)
-    np.testing.assert_allclose(found, [expected, 0.0, 0.0, 0.0], atol=1e-12)
-    # Of two cameras none can be left out.
-    pair = people.with_arrays({n: a[:, :2] for n, a in arrays.items()}, people.frame)
-    assert not synchronization._disagreement(
-        cameras[np.arange(2)], pair, FPS, late[:2], error[:2]
-    ).any()

@@ -4,16 +4,13 @@ from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation.chunking import reconstruct_joints
-from worldpose.triangulation.clocks import _Sums, estimate_clocks, shift_in_time
+from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import (
-    _factorize,
-    _invert,
-    _substitute,
-    segments,
-    smooth_joints,
-)
+from worldpose.triangulation.smoothing import segments, smooth_joints
+from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
+
+as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
 
@@ -45,8 +42,8 @@ def test_segments_break_at_long_gaps_only():
 def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
     camera, joints = ring(4), runner(100)
     arrays = detections(camera, joints, 2.0)
-    raw = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), SETTINGS)
-    smooth = smooth_joints(camera, KeypointDetections.from_keypoints(*arrays), raw, FPS, SETTINGS)
+    raw = triangulate_joints(camera, as_detections(*arrays), SETTINGS)
+    smooth = smooth_joints(camera, as_detections(*arrays), raw, FPS, SETTINGS)
     error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (raw, smooth)]
     jerk = [np.abs(np.diff(r.joints - joints, 2, axis=0)).mean() for r in (raw, smooth)]
     # White noise at 50 frames/s and swings of 2 Hz: several frames count as one.
@@ -69,12 +66,8 @@ def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
     keypoints, confidence, index = detections(camera, joints, 1.0)
     index[20:30, 1:] = -1  # one view
     index[50:90] = -1  # 0.8 s without any
-    raw = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    smooth = smooth_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
-    )
+    raw = triangulate_joints(camera, as_detections(keypoints, confidence, index), SETTINGS)
+    smooth = smooth_joints(camera, as_detections(keypoints, confidence, index), raw, FPS, SETTINGS)
     assert np.isnan(raw.joints[20:30]).all()
     assert smooth.filled[20:30].all()
     assert smooth.filled.sum() == 10 * 17
@@ -84,27 +77,6 @@ def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
     size = np.trace(smooth.covariance, axis1=-2, axis2=-1)
     assert (size[25] > size[15]).all()
     assert smooth.report.filled == 170
-
-
-def test_single_frame_and_no_joint_are_passed_through(ring):
-    camera = ring(4)
-    keypoints, confidence, index = detections(camera, runner(1, 1), 1.0)
-    raw = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    smooth = smooth_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
-    )
-    np.testing.assert_allclose(smooth.joints, raw.joints, atol=1e-2)
-    index[:] = -1
-    raw = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    smooth = smooth_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
-    )
-    assert np.isnan(smooth.joints).all()
-    assert smooth.report.filled_share is None
 
 
 def late_detections(camera, frames, late, noise=1.0, seed=0):
@@ -128,53 +100,22 @@ def test_late_clocks_are_found(ring):
     late = np.array([0.0, 3.0, -3.0, 0.5, -0.5, 1.0])
     camera = ring(6)
     arrays = late_detections(camera, 100, late)
-    clocks = estimate_clocks(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
+    clocks = estimate_clocks(camera, as_detections(*arrays), FPS, SETTINGS)
     assert clocks.determined.all()
     np.testing.assert_allclose(clocks.late, late - late.mean(), atol=0.1)
     corrected = SETTINGS.model_copy(update={"correct_clocks": True})
-    result = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, corrected)
-    plain = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
+    result = reconstruct_joints(camera, as_detections(*arrays), FPS, corrected)
+    plain = reconstruct_joints(camera, as_detections(*arrays), FPS, SETTINGS)
     assert (
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
     )
 
 
-def test_stated_errors_of_clocks_are_those_that_are_made(ring):
-    late = np.array([0.0, 0.7, -0.3, 0.5, -0.5, 1.0])
-    camera = ring(6)
-    anyhow = SETTINGS.model_copy(update={"max_clock_error_frames": 1.0})
-    errors, stated = [], []
-    for seed in range(8):
-        arrays = late_detections(camera, 50, late, noise=4.0, seed=10 * seed)
-        clocks = estimate_clocks(camera, KeypointDetections.from_keypoints(*arrays), FPS, anyhow)
-        assert clocks.determined.all()
-        errors.append(clocks.late - late + late.mean())
-        stated.append(clocks.standard_error)
-    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stated)))
-    # 48 errors tell their size to 10 %, three of that above one. White noise is all there is
-    # here: what a detector has in common for all people makes the stated errors larger.
-    assert 0.3 < ratio < 1.3
-
-
-def test_camera_that_sees_nobody_hides_no_other_clock(ring):
-    late = np.array([0.0, 2.0, -1.0, 0.5, 0.0, 0.0])
-    keypoints, confidence, index = late_detections(ring(6), 100, late)
-    index[:, 4:] = -1
-    clocks = estimate_clocks(
-        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), FPS, SETTINGS
-    )
-    assert clocks.determined.tolist() == [True] * 4 + [False] * 2
-    np.testing.assert_allclose(clocks.late[:4], late[:4] - late[:4].mean(), atol=0.1)
-    assert clocks.report.clock_late_frames[4:] == (None, None)
-
-
 def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
     camera = ring(4)
     still = np.broadcast_to(runner(1), (60, 2, 17, 3))
-    clocks = estimate_clocks(
-        camera, KeypointDetections.from_keypoints(*detections(camera, still, 1.0)), FPS, SETTINGS
-    )
+    clocks = estimate_clocks(camera, as_detections(*detections(camera, still, 1.0)), FPS, SETTINGS)
     assert not clocks.determined.any()
     assert np.isnan(clocks.late).all()
     assert clocks.report.clock_late_frames == (None,) * 4
@@ -184,7 +125,7 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
     keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
     index[4, 1, 0] = -1
     late = np.array([0.0, 2.0, -0.5])
-    shifted = shift_in_time(KeypointDetections.from_keypoints(keypoints, confidence, index), late)
+    shifted = shift_in_time(as_detections(keypoints, confidence, index), late)
     pixels, moved = shifted.keypoints, shifted.detection_index
     np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
     np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
@@ -194,28 +135,3 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
         pixels[:-1, 2], 0.5 * (keypoints[:-1, 2] + keypoints[1:, 2]), atol=1e-9
     )
     assert (moved[-1, 2] == -1).all()
-
-
-@pytest.mark.parametrize(
-    ("weights", "seen", "error"),
-    [
-        # They say 3, -1 and 1, together 1: a third each, which leaves 2, -2 and 0 of 1 - 1/3.
-        ([100.0, 100.0, 100.0], [3.0, -1.0, 1.0], np.sqrt(2.0) * 100.0 * 2.0 / (2.0 / 3.0)),
-        # 1, 0 and 0, together 0.6; a weight above half counts as half.
-        ([180.0, 60.0, 60.0], [1.0, 0.0, 0.0], np.hypot(180.0 * 0.4 / 0.5, np.sqrt(2.0) * 45.0)),
-    ],
-)
-def test_a_clock_errs_by_what_each_person_misses_the_others_by(
-    ring, monkeypatch, weights, seen, error
-):
-    weights = np.array(weights)
-    information = np.zeros((3, 2, 2))
-    information[:, 0, 0] = information[:, 1, 1] = weights
-    # Only in front of the first camera there is evidence.
-    score = np.stack([weights * seen, np.zeros(3)], axis=-1)
-    sums = _Sums(information, score, np.zeros(2), np.zeros(2), np.zeros(2))
-    monkeypatch.setattr("worldpose.triangulation.clocks._sum_equations", lambda *_: sums)
-    nothing = detections(ring(2), runner(5), 1.0)
-    found = estimate_clocks(ring(2), KeypointDetections.from_keypoints(*nothing), FPS, SETTINGS)
-    # Over the sum of weights, and half of it from the mean of two clocks. 0.01 is known before.
-    np.testing.assert_allclose(found.standard_error, 0.5 * error / 300.0, rtol=1e-3)

@@ -1,14 +1,11 @@
 """Points besides COCO-17 are triangulated like joints, and change none of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation.chunking import learn_clip, reconstruct_chunks, reconstruct_joints
-from worldpose.triangulation.clocks import shift_in_time
 from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
@@ -65,59 +62,6 @@ def replace_settings(**changes):
     return TriangulationSettings().model_copy(update=changes)
 
 
-def test_their_noise_is_learned_apart_from_that_of_joints(clip):
-    cameras, plain, with_feet, _ = clip
-    rng = np.random.default_rng(1)
-    worse = with_feet.extra_keypoints + 6.0 * rng.standard_normal(with_feet.extra_keypoints.shape)
-    noisy = plain.add_points(FEET, worse, with_feet.extra_confidence)
-    settings = replace_settings(offsets="none")
-    exact = triangulate_joints(cameras, with_feet, settings).extra
-    rough = triangulate_joints(cameras, noisy, settings).extra
-
-    def noise(extra):
-        random = extra.covariance - extra.common_bias[0] ** 2 * np.eye(3)
-        return np.sqrt(np.nanmean(np.einsum("...aa", random)))
-
-    assert noise(rough) == pytest.approx(noise(exact) * np.hypot(2.0, 6.0) / 2.0, rel=0.15)
-
-
-def test_a_gross_error_of_one_view_is_rejected(clip):
-    cameras, plain, with_feet, truth = clip
-    shifted = with_feet.extra_keypoints.copy()
-    shifted[:, 2] += 80.0
-    found = triangulate_joints(
-        cameras,
-        plain.add_points(FEET, shifted, with_feet.extra_confidence),
-        replace_settings(offsets="none"),
-    ).extra
-    assert np.sqrt(np.nanmean((found.joints - truth) ** 2)) < 0.03
-    assert np.nanmax(found.views) <= 5
-
-
-def test_points_that_one_camera_sees_are_missing(clip):
-    cameras, plain, with_feet, _ = clip
-    sure = with_feet.extra_confidence.copy()
-    sure[:, 1:, :, 0] = np.nan
-    pixels = np.where(np.isfinite(sure)[..., None], with_feet.extra_keypoints, np.nan)
-    found = triangulate_joints(cameras, plain.add_points(FEET, pixels, sure)).extra
-    assert np.isnan(found.joints[:, :, 0]).all() and not found.views[:, :, 0].any()
-    assert np.isfinite(found.joints[:, :, 1:]).mean() > 0.99
-
-
-def test_feet_are_swapped_back_with_the_legs(clip):
-    _, _, with_feet, _ = clip
-    exchanged = np.zeros((60, 6, 2, 3), dtype=bool)
-    exchanged[10, 3, 1, 2] = True  # the legs
-    exchanged[11, 3, 1, 1] = True  # the arms
-    found = undo_swaps(with_feet, exchanged)
-    given = with_feet.extra_keypoints
-    np.testing.assert_array_equal(
-        found.extra_keypoints[10, 3, 1], given[10, 3, 1][[3, 4, 5, 0, 1, 2]]
-    )
-    changed = (found.extra_keypoints != given).any(axis=(-1, -2))
-    assert np.argwhere(changed).tolist() == [[10, 3, 1]]
-
-
 def test_landmarks_are_swapped_with_their_part_and_the_trunk_with_all_limbs(clip):
     _, plain, _, _ = clip
     names = ("left_thigh_1", "right_thigh_1", "left_trunk_1", "right_trunk_1", "left_forearm_1")
@@ -133,15 +77,6 @@ def test_landmarks_are_swapped_with_their_part_and_the_trunk_with_all_limbs(clip
     np.testing.assert_array_equal(found[5, 0, 0], all_[[1, 0, 3, 2, 4]])  # a lone point stays
 
 
-def test_they_follow_the_clock_correction_of_their_camera(clip):
-    _, _, with_feet, _ = clip
-    late = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
-    found = shift_in_time(with_feet, late)
-    middle = 0.5 * (with_feet.extra_keypoints[9, 1] + with_feet.extra_keypoints[10, 1])
-    np.testing.assert_allclose(found.extra_keypoints[10, 1], middle)
-    np.testing.assert_array_equal(found.extra_keypoints[10, 0], with_feet.extra_keypoints[10, 0])
-
-
 def test_chunks_give_the_same_points_as_the_whole_clip(clip):
     cameras, _, with_feet, _ = clip
     settings = TriangulationSettings()
@@ -153,14 +88,3 @@ def test_chunks_give_the_same_points_as_the_whole_clip(clip):
     joined = np.concatenate([part.triangulation.extra.joints for part in parts])
     np.testing.assert_array_equal(joined[:60], whole.joints)
     np.testing.assert_allclose(joined[120:180], whole.joints, atol=1e-6)  # in other tiles
-
-
-def test_replacing_all_points_by_nothing_leaves_them_missing(clip):
-    cameras, plain, with_feet, _ = clip
-    empty = plain.add_points(
-        FEET,
-        np.full_like(with_feet.extra_keypoints, np.nan),
-        np.full_like(with_feet.extra_confidence, np.nan),
-    )
-    found = triangulate_joints(cameras, replace(empty, frame=plain.frame)).extra
-    assert np.isnan(found.joints).all() and not found.views.any()

@@ -10,14 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, TypeAlias, get_args
 
-from pydantic import ValidationError
-
-from worldpose.errors import InputError
 from worldpose.formats.annotations.annotated_images import (
     AnnotatedImage,
-    AnnotatedPerson,
     ContentError,
     coco_bytes,
+    decode_file,
     read_coco,
 )
 from worldpose.formats.annotations.programs import (
@@ -26,17 +23,6 @@ from worldpose.formats.annotations.programs import (
     read_cvat,
     read_label_studio,
 )
-
-__all__ = [
-    "FORMATS",
-    "AnnotatedImage",
-    "AnnotatedPerson",
-    "Format",
-    "detect_format",
-    "format_suffix",
-    "read_annotations",
-    "write_annotations",
-]
 
 Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
@@ -92,29 +78,13 @@ def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedIm
     Raises:
         InputError: the content is invalid; nothing is read.
     """
-    try:
-        size = path.stat().st_size
-        if size > MOST:
-            raise ContentError(f"{size} bytes, more than {MOST}")
-        content = path.read_bytes()
-        form = form or detect_format(content)
-        pictures = _CODECS[form].decode(content)
+
+    def decode(content: bytes) -> list[AnnotatedImage]:
+        pictures = _CODECS[form or detect_format(content)].decode(content)
         if len({picture.name for picture in pictures}) < len(pictures):
             raise ContentError("two images with one name")
         return pictures
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise _refusal(path, form, f"{place}: {first['msg']}" if place else first["msg"]) from None
-    except (OSError, ContentError) as error:
-        raise _refusal(path, form, str(error)) from error
 
-
-def _refusal(path: Path, form: Format | None, found: str) -> InputError:
-    known = " or ".join(codec.name for codec in _CODECS.values())
-    return InputError(
-        str(path),
-        expected=known if form is None else _CODECS[form].name,
-        found=found,
-        todo="Export it again from the annotator; docs/how-to/review.md says how.",
-    )
+    expected = " or ".join(codec.name for name, codec in _CODECS.items() if form in (None, name))
+    todo = "Export it again from the annotator; docs/how-to/review.md says how."
+    return decode_file(path, MOST, decode, expected, todo)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, TypedDict, get_args
+from pathlib import Path
+from typing import Annotated, Any, Final, TypedDict, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.review import Origin
+from worldpose.errors import InputError
+
+Content = TypeVar("Content")
 
 CORNER: Final = 0.5
 """Offset of the image corner from the centre of the first pixel [px]: CVAT and Label Studio
@@ -25,6 +29,35 @@ SEEN: Final = 0.5
 
 class ContentError(ValueError):
     """Another program's file does not match its format; errors of the file raise only this."""
+
+
+def decode_file(
+    path: Path, limit: int, decode: Callable[[bytes], Content], expected: str, todo: str
+) -> Content:
+    """Return what `decode` makes of a file.
+
+    Args:
+        path: the file.
+        limit: maximum size [byte].
+        decode: raises ContentError or pydantic's error for a bad content.
+        expected: what the file should be, for messages.
+        todo: what to do about another file, for messages.
+
+    Raises:
+        InputError: the file is unreadable, too large, or invalid.
+    """
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            raise ContentError(f"{size} bytes, more than {limit}")
+        return decode(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        found = f"{place}: {first['msg']}" if place else first["msg"]
+    except (OSError, ContentError) as error:
+        found = str(error)
+    raise InputError(str(path), expected=expected, found=found[:300], todo=todo)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,32 +149,34 @@ def read_attributes(given: Mapping[str, str]) -> Attributes:
 Scalar = str | int | float | bool | None
 
 
-class _Given(BaseModel):
+class Given(BaseModel):
     """Part of an external file; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
-class _Image(_Given):
+class CocoImage(Given):
+    """An image of a COCO file."""
+
     id: int
     file_name: str = Field(min_length=1)
     width: int = Field(ge=1)
     height: int = Field(ge=1)
 
 
-class _Person(_Given):
+class _Person(Given):
     image_id: int
     bbox: tuple[float, float, float, float]
     keypoints: Annotated[tuple[float, ...], Field(min_length=51, max_length=51)] | None = None
     attributes: dict[str, Scalar] = {}
 
 
-class _Category(_Given):
+class _Category(Given):
     keypoints: tuple[str, ...] | None = None
 
 
-class _Dataset(_Given):
-    images: tuple[_Image, ...]
+class _Dataset(Given):
+    images: tuple[CocoImage, ...]
     annotations: tuple[_Person, ...]
     categories: tuple[_Category, ...] = ()
 

@@ -7,18 +7,23 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from data_contracts.arrays import Floats
-from worldpose.errors import InputError
-from worldpose.formats.annotations.annotated_images import CORNER, ContentError
-from worldpose.formats.annotations.programs import read_xml
+from worldpose.formats.annotations.annotated_images import (
+    CORNER,
+    CocoImage,
+    ContentError,
+    Given,
+    decode_file,
+)
+from worldpose.formats.annotations.programs import Answer, read_xml
 
 MAX_BYTES: Final = 1 << 26
 """Maximum file size [bytes]."""
@@ -48,33 +53,19 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
     Raises:
         InputError: the file has none of these forms, or no labelled point or line.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ContentError(f"more than {MAX_BYTES >> 20} MB")
-        content = path.read_bytes()
+
+    def decode(content: bytes) -> list[MarkedImage]:
         begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
-        decode: Callable[[bytes], Iterator[MarkedImage]]
-        decode = (
-            _read_cvat if begin == b"<" else _read_label_studio if begin == b"[" else _read_coco
-        )
-        images = [image for image in decode(content) if image.points or image.lines]
+        decoders = {b"<": _read_cvat, b"[": _read_label_studio}
+        found = decoders.get(begin, _read_coco)(content)
+        images = [image for image in found if image.points or image.lines]
         if not images:
             raise ContentError("no labelled point or line")
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        raise _refusal(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    except (OSError, ContentError) as error:
-        raise _refusal(path, str(error)) from error
-    return images
+        return images
 
-
-def _refusal(path: Path, found: str) -> InputError:
-    return InputError(
-        str(path),
-        expected="labelled points as CVAT for images XML 1.1, Label Studio JSON or COCO keypoints",
-        found=found[:300],
-        todo="Export the clicks from the annotator in one of these forms.",
-    )
+    expected = "labelled points as CVAT for images XML 1.1, Label Studio JSON or COCO keypoints"
+    todo = "Export the clicks from the annotator in one of these forms."
+    return decode_file(path, MAX_BYTES, decode, expected, todo)
 
 
 def _read_cvat(content: bytes) -> Iterator[MarkedImage]:
@@ -107,34 +98,23 @@ def _read_cvat(content: bytes) -> Iterator[MarkedImage]:
         yield MarkedImage(name, size, tuple(points), tuple(lines))
 
 
-class _Given(BaseModel):
-    """Part of an external file; unknown fields are ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-
-class _Answer(_Given):
-    result: tuple[dict[str, Any], ...] = ()
-    was_cancelled: bool = False
-
-
-class _Task(_Given):
+class _Task(Given):
     data: dict[str, Any]
-    annotations: tuple[_Answer, ...] = ()
+    annotations: tuple[Answer, ...] = ()
 
 
-class _Place(_Given):
+class _Place(Given):
     x: float
     y: float
     keypointlabels: tuple[str, ...] = Field(min_length=1, max_length=1)
 
 
-class _Outline(_Given):
+class _Outline(Given):
     points: tuple[tuple[float, float], ...]
     polygonlabels: tuple[str, ...] = Field(min_length=1, max_length=1)
 
 
-class _Region(_Given):
+class _Region(Given):
     type: str
     original_width: int = Field(ge=1)
     original_height: int = Field(ge=1)
@@ -170,26 +150,19 @@ def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
             yield MarkedImage(name, sizes.pop(), tuple(points), tuple(lines))
 
 
-class _Image(_Given):
-    id: int
-    file_name: str
-    width: int = Field(ge=1)
-    height: int = Field(ge=1)
-
-
-class _Category(_Given):
+class _Category(Given):
     id: int
     keypoints: tuple[str, ...] = ()
 
 
-class _Annotation(_Given):
+class _Annotation(Given):
     image_id: int
     category_id: int
     keypoints: tuple[float, ...] = ()
 
 
-class _Dataset(_Given):
-    images: tuple[_Image, ...]
+class _Dataset(Given):
+    images: tuple[CocoImage, ...]
     annotations: tuple[_Annotation, ...]
     categories: tuple[_Category, ...]
 

@@ -10,11 +10,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
@@ -23,50 +22,24 @@ from worldpose.formats.annotations.annotated_images import (
     AnnotatedImage,
     AnnotatedPerson,
     ContentError,
+    Given,
     format_attributes,
     hull,
     read_attributes,
 )
-
-DEEPEST: Final = 16
-"""Maximum nesting of elements; annotations have five."""
+from worldpose.formats.files import parse_xml
 
 
-def read_xml(content: bytes) -> ElementTree.Element:
-    """Return the root element of a document without a document type and thus without entities.
+def read_xml(content: bytes) -> Element:
+    """Return the root element of a document; see `parse_xml`.
 
     Raises:
         ContentError: the document is not XML, declares a document type, or is nested deeply.
     """
-    parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
-    depth = 0
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > DEEPEST:
-            raise ContentError(f"elements nested more than {DEEPEST} deep")
-        builder.start(tag, attributes)
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-        builder.end(tag)
-
-    def refuse(*_: object) -> None:
-        raise ContentError("a document type declaration, which can hide other files and floods")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = builder.data
-    parser.StartDoctypeDeclHandler = refuse
     try:
-        parser.Parse(content, True)
-    except ContentError:
-        raise
-    # ValueError and LookupError: an encoding unknown to expat or Python.
-    except (expat.ExpatError, ValueError, LookupError) as error:
-        raise ContentError(f"no XML: {error}") from error
-    return builder.close()
+        return parse_xml(content)
+    except ValueError as error:
+        raise ContentError(str(error)) from error
 
 
 BOX: Final = "person"
@@ -249,13 +222,7 @@ POINT: Final = 0.3
 """Displayed size of a keypoint [% of the image width]."""
 
 
-class _Given(BaseModel):
-    """Part of an external file; unknown fields are ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-
-class _Value(_Given):
+class _Value(Given):
     x: float
     y: float
     width: float = Field(default=0.0, ge=0)
@@ -264,11 +231,11 @@ class _Value(_Given):
     keypointlabels: tuple[str, ...] = ()
 
 
-class _Meta(_Given):
+class _Meta(Given):
     text: tuple[str, ...] = ()
 
 
-class _Region(_Given):
+class _Region(Given):
     id: str
     type: str
     original_width: int = Field(ge=1)
@@ -279,21 +246,23 @@ class _Region(_Given):
     parent: str | None = Field(default=None, alias="parentID")
 
 
-class _Answer(_Given):
+class Answer(Given):
+    """Regions that one annotator, or a detector, drew in an image."""
+
     result: tuple[dict[str, Any], ...] = ()
     was_cancelled: bool = False
 
 
-class _Data(_Given):
+class _Data(Given):
     image: str = Field(min_length=1)
     width: int = Field(ge=1)
     height: int = Field(ge=1)
 
 
-class _Task(_Given):
+class _Task(Given):
     data: _Data
-    annotations: tuple[_Answer, ...] = ()
-    predictions: tuple[_Answer, ...] = ()
+    annotations: tuple[Answer, ...] = ()
+    predictions: tuple[Answer, ...] = ()
 
 
 def label_studio_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:

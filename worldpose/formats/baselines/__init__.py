@@ -8,26 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from worldpose.body.model import BodyModel
 from worldpose.errors import UsageError
 from worldpose.formats.baselines.camera_methods import read_humans4d, read_hybrik
-from worldpose.formats.baselines.result import MethodResult, resample_result
+from worldpose.formats.baselines.result import MethodResult
 from worldpose.formats.baselines.world_methods import (
-    WITH_MOTION_PRIOR,
-    WITHOUT_MOTION_PRIOR,
-    make_slahmr_reader,
     read_glamr,
     read_gvhmr,
     read_prompthmr,
+    read_slahmr,
     read_smpl,
     read_tram,
     read_wham,
 )
-
-__all__ = ["METHODS", "Method", "MethodResult", "find_method", "resample_result"]
 
 
 @dataclass(frozen=True)
@@ -48,11 +45,13 @@ METHODS: Final = {
         Method("hybrik", "HybrIK", read_hybrik),
         Method("4dhumans", "4DHumans", read_humans4d),
         Method("glamr", "GLAMR", read_glamr),
-        Method("slahmr", "SLAHMR", make_slahmr_reader(WITH_MOTION_PRIOR)),
+        Method("slahmr", "SLAHMR", partial(read_slahmr, phase="motion_chunks")),
         Method(
-            "slahmr-true-cameras", "SLAHMR w/ GT cameras", make_slahmr_reader(WITH_MOTION_PRIOR)
+            "slahmr-true-cameras",
+            "SLAHMR w/ GT cameras",
+            partial(read_slahmr, phase="motion_chunks"),
         ),
-        Method("slahmr-no-humor", "SLAHMR w/o HuMoR", make_slahmr_reader(WITHOUT_MOTION_PRIOR)),
+        Method("slahmr-no-humor", "SLAHMR w/o HuMoR", partial(read_slahmr, phase="smooth_fit")),
         Method("wham", "WHAM", read_wham),
         Method("gvhmr", "GVHMR", read_gvhmr),
         Method("tram", "TRAM", read_tram),

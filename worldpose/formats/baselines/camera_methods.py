@@ -6,27 +6,24 @@ Each docstring states the layout as written by the method's own code at that com
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body.model import BodyModel
 from worldpose.formats.baselines.result import (
     MethodResult,
+    Part,
+    Person,
     Track,
-    as_floats,
     boxes_around,
-    floats,
     format_error,
-    get_part,
-    integer,
-    integers,
     merge_people,
     pose_track,
     read_pickled,
-    require_ascending,
     rotation_vectors,
 )
 
@@ -51,65 +48,47 @@ def read_hybrik(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResul
         InputError: the file has neither of the two layouts.
     """
     content = read_pickled(path)
-    single = isinstance(content, dict) and "pred_thetas" in content
-    rows = {0: _read_person(path, content)} if single else _read_people(path, content)
-    people, boxes, used = [], [], ""
-    for person, (track, around) in rows.items():
+    single = isinstance(content.value, dict) and "pred_thetas" in content.value
+    rows = {0: _read_person(content)} if single else _read_people(content)
+    people, used = [], ""
+    for number, (track, boxes) in rows.items():
         joints, used = pose_track(track, model, "smpl", "transl" if single else "pelvis")
-        people.append((person, track.frames, joints))
-        boxes.append(around)
-    tracks, found = merge_people(people, boxes)
-    return MethodResult(tracks, "camera", found, notes={"shape": used})
+        people.append(Person(number, track.frames, joints, boxes))
+    return merge_people("camera", people, {"shape": used})
 
 
-def _read_people(path: Path, content: Any) -> dict[int, tuple[Track, NDArray[np.float64]]]:  # noqa: ANN401
-    if not isinstance(content, dict):
-        raise format_error(path, "a dictionary by person", f"a {type(content).__name__}")
+def _read_people(content: Part) -> dict[int, tuple[Track, Floats]]:
     rows = {}
-    for name, person in content.items():
-        where = f"{path}: person {name}"
-        frames = require_ascending(where, integers(where, get_part(where, person, "frames")))
-        turns = as_floats(where, get_part(where, person, "smpl_pose_quat_wroot"))
-        track = _build_track(
-            where,
-            frames,
-            turns.reshape(len(frames), -1) if turns.shape[:1] == (len(frames),) else turns,
-            get_part(where, person, "smpl_beta"),
-            get_part(where, person, "root_trans"),
-        )
-        points = floats(where, get_part(where, person, "kp_2d"), (len(frames), None, 2))
-        rows[integer(where, name)] = (track, boxes_around(points))
+    for number, person in content.by_person():
+        frames = person["frames"].frames()
+        turns = person["smpl_pose_quat_wroot"]
+        if turns.as_floats().shape[:1] == frames.shape:
+            turns = Part(turns.where, turns.as_floats().reshape(len(frames), -1))
+        track = _build_track(frames, turns, person["smpl_beta"], person["root_trans"])
+        rows[number] = (track, boxes_around(person["kp_2d"].floats(len(frames), None, 2)))
     return rows
 
 
-def _read_person(path: Path, content: Any) -> tuple[Track, NDArray[np.float64]]:  # noqa: ANN401
-    where = str(path)
-    names = [str(name) for name in get_part(where, content, "img_path")]
-    numbers = [re.search(r"(\d+)\.\w+$", name) for name in names]
-    if not all(numbers):
-        raise format_error(f"{path}: img_path", "images with a number", f"{names[:3]}")
-    frames = require_ascending(where, np.array([int(found[1]) - 1 for found in numbers if found]))
-    track = _build_track(
-        where,
-        frames,
-        get_part(where, content, "pred_thetas"),
-        get_part(where, content, "pred_betas"),
-        get_part(where, content, "transl"),
-    )
-    return track, floats(where, get_part(where, content, "bbox"), (len(frames), 4))
+def _read_person(content: Part) -> tuple[Track, Floats]:
+    images = content["img_path"]
+    names = [str(name) for name in images.value]
+    numbers = [int(found[1]) - 1 for n in names if (found := re.search(r"(\d+)\.\w+$", n))]
+    if len(numbers) < len(names):
+        raise format_error(images.where, "images with a number", f"{names[:3]}")
+    frames = Part(images.where, numbers).frames()
+    track = _build_track(frames, content["pred_thetas"], content["pred_betas"], content["transl"])
+    return track, content["bbox"].floats(len(frames), 4)
 
 
-def _build_track(
-    where: str, frames: NDArray[np.int64], turns: object, betas: object, place: object
-) -> Track:
-    matrices = floats(where, turns, (len(frames), 216)).reshape(-1, 24, 3, 3)
-    vectors = rotation_vectors(matrices)
+def _build_track(frames: NDArray[np.int64], turns: Part, betas: Part, place: Part) -> Track:
+    count = len(frames)
+    vectors = rotation_vectors(turns.floats(count, 216).reshape(-1, 24, 3, 3))
     return Track(
         frames=frames,
         global_orient=vectors[:, 0],
         body_pose=vectors[:, 1:].reshape(-1, 69),
-        place=floats(where, place, (len(frames), 3)),
-        betas=floats(where, betas, (len(frames), None)),
+        place=place.floats(count, 3),
+        betas=betas.floats(count, None),
     )
 
 
@@ -136,48 +115,35 @@ def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRes
         InputError: the file has another format.
     """
     content = read_pickled(path)
-    if not isinstance(content, dict):
-        raise format_error(path, "a dictionary by image", f"a {type(content).__name__}")
+    if not isinstance(content.value, dict):
+        raise format_error(path, "a dictionary by image", f"a {type(content.value).__name__}")
     rows: dict[int, dict[int, _Row]] = {}
-    for name, image in content.items():
-        for person, row in _read_image(f"{path}: {name}", image):
-            rows.setdefault(person, {})[row[0]] = row
-    people, boxes, used = [], [], ""
-    for person, found in sorted(rows.items()):
-        frames, turns, betas, place, around = (
+    for name, image in content.value.items():
+        for number, row in _read_image(Part(f"{path}: {name}", image)):
+            rows.setdefault(number, {})[row[0]] = row
+    people, used = [], ""
+    for number, found in sorted(rows.items()):
+        frames, turns, betas, place, boxes = (
             np.array(part) for part in zip(*(found[frame] for frame in sorted(found)), strict=True)
         )
         vectors = rotation_vectors(turns)
         track = Track(frames, vectors[:, 0], vectors[:, 1:].reshape(-1, 69), place, betas)
         joints, used = pose_track(track, model, "smpl")
-        people.append((person, frames, joints))
-        boxes.append(around)
-    tracks, found_boxes = merge_people(people, boxes)
-    return MethodResult(tracks, "camera", found_boxes, notes={"shape": used})
+        people.append(Person(number, frames, joints, boxes))
+    return merge_people("camera", people, {"shape": used})
 
 
-def _read_image(where: str, image: Any) -> list[tuple[int, _Row]]:  # noqa: ANN401
-    """Return id and row of every person detected in one image."""
-    frame = integer(where, get_part(where, image, "time"))
-    ages = get_part(where, image, "tracked_time")
-    found = []
-    for place, person in enumerate(get_part(where, image, "tid")):
+def _read_image(image: Part) -> Iterator[tuple[int, _Row]]:
+    """Yield id and row of every person detected in one image."""
+    frame, ages = image["time"].integer(), image["tracked_time"].value
+    for place, person in enumerate(image["tid"].value):
         if ages[place]:
             continue
-        body, box = (get_part(where, image, key)[place] for key in ("smpl", "bbox"))
-        turns = np.concatenate(
-            [
-                floats(where, get_part(where, body, "global_orient"), (3, 3))[None],
-                floats(where, get_part(where, body, "body_pose"), (23, 3, 3)),
-            ]
+        body, box, camera = (
+            Part(image[key].where, image[key].value[place]) for key in ("smpl", "bbox", "camera")
         )
-        x, y, width, height = floats(where, box, (4,))
-        row = (
-            frame,
-            turns,
-            floats(where, get_part(where, body, "betas"), (10,)),
-            floats(where, get_part(where, image, "camera")[place], (3,)),
-            np.array([x, y, x + width, y + height]),
-        )
-        found.append((integer(where, person), row))
-    return found
+        turns = [body["global_orient"].floats(3, 3)[None], body["body_pose"].floats(23, 3, 3)]
+        x, y, width, height = box.floats(4)
+        around = np.array([x, y, x + width, y + height])
+        row = (frame, np.concatenate(turns), body["betas"].floats(10), camera.floats(3), around)
+        yield Part(image.where, person).integer(), row

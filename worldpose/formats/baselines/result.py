@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,7 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.parsing import read_npz_members
-from worldpose.pickles import FILE_BYTES, plain, read_notes
+from worldpose.pickles import read_pickle
 
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation of world points to axes with y down, the ground orientation of SLAHMR."""
@@ -191,15 +189,25 @@ def pose_track(
     return joints, "the file's betas" if used else f"the mean shape of {model.name}"
 
 
-def merge_people(
-    people: Sequence[tuple[int, NDArray[np.int64], Floats]],
-    boxes: Sequence[Floats | None] | None = None,
-) -> tuple[JointTracks, Floats | None]:
-    """Merge people with their own frames into one set, NaN where a person is missing.
+class Person(NamedTuple):
+    """One person of a result."""
 
-    Args:
-        people: id, frames (frames,) and joints (frames, 17, 3) [m] of each.
-        boxes: (frames, 4) [px] of each, in the same frames.
+    id: int
+    frames: NDArray[np.int64]
+    """(frames,) images from 0, ascending."""
+    joints: Floats
+    """(frames, 17, 3) [m]."""
+    boxes: Floats | None = None
+    """(frames, 4) [px]; None if unknown."""
+
+
+def merge_people(
+    world: World,
+    people: Sequence[Person],
+    notes: Mapping[str, str],
+    image_size: tuple[float, float] | None = None,
+) -> MethodResult:
+    """Merge people with their own frames into one result, NaN where a person is missing.
 
     Raises:
         InputError: there are no people.
@@ -211,17 +219,17 @@ def merge_people(
             found="no people",
             todo="Check that this is the result for the clip, or run the method again.",
         )
-    frames = np.unique(np.concatenate([own for _, own, _ in people]))
+    frames = np.unique(np.concatenate([person.frames for person in people]))
     joints = np.full((len(frames), len(people), len(COCO17), 3), np.nan)
     around = np.full((len(frames), len(people), 4), np.nan)
-    for place, (_, own, points) in enumerate(people):
-        rows = np.searchsorted(frames, own)
-        joints[rows, place] = points
-        if boxes is not None and boxes[place] is not None:
-            around[rows, place] = boxes[place]
-    ids = np.array([person for person, _, _ in people], dtype=np.int64)
-    known = boxes is not None and bool(np.isfinite(around).any())
-    return JointTracks(frames, ids, joints), around if known else None
+    for place, person in enumerate(people):
+        rows = np.searchsorted(frames, person.frames)
+        joints[rows, place] = person.joints
+        if person.boxes is not None:
+            around[rows, place] = person.boxes
+    ids = np.array([person.id for person in people], dtype=np.int64)
+    boxes = around if np.isfinite(around).any() else None
+    return MethodResult(JointTracks(frames, ids, joints), world, boxes, image_size, notes)
 
 
 def project_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
@@ -311,7 +319,7 @@ def format_error(where: object, expected: str, found: str) -> InputError:
     )
 
 
-def read_pickled(path: Path) -> Any:  # noqa: ANN401
+def read_pickled(path: Path) -> Part:
     """Return the content of a file: dictionaries, lists, numbers, text and arrays.
 
     `worldpose.pickles` reads pickles, also of joblib, numpy and torch, and runs nothing in them.
@@ -320,10 +328,10 @@ def read_pickled(path: Path) -> Any:  # noqa: ANN401
         InputError: the file is not readable, or names classes that no result needs.
     """
     try:
-        found = plain(read_notes(path))
+        found = read_pickle(path)
         if not isinstance(found, dict | list | np.ndarray):
             raise ValueError(f"a {type(found).__name__}")
-        return found
+        return Part(str(path), found)
     except OSError as error:
         raise _reading_error(path, f"a file that cannot be read ({error})") from None
     except ValueError as error:
@@ -339,108 +347,78 @@ def _reading_error(path: Path, found: str) -> InputError:
     )
 
 
-def get_part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
-    """Return the value at a path of keys in nested dictionaries.
+@dataclass(frozen=True)
+class Part:
+    """A value in a method's file, with its place for messages.
 
-    Raises:
-        InputError: a key is missing; the error names the first missing key.
+    All methods raise InputError, with the place, for a value of another form.
     """
-    for key in keys:
-        if not isinstance(content, Mapping) or key not in content:
-            known = ", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else ""
-            raise format_error(where, f"{key}", known or f"a {type(content).__name__}")
-        content = content[key]
-        where = f"{where}: {key}"
-    return content
 
+    where: str
+    value: Any
 
-def as_floats(where: str, value: object) -> Floats:
-    """Return numbers as an array of any shape.
+    def __getitem__(self, key: str) -> Part:
+        """Return the value of a key; the error names the keys that there are."""
+        if not isinstance(self.value, Mapping) or key not in self.value:
+            known = isinstance(self.value, Mapping) and ", ".join(map(str, [*self.value][:8]))
+            raise format_error(self.where, key, known or f"a {type(self.value).__name__}")
+        return Part(f"{self.where}: {key}", self.value[key])
 
-    Raises:
-        InputError: the values are not numbers.
-    """
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise format_error(where, "numbers", f"a {type(value).__name__}") from None
+    def by_person(self) -> Iterator[tuple[int, Part]]:
+        """Yield id and value of each person in a dictionary by person."""
+        if not isinstance(self.value, Mapping):
+            found = f"a {type(self.value).__name__}"
+            raise format_error(self.where, "a dictionary by person", found)
+        for name, value in self.value.items():
+            where = f"{self.where}: person {name}"
+            yield Part(where, name).integer(), Part(where, value)
 
+    def as_floats(self) -> Floats:
+        """Return numbers as an array of any shape."""
+        try:
+            return np.asarray(self.value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise format_error(self.where, "numbers", f"a {type(self.value).__name__}") from None
 
-def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
-    """Return numbers of a shape, None for any length; extra dimensions of length one are dropped.
+    def floats(self, *shape: int | None) -> Floats:
+        """Return numbers of a shape, None for any length; extra dimensions of 1 are dropped."""
+        array = self.as_floats()
+        while array.ndim > len(shape) and 1 in array.shape:
+            # The first extra dimension that the shape lacks.
+            lone = next(
+                (
+                    i
+                    for i, n in enumerate(array.shape)
+                    if n == 1 and _fits(np.delete(array.shape, i), shape)
+                ),
+                array.shape.index(1),
+            )
+            array = array.squeeze(lone)
+        if not _fits(array.shape, shape):
+            wanted = ", ".join("any" if n is None else str(n) for n in shape)
+            raise format_error(self.where, f"numbers of shape ({wanted})", f"{array.shape}")
+        return array
 
-    Raises:
-        InputError: not numbers, or another shape.
-    """
-    array = as_floats(where, value)
-    while array.ndim > len(shape) and 1 in array.shape:
-        # The first extra dimension that the shape lacks.
-        lone = next(
-            (
-                i
-                for i, n in enumerate(array.shape)
-                if n == 1 and _fits(np.delete(array.shape, i), shape)
-            ),
-            array.shape.index(1),
-        )
-        array = array.squeeze(lone)
-    if not _fits(array.shape, shape):
-        wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise format_error(where, f"numbers of shape ({wanted})", f"{array.shape}")
-    return array
+    def integers(self, count: int | None = None) -> NDArray[np.int64]:
+        """Return integers (count,)."""
+        array = self.floats(count)
+        if not np.array_equal(array, np.round(array)):
+            raise format_error(self.where, "whole numbers", f"{array[:4]}")
+        return array.astype(np.int64)
 
+    def integer(self) -> int:
+        """Return one integer, also if written as text."""
+        found = self.floats()
+        if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
+            raise format_error(self.where, "a whole number", f"{self.value}")
+        return int(found)
 
-def integers(where: str, value: object, count: int | None = None) -> NDArray[np.int64]:
-    """Return integers (count,), such as frames.
-
-    Raises:
-        InputError: not integers, or another number of them.
-    """
-    array = floats(where, value, (count,))
-    if not np.array_equal(array, np.round(array)):
-        raise format_error(where, "whole numbers", f"{array[:4]}")
-    return array.astype(np.int64)
-
-
-def integer(where: str, value: object) -> int:
-    """Return one integer, also if written as text.
-
-    Raises:
-        InputError: the value is not an integer.
-    """
-    found = floats(where, value, ())
-    if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
-        raise format_error(where, "a whole number", f"{value}")
-    return int(found)
-
-
-def require_ascending(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return frames after checking that they ascend.
-
-    Raises:
-        InputError: the frames do not ascend, or are negative.
-    """
-    if np.any(np.diff(frames) <= 0) or np.any(frames < 0):
-        raise format_error(where, "frames that rise from 0", f"{frames[:8]}")
-    return frames
-
-
-def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Return some arrays of an npz file; others are ignored, pickled ones refused.
-
-    Raises:
-        InputError: the file is not an npz file, is too large, or lacks an array.
-    """
-    try:
-        with zipfile.ZipFile(path) as file:
-            size = sum(file.getinfo(f"{name}.npy").file_size for name in names)
-        if size > FILE_BYTES:
-            raise format_error(path, f"at most {FILE_BYTES} bytes of arrays", f"{size}")
-        return read_npz_members(path, names)
-    except KeyError as error:
-        raise format_error(path, f"the arrays {', '.join(names)}", str(error.args[0])) from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise format_error(path, "a whole npz file", str(error)) from None
+    def frames(self) -> NDArray[np.int64]:
+        """Return frames, which ascend from 0 or more."""
+        frames = self.integers()
+        if np.any(np.diff(frames) <= 0) or np.any(frames < 0):
+            raise format_error(self.where, "frames that rise from 0", f"{frames[:8]}")
+        return frames
 
 
 def _fits(found: object, shape: tuple[int | None, ...]) -> bool:

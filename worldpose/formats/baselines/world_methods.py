@@ -7,33 +7,30 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body.body_file import is_open_body
 from worldpose.body.model import BodyModel
+from worldpose.formats.archives import read_npz
 from worldpose.formats.baselines.result import (
     MethodResult,
+    Part,
+    Person,
     Track,
     boxes_around,
-    floats,
     format_error,
-    get_part,
-    integer,
-    integers,
     merge_people,
     pose_track,
     project_boxes,
-    read_arrays,
     read_pickled,
-    require_ascending,
     rotation_vectors,
 )
 from worldpose.formats.joints_file import read_poses
+from worldpose.pickles import FILE_BYTES
 
 
 def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -54,32 +51,25 @@ def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
     Raises:
         InputError: the file has another format.
     """
-    people, boxes, used = [], [], ""
-    for name, person in get_part(str(path), read_pickled(path), "person_data").items():
-        where = f"{path}: person {name}"
-        exists = floats(where, get_part(where, person, "exist_frames"), (None,)) > 0.5
+    people, used = [], ""
+    for number, person in read_pickled(path)["person_data"].by_person():
+        exists = person["exist_frames"].floats(None) > 0.5
         count = len(exists)
-
-        def numbers(key: str, *shape: int | None, data: object = person) -> np.ndarray:
-            return floats(f"{path}: {key}", get_part(str(path), data, key), shape)
-
-        scale = None if get_part(where, person, "scale") is None else numbers("scale", count)
+        scale = person["scale"]
         track = Track(
             frames=np.flatnonzero(exists),
-            global_orient=numbers("smpl_orient_world", count, 3)[exists],
-            body_pose=numbers("smpl_pose", count, 69)[exists],
-            place=numbers("root_trans_world", count, 3)[exists],
-            betas=numbers("smpl_beta", count, None)[exists],
-            scale=None if scale is None else scale[exists],
+            global_orient=person["smpl_orient_world"].floats(count, 3)[exists],
+            body_pose=person["smpl_pose"].floats(count, 69)[exists],
+            place=person["root_trans_world"].floats(count, 3)[exists],
+            betas=person["smpl_beta"].floats(count, None)[exists],
+            scale=None if scale.value is None else scale.floats(count)[exists],
         )
         joints, used = pose_track(track, model, "smpl", "pelvis")
-        points = numbers("kp_2d", count, None, 2)[exists]
+        points = person["kp_2d"].floats(count, None, 2)[exists]
         # Joints that HybrIK lacks, and people in frames without an image of them, are zeros.
         points = np.where((points == 0.0).all(-1, keepdims=True), np.nan, points)
-        people.append((integer(where, name), track.frames, joints))
-        boxes.append(boxes_around(points))
-    tracks, around = merge_people(people, boxes)
-    return MethodResult(tracks, "shared", around, notes={"shape": used})
+        people.append(Person(number, track.frames, joints, boxes_around(points)))
+    return merge_people("shared", people, {"shape": used})
 
 
 def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> MethodResult:
@@ -101,30 +91,24 @@ def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> Meth
     Raises:
         InputError: the file has another format.
     """
-    content = read_pickled(path)
-    if not isinstance(content, dict):
-        raise format_error(path, "a dictionary by person", f"a {type(content).__name__}")
     size = np.array(image_size, dtype=np.float64)
-    people, boxes, used = [], [], ""
-    for name, person in content.items():
-        where = f"{path}: person {name}"
-        frames = require_ascending(where, integers(where, get_part(where, person, "frame_ids")))
-        count = len(frames)
+    focal = np.full(2, np.linalg.norm(size))
+    people, used = [], ""
+    for number, person in read_pickled(path).by_person():
+        frames = person["frame_ids"].frames()
+        joints, used = pose_track(
+            _read_wham_track(person, frames, "_world"), model, "smpl", "mid_hip"
+        )
+        seen = pose_track(_read_wham_track(person, frames, ""), model, "smpl")[0]
+        people.append(Person(number, frames, joints, project_boxes(seen, focal, size / 2.0)))
+    return merge_people("own", people, {"shape": used})
 
-        def track(suffix: str, data: object = person, own: np.ndarray = frames) -> Track:
-            pose, place, betas = (
-                floats(f"{path}: {key}", get_part(str(path), data, key), (len(own), length))
-                for key, length in ((f"pose{suffix}", 72), (f"trans{suffix}", 3), ("betas", None))
-            )
-            return Track(own, pose[:, :3], pose[:, 3:], place, betas)
 
-        joints, used = pose_track(track("_world"), model, "smpl", "mid_hip")
-        seen = pose_track(track(""), model, "smpl")[0]
-        focal = np.full(2, np.linalg.norm(size))
-        people.append((integer(where, name), frames, joints))
-        boxes.append(project_boxes(seen, focal, size / 2.0) if count else None)
-    tracks, around = merge_people(people, boxes)
-    return MethodResult(tracks, "own", around, notes={"shape": used})
+def _read_wham_track(person: Part, frames: NDArray[np.int64], suffix: str) -> Track:
+    count = len(frames)
+    pose = person[f"pose{suffix}"].floats(count, 72)
+    place = person[f"trans{suffix}"].floats(count, 3)
+    return Track(frames, pose[:, :3], pose[:, 3:], place, person["betas"].floats(count, None))
 
 
 def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -151,33 +135,24 @@ def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
     files = [file for file in files if file.parent.name != "preprocess"]
     if not files:
         raise format_error(path, "hmr4d_results.pt, or a folder of such files", "none")
-    people, boxes, used = [], [], ""
-    for person, file in enumerate(files):
+    people, used = [], ""
+    for number, file in enumerate(files):
         content = read_pickled(file)
         world, seen = (
-            _read_gvhmr_track(file, get_part(str(file), content, f"smpl_params_{name}"))
-            for name in ("global", "incam")
+            _read_gvhmr_track(content[f"smpl_params_{name}"]) for name in ("global", "incam")
         )
-        intrinsics = floats(
-            f"{file}: K_fullimg",
-            get_part(str(file), content, "K_fullimg"),
-            (len(seen.frames), 3, 3),
-        )
+        intrinsics = content["K_fullimg"].floats(len(seen.frames), 3, 3)
         joints, used = pose_track(world, model, "other")
         in_camera = pose_track(seen, model, "other")[0]
-        people.append((person, world.frames, joints))
-        boxes.append(project_boxes(in_camera, intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2]))
-    tracks, around = merge_people(people, boxes)
-    return MethodResult(tracks, "own", around, notes={"shape": used})
+        focal, center = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2]
+        people.append(Person(number, world.frames, joints, project_boxes(in_camera, focal, center)))
+    return merge_people("own", people, {"shape": used})
 
 
-def _read_gvhmr_track(file: Path, parameters: object) -> Track:
-    where = str(file)
-    place = floats(where, get_part(where, parameters, "transl"), (None, 3))
-    turns, angles = (
-        floats(f"{file}: {key}", get_part(where, parameters, key), (len(place), length))
-        for key, length in (("global_orient", 3), ("body_pose", 63))
-    )
+def _read_gvhmr_track(parameters: Part) -> Track:
+    place = parameters["transl"].floats(None, 3)
+    turns = parameters["global_orient"].floats(len(place), 3)
+    angles = parameters["body_pose"].floats(len(place), 63)
     return Track(np.arange(len(place)), turns, angles, place)
 
 
@@ -207,39 +182,32 @@ def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     }
     if not files:
         raise format_error(path, "hps/hps_track_<n>.npy", "none")
-    file = path / "camera.npy"
-    camera = read_pickled(file)
-    turns = floats(f"{file}: world_cam_R", get_part(str(file), camera, "world_cam_R"), (None, 3, 3))
-    shifts = floats(
-        f"{file}: world_cam_T", get_part(str(file), camera, "world_cam_T"), (len(turns), 3)
-    )
-    focal = floats(f"{file}: img_focal", get_part(str(file), camera, "img_focal"), ())
-    center = floats(f"{file}: img_center", get_part(str(file), camera, "img_center"), (2,))
-    people, boxes, used = [], [], ""
-    for person, name in sorted(files.items()):
-        where, content = str(name), read_pickled(name)
+    camera = read_pickled(path / "camera.npy")
+    turns = camera["world_cam_R"].floats(None, 3, 3)
+    shifts = camera["world_cam_T"].floats(len(turns), 3)
+    focal, center = camera["img_focal"].floats(), camera["img_center"].floats(2)
+    people, used = [], ""
+    for number, file in sorted(files.items()):
+        content = read_pickled(file)
         # A track consists of pieces, in temporal order.
-        frames = require_ascending(where, integers(where, get_part(where, content, "frame")))
+        frames = content["frame"].frames()
         if frames[-1] >= len(turns):
-            raise format_error(
-                where, f"frames below {len(turns)}, as the camera has", f"{frames[-1]}"
-            )
+            expected = f"frames below {len(turns)}, as the camera has"
+            raise format_error(file, expected, f"{frames[-1]}")
         count = len(frames)
-        matrices = floats(where, get_part(where, content, "pred_rotmat"), (count, 24, 3, 3))
-        vectors = rotation_vectors(matrices)
+        vectors = rotation_vectors(content["pred_rotmat"].floats(count, 24, 3, 3))
         track = Track(
             frames=frames,
             global_orient=vectors[:, 0],
             body_pose=vectors[:, 1:].reshape(-1, 69),
-            place=floats(where, get_part(where, content, "pred_trans"), (count, 3)),
-            betas=floats(where, get_part(where, content, "pred_shape"), (count, None)).mean(0),
+            place=content["pred_trans"].floats(count, 3),
+            betas=content["pred_shape"].floats(count, None).mean(0),
         )
         joints, used = pose_track(track, model, "smpl")
         world = np.einsum("fab,fjb->fja", turns[frames], joints) + shifts[frames, None]
-        people.append((person, frames, world))
-        boxes.append(project_boxes(joints, np.full(2, focal), center))
-    tracks, around = merge_people(people, boxes)
-    return MethodResult(tracks, "shared", around, notes={"shape": used})
+        boxes = project_boxes(joints, np.full(2, focal), center)
+        people.append(Person(number, frames, world, boxes))
+    return merge_people("shared", people, {"shape": used})
 
 
 def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -259,25 +227,17 @@ def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRe
     Raises:
         InputError: the file has another format.
     """
-    file = path / "results.pkl" if path.is_dir() else path
-    content = read_pickled(file)
-    people, boxes, used = [], [], ""
-    for name, person in get_part(str(file), content, "people").items():
-        where = f"{file}: person {name}"
-        frames = require_ascending(where, integers(where, get_part(where, person, "frames")))
+    content = read_pickled(path / "results.pkl" if path.is_dir() else path)
+    people, used = [], ""
+    for number, person in content["people"].by_person():
+        frames = person["frames"].frames()
         count = len(frames)
-        pose = floats(where, get_part(where, person, "smplx_world", "pose"), (count, 165))
-        place = floats(where, get_part(where, person, "smplx_world", "trans"), (count, 3))
+        pose = person["smplx_world"]["pose"].floats(count, 165)
+        place = person["smplx_world"]["trans"].floats(count, 3)
         joints, used = pose_track(Track(frames, pose[:, :3], pose[:, 3:66], place), model, "other")
-        people.append((integer(where, name), frames, joints))
-        box = floats(where, get_part(where, person, "bboxes"), (count, None))
-        boxes.append(box[:, :4])
-    tracks, around = merge_people(people, boxes)
-    center = floats(
-        f"{file}: img_center", get_part(str(file), content, "camera", "img_center"), (2,)
-    )
-    size = (2.0 * float(center[0]), 2.0 * float(center[1]))
-    return MethodResult(tracks, "shared", around, size, {"shape": used})
+        people.append(Person(number, frames, joints, person["bboxes"].floats(count, None)[:, :4]))
+    width, height = (2.0 * content["camera"]["img_center"].floats(2)).tolist()
+    return merge_people("shared", people, {"shape": used}, (width, height))
 
 
 def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -303,29 +263,15 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
         )
         same = named in (None, model.name)
         joints, used = pose_track(track, model, "open" if own else "smpl" if same else "other")
-        people.append((person, track.frames, joints))
-    return MethodResult(merge_people(people)[0], "shared", notes={"shape": used})
+        people.append(Person(person, track.frames, joints))
+    return merge_people("shared", people, {"shape": used})
 
-
-WITH_MOTION_PRIOR: Final = "motion_chunks"
-"""Phase with the final results."""
-WITHOUT_MOTION_PRIOR: Final = "smooth_fit"
-"""Phase before HuMoR, the motion prior, is used (E5)."""
 
 _ARRAYS: Final = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
 _Piece = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 
 
-def make_slahmr_reader(phase: str) -> Callable[[Path, BodyModel, tuple[int, int]], MethodResult]:
-    """Return a reader for the results of one phase."""
-
-    def read(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
-        return read_slahmr(path, model, phase)
-
-    return read
-
-
-def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
+def read_slahmr(path: Path, model: BodyModel, _: tuple[int, int], phase: str) -> MethodResult:
     """Return the people of SLAHMR's runs, all in one world.
 
     SLAHMR: a folder for each piece of the video.
@@ -345,7 +291,8 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
     Args:
         path: a run's folder, or one that holds the folders of all pieces at any depth.
         model: body model to pose.
-        phase: phase to read; its last iteration is used.
+        phase: phase to read; its last iteration is used. HuMoR, the motion prior, is used in
+            `motion_chunks`, not yet in `smooth_fit` (E5).
 
     Raises:
         InputError: the folder has another layout.
@@ -358,40 +305,37 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
         raise format_error(path, "track_info.json of a run", "no such file")
     pieces: dict[int, list[_Piece]] = {}
     last = None
-    for _, people, centers, _ in runs:
+    for people, centers in (run[1:3] for run in runs):
         shift = np.zeros(3) if last is None else last - centers[0]
         last = centers[-1] + shift
         for person, (frames, joints, boxes) in people.items():
             pieces.setdefault(person, []).append((frames, joints + shift, boxes))
-    found, around = [], []
+    found = []
     for person, some in sorted(pieces.items()):
         frames, joints, boxes = (np.concatenate(arrays) for arrays in zip(*some, strict=True))
         # Where pieces overlap, the first one is used.
         frames, first = np.unique(frames, return_index=True)
-        found.append((person, frames, joints[first]))
-        around.append(boxes[first])
-    tracks, known = merge_people(found, around)
+        found.append(Person(person, frames, joints[first], boxes[first]))
     notes = {"shape": runs[-1][3], "phase": phase, "pieces": str(len(runs))}
-    return MethodResult(tracks, "shared", known, notes=notes)
+    return merge_people("shared", found, notes)
 
 
 def _read_run(
     info: Path, model: BodyModel, phase: str
 ) -> tuple[int, dict[int, _Piece], NDArray[np.float64], str]:
     """Return first image, people by id, camera centres, and the body model of the shapes."""
-    where = str(info)
-    try:
-        content: Any = json.loads(info.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise format_error(where, "JSON", str(error)) from None
+    content = _read_json(info)
     files = sorted((info.parent / phase).glob("*_world_results.npz"))
     if not files:
         raise format_error(info.parent / phase, "<clip>_<iteration>_world_results.npz", "none")
-    arrays = read_arrays(files[-1], _ARRAYS)
-    place = floats(f"{files[-1]}: trans", arrays["trans"], (None, None, 3))
+    arrays = read_npz(files[-1], FILE_BYTES)
+    if not {*_ARRAYS} <= {*arrays}:
+        raise format_error(files[-1], f"the arrays {', '.join(_ARRAYS)}", ", ".join(arrays))
+    where = str(files[-1])
+    place = Part(f"{where}: trans", arrays["trans"]).floats(None, None, 3)
     count, length = place.shape[:2]
     turns, pose, camera, shift = (
-        floats(f"{files[-1]}: {name}", arrays[name][:, :length], (count, length, *tail))
+        Part(f"{where}: {name}", arrays[name][:, :length]).floats(count, length, *tail)
         for name, tail in (
             ("root_orient", (3,)),
             ("pose_body", (63,)),
@@ -400,17 +344,18 @@ def _read_run(
         )
     )
     focal, center = _read_intrinsics(files[-1], length)
-    begin = int(integers(where, get_part(where, content, "meta", "data_interval"), 2)[0])
-    start = int(integers(where, get_part(where, content, "meta", "seq_interval"), 2)[0])
+    begin = int(content["meta"]["data_interval"].integers(2)[0])
+    start = int(content["meta"]["seq_interval"].integers(2)[0])
     people: dict[int, _Piece] = {}
     used = ""
-    for name, track in get_part(where, content, "tracks").items():
-        row = integer(where, get_part(where, track, "index"))
-        mask = floats(where, get_part(where, track, "vis_mask"), (None,)) > 0.5
+    for number, track in content["tracks"].by_person():
+        row = track["index"].integer()
+        mask = track["vis_mask"].floats(None) > 0.5
         if not mask.any():
             continue
         if row >= count:
-            raise format_error(where, f"tracks below {count}, as the results have", f"{row}")
+            expected = f"tracks below {count}, as the results have"
+            raise format_error(track.where, expected, f"{row}")
         # A track lasts from the first to the last image of its person, visible or not.
         seen = np.flatnonzero(mask) - start
         rows = np.arange(seen[0], min(seen[-1] + 1, length))
@@ -419,7 +364,7 @@ def _read_run(
         )
         relative = np.einsum("fab,fjb->fja", camera[row, rows], joints) + shift[row, rows, None]
         boxes = project_boxes(relative, focal[rows], center[rows])
-        people[integer(where, name)] = (begin + start + rows, joints, boxes)
+        people[number] = (begin + start + rows, joints, boxes)
     centers = -np.einsum("fba,fb->fa", camera[0], shift[0])
     return begin + start, people, centers, used
 
@@ -430,11 +375,14 @@ def _read_intrinsics(results: Path, length: int) -> tuple[NDArray[np.float64], N
     files = sorted(results.parent.glob(f"*_cameras_{iteration}.json"))
     if not files:
         raise format_error(results.parent, f"<clip>_cameras_{iteration}.json", "none")
-    try:
-        rows = json.loads(files[0].read_bytes())["intrinsics"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise format_error(files[0], "intrinsics in JSON", f"{error!r}") from None
-    numbers = floats(f"{files[0]}: intrinsics", rows, (None, 4))
+    numbers = _read_json(files[0])["intrinsics"].floats(None, 4)
     if len(numbers) < length:
         raise format_error(files[0], f"intrinsics of {length} images", f"{len(numbers)}")
     return numbers[:length, :2], numbers[:length, 2:]
+
+
+def _read_json(path: Path) -> Part:
+    try:
+        return Part(str(path), json.loads(path.read_bytes()))
+    except (OSError, ValueError, RecursionError) as error:
+        raise format_error(path, "JSON", str(error)) from None

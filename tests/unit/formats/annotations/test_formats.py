@@ -182,6 +182,9 @@ IMAGE = '<annotations><image id="0" name="a" width="9" height="9">{}</image></an
         (json.dumps([task(BOX | {"image_rotation": 90})]), "rotated"),
         (json.dumps([task(BOX | {"meta": {"text": ["detection=-1"]}})]), "detection"),
         (json.dumps([task(), task()]), "one name"),
+        ('<?xml version="1.0" encoding="utf-7"?><annotations/>', "no XML"),
+        (IMAGE.replace('width="9"', 'width="x"').format(""), "'x' for a number"),
+        (json.dumps([task(BOX | {"meta": {"text": ["score=high"]}})]), "score is 'high'"),
     ],
 )
 def test_what_is_hostile_or_damaged_is_refused_with_its_file_and_reason(tmp_path, content, found):
@@ -198,34 +201,3 @@ def test_a_file_that_is_not_there_or_is_none_of_text_is_refused(tmp_path):
     for name in ("a", "none"):
         with pytest.raises(InputError):
             read_annotations(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("content", "found"),
-    [
-        ('<?xml version="1.0" encoding="utf-7"?><annotations/>', "no XML"),
-        (
-            '<annotations><image name="a" width="x" height="2"/></annotations>',
-            "'x' for a number",
-        ),
-        (json.dumps([task(BOX | {"meta": {"text": ["score=high"]}})]), "score is 'high'"),
-    ],
-)
-def test_numbers_and_encodings_that_are_none_are_refused(tmp_path, content, found):
-    file = tmp_path / "labels.any"
-    file.write_text(content)
-    with pytest.raises(InputError, match=found):
-        read_annotations(file)
-
-
-def test_an_error_of_ours_is_no_fault_of_the_file(tmp_path, monkeypatch):
-    file = tmp_path / "labels.json"
-    write_annotations(file, pictures())
-
-    def broken(*_):
-        raise ValueError("operands could not be broadcast together")
-
-    monkeypatch.setattr("worldpose.formats.annotations.annotated_images._read", broken)
-    with pytest.raises(ValueError, match="broadcast") as error:
-        read_annotations(file)
-    assert not isinstance(error.value, InputError)

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from method_files import (
     FIRST,
-    FRAMES,
-    PATTERN,
     STEP,
     WALK,
     WRITERS,
@@ -167,9 +165,3 @@ def test_method_without_a_common_world_needs_a_camera(truth, tmp_path):
         scored("hybrik", tmp_path / "nothing", truth)
     with pytest.raises(InputError, match="person_data"):
         scored("glamr", path, truth)
-
-
-def test_pattern_cannot_be_aligned_away():
-    time = np.arange(FRAMES)
-    assert abs(PATTERN.sum()) < 1e-12
-    assert abs((PATTERN * time).sum()) < 1e-12

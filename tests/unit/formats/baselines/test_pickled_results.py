@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats.baselines.result import as_floats, integer, read_pickled
+from worldpose.formats.baselines.result import Part, read_pickled
 
 rng = np.random.default_rng(0)
 CONTENT = {
@@ -44,7 +44,7 @@ class Hostile:
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
 def test_pickles_of_every_protocol_give_what_was_written(protocol, tmp_path):
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(CONTENT, protocol))
-    same(read_pickled(tmp_path / "a.pkl"))
+    same(read_pickled(tmp_path / "a.pkl").value)
 
 
 @pytest.mark.parametrize("compress", [0, 3, ("gzip", 3)])
@@ -52,7 +52,7 @@ def test_joblib_files_give_what_joblib_wrote(compress, tmp_path):
     content = defaultdict(dict)
     content[np.int64(1)]["again"] = content[2] = CONTENT
     joblib.dump(content, tmp_path / "a.pkl", compress=compress)
-    found = read_pickled(tmp_path / "a.pkl")
+    found = read_pickled(tmp_path / "a.pkl").value
     same(found[1]["again"])
     same(found[2])
 
@@ -76,7 +76,7 @@ def test_torch_tensors_give_their_numbers(form, tmp_path):
         with pytest.raises(InputError, match="expected results of a method"):
             read_pickled(path)
         return
-    found = read_pickled(path)
+    found = read_pickled(path).value
     for name, tensor in content.items():
         assert np.array_equal(found[name], tensor.numpy()), name
 
@@ -131,7 +131,7 @@ def test_shared_parts_do_not_grow_and_circles_are_refused(tmp_path):
     for _ in range(60):
         layer = [layer, layer]
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(layer))
-    assert len(read_pickled(tmp_path / "a.pkl")) == 2
+    assert len(read_pickled(tmp_path / "a.pkl").value) == 2
     circle = []
     circle.append(circle)
     (tmp_path / "b.pkl").write_bytes(pickle.dumps(circle))
@@ -159,13 +159,13 @@ def test_tensor_beyond_its_storage_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("text", "value"), [("7", 7), (np.int64(3), 3), ([4.0], 4)])
 def test_one_whole_number_is_read_however_it_is_written(text, value):
-    assert integer("a: person", text) == value
+    assert Part("a: person", text).integer() == value
 
 
 @pytest.mark.parametrize("text", ["player", 0.5, float("nan"), "1e300", None, [1, 2], {}])
 def test_what_is_no_whole_number_is_refused_with_its_place(text):
     with pytest.raises(InputError, match="a: person"):
-        integer("a: person", text)
+        Part("a: person", text).integer()
 
 
 def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
@@ -174,7 +174,7 @@ def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr("worldpose.formats.baselines.result.plain", full)
+    monkeypatch.setattr("worldpose.formats.baselines.result.read_pickle", full)
     with pytest.raises(MemoryError):
         read_pickled(tmp_path / "a.pkl")
 
@@ -182,4 +182,4 @@ def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
 @pytest.mark.parametrize("value", ["left", {"a": 1}, [[1.0], [1.0, 2.0]], [10**400]])
 def test_what_are_no_numbers_is_refused_with_its_place(value):
     with pytest.raises(InputError, match="a: turns"):
-        as_floats("a: turns", value)
+        Part("a: turns", value).as_floats()

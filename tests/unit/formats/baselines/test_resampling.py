@@ -34,11 +34,6 @@ def test_straight_motion_stays_what_it_is(seen, fps):
     assert f"from {seen:g} to {fps:g}" in found.notes["resampled"]
 
 
-def test_the_same_rate_changes_nothing():
-    result = straight(np.arange(4), 1.0)
-    assert resample_result(result, 50.0, 50.0) is result
-
-
 def test_a_gap_stays_a_gap_and_its_edges_are_not_drawn_out():
     result = straight([3, 4, 7, 8], 1.0)
     found = resample_result(result, 25.0, 50.0)

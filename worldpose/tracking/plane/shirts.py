@@ -19,44 +19,8 @@ from data_contracts.arrays import AnyFloats, Floats, Image
 
 TORSO: Final = (5, 6, 11, 12)
 """Shoulders and hips in COCO-17."""
-MIN_CONFIDENCE: Final = 0.3
-"""Least confidence of each of them; with less the box tells where the upper body is [1]."""
-GRID: Final = (7, 9)
-"""Samples across and along the upper body."""
-ALONG: Final = (0.1, 0.75)
-"""Part from the shoulders to the hips that is sampled [1]: neither collar nor shorts."""
-WIDTH: Final = 0.3
-"""Width of a trunk seen from the side, relative to its length [1]."""
-INNER: Final = 0.7
-"""Share of the trunk's width that is sampled [1]."""
-BOX_TORSO: Final = (0.18, 0.48, 0.35)
-"""Shoulders, hips and width of the trunk in a box: from its top, relative to its height, and
-relative to its width [1]."""
-BORDER: Final = 2.0
-"""A box so near to a side of the image is cut off by it [px]."""
-MIN_SAMPLES: Final = 32
-"""Least number of samples for a colour: half of the grid, the others are hidden."""
 LEAST_STD: Final = np.array([4.0, 2.0, 2.0])
 """Least standard deviation of one person's colour [1, CIELAB]: noise of a small image."""
-LASTING: Final = 2.0
-"""Standard deviation of one person's colour over the clip, relative to that between two frames [1]:
-front, back and light differ by more than two neighbouring frames do."""
-NEXT_M: Final = 0.5
-"""Farther mutual nearest neighbours of two frames are not taken as one person [m]."""
-MIN_PAIRS: Final = 30
-"""Least number of such pairs, and of colours, from which a clip's statistics are learned."""
-USUAL: Final = 7.8
-"""Squared distance of one person's colours, 95 % of three dimensions [1]."""
-MAX_SQUARED: Final = 100.0
-"""Largest squared distance that counts: two shirts that differ so are of two people [1]."""
-DOUBT: Final = 0.05
-"""Share of colours that tell nothing [1]: of the person in front, or of another's limb."""
-MAX_SAMPLE: Final = 300
-"""Largest sample of a clip's colours, evenly over its frames."""
-MEMORY_FRAMES: Final = 25
-"""A person's colour is the median over so many sightings."""
-MIN_SIGHTINGS: Final = 3
-"""Sightings from which on a person's colour is known: one may show the background."""
 
 
 def measure_shirts(
@@ -78,7 +42,8 @@ def measure_shirts(
     colours = np.full((len(boxes), 3), np.nan)
     there = np.flatnonzero(np.isfinite(boxes).all(axis=1))
     size = np.array([image.shape[1], image.shape[0]])
-    whole = there[(boxes[there, 0] > BORDER) & (boxes[there, 2] < size[0] - 1.0 - BORDER)]
+    border = 2.0  # A box so near to a side of the image is cut off by it [px].
+    whole = there[(boxes[there, 0] > border) & (boxes[there, 2] < size[0] - 1.0 - border)]
     for person in whole:
         places = _sample(keypoints[person], confidence[person], boxes[person])
         cells = np.rint(places).astype(np.int64)
@@ -87,7 +52,8 @@ def measure_shirts(
             if boxes[other, 3] > boxes[person, 3]:
                 inside = (places >= boxes[other, :2]) & (places <= boxes[other, 2:])
                 kept &= ~inside.all(axis=1)
-        if np.count_nonzero(kept) < MIN_SAMPLES:
+        # Least number of samples for a colour: half of the grid, the others are hidden.
+        if np.count_nonzero(kept) < 32:
             continue
         seen = image[cells[kept, 1], cells[kept, 0]].astype(np.float32) / 255.0
         colours[person] = np.median(cv2.cvtColor(seen[None], cv2.COLOR_RGB2LAB)[0], axis=0)
@@ -97,31 +63,44 @@ def measure_shirts(
 def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floats:
     """Return places on a person's upper body (samples, 2) [px]."""
     torso = np.asarray(keypoints[list(TORSO)], dtype=np.float64)
-    known = np.asarray(confidence[list(TORSO)]) >= MIN_CONFIDENCE
+    # Least confidence of each of them; with less the box tells where the upper body is [1].
+    known = np.asarray(confidence[list(TORSO)]) >= 0.3
+    # Shoulders, hips and width of the trunk in a box: from its top, relative to its height, and
+    # relative to its width [1].
+    box_torso = (0.18, 0.48, 0.35)
     if known.all() and np.isfinite(torso).all():
         top, bottom = torso[:2].mean(axis=0), torso[2:].mean(axis=0)
         length = float(np.linalg.norm(bottom - top))
         spans = np.linalg.norm(torso[[0, 2]] - torso[[1, 3]], axis=1)
-        wide = max(float(spans.max()), WIDTH * length)
+        # Width of a trunk seen from the side, relative to its length [1].
+        wide = max(float(spans.max()), 0.3 * length)
     else:
         left, upper, right, lower = (float(side) for side in box)
         middle, tall = 0.5 * (left + right), lower - upper
-        top = np.array([middle, upper + BOX_TORSO[0] * tall])
-        bottom = np.array([middle, upper + BOX_TORSO[1] * tall])
+        top = np.array([middle, upper + box_torso[0] * tall])
+        bottom = np.array([middle, upper + box_torso[1] * tall])
         length = float(np.linalg.norm(bottom - top))
-        wide = BOX_TORSO[2] * (right - left)
+        wide = box_torso[2] * (right - left)
     ahead = (bottom - top) / max(length, 1e-6)
     across = np.array([-ahead[1], ahead[0]])
-    u, v = np.meshgrid(np.linspace(-0.5, 0.5, GRID[0]), np.linspace(ALONG[0], ALONG[1], GRID[1]))
+    grid = (7, 9)  # Samples across and along the upper body.
+    # Part from the shoulders to the hips that is sampled [1]: neither collar nor shorts.
+    along = (0.1, 0.75)
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, grid[0]), np.linspace(along[0], along[1], grid[1]))
     middle_line = top + v.reshape(-1, 1) * (bottom - top)
-    return np.asarray(middle_line + INNER * wide * u.reshape(-1, 1) * across)
+    # Share of the trunk's width that is sampled [1].
+    return np.asarray(middle_line + 0.7 * wide * u.reshape(-1, 1) * across)
 
 
 class ShirtMemory:
-    """Colour of one person in one camera: the median of the last sightings."""
+    """Colour of one person in one camera: the median of the last sightings.
+
+    One of them may show the background.
+    """
 
     def __init__(self) -> None:
-        self._seen: deque[Floats] = deque(maxlen=MEMORY_FRAMES)
+        # A person's colour is the median over so many sightings.
+        self._seen: deque[Floats] = deque(maxlen=25)
 
     def see(self, shirt: Floats) -> None:
         """Add a colour (3,) [CIELAB]; NaN changes nothing."""
@@ -130,8 +109,8 @@ class ShirtMemory:
 
     @property
     def colour(self) -> Floats | None:
-        """Return the colour (3,) [CIELAB]; None before `MIN_SIGHTINGS`."""
-        if len(self._seen) < MIN_SIGHTINGS:
+        """Return the colour (3,) [CIELAB]; None before three sightings."""
+        if len(self._seen) < 3:
             return None
         return np.asarray(np.median(self._seen, axis=0))
 
@@ -167,15 +146,19 @@ class ShirtModel:
             one, two = xy[frame, a], xy[frame + 1, b]
             distance, nearest = KDTree(two).query(one)
             _, back = KDTree(one).query(two)
-            mutual = (back[nearest] == np.arange(len(a))) & (distance <= NEXT_M)
+            # Farther mutual nearest neighbours of two frames are not taken as one person [m].
+            mutual = (back[nearest] == np.arange(len(a))) & (distance <= 0.5)
             changes.append(shirts[frame + 1, b[nearest[mutual]]] - shirts[frame, a[mutual]])
         change, everyone = np.concatenate(changes), shirts[known]
-        if min(len(change), len(everyone)) < MIN_PAIRS:
+        # Least number of such pairs, and of colours, from which a clip's statistics are learned.
+        if min(len(change), len(everyone)) < 30:
             return None
         # The difference of two colours has twice the variance of one.
         spread = 1.4826 * np.median(np.abs(change), axis=0) / np.sqrt(2.0)
-        chosen = np.linspace(0, len(everyone) - 1, min(len(everyone), MAX_SAMPLE)).astype(np.int64)
-        return cls(LASTING * np.maximum(spread, LEAST_STD), everyone[chosen])
+        # Largest sample of a clip's colours, evenly over its frames.
+        chosen = np.linspace(0, len(everyone) - 1, min(len(everyone), 300)).astype(np.int64)
+        # Over the clip, front, back and light differ twice as much as between two frames.
+        return cls(2.0 * np.maximum(spread, LEAST_STD), everyone[chosen])
 
     def same_person(self, memory: ShirtMemory | None, shirts: Floats) -> Floats:
         """Return log odds (n,) that colours (n, 3) are those of a person and not of anyone.
@@ -190,7 +173,9 @@ class ShirtModel:
         own = self._likeness(shirts[known], colour[None])[:, 0]
         others = self._likeness(shirts[known], self.anyone)
         odds = own - np.log(np.exp(others).mean(axis=1))
-        result[known] = np.logaddexp(np.log(1.0 - DOUBT) + odds, np.log(DOUBT))
+        # Share of colours that tell nothing [1]: of the person in front, or of another's limb.
+        doubt = 0.05
+        result[known] = np.logaddexp(np.log(1.0 - doubt) + odds, np.log(doubt))
         return result
 
     def _likeness(self, first: Floats, second: Floats) -> Floats:
@@ -200,4 +185,5 @@ class ShirtModel:
         team must not be told apart by their shading.
         """
         squared = np.square((first[:, None] - second) / self.within).sum(axis=-1)
-        return np.asarray(-0.5 * np.clip(squared - USUAL, 0.0, MAX_SQUARED))
+        # 95 % of one person's colours are nearer; shirts that differ by 100 are of two people.
+        return np.asarray(-0.5 * np.clip(squared - 7.8, 0.0, 100.0))

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Floats
-from worldpose.tracking.feet import GroundPositions
-from worldpose.tracking.ground_tracks import track_on_plane
+from data_contracts.arrays import Flags, Floats
+from worldpose.tracking.plane.feet import GroundPositions
+from worldpose.tracking.plane.tracker import track_on_plane
 
-PAIR_DISTANCE_M: Final = 2.0
-"""Largest distance of two cameras' positions of one person [m]."""
+MIN_RUNNERS: Final = 3
+"""Least pairs of tracks that determine a clock offset [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,14 @@ class PlaneClocks:
             the mean of its group; 0 where not determined.
         std: (cameras,) standard deviation [s]; infinite where not determined.
         people: pairs of tracks that tell the offsets.
+        runs: (cameras,), whether the camera sees enough people run. Standing people have the same
+            places at all offsets.
     """
 
     seconds: Floats
     std: Floats
     people: int
+    runs: Flags
 
 
 def estimate_plane_clocks(
@@ -43,8 +46,7 @@ def estimate_plane_clocks(
 
     Each camera tracks its people alone. Two cameras' tracks of one person differ by the velocity
     times the clock offset, and by the disagreement of the two calibrations, which is an affine map
-    here. The offset is searched in whole frames and refined below a frame; people, one at a time
-    left out (jackknife), give its standard deviation.
+    here.
 
     Args:
         positions: the clip's foot positions.
@@ -53,10 +55,11 @@ def estimate_plane_clocks(
         max_offset_s: largest offset between two cameras [s].
     """
     cameras = positions.xy.shape[1]
-    alone = [
-        track_on_plane(_one_camera(positions, c), fps, pitch_size=pitch_size)
-        for c in range(cameras)
-    ]
+    alone = []
+    for c in range(cameras):
+        one = {name: array[:, c : c + 1] for name, array in positions.arrays().items()}
+        given = GroundPositions(*(one[name] for name in ("xy", "noise", "calibration", "height")))
+        alone.append(track_on_plane(given, fps, pitch_size=pitch_size))
     rows, values, weights, count = [], [], [], 0
     for a, b in combinations(range(cameras), 2):
         found = _compare_clocks(alone[a].xy, alone[b].xy, fps, max_offset_s)
@@ -76,36 +79,21 @@ def estimate_plane_clocks(
         told = np.abs(matrix).sum(axis=0) > 0.0
         seconds = inverse @ matrix.T @ (np.array(values) * scale)
         std[told] = np.sqrt(np.diag(inverse))[told]
-    return PlaneClocks(seconds, std, count)
+    runs = np.array([_see_runners(each.velocity) for each in alone], dtype=np.bool_)
+    return PlaneClocks(seconds, std, count, runs)
 
 
-MIN_RUNNERS: Final = 3
-"""Least pairs of tracks that determine a clock offset [1]."""
-STEPS: Final = 10
-"""Refinements of a clock offset [1]."""
-
-
-def _one_camera(positions: GroundPositions, camera: int) -> GroundPositions:
-    one = slice(camera, camera + 1)
-    return GroundPositions(
-        positions.xy[:, one],
-        positions.noise[:, one],
-        positions.calibration[:, one],
-        positions.height[:, one],
-    )
+def _see_runners(velocity: Floats) -> bool:
+    """Return whether enough of the people with velocities (frames, people, 2) [m/s] run."""
+    seen = np.isfinite(velocity[..., 0]).any(axis=0)
+    speed = np.sqrt(np.nanmean((velocity[:, seen] ** 2).sum(axis=-1), axis=0))
+    return bool((speed > 1.0).sum() >= MIN_RUNNERS)
 
 
 def _compare_clocks(
     a: Floats, b: Floats, fps: float, max_offset_s: float
 ) -> tuple[float, float, int] | None:
-    """Return clock of b minus clock of a, its standard deviation [s], and the number of pairs.
-
-    Args:
-        a: (frames, persons, 2) [m], places by the first camera.
-        b: (frames, others, 2) [m], by the second.
-        fps: frames per second [1/s].
-        max_offset_s: largest offset [s].
-    """
+    """Return clock of b minus clock of a, its standard deviation [s], and the number of pairs."""
     most = min(round(max_offset_s * fps), len(a) // 2)
     if not a.shape[1] or not b.shape[1]:
         return None
@@ -117,7 +105,7 @@ def _compare_clocks(
     pairs = _pair_tracks(a, _shift(b, late))
     if len(pairs) < MIN_RUNNERS:
         return None
-    for _ in range(STEPS):
+    for _ in range(10):
         step = _refine(a, b, late, pairs)
         late = float(np.clip(late + np.clip(step, -1.0, 1.0), -most, most))
         if abs(step) < 1e-3:
@@ -144,14 +132,14 @@ def _shift(b: Floats, late: float) -> Floats:
 
 
 def _mutual(a: Floats, b: Floats) -> list[tuple[int, int, float]]:
-    """Return mutual nearest neighbours (i, j, distance) within `PAIR_DISTANCE_M` of one frame."""
+    """Return mutual nearest neighbours (i, j, distance) within 2 m of one frame."""
     distance = np.linalg.norm(a[:, None] - b[None], axis=-1)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
     return [
         (i, int(j), float(distance[i, j]))
         for i, j in enumerate(nearest)
-        if back[j] == i and distance[i, j] <= PAIR_DISTANCE_M
+        if back[j] == i and distance[i, j] <= 2.0
     ]
 
 

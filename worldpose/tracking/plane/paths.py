@@ -10,32 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.tracking.feet import PART_OVERLAP, FrameBlocks, GroundPositions
+from worldpose.tracking.plane.feet import PART_OVERLAP, FrameBlocks, GroundPositions
 
 MIN_TRACK_S: Final = 0.4
 """Least time with detections of a track [s]."""
-HEIGHTS: Final = (1.1, 2.4)
-"""Range of a track's median height [m]."""
-FLAG_DISTANCE: Final = 1.0
-"""A track that never leaves this distance from a corner is a flag [m]."""
 DOUBLE_DISTANCE: Final = 1.0
 """A second track of a person stays this near to the first [m]."""
-BODY_DISTANCE: Final = 0.5
-"""Two tracks nearer than this for half of their common time are one person [m]."""
-MAX_DOUBLE: Final = 0.7
-"""Largest length of such a track relative to the first [1]."""
-MAX_PART_DISTANCE_M: Final = 2.5
-"""Median distance of two tracks from which overlapping boxes are two people [m]; that of two boxes
-of one person is an error along the line of sight."""
-MIN_OVERLAPPING: Final = 0.8
-"""Two tracks whose boxes overlap in this share of the frames in which a camera has both are one
-person [1]: a detector gives two boxes for the person, and two people part."""
-SAME_PERSON_M: Final = 1.0
-"""Two tracks nearer than this on average, that no camera sees apart, are one person [m]."""
-MIN_COVER_SHARE: Final = 0.34
-"""Least share of the cameras that cover a person's place, and detect the person there [1]. One of
-three may; where more look and see no person, the detection is a reflection, a part of another
-person, or misplaced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +84,7 @@ def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPos
     if not len(apart):
         return False
     inside = len(apart) >= MIN_TRACK_S * fps and np.quantile(apart, 0.9) < DOUBLE_DISTANCE
-    if inside and np.median(apart) < BODY_DISTANCE:
+    if inside and np.median(apart) < 0.5:
         return True
     both = [
         (frame, camera)
@@ -112,11 +92,12 @@ def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPos
         for camera in set(a.index[frame]) & set(b.index[frame])
     ]
     if not both:
-        return bool(apart.mean() <= SAME_PERSON_M)
+        return bool(apart.mean() <= 1.0)
     boxes, whole = positions.boxes, positions.is_whole
     if boxes is None or whole is None or len(both) < MIN_TRACK_S * fps:
         return False
-    if np.median(apart) > MAX_PART_DISTANCE_M:
+    # Two boxes of one person differ by an error along the line of sight.
+    if np.median(apart) > 2.5:
         return False
     parts = [
         not all(whole[frame, camera, path.index[frame][camera]] for path in (a, b))
@@ -129,7 +110,8 @@ def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPos
     low, high = np.maximum(first[:, :2], second[:, :2]), np.minimum(first[:, 2:], second[:, 2:])
     smaller = np.minimum(*((box[:, 2:] - box[:, :2]).prod(axis=1) for box in (first, second)))
     overlapping = np.clip(high - low, 0.0, None).prod(axis=1) >= PART_OVERLAP * smaller
-    return bool((overlapping & np.array(parts)).mean() >= MIN_OVERLAPPING)
+    # A detector gives two boxes for the person all the time, and two people part.
+    return bool((overlapping & np.array(parts)).mean() >= 0.8)
 
 
 def _join(a: PlanePath, b: PlanePath) -> PlanePath:
@@ -169,7 +151,7 @@ def drop_doubles(paths: list[PlanePath]) -> list[PlanePath]:
 
 def _is_double(path: PlanePath, other: PlanePath) -> bool:
     """Return whether `path` lies in the time of `other`, which is longer, and always near it."""
-    if len(path.xy) > MAX_DOUBLE * len(other.xy):
+    if len(path.xy) > 0.7 * len(other.xy):
         return False
     if path.first < other.first or path.last > other.last:
         return False
@@ -180,7 +162,7 @@ def _is_double(path: PlanePath, other: PlanePath) -> bool:
 def is_flag(path: PlanePath, pitch_size: tuple[float, float]) -> bool:
     """Return whether a path never leaves a corner: a flag, which nets mistake for people."""
     corner = np.abs(path.xy) - 0.5 * np.asarray(pitch_size)
-    return bool((np.linalg.norm(corner, axis=1) < FLAG_DISTANCE).all())
+    return bool((np.linalg.norm(corner, axis=1) < 1.0).all())
 
 
 def track_height(path: PlanePath, positions: GroundPositions) -> float:
@@ -197,7 +179,7 @@ def track_height(path: PlanePath, positions: GroundPositions) -> float:
 def has_odd_height(path: PlanePath, positions: GroundPositions) -> bool:
     """Return whether no person has the path's height: a ball, a mark, two people in one box."""
     height = track_height(path, positions)
-    return bool(np.isfinite(height)) and not HEIGHTS[0] <= height <= HEIGHTS[1]
+    return bool(np.isfinite(height)) and not 1.1 <= height <= 2.4
 
 
 def is_contradicted(path: PlanePath, covering: NDArray[np.integer] | FrameBlocks | None) -> bool:
@@ -206,4 +188,5 @@ def is_contradicted(path: PlanePath, covering: NDArray[np.integer] | FrameBlocks
         return False
     sights = [(f, c, d) for f, seen in path.index.items() for c, d in seen.items()]
     cover = np.mean([covering[sight] for sight in sights])
-    return bool(len(sights) / len(path.index) < MIN_COVER_SHARE * cover)
+    # One of three may; where more look and see no person, the detection is none.
+    return bool(len(sights) / len(path.index) < 0.34 * cover)

@@ -19,37 +19,13 @@ from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
 
-ANKLES: Final = (15, 16)
 ANKLE_HEIGHT: Final = 0.09
 """Height of an ankle of a standing adult [m]."""
 MIN_CONFIDENCE: Final = 0.2
 """Least confidence of an ankle that is used [1]."""
-FOOT_HEIGHT_STD: Final = 0.06
-"""Standard deviation of an ankle's height [m], feet lifted and strides in depth included: 0.05 and
-0.05 in simulated matches of two kinds."""
-BOX_HEIGHT_STD: Final = 0.12
-"""The same of the lower edge of a box [m], with its bias."""
-BOX_HEIGHT: Final = -0.06
-"""Height at which the ray of a box's lower edge passes below the middle of the feet [m]: the edge
-lies at the toes of the nearer foot."""
-BOX_SHARE: Final = 0.5
-"""Share of the box in the place where both ankles and box tell it [1]. Two real cameras with the
-bundled nets put the same people 0.23 m apart at 0, 0.19 at 0.5, 0.17 at 1; in simulated matches of
-two kinds errors change by 2 cm between 0 and 0.7."""
-ACROSS_STD: Final = 0.09
-"""Standard deviation of the middle of the feet from the mid-hip, across the line of sight [m]."""
-BORDER_SHARE: Final = 0.03
-"""A box so near to the image's border, relative to its height, is cut by it [1]."""
-MAX_PART_MOTION: Final = 0.08
-"""Maximum distance of a joint in a part's own keypoints from the same joint of the whole person
-[heights of the whole one's box]: in simulation below 0.02 for one person and above 0.12 for two."""
 PART_OVERLAP: Final = 0.3
 """Share of the smaller box from which two boxes may be of one person [1]. Second boxes of a person
 on the real pair: 0.3 to 1.0; people apart: 0."""
-COVER_HEIGHT_M: Final = 1.7
-"""Height of a person that a camera should see [m]."""
-MIN_COVER_SIZE: Final = 0.6
-"""Such a camera shows the person at least this large, relative to the camera that does see it."""
 PIXEL_STD: Final = 1.0
 """Standard deviation of a keypoint [px], in addition to `PIXEL_SHARE`."""
 PIXEL_SHARE: Final = 0.02
@@ -191,13 +167,18 @@ def locate_feet(
     calibration = np.zeros((*shape, 2, 2))
     height = np.full(shape, np.nan)
     is_whole = np.zeros(shape, dtype=np.bool_)
+    ankles = (15, 16)
+    # Standard deviation of an ankle's height [m], feet lifted and strides in depth included: 0.05
+    # and 0.05 in simulated matches of two kinds.
+    foot_height_std = 0.06
+    box_share = 0.5  # Share of the box in the place where both ankles and box tell it [1].
     for c in range(shape[1]):
         camera = cameras[c]
         here = np.ones(shape[::2], dtype=np.bool_) if chosen is None else chosen[:, c]
         points = np.asarray(keypoints[:, c][here], dtype=np.float64)  # (people, 17, 2)
         box = np.asarray(boxes[:, c][here], dtype=np.float64)
-        feet = np.moveaxis(points[:, ANKLES, :], 1, 0).copy()  # (2, people, 2)
-        feet[(confidence[:, c][here][:, ANKLES] < MIN_CONFIDENCE).T] = np.nan
+        feet = np.moveaxis(points[:, ankles, :], 1, 0).copy()  # (2, people, 2)
+        feet[(confidence[:, c][here][:, ankles] < MIN_CONFIDENCE).T] = np.nan
         places = np.stack([_meet(camera, foot, pitch, ANKLE_HEIGHT) for foot in feet])
         found = np.isfinite(places[..., 0])
         center = camera.center[:2]
@@ -212,7 +193,7 @@ def locate_feet(
             sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
         along = ((nearer - place) * sight).sum(axis=-1)
         place[both] += (0.5 * along[..., None] * sight)[both]
-        height_std = np.where(both, FOOT_HEIGHT_STD, 1.5 * FOOT_HEIGHT_STD)
+        height_std = np.where(both, foot_height_std, 1.5 * foot_height_std)
         bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
         # A person who is cut by the image's border has no known middle or feet.
         inside = _are_inside(box, camera.image_size)
@@ -220,12 +201,14 @@ def locate_feet(
         on_pitch = (np.abs(place) <= half).all(axis=-1)
         is_part = _are_parts(boxes[:, c], keypoints[:, c], confidence[:, c], here, on_pitch)
         is_whole[:, c][here] = (inside | np.isnan(box[..., 0])) & ~is_part
-        lower = np.where(inside[..., None], _meet(camera, bottom, pitch, BOX_HEIGHT), np.nan)
+        # A box's lower edge lies at the toes of the nearer foot: its ray passes below the middle.
+        lower = np.where(inside[..., None], _meet(camera, bottom, pitch, -0.06), np.nan)
         absent = ~np.isfinite(place[..., 0])
         place[absent] = lower[absent]
-        height_std = np.where(absent, BOX_HEIGHT_STD, height_std)
+        # Of the lower edge of a box, with its bias.
+        height_std = np.where(absent, 0.12, height_std)
         known = ~absent & np.isfinite(lower[..., 0])
-        place[known] = ((1.0 - BOX_SHARE) * place + BOX_SHARE * lower)[known]
+        place[known] = ((1.0 - box_share) * place + box_share * lower)[known]
         top = np.stack([bottom[..., 0], box[..., 1]], axis=-1)
         height[:, c][here] = _height_above(camera, top, place, pitch)
         xy[:, c][here] = place
@@ -247,7 +230,8 @@ def locate_feet(
 def _are_inside(boxes: Floats, image_size: NDArray[np.int64]) -> Flags:
     """Return whether boxes (..., 4) [px] do not reach the image's border."""
     with np.errstate(invalid="ignore"):
-        margin = np.maximum(2.0, BORDER_SHARE * (boxes[..., 3] - boxes[..., 1]))[..., None]
+        # A box so near to the image's border, relative to its height, is cut by it [1].
+        margin = np.maximum(2.0, 0.03 * (boxes[..., 3] - boxes[..., 1]))[..., None]
         low, high = boxes[..., :2] >= margin, boxes[..., 2:] <= image_size - 1.0 - margin
     low[..., 1] = True  # the feet do not depend on the head
     return np.asarray(low.all(axis=-1) & high.all(axis=-1))
@@ -263,15 +247,7 @@ def _are_parts(
     """Return which chosen boxes a surer detection of their frame explains.
 
     Detectors give a person's upper body, or the legs, a box of their own beside the whole one. Its
-    joints are those of the whole one; the joints of a person who is partly hidden are not. Outside
-    of the lines people sit and stand in rows, where boxes alone decide.
-
-    Args:
-        boxes: (frames, detections, 4) [px].
-        keypoints: (frames, detections, 17, 2) [px].
-        confidence: (frames, detections, 17).
-        chosen: (frames, detections).
-        on_pitch: (number of chosen,), feet are between the lines.
+    joints are those of the whole one; the joints of a person who is partly hidden are not.
     """
     frame, detection = np.nonzero(chosen)
     all_boxes = np.asarray(boxes, dtype=np.float64)
@@ -291,7 +267,8 @@ def _are_parts(
     apart[~on_pitch[row]] = 0.0
     height = all_boxes[second][:, 3] - all_boxes[second][:, 1]
     # At least half of the joints that both know; without a common one, the boxes alone decide.
-    near = (apart < MAX_PART_MOTION * height[:, None]).sum(axis=1)
+    # In simulation their distance is below 0.02 heights for one person and above 0.12 for two.
+    near = (apart < 0.08 * height[:, None]).sum(axis=1)
     is_part = np.zeros(len(frame), dtype=np.bool_)
     is_part[row[2 * near >= known.sum(axis=1)]] = True
     return is_part
@@ -318,12 +295,14 @@ def _count_covering(cameras: Camera, places: Floats) -> NDArray[np.int64]:
     """Return the cameras that should see people at places (frames, cameras, detections, 2) [m]."""
     found = np.nonzero(np.isfinite(places[..., 0]))
     xy = places[found]
-    ends = np.stack([np.insert(xy, 2, z, axis=1) for z in (0.0, COVER_HEIGHT_M)])
+    # Height of a person that a camera should see [m].
+    ends = np.stack([np.insert(xy, 2, z, axis=1) for z in (0.0, 1.7)])
     pixels = cameras[:, None].project(ends)  # (cameras, ends, detections, 2)
     size = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1)
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0.0) & (pixels <= cameras.image_size[:, None, None] - 1.0)
-        large = size >= MIN_COVER_SIZE * size[found[1], np.arange(len(xy))]
+        # Relative to the camera that does see the person.
+        large = size >= 0.6 * size[found[1], np.arange(len(xy))]
     count = np.zeros(places.shape[:3], dtype=np.int64)
     count[found] = np.maximum(1, np.count_nonzero(inside.all(axis=(1, -1)) & large, axis=0))
     return count
@@ -370,14 +349,16 @@ def _foot_noise(camera: Camera, place: Floats, height_std: Floats, size: Floats)
     """Return the covariance (..., 2, 2) [m^2] of places by the error of feet in the image."""
     offset = place - camera.center[:2]
     distance = np.linalg.norm(offset, axis=-1)
+    # Standard deviation of the middle of the feet from the mid-hip, across the line of sight [m].
+    across_std = 0.09
     with np.errstate(invalid="ignore", divide="ignore"):
         along = offset / distance[..., None]
         slope = camera.center[2] / distance  # tangent of the elevation
         pixel = (PIXEL_STD + PIXEL_SHARE * size) / camera.focal.mean()
         reach = np.hypot(distance, camera.center[2])
         sine = camera.center[2] / reach
-        across_variance = ACROSS_STD**2 + (pixel * reach) ** 2
-        along_variance = ACROSS_STD**2 + (height_std / slope) ** 2 + (pixel * reach / sine) ** 2
+        across_variance = across_std**2 + (pixel * reach) ** 2
+        along_variance = across_std**2 + (height_std / slope) ** 2 + (pixel * reach / sine) ** 2
     outer = along[..., :, None] * along[..., None, :]
     return np.asarray(
         along_variance[..., None, None] * outer
