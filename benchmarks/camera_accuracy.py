@@ -172,7 +172,7 @@ def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:
         for name, true in scene.cameras.items():
             clicks = scene.clicks[name]
             size = (int(true.image_size[0]), int(true.image_size[1]))
-            still = render_pitch(true, painted, scene.truth.joints[0], seed)
+            still = render_pitch(true, painted, scene.poses[:, 0], seed)
             try:
                 found = [
                     calibrate_camera(surveyed, clicks.markings, size, picture=each)
@@ -247,7 +247,7 @@ def calibrate_static(scene: Scene, scenario: Scenario, seed: int) -> dict[str, S
     painted = PitchTemplate.from_spec(scenario.pitch)
     found = {}
     for name, camera in scene.cameras.items():
-        still = render_pitch(camera, painted, scene.truth.joints[0], seed)
+        still = render_pitch(camera, painted, scene.poses[:, 0], seed)
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
         found[name] = calibrate_camera(surveyed, scene.clicks[name].markings, size, picture=still)
     return found

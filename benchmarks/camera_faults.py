@@ -17,7 +17,8 @@ from worldpose.camera_consistency.consistency import check_consistency
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_scene
+from worldpose.simulation.foreign.matches import simulate_foreign_scene
+from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 
 KINDS = ("flipped", "mirrored", "focal", "lens", "clock", "frame_rate", "swapped", "duplicate")
 

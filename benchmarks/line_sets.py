@@ -405,7 +405,7 @@ def simulate_stills(scenario: str, seeds: range) -> Iterator[Outcome]:
         pitch = PitchTemplate.from_spec(scene.surveyed)
         places = places_of_feet(scene.truth.joints[::3], painted)
         for name, true in scene.cameras.items():
-            still = render_pitch(true, painted, scene.truth.joints[0], seed)
+            still = render_pitch(true, painted, scene.poses[:, 0], seed)
             start = time.process_time()
             label = f"{scenario} {seed} {name}"
             try:

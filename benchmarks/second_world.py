@@ -39,7 +39,8 @@ from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.ingest.match_folder import read_match
-from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_match
+from worldpose.simulation.foreign.matches import simulate_foreign_match
+from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.store import Run, Store, open_run

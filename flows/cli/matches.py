@@ -80,7 +80,8 @@ def simulate(
 
     Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
     """
-    from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_match
+    from worldpose.simulation.foreign.matches import simulate_foreign_match
+    from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
     from worldpose.simulation.matches import MatchOptions, simulate_match
     from worldpose.simulation.scenarios import SCENARIOS
 

@@ -18,7 +18,7 @@ from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.image_formation import RenderedFrame
 from worldpose.simulation.mannequins import Surfaces
-from worldpose.simulation.matches import open_view, render_frame
+from worldpose.simulation.renderer import open_view, render_frame
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import (
     PATTERNS,

@@ -82,7 +82,7 @@ def click(
     chosen = _choose_points(
         there, pixels[:, 0], places, camera.image_size[0], settings, clustered, rng
     )
-    noisy = _clip_to_image(camera, pixels + settings.noise_px * rng.standard_normal(pixels.shape))
+    noisy = pixels + settings.noise_px * rng.standard_normal(pixels.shape)
     clicked = {names[index]: noisy[index] for index in chosen}
     wrong: dict[str, str] = {}
     if mistaken and len(chosen):
@@ -90,7 +90,9 @@ def click(
     drawn: tuple[DrawnMarking, ...] = ()
     if len(there) < settings.enough:
         drawn = _draw_markings(camera, pitch, people, settings, rng)
-    points = tuple(ClickedPoint(name=name, xy=_round_click(xy)) for name, xy in clicked.items())
+    points = tuple(
+        ClickedPoint(name=name, xy=_place_click(camera, xy)) for name, xy in clicked.items()
+    )
     return Clicks(ClickedMarkings(points=points, drawn=drawn), wrong, clustered)
 
 
@@ -211,21 +213,15 @@ def _draw_markings(
         # Clicks are at about even steps, wherever a sample is near.
         steps = np.linspace(0.0, len(seen) - 1.0, settings.drawn_points).round().astype(int)
         points = seen[np.unique(steps)]
-        points = _clip_to_image(
-            camera, points + settings.noise_px * rng.standard_normal(points.shape)
-        )
-        drawn.append(DrawnMarking(name=name, xy=tuple(_round_click(xy) for xy in points)))
+        points = points + settings.noise_px * rng.standard_normal(points.shape)
+        drawn.append(DrawnMarking(name=name, xy=tuple(_place_click(camera, xy) for xy in points)))
     return tuple(drawn)
 
 
-def _clip_to_image(camera: Camera, pixels: Floats) -> Floats:
-    """Return pixels (n, 2) limited to the image, as clicks are."""
-    return np.clip(pixels, 0.0, camera.image_size - 1.0)
-
-
-def _round_click(xy: Floats) -> tuple[float, float]:
-    """Return a click in annotation tools' precision, a hundredth of a pixel."""
-    return round(float(xy[0]), 2), round(float(xy[1]), 2)
+def _place_click(camera: Camera, xy: Floats) -> tuple[float, float]:
+    """Return a click in the image in annotation tools' precision, a hundredth of a pixel."""
+    x, y = np.clip(xy, 0.0, camera.image_size - 1.0)
+    return round(float(x), 2), round(float(y), 2)
 
 
 SEARCH_RANGE: Final = 0.1
@@ -313,6 +309,8 @@ def add_calibration_errors(
         errors: spreads; all zero returns the true cameras.
         rng: draws the errors, and which cameras are bad.
     """
+    if errors == CalibrationErrors():
+        return cameras
     bad = rng.permutation(len(cameras))[: errors.bad_cameras]
     given = {}
     for index, (name, camera) in enumerate(cameras.items()):
@@ -320,12 +318,8 @@ def add_calibration_errors(
         turn = factor * errors.rotation_rad * rng.standard_normal(3)
         shift = factor * errors.center_m * rng.standard_normal(3)
         scale = 1.0 + factor * errors.focal * rng.standard_normal()
-        given[name] = _move_camera(camera, turn, shift, scale) if _has_errors(errors) else camera
+        given[name] = _move_camera(camera, turn, shift, scale)
     return given
-
-
-def _has_errors(errors: CalibrationErrors) -> bool:
-    return max(errors.rotation_rad, errors.center_m, errors.focal) > 0.0
 
 
 def _move_camera(

@@ -8,7 +8,6 @@ broadcast images.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -17,45 +16,26 @@ from pydantic import Field
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_SIGMAS
-from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
-from worldpose.body.body_file import load_open_body
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.formats.archives import write_archive
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.gait import walk
-from worldpose.simulation.paths import bursts, drift, wander
-from worldpose.simulation.settings import CrowdSettings, ObservationNoise, Scenario
+from worldpose.simulation.paths import STEP, GroundPath, bursts, drift, sample_times
+from worldpose.simulation.reference import Report, list_detections
+from worldpose.simulation.settings import ObservationNoise, Scenario
 from worldpose.simulation.skeletons import draw_body
-
-TRUNK: Final = (5, 6, 11, 12)
-
-
-@dataclass(frozen=True, eq=False)
-class Bodies:
-    """People, or false positives, in front of one camera.
-
-    Attributes:
-        joints: (frames, persons, 17, 3) [m], world; NaN where absent.
-        heights: (persons,) [m].
-        bias: (frames, persons, 17, 3) [m], world: from a joint to the detector's joint; None =
-            zero.
-    """
-
-    joints: Floats
-    heights: Floats
-    bias: Floats | None = None
+from worldpose.simulation.visibility import TRUNK, facing_axes, find_hiders
 
 
 @dataclass(frozen=True, eq=False)
 class Projections:
-    """Projections of bodies into an image, and their occlusions.
+    """People, or false positives, in one camera's image, and their occlusions.
 
     Attributes:
         keypoints: (frames, persons, 17, 2) [px]; NaN outside the image.
-        bias: (frames, persons, 17, 2) [px], of `Bodies.bias`; 0 without.
+        bias: (frames, persons, 17, 2) [px], from a joint to the detector's joint.
         hider: (frames, persons, 17) int16, the nearest of the persons before a joint, -1 = none.
         size: (frames, persons) height of a standing person there [px].
         azimuth: (frames, persons) direction of the camera seen from the body [rad]: 0 in front,
@@ -69,79 +49,43 @@ class Projections:
     azimuth: Floats
 
     @property
-    def hidden(self) -> Flags:
-        """Return the joints behind a nearer person (frames, persons, 17)."""
-        hidden: Flags = self.hider >= 0
-        return hidden
-
-    @property
     def seen(self) -> Flags:
         """Return the joints in the image that are not occluded (frames, persons, 17)."""
-        seen: Flags = np.isfinite(self.keypoints[..., 0]) & ~self.hidden
-        return seen
+        return np.asarray(np.isfinite(self.keypoints[..., 0]) & (self.hider < 0))
 
 
-def project_bodies(camera: Camera, bodies: Bodies) -> Projections:
+def project_bodies(
+    camera: Camera, joints: Floats, heights: Floats, bias: Floats | None = None
+) -> Projections:
     """Return the exact pixels of bodies, and the occlusions of joints by nearer bodies.
-
-    A nearer body hides the contents of its box: from its highest to its lowest joint, as wide as
-    its shoulders and hips with a third on either side.
 
     Args:
         camera: a single camera, or one for every frame.
-        bodies: all people; every one may hide every other.
+        joints: (frames, persons, 17, 3) [m], world; NaN where absent.
+        heights: (persons,) [m].
+        bias: (frames, persons, 17, 3) [m], world, from a joint to the detector's joint; None =
+            zero.
     """
-    pixels = _project(camera, bodies.joints)
-    bias = np.zeros(pixels.shape)
-    if bodies.bias is not None:
-        bias = _project(camera, bodies.joints + bodies.bias) - pixels
+    frames, persons = joints.shape[:2]
+
+    def project(places: Floats) -> Floats:
+        return camera.project(places.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
+
+    pixels = project(joints)
     inside = (pixels >= -0.5) & (pixels <= camera.image_size.reshape(-1, 1, 1, 2) - 0.5)
-    middle = bodies.joints[..., TRUNK, :].mean(axis=-2)
+    middle = joints[..., TRUNK, :].mean(axis=-2)
     depth = camera.cam_from_world.apply(middle)[..., 2]
     focal = camera.focal.mean(axis=-1)[..., None]
-    front, left = facing_axes(bodies.joints)
+    size = focal * heights / np.where(depth > 0.0, depth, np.nan)
+    front, left = facing_axes(joints)
     away = camera.center.reshape(-1, 1, 3) - middle
     return Projections(
         keypoints=np.where(np.all(inside, axis=-1, keepdims=True), pixels, np.nan),
-        bias=bias,
-        hider=_hiders(pixels, depth),
-        size=focal * bodies.heights / np.where(depth > 0.0, depth, np.nan),
+        bias=np.zeros(pixels.shape) if bias is None else project(joints + bias) - pixels,
+        hider=find_hiders(pixels, depth, size),
+        size=size,
         azimuth=np.arctan2((away * left).sum(-1), (away * front).sum(-1)),
     )
-
-
-def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
-    """Return horizontal unit vectors (..., 3) to the front and left of bodies (..., 17, 3)."""
-    left = joints[..., (5, 11), :].sum(axis=-2) - joints[..., (6, 12), :].sum(axis=-2)
-    left[..., 2] = 0.0
-    left /= np.linalg.norm(left, axis=-1, keepdims=True)
-    return np.stack([left[..., 1], -left[..., 0], left[..., 2]], axis=-1), left
-
-
-def _project(camera: Camera, joints: Floats) -> Floats:
-    frames, persons = joints.shape[:2]
-    return camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
-
-
-def _hiders(pixels: Floats, depth: Floats) -> NDArray[np.int16]:
-    low, high = pixels.min(axis=2), pixels.max(axis=2)
-    trunk = pixels[..., TRUNK, 0]
-    third = (trunk.max(axis=2) - trunk.min(axis=2)) / 3.0
-    low[..., 0], high[..., 0] = trunk.min(axis=2) - third, trunk.max(axis=2) + third
-    hider = np.full(pixels.shape[:3], -1, dtype=np.int16)
-    nearest = np.full(pixels.shape[:3], np.inf)
-    reach_low, reach_high = pixels.min(axis=2), pixels.max(axis=2)
-    for person in range(pixels.shape[1]):
-        one_low, one_high = low[:, person, None], high[:, person, None]
-        # Only the few bodies with overlapping extents need the test joint by joint.
-        meets = np.all((reach_high >= one_low) & (reach_low <= one_high), axis=-1)
-        frame, other = np.nonzero(meets & (depth[:, person, None] < depth))
-        joints, before = pixels[frame, other], depth[frame, person, None]
-        covered = (joints >= low[frame, person, None]) & (joints <= high[frame, person, None])
-        hides = np.all(covered, axis=-1) & (before < nearest[frame, other])
-        hider[frame, other] = np.where(hides, person, hider[frame, other])
-        nearest[frame, other] = np.where(hides, before, nearest[frame, other])
-    return hider
 
 
 DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
@@ -202,30 +146,12 @@ def draw_systematic_errors(rng: np.random.Generator) -> SystematicErrors:
     return SystematicErrors(joint_bias, rng.standard_normal((17, 2, 2)))
 
 
-def perceived_bias(
-    joints: Floats, systematic: SystematicErrors, noise: ObservationNoise, own: Floats
-) -> Floats:
-    """Return offsets (frames, persons, 17, 3) [m], world, from joints to the detector's joints.
-
-    Args:
-        joints: (frames, persons, 17, 3) [m], world.
-        systematic: the detector's systematic errors.
-        noise: spreads.
-        own: (persons, 17, 3) person-specific offsets [standard deviations].
-    """
-    front, left = facing_axes(joints)
-    up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
-    offsets = noise.shared_bias_m * systematic.joint_bias + noise.own_bias_m * own
-    turned: Floats = offsets @ np.stack([front, left, up], axis=-2)
-    return turned
-
-
 def detect(
     projections: Projections,
     noise: ObservationNoise,
     systematic: SystematicErrors,
     fps: float,
-    rngs: list[np.random.Generator],
+    rng: np.random.Generator,
 ) -> Detections:
     """Return a detector's reports.
 
@@ -234,79 +160,56 @@ def detect(
         noise: rates and spreads.
         systematic: the detector's systematic errors.
         fps: [1/s].
-        rngs: one per person; one person's draws never change another's errors.
+        rng: this camera's own.
     """
-    shape = projections.hidden.shape
-    keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
-    displaced, merged = np.zeros(shape, dtype=bool), np.full(shape[:2], -1, dtype=np.int16)
-    for person, rng in enumerate(rngs):
-        if np.isfinite(projections.keypoints[:, person]).any():
-            one = _detect_one(projections, person, noise, systematic, fps, rng)
-            keypoints[:, person], confidence[:, person] = one.keypoints, one.confidence
-            displaced[:, person], merged[:, person] = one.displaced, one.merged_into
-    return Detections(keypoints, confidence, displaced, merged)
-
-
-def _detect_one(
-    projections: Projections,
-    person: int,
-    noise: ObservationNoise,
-    systematic: SystematicErrors,
-    fps: float,
-    rng: np.random.Generator,
-) -> Detections:
-    pixels, size = projections.keypoints[:, person], projections.size[:, person]
-    hider = projections.hider[:, person]
-    hidden, frames = hider >= 0, len(pixels)
-    small = size < noise.small_px
-    spread = size[:, None] * DIFFICULTY
-
+    pixels, size, hider = projections.keypoints, projections.size, projections.hider
+    hidden, shape = hider >= 0, hider.shape
+    spread = size[..., None] * DIFFICULTY
     error = _draw_errors(pixels, spread, noise, fps, rng)
     error *= (1.0 + noise.hidden_std * hidden)[..., None]
-    far = np.linalg.norm(error, axis=-1) / size[:, None]
-    doubt = 1.0 + noise.confidence_std * rng.standard_normal((frames, 17))
+    far = np.linalg.norm(error, axis=-1) / size[..., None]
+    doubt = 1.0 + noise.confidence_std * rng.standard_normal(shape)
     confidence = np.exp(-noise.confidence_drop * far) * doubt
     confidence = np.clip(confidence * (1.0 - noise.hidden_doubt * hidden), 0.01, 1.0)
-    twice = 2.0 * projections.azimuth[:, person]
+    twice = 2.0 * projections.azimuth
     waves = np.stack([np.cos(twice), np.sin(twice)], axis=-1)
-    view = np.einsum("fw,jwa->fja", waves, systematic.view_bias)
-    error = error + projections.bias[:, person] + noise.view_bias * spread[..., None] * view
+    view = np.einsum("fpw,jwa->fpja", waves, systematic.view_bias)
+    error = error + projections.bias + noise.view_bias * spread[..., None] * view
 
-    thrown = rng.random((frames, 17)) < noise.displaced
-    angle = 2.0 * np.pi * rng.random((frames, 17))
-    reach = rng.uniform(DISPLACED[0], DISPLACED[1], (frames, 17))
+    thrown = rng.random(shape) < noise.displaced
+    angle = 2.0 * np.pi * rng.random(shape)
     sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, noise.floor_px)
-    throw = (reach * sigma)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    keypoints = pixels + error + np.where(thrown[..., None], throw, 0.0)
-
-    stolen = bursts(noise.stolen, noise.stolen_time_s, (frames, 17), fps, rng) & hidden
-    frame, joint = np.nonzero(stolen)
-    theirs = projections.keypoints[frame, hider[frame, joint], joint]
+    throw = rng.uniform(*DISPLACED, shape) * sigma * thrown
+    error = error + throw[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    keypoints = pixels + error
+    stolen = bursts(noise.stolen, noise.stolen_time_s, shape, fps, rng) & hidden
+    frame, person, joint = np.nonzero(stolen)
+    theirs = pixels[frame, hider[frame, person, joint], joint]
     there = np.isfinite(theirs[:, 0])
-    keypoints[frame[there], joint[there]] = theirs[there] + error[frame[there], joint[there]]
+    at = (frame[there], person[there], joint[there])
+    keypoints[at] = theirs[there] + error[at]
 
-    luck = rng.random((frames, 17))
-    lost = luck < np.where(hidden, noise.hidden_joint_missed, noise.joint_missed)
+    lost = rng.random(shape) < np.where(hidden, noise.hidden_joint_missed, noise.joint_missed)
+    small = size < noise.small_px
     missed = _draw_bursts_by_size(noise.person_missed, noise.person_missed_time_s, small, fps, rng)
     overlapped = hidden.mean(axis=-1) >= MOSTLY_HIDDEN
-    overlapped &= rng.random(frames) < noise.hidden_person_missed
-    merges = overlapped & (rng.random(frames) < noise.merged)
-    lost |= (missed | overlapped)[:, None]
+    overlapped &= rng.random(small.shape) < noise.hidden_person_missed
+    merges = overlapped & (rng.random(small.shape) < noise.merged)
     outside = np.isnan(pixels[..., 0])
-    lost |= outside | ((~outside).sum(axis=-1) < noise.min_joints)[:, None]
+    few = (~outside).sum(axis=-1) < noise.min_joints
+    lost |= outside | (missed | overlapped | few)[..., None]
     swapped = _draw_bursts_by_size(noise.swapped, noise.swapped_time_s, small, fps, rng)
     for array in (keypoints, lost, confidence, thrown):
         array[swapped] = array[swapped][:, MIRRORED]
     keypoints[lost], confidence[lost] = np.nan, np.nan
-    return Detections(
-        keypoints, confidence, thrown & ~lost, np.where(merges, hider.max(axis=-1), -1)
-    )
+    merged_into = np.where(merges, hider.max(axis=-1), -1)
+    return Detections(keypoints, confidence, thrown & ~lost, merged_into)
 
 
 def _draw_errors(
     pixels: Floats, spread: Floats, noise: ObservationNoise, fps: float, rng: np.random.Generator
 ) -> Floats:
-    """Return errors of zero mean (frames, 17, 2) [px]: white, slow and by motion."""
+    """Return errors of zero mean (frames, persons, 17, 2) [px]: white, slow and by motion."""
     white = rng.standard_normal(pixels.shape)
     slow = drift(pixels.shape, noise.slow_time_s, fps, rng)
     along = rng.standard_normal((*spread.shape, 1))
@@ -322,97 +225,75 @@ def _draw_errors(
 def _draw_bursts_by_size(
     share: float, time: float, small: Flags, fps: float, rng: np.random.Generator
 ) -> Flags:
-    """Return bursts (frames,); small people have them from two sources."""
-    both = bursts(share, time, (len(small), 2), fps, rng)
-    on: Flags = both[:, 0] | (both[:, 1] & small)
-    return on
+    """Return bursts (frames, persons); small people have them from two sources."""
+    both = bursts(share, time, (*small.shape, 2), fps, rng)
+    return np.asarray(both[..., 0] | (both[..., 1] & small))
 
 
 ROOM: Final = 0.06
 """Margin of a box around the keypoints, for head, hands and feet [person height]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Report:
-    """A camera's detections and their persons.
-
-    Attributes:
-        observations: input of the factory.
-        person: (frames, detections) int16, the body of every detection, -1 for padding.
-        displaced: (frames, detections, 17), joints with gross errors.
-    """
-
-    observations: KeypointDetections
-    person: NDArray[np.int16]
-    displaced: Flags
+MAX_FALSE_POSITIVES: Final = 2
+"""Maximum number of false positives at a time in one camera."""
 
 
 def report(
-    detections: Detections,
+    real: Detections,
+    false: Detections,
     size: Floats,
+    false_doubt: float,
     dropped: Flags,
     rng: np.random.Generator,
 ) -> Report:
-    """Return detections in shuffled order, and the body of each.
+    """Return detections in shuffled order, and the person of each.
 
     Args:
-        detections: detections of all bodies, including false positives.
-        size: (frames, bodies) [px]; scales the margins of boxes.
+        real: detections of people.
+        false: false positives.
+        size: (frames, people and false positives) [px]; scales the margins of boxes.
+        false_doubt: reduction of the confidence of false positives, as a share of it [1].
         dropped: (frames,), frames without any detection.
         rng: shuffles every frame independently.
     """
-    found = np.isfinite(detections.confidence).any(-1) & ~dropped[:, None]
-    boxes = _bounding_boxes(detections, size, found)
-    order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
-    order = order[:, : int(found.sum(axis=1).max(initial=0))]
-    found = np.take_along_axis(found, order, axis=1)
-    keypoints = np.take_along_axis(detections.keypoints, order[..., None, None], axis=1)
-    confidence = np.take_along_axis(detections.confidence, order[..., None], axis=1)
-    displaced = np.take_along_axis(detections.displaced, order[..., None], axis=1)
-    # Padding has neither box nor score: reports omit detections without keypoints.
-    keypoints[~found], confidence[~found] = np.nan, np.nan
-    boxes = np.take_along_axis(boxes, order[..., None], axis=1)
-    joints = np.maximum(np.isfinite(confidence).sum(-1), 1)
-    score = np.where(found, np.nansum(confidence, axis=-1) / joints, np.nan)
-    observations = KeypointDetections(
-        frame=np.arange(len(found), dtype=np.int64),
-        keypoints=keypoints.astype(np.float32),
-        confidence=confidence.astype(np.float32),
-        boxes=boxes.astype(np.float32),
-        score=score.astype(np.float32),
+    keypoints = np.concatenate([real.keypoints, false.keypoints], axis=1)
+    confidence = [real.confidence, false.confidence * (1.0 - false_doubt)]
+    displaced = np.concatenate([real.displaced, false.displaced], axis=1)
+    boxes = _bounding_boxes(keypoints, real.merged_into, size)
+    persons = real.merged_into.shape[1]
+    return list_detections(
+        keypoints,
+        np.where(dropped[:, None, None], np.nan, np.concatenate(confidence, axis=1)),
+        displaced,
+        np.concatenate([np.arange(persons), np.full(keypoints.shape[1] - persons, -1)]),
+        lambda order, keypoints, found: np.take_along_axis(boxes, order[..., None], axis=1),
+        rng,
     )
-    person = np.where(found, order, -1).astype(np.int16)
-    return Report(observations, person, displaced & found[..., None])
 
 
-def _bounding_boxes(detections: Detections, size: Floats, found: Flags) -> Floats:
+def _bounding_boxes(keypoints: Floats, merged_into: NDArray[np.int16], size: Floats) -> Floats:
     """Return boxes (frames, bodies, 4) [px]; a merged one includes the lost person's width."""
     room = ROOM * size[..., None]
-    missing = np.isnan(detections.keypoints)
-    low = np.where(missing, np.inf, detections.keypoints).min(axis=2) - room
-    high = np.where(missing, -np.inf, detections.keypoints).max(axis=2) + room
-    frame, lost = np.nonzero(detections.merged_into >= 0)
-    into = detections.merged_into[frame, lost].astype(np.intp)
+    missing = np.isnan(keypoints)
+    low = np.where(missing, np.inf, keypoints).min(axis=2) - room
+    high = np.where(missing, -np.inf, keypoints).max(axis=2) + room
+    frame, lost = np.nonzero(merged_into >= 0)
+    into = merged_into[frame, lost]
     # Most of the lost person is hidden: half the person's width shows on the far side.
     half = 0.2 * size[frame, lost]
-    side = np.where(lost % 2 == 0, 1.0, -1.0)
-    low[frame, into, 0] -= np.where(side < 0.0, half, 0.0)
-    high[frame, into, 0] += np.where(side > 0.0, half, 0.0)
-    return np.where(found[..., None], np.concatenate([low, high], axis=-1), np.nan)
+    low[frame, into, 0] -= np.where(lost % 2 == 0, 0.0, half)
+    high[frame, into, 0] += np.where(lost % 2 == 0, half, 0.0)
+    return np.concatenate([low, high], axis=-1)
 
 
-MAX_FALSE_POSITIVES: Final = 2
-"""Maximum number of false positives at a time in one camera."""
 POSTURES: Final = 12.0
 """Length of the walk that supplies postures [s]."""
 
 
 def draw_false_positives(
     scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
-) -> Bodies:
-    """Return motionless false positives that appear and vanish at random places.
+) -> tuple[Floats, Floats]:
+    """Return joints (frames, n, 17, 3) and heights (n,) [m] of motionless false positives.
 
-    The places are on and around the area of the scenario.
+    They appear and vanish at random places on and around the area of the scenario.
 
     Args:
         scenario: area and the rates of false positives.
@@ -426,10 +307,10 @@ def draw_false_positives(
     on = bursts(share, noise.false_people_time_s, shape, scenario.fps, rng)
     body = draw_body(crowd.height_m, rng)
     # Any moment of a walk serves as a posture; every appearance draws another.
-    path = wander(CrowdSettings(height_m=crowd.height_m), POSTURES, (), rng)
+    path = _walk_in_circle(rng)
     appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
     times = rng.uniform(0.0, POSTURES, appeared.shape)
-    joints = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
+    joints, _ = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
     joints = joints.reshape(*appeared.shape, 17, 3)
     joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)
     place = np.array(crowd.area_center_m) + np.array(crowd.area_size_m) * rng.uniform(
@@ -441,7 +322,16 @@ def draw_false_positives(
     since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
     joints = np.take_along_axis(joints, since[..., None, None], axis=0)
     joints[~on] = np.nan
-    return Bodies(joints, np.full(MAX_FALSE_POSITIVES, body.height))
+    return joints, np.full(MAX_FALSE_POSITIVES, body.height)
+
+
+def _walk_in_circle(rng: np.random.Generator) -> GroundPath:
+    """Return a path in all directions, from a stroll to a run."""
+    time = sample_times(POSTURES)
+    speed = 2.5 + 1.5 * np.sin(2.0 * np.pi * (3.0 * time / POSTURES + rng.random()))
+    heading = 2.0 * np.pi * (time / POSTURES + rng.random())
+    way = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return GroundPath(time, np.cumsum(speed[:, None] * way, axis=0) * STEP, heading, speed)
 
 
 class MonocularErrors(Record):
@@ -529,25 +419,6 @@ def estimate_bodies(
         "box_size": side[frame, person],
         "img_size": camera.image_size[frame],
     }
-
-
-def write_estimates(
-    path: Path, poses: BodyParameters, camera: Camera, fps: float, seed: int
-) -> None:
-    """Write the results of `estimate_bodies` for a scene's open bodies.
-
-    Args:
-        path: the npz file.
-        poses: (persons, frames), world.
-        camera: batch (frames,).
-        fps: [1/s].
-        seed: seed of the scene.
-    """
-    given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
-    bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
-    rng = np.random.default_rng([seed, 5])
-    estimates = estimate_bodies(load_open_body(), bodies, camera, fps, MonocularErrors(), rng)
-    write_archive(path, estimates)
 
 
 def _rotations_to_front(ahead: Floats) -> Floats:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
-from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rasters import (
     NOBODY,
@@ -24,10 +23,9 @@ from worldpose.geometry.rasters import (
     outline_surfaces,
     resolve,
 )
-from worldpose.simulation.cast import Cast, Prop
-from worldpose.simulation.mannequins import Surfaces
-from worldpose.simulation.settings import RenderingSettings
-from worldpose.simulation.venues import FOG_COLOR, Venue
+from worldpose.simulation.cast import Cast
+from worldpose.simulation.mannequins import Mannequin, Surfaces
+from worldpose.simulation.venues import FOG_COLOR, Prop, Venue
 
 
 def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floats) -> Outlines:
@@ -42,35 +40,16 @@ def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floa
         vertices: (persons, vertices, 3) [m], world.
         light: (4,) direction down from the light, z = -1, and its share of all light.
     """
-    straight_down = not light[:2].any()
-    edge = venue.edge if venue.shade > 0.0 and not straight_down else np.inf
-    fallen = np.empty_like(vertices)
-    ground = np.array([*venue.bend, *venue.half, venue.side, edge])
-    _throw(vertices, light, ground, fallen)
-    return outline_surfaces(camera, fallen)
-
-
-@compile_kernel
-def _throw(vertices: Singles, light: Floats, ground: Floats, fallen: Singles) -> None:
-    """Write the grass points in the shadows of vertices; NaN where none is darkened.
-
-    Args:
-        vertices: (persons, vertices, 3) [m], world.
-        light: (4,), its direction down first.
-        ground: both bends of the surface, half the distances between the boards along x and y, the
-            side of the stand that casts a shadow, and the start of that shadow.
-        fallen: (persons, vertices, 3), written.
-    """
-    for p in range(vertices.shape[0]):
-        for v in range(vertices.shape[1]):
-            x, y, z = vertices[p, v, 0], vertices[p, v, 1], vertices[p, v, 2]
-            up = max(z + ground[0] * x * x + ground[1] * y * y, 0.0)
-            gx, gy = x + up * light[0], y + up * light[1]
-            if not (abs(gx) < ground[2] and abs(gy) < ground[3] and ground[4] * gy < ground[5]):
-                fallen[p, v] = np.nan
-                continue
-            fallen[p, v, 0], fallen[p, v, 1] = gx, gy
-            fallen[p, v, 2] = -ground[0] * gx * gx - ground[1] * gy * gy
+    bend, way = venue.bend.astype(np.float32), light[:2].astype(np.float32)
+    height = np.maximum(vertices[..., 2] + vertices[..., :2] ** 2 @ bend, np.float32(0.0))
+    fallen = vertices[..., :2] + height[..., None] * way
+    lit = np.all(np.abs(fallen) < venue.half, axis=-1)
+    if venue.shade > 0.0 and way.any():
+        lit &= venue.side * fallen[..., 1] < venue.edge
+    fallen[~lit] = np.nan
+    ground = -(fallen**2) @ bend
+    places = np.concatenate([fallen, ground[..., None]], axis=-1)
+    return outline_surfaces(camera, np.asarray(places, dtype=np.float32))
 
 
 Faces = NDArray[np.int32]
@@ -79,14 +58,12 @@ SKY: Final = np.array([0.0, 0.0, -1.0, 0.2])
 """Ambient light, as a light straight from above: dims the grass at the feet."""
 SOFT: Final = 0.9
 """Standard deviation of a shadow's rim [px]: some centimetres."""
-_MARGIN: Final = 3
-"""Margin around a shadow, the extent of its rim [px]."""
 
 
 def shade_ground(
     venue: Venue, camera: Camera, image: Image, things: Sequence[tuple[Faces, Singles]]
-) -> list[Box]:
-    """Darken the grass in shadows, and return the boxes that changed.
+) -> None:
+    """Darken the grass in shadows.
 
     Args:
         venue: the stadium and its lights.
@@ -99,40 +76,16 @@ def shade_ground(
     mask = np.zeros((height, width), dtype=np.uint8)
     # Levels of 255 that each combination of lights takes.
     taken = np.zeros(256, dtype=np.uint8)
-    boxes: list[Box] = []
     for index, light in enumerate((*venue.lights, SKY)):
         bit = 1 << index
         taken[[value for value in range(256) if value & bit]] += round(255.0 * float(light[3]))
         for faces, vertices in things:
             shadows = outline_shadows(venue, camera, vertices, light)
             for number in range(len(vertices)):
-                box = shadows.box(number, _MARGIN, width, height)
-                if box is not None:
+                if shadows.box(number, 0, width, height) is not None:
                     cover_triangles(shadows.pixels[number], faces, bit, mask)
-                    boxes.append(box)
-    dark = np.zeros((height, width), dtype=np.uint8)
-    for left, top, right, bottom in boxes:
-        part = (slice(top, bottom), slice(left, right))
-        soft = cv2.GaussianBlur(taken[mask[part]], (0, 0), SOFT)
-        # Where boxes overlap, both have the whole shadow.
-        np.maximum(dark[part], soft, out=dark[part])
-    for left, top, right, bottom in boxes:
-        part = (slice(top, bottom), slice(left, right))
-        _darken(image[part], dark[part])
-    return boxes
-
-
-@compile_kernel
-def _darken(picture: Image, dark: Image) -> None:
-    """Subtract a share (height, width) [1/255] from an image, and reset the share to zero."""
-    for v in range(picture.shape[0]):
-        for u in range(picture.shape[1]):
-            left = 255 - int(dark[v, u])
-            if left == 255:
-                continue
-            for k in range(3):
-                picture[v, u, k] = (int(picture[v, u, k]) * left + 127) // 255
-            dark[v, u] = 0
+    left = 255 - cv2.GaussianBlur(cv2.LUT(mask, taken), (0, 0), SOFT)
+    cv2.multiply(image, cv2.merge([left] * 3), dst=image, scale=1.0 / 255.0)
 
 
 AMBIENT: Final = 0.58
@@ -166,42 +119,43 @@ class RenderedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """People and other things while the shutter is open.
+    """People while the shutter is open.
 
     Attributes:
         cast: the people.
         opened: their surfaces when the shutter opens.
         closed: their surfaces when it closes.
-        props: static things.
     """
 
     cast: Cast
     opened: Surfaces
     closed: Surfaces
-    props: Sequence[Prop]
 
 
 def expose(
-    venue: Venue, camera: Camera, sharp: Image, blurred: Image, grain: NDArray[np.int8],
-    moment: Moment, frame: int,
-) -> RenderedFrame:  # fmt: skip
+    venue: Venue,
+    camera: Camera,
+    scene: Image,
+    grain: NDArray[np.int8],
+    moment: Moment,
+    frame: int,
+) -> RenderedFrame:
     """Return the image of people before a scene.
 
     Args:
         venue: the stadium.
         camera: a single camera.
-        sharp: (height, width, 3) the scene without them; changed in place.
-        blurred: the same image through the lens; changed in place.
+        scene: (height, width, 3) the scene without them, before the lens; changed in place.
         grain: grain of `sensor_grain`.
-        moment: people and things in the scene.
+        moment: the people.
         frame: seeds the noise of this image.
     """
-    height, width = sharp.shape[:2]
-    cast = moment.cast
+    height, width = scene.shape[:2]
+    cast, goals = moment.cast, venue.goals
     persons = len(cast.shaped)
-    throwing = [(each.faces, each.surfaces.vertices) for each in moment.props if each.shadow]
-    throwing.append((cast.mannequin.faces, moment.opened.vertices))
-    changed = shade_ground(venue, camera, sharp, throwing)
+    things = [(goals.faces, goals.surfaces.vertices)]
+    things.append((cast.mannequin.faces, moment.opened.vertices))
+    shade_ground(venue, camera, scene, things)
     drawn, spans, boxes = _outline_surfaces(venue, camera, moment, width, height)
     ids = np.full((height, width), NOBODY, dtype=np.int16)
     seen, filled = np.zeros(persons, dtype=np.int64), np.zeros(persons, dtype=np.int64)
@@ -213,68 +167,50 @@ def expose(
             if number < persons:
                 filled[number] = count
         part = (slice(top, bottom), slice(left, right))
-        resolve(samples.who, samples.color, sharp[part], ids[part], seen)
-        changed.append((left, top, right, bottom))
-    for box in changed:
-        _refocus(venue.settings, sharp, blurred, box)
+        resolve(samples.who, samples.color, scene[part], ids[part], seen)
+    image = scene
+    if venue.settings.blur_px > 0.0:
+        image = np.asarray(cv2.GaussianBlur(scene, (0, 0), venue.settings.blur_px), np.uint8)
     rng = np.random.default_rng([venue.seed, 7, frame])
     down, across = (int(n) for n in rng.integers(_SPARE, size=2))
-    _add_grain(blurred, grain[down : down + height, 3 * across : 3 * (across + width)])
+    noise = grain[down : down + height, across : across + width]
+    image = np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
     visible = np.where(filled > 0, seen / np.maximum(filled, 1), 0.0)
-    return RenderedFrame(blurred, ids, boxes, visible)
+    return RenderedFrame(image, ids, boxes, visible)
 
 
 def _outline_surfaces(
     venue: Venue, camera: Camera, moment: Moment, width: int, height: int
 ) -> tuple[list[Surface], list[Box | None], Floats]:
     """Return all surfaces, people first; the image region of each; people's boxes (n, 4)."""
-    cast = moment.cast
+    cast, goals = moment.cast, venue.goals
     opened = outline_surfaces(camera, moment.opened.vertices)
     closed = opened
     if moment.closed is not moment.opened:
         closed = outline_surfaces(camera, moment.closed.vertices)
-    light = _shade_surfaces(venue, moment.opened)
-    shape = cast.mannequin
-    drawn = [
-        Surface(
-            faces=shape.faces,
-            backs=shape.backs,
-            texels=shape.texels,
-            textures=image,
-            opened=first,
-            closed=last,
-            light=brightness,
-        )
-        for image, first, last, brightness in zip(
-            cast.images, opened.pixels, closed.pixels, light, strict=True
-        )
-    ]
-    spans = [_exposed_box(opened, closed, person, width, height) for person in range(len(drawn))]
-    for prop in moment.props:
-        outline = outline_surfaces(camera, prop.surfaces.vertices)
-        pixels = outline.pixels[0]
-        lit = _shade_surfaces(venue, prop.surfaces)[0]
-        drawn.append(
-            Surface(
-                faces=prop.faces,
-                backs=prop.backs,
-                texels=prop.texels,
-                textures=prop.image,
-                opened=pixels,
-                closed=pixels,
-                light=lit,
+    posts = outline_surfaces(camera, goals.surfaces.vertices)
+    drawn, spans = list[Surface](), list[Box | None]()
+    things: tuple[tuple[Mannequin | Prop, Image, Surfaces, Outlines, Outlines], ...] = (
+        (cast.mannequin, cast.images, moment.opened, opened, closed),
+        (goals, goals.image, goals.surfaces, posts, posts),
+    )
+    for mesh, images, surfaces, begin, end in things:
+        light = _shade_surfaces(venue, surfaces)
+        for number, image in enumerate(images):
+            pixels = (begin.pixels[number], end.pixels[number])
+            drawn.append(
+                Surface(mesh.faces, mesh.backs, mesh.texels, image, *pixels, light[number])
             )
-        )
-        spans.append(outline.box(0, 1, width, height))
+            spans.append(_exposed_box(begin, end, number, width, height))
     both = np.stack([opened.boxes, closed.boxes])
     boxes = np.concatenate([both[..., :2].min(axis=0), both[..., 2:].max(axis=0)], axis=1)
     return drawn, spans, boxes
 
 
 def _exposed_box(
-    opened: Outlines, closed: Outlines, person: int, width: int, height: int
+    opened: Outlines, closed: Outlines, number: int, width: int, height: int
 ) -> Box | None:
-    a, b = (each.box(person, 1, width, height) for each in (opened, closed))
+    a, b = (each.box(number, 1, width, height) for each in (opened, closed))
     if a is None or b is None:
         return None
     return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
@@ -330,47 +266,11 @@ def _overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def blur_by_lens(light: Singles, settings: RenderingSettings) -> Singles:
-    """Return an image blurred by the lens."""
-    if settings.blur_px == 0.0:
-        return light
-    return np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur_px), dtype=np.float32)
-
-
-def to_bytes(light: Singles) -> Image:
-    """Return levels of 255 rounded and clipped."""
-    return np.asarray(np.clip(np.rint(light), 0.0, 255.0), dtype=np.uint8)
-
-
 def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
-    """Return a camera's noise (height + 64, 3 (width + 64)), the same for all colours."""
+    """Return a camera's noise (height + 64, width + 64, 3), the same for all colours."""
     width, height = (int(n) for n in camera.image_size.reshape(-1, 2)[0])
     center = np.abs(np.rint(1e3 * camera.center.reshape(-1, 3)[0])).astype(int)
     rng = np.random.default_rng([venue.seed, 3, *center])
     field = rng.standard_normal((height + _SPARE, width + _SPARE), dtype=np.float32)
     levels = np.clip(np.rint(np.float32(venue.settings.noise) * field), -127, 127)
-    return np.repeat(levels.astype(np.int8), 3, axis=1)
-
-
-def _refocus(settings: RenderingSettings, sharp: Image, blurred: Image, box: Box) -> None:
-    """Write `sharp` blurred by the lens into `blurred` around a box."""
-    height, width = sharp.shape[:2]
-    left, top = max(box[0] - _MARGIN, 0), max(box[1] - _MARGIN, 0)
-    right, bottom = min(box[2] + _MARGIN, width), min(box[3] + _MARGIN, height)
-    if settings.blur_px == 0.0:
-        blurred[top:bottom, left:right] = sharp[top:bottom, left:right]
-        return
-    a, b = max(left - _MARGIN, 0), max(top - _MARGIN, 0)
-    part = sharp[b : bottom + _MARGIN, a : right + _MARGIN]
-    soft = cv2.GaussianBlur(part, (0, 0), settings.blur_px)
-    blurred[top:bottom, left:right] = soft[top - b : bottom - b, left - a : right - a]
-
-
-@compile_kernel
-def _add_grain(picture: Image, grain: NDArray[np.int8]) -> None:
-    """Add noise (height, 3 width) to an image (height, width, 3), in place."""
-    for v in range(picture.shape[0]):
-        row, noise = picture[v].reshape(-1), grain[v]
-        for u in range(len(row)):
-            value = np.int16(row[u]) + np.int16(noise[u])
-            row[u] = np.uint8(min(max(value, np.int16(0)), np.int16(255)))
+    return np.repeat(levels.astype(np.int8)[..., None], 3, axis=2)

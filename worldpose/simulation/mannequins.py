@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, Image, Singles
 from worldpose.body.body_file import load_open_body
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.compiled import compile_kernel
 from worldpose.simulation.settings import PATTERNS, Pattern
 
 CELL: Final = 0.03
@@ -119,17 +118,13 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
     ).astype(np.float32)
     feature = posed.pose_feature[:, : len(mannequin.correctives)].astype(np.float32)
     unposed = shaped + (feature @ mannequin.correctives).reshape(shaped.shape)
-    vertices, normals = np.empty_like(shaped), np.empty_like(shaped)
-    _skin(
-        unposed,
-        mannequin.outward,
-        motions,
-        mannequin.bones,
-        mannequin.shares,
-        vertices,
-        normals,
-    )
-    return Surfaces(vertices, normals)
+    blend = np.zeros((*shaped.shape, 4), dtype=np.float32)
+    for bones, shares in zip(mannequin.bones.T, mannequin.shares.T, strict=True):
+        blend += shares[:, None, None] * motions[:, bones]
+    vertices = np.einsum("pvij,pvj->pvi", blend[..., :3], unposed) + blend[..., 3]
+    normals = np.einsum("pvij,vj->pvi", blend[..., :3], mannequin.outward)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return Surfaces(vertices, normals / np.maximum(length, np.float32(1e-6)))
 
 
 def _normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
@@ -180,45 +175,6 @@ def _cloth_thickness(template: Floats, outward: Floats) -> Floats:
     hair = (y > HAIRLINE) | ((y > 0.45) & (z < 0.04))
     off[hair] = 0.016
     return off
-
-
-@compile_kernel
-def _skin(
-    shaped: Singles,
-    outward: Singles,
-    motions: Singles,
-    bones: NDArray[np.int64],
-    shares: Singles,
-    vertices: Singles,
-    normals: Singles,
-) -> None:
-    """Write surfaces and their normals, each vertex moved by the blend of its joints' motions."""
-    blend = np.empty((3, 4), dtype=np.float32)
-    for p in range(shaped.shape[0]):
-        for v in range(shaped.shape[1]):
-            blend[:] = 0.0
-            for k in range(bones.shape[1]):
-                share = shares[v, k]
-                if share > 0.0:
-                    for i in range(3):
-                        for j in range(4):
-                            blend[i, j] += share * motions[p, bones[v, k], i, j]
-            for i in range(3):
-                vertices[p, v, i] = (
-                    blend[i, 0] * shaped[p, v, 0]
-                    + blend[i, 1] * shaped[p, v, 1]
-                    + blend[i, 2] * shaped[p, v, 2]
-                    + blend[i, 3]
-                )
-                normals[p, v, i] = (
-                    blend[i, 0] * outward[v, 0]
-                    + blend[i, 1] * outward[v, 1]
-                    + blend[i, 2] * outward[v, 2]
-                )
-            n = normals[p, v]
-            length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
-            for i in range(3):
-                normals[p, v, i] /= max(length, np.float32(1e-6))
 
 
 Role = Literal["first", "second", "first keeper", "second keeper", "official"]

@@ -2,140 +2,42 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
-import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.arrays import Image, Singles
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from worldpose.body.body_file import OPEN_BODY
+from worldpose.body.body_file import OPEN_BODY, load_open_body
+from worldpose.body.model import BodyParameters
 from worldpose.formats.archives import write_archive
-from worldpose.formats.calibration_files import write_calibration_toml
-from worldpose.formats.challenge import write_moving_camera, write_static_camera
-from worldpose.formats.joints_file import write_joints, write_poses
-from worldpose.geometry.cameras import Camera
+from worldpose.formats.challenge import write_moving_camera
+from worldpose.formats.joints_file import write_poses
 from worldpose.ingest.footage import write_still
 from worldpose.ingest.writing import MatchAnnotations, write_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click_key_frames
-from worldpose.simulation.cast import (
-    BALL,
-    Cast,
-    Prop,
-    assign_roles,
-    ball,
-    dress_people,
-    goals,
-    place_bystanders,
-)
-from worldpose.simulation.detector_errors import write_estimates
-from worldpose.simulation.image_formation import (
-    Moment,
-    RenderedFrame,
-    blur_by_lens,
-    expose,
-    sensor_grain,
-    to_bytes,
-)
-from worldpose.simulation.mannequins import Surfaces
+from worldpose.simulation.cast import Cast, assign_roles, dress_people
+from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
+from worldpose.simulation.image_formation import Moment, RenderedFrame
 from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.recordings import read_clip, read_trajectories
-from worldpose.simulation.renderer import film_broadcast, render_broadcast, render_pitch
+from worldpose.simulation.reference import CLIP_ID, write_reference
+from worldpose.simulation.renderer import film_broadcast, open_view, render_frame
 from worldpose.simulation.scene import Scene, simulate_scene
-from worldpose.simulation.settings import CalibrationErrors, RenderingSettings, Scenario
-from worldpose.simulation.venues import Venue, build_venue, paint_empty
+from worldpose.simulation.settings import CalibrationErrors, Scenario
+from worldpose.simulation.venues import build_venue
 from worldpose.video.files import write_video
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A static camera before an empty stadium.
-
-    Attributes:
-        venue: the stadium.
-        camera: a single camera.
-        sharp: (height, width, 3) RGB, before the lens; without goals.
-        blurred: the same image through the lens.
-        grain: noise of the sensor.
-        props: the goals.
-    """
-
-    venue: Venue
-    camera: Camera
-    sharp: Image
-    blurred: Image
-    grain: NDArray[np.int8]
-    props: tuple[Prop, ...]
-
-
-def open_view(
-    camera: Camera, pitch: PitchTemplate, seed: int, settings: RenderingSettings | None = None
-) -> View:
-    """Return a static camera's view of a stadium, about a second for 1920 x 1080.
-
-    Args:
-        camera: a single camera.
-        pitch: the painted pitch.
-        seed: seed of the stadium's look and the sensor's noise.
-        settings: the defaults if None.
-    """
-    venue = build_venue(pitch, seed, settings or RenderingSettings())
-    seen = paint_empty(venue, camera)
-    venue.add_fog(seen.color, seen.distance)
-    light = np.asarray(255.0 * venue.settings.brightness * seen.color, dtype=np.float32)
-    blurred = blur_by_lens(light, venue.settings)
-    return View(
-        venue,
-        camera,
-        to_bytes(light),
-        to_bytes(blurred),
-        sensor_grain(venue, camera),
-        goals(pitch),
-    )
-
-
-def render_frame(
-    view: View,
-    cast: Cast,
-    opened: Surfaces,
-    closed: Surfaces | None = None,
-    *,
-    frame: int = 0,
-    props: Sequence[Prop] = (),
-) -> RenderedFrame:
-    """Return one image of people; the same arguments give the same bytes.
-
-    Args:
-        view: a static camera.
-        cast: the people.
-        opened: their surfaces when the shutter opens.
-        closed: their surfaces when it closes; None = no motion.
-        frame: index of the image, which seeds its noise.
-        props: things in addition to the goals.
-    """
-    moment = Moment(cast, opened, closed or opened, [*view.props, *props])
-    return expose(
-        view.venue,
-        view.camera,
-        view.sharp.copy(),
-        view.blurred.copy(),
-        view.grain,
-        moment,
-        frame,
-    )
-
 
 Advance = Callable[[str, int, int], None]
 
@@ -143,54 +45,22 @@ AT_ONCE: Final = 4
 """Maximum number of cameras filmed at a time: each holds its empty stadium and encoder frames."""
 
 
-def film_scene(
-    scene: Scene,
-    scenario: Scenario,
-    seed: int,
-    folder: Path,
-    *,
-    stills: bool,
-    masks: bool,
-    advance: Advance | None,
+def _film_scene(
+    stage: _FilmSet, folder: Path, options: MatchOptions, advance: Advance | None
 ) -> None:
     """Write the videos of all cameras into a match folder, frame by frame.
 
-    In addition to videos/<camera>.mp4 and broadcast/<clip>.mp4, for every camera or clip:
-
-    - reference/boxes/<name>.npz: `boxes` (frames, persons, 4) left, top, right, bottom of every
-      person's outline [px], occluded parts included; `visible` (frames, persons), the unoccluded
-      share of the outline's part in the image;
-    - with `stills`, stills/<camera>.png, its first frame before encoding;
-    - with `masks`, reference/masks/<name>/<frame>.png, 8 bit: person + 1, 0 for no person.
-
-    Args:
-        scene: the scene to film.
-        scenario: its look, and its frame rate.
-        seed: seed of the stadium, kits and noise.
-        folder: folder of the match.
-        stills: write stills, too.
-        masks: write masks, too.
-        advance: called with the camera or clip, its finished frames and its number of frames.
+    docs/explanation/simulation.md describes the files.
     """
-    stage = _FilmSet(scene, scenario, seed)
-    names = [*scene.cameras, *([] if scene.broadcast is None else [CLIP_ID])]
-
-    def report_progress(name: str, frames: int, done: int) -> None:
-        if advance is not None:
-            advance(name, done, frames)
 
     def film(name: str) -> None:
-        frames = stage.broadcast() if name == CLIP_ID else stage.static(name)
         part = "broadcast" if name == CLIP_ID else "videos"
         file = folder / part / f"{name}.mp4"
         file.parent.mkdir(exist_ok=True)
-        still = folder / "stills" / f"{name}.png" if stills and name != CLIP_ID else None
-        mask = folder / "reference" / "masks" / name if masks else None
-        kept = _Labels(still, mask, partial(report_progress, name, len(stage.times) - 1))
-        write_video(file, kept.collect_labels(frames), scenario.fps)
-        boxes = folder / "reference" / "boxes" / f"{name}.npz"
-        write_archive(boxes, {"boxes": np.array(kept.boxes), "visible": np.array(kept.visible)})
+        labelled = _keep_labels(stage, name, folder, options, advance)
+        write_video(file, labelled, stage.scenario.fps)
 
+    names = [*stage.scene.cameras, *([] if stage.scene.broadcast is None else [CLIP_ID])]
     with ThreadPoolExecutor(min(AT_ONCE, os.cpu_count() or 1)) as pool:
         for _ in pool.map(film, names):
             pass
@@ -205,79 +75,66 @@ class _FilmSet:
         # One more than there are frames: positions of people while the last frame's shutter is
         # open.
         self.times = np.arange(len(scene.truth.frames) + 1) / scenario.fps
-        self.poses = scene.crowd.poses(self.times)
-        roles = assign_roles(scenario.crowd, len(scene.crowd.paths))
-        betas = np.array([body.figure.betas for body in scene.crowd.bodies]).reshape(-1, 10)
-        self.cast: Cast = dress_people(betas, roles, seed, scenario.look.patterns)
-        self.bystanders = place_bystanders(self.pitch, scenario.look.bystanders, seed)
-        self.ball = ball() if scenario.crowd.movement == "football" else None
 
-    def static(self, name: str) -> Iterator[RenderedFrame]:
-        """Yield the frames of a static camera."""
+    @functools.cached_property
+    def poses(self) -> BodyParameters:
+        """Return the bodies (persons, times)."""
+        return self.scene.crowd.poses(self.times)
+
+    @functools.cached_property
+    def cast(self) -> Cast:
+        """Return the people in their clothes."""
+        crowd, look = self.scene.crowd, self.scenario.look
+        roles = assign_roles(self.scenario.crowd, len(crowd.paths))
+        betas = np.array([body.betas for body in crowd.bodies]).reshape(-1, 10)
+        return dress_people(betas, roles, self.seed, look.patterns)
+
+    def film(self, name: str, frames: int | None = None) -> Iterator[RenderedFrame]:
+        """Yield the first frames of a static camera or the clip, by default all."""
+        moments = self._moments(self.scene.clocks.get(name, 0.0) / self.scenario.fps, frames)
+        if name == CLIP_ID:
+            assert self.scene.broadcast is not None  # callers check this
+            venue = build_venue(self.pitch, self.seed, self.scenario.look)
+            yield from film_broadcast(self.scene.broadcast, venue, moments)
+            return
         view = open_view(self.scene.cameras[name], self.pitch, self.seed, self.scenario.look)
-        clock_offset = self.scene.clocks[name] / self.scenario.fps
-        for frame, moment in enumerate(self._moments(clock_offset)):
-            yield render_frame(
-                view, self.cast, moment.opened, moment.closed, frame=frame, props=moment.props
-            )
+        for frame, each in enumerate(moments):
+            yield render_frame(view, each.cast, each.opened, each.closed, frame=frame)
 
-    def broadcast(self) -> Iterator[RenderedFrame]:
-        """Yield the frames of the broadcast camera."""
-        assert self.scene.broadcast is not None  # callers check this
-        venue = build_venue(self.pitch, self.seed, self.scenario.look)
-        standing = goals(self.pitch)
-        moments = (
-            Moment(each.cast, each.opened, each.closed, [*standing, *each.props])
-            for each in self._moments(0.0)
-        )
-        return film_broadcast(self.scene.broadcast, venue, moments)
-
-    def _moments(self, clock_offset: float) -> Iterator[Moment]:
-        """Yield the content of every frame of a camera with a clock offset [s]."""
-        times = self.times + clock_offset
+    def _moments(self, clock_offset: float, frames: int | None) -> Iterator[Moment]:
+        """Yield the people in every frame of a camera with a clock offset [s]."""
+        times = (self.times if frames is None else self.times[: frames + 1]) + clock_offset
         poses = self.poses if clock_offset == 0.0 else self.scene.crowd.poses(times)
         share = self.scenario.look.exposure_s * self.scenario.fps
         surfaces = (self.cast.pose(poses[:, k]) for k in range(len(times)))
-        for time, (opened, following) in zip(times, pairwise(surfaces), strict=False):
+        for opened, following in pairwise(surfaces):
             closed = opened.toward(following, share) if share > 0.0 else opened
-            yield Moment(self.cast, opened, closed, self._props(float(time)))
-
-    def _props(self, time: float) -> tuple[Prop, ...]:
-        if self.ball is None:
-            return self.bystanders
-        crowd = self.scene.crowd
-        x, y = (float(np.interp(time, crowd.action_times, axis)) for axis in crowd.action.T)
-        at = np.array([x, y, BALL + float(self.pitch.height(x, y))])
-        return (*self.bystanders, self.ball.at(at))
+            yield Moment(self.cast, opened, closed)
 
 
-class _Labels:
-    """Boxes, stills and masks kept from a camera's frames."""
-
-    def __init__(
-        self, still: Path | None, masks: Path | None, advance: Callable[[int], None]
-    ) -> None:
-        self.still, self.masks, self.advance = still, masks, advance
-        self.boxes: list[Singles] = []
-        self.visible: list[Singles] = []
-        if masks is not None:
-            masks.mkdir(parents=True)
-
-    def collect_labels(self, frames: Iterator[RenderedFrame]) -> Iterator[NDArray[np.uint8]]:
-        """Yield the images of frames."""
-        for number, frame in enumerate(frames):
-            self.boxes.append(frame.boxes.astype(np.float32))
-            self.visible.append(frame.visible.astype(np.float32))
-            if self.still is not None and number == 0:
-                write_still(self.still, frame.image)
-            if self.masks is not None:
-                file = self.masks / f"{number:06d}.png"
-                cv2.imwrite(str(file), (frame.person_ids + 1).astype(np.uint8))
-            yield frame.image
-            self.advance(number + 1)
+def _keep_labels(
+    stage: _FilmSet, name: str, folder: Path, options: MatchOptions, advance: Advance | None
+) -> Iterator[Image]:
+    """Yield a camera's images, and write its still, masks and boxes."""
+    boxes, visible = list[Singles](), list[Singles]()
+    masks = folder / "reference" / "masks" / name
+    if options.masks:
+        masks.mkdir(parents=True)
+    for number, frame in enumerate(stage.film(name)):
+        boxes.append(frame.boxes.astype(np.float32))
+        visible.append(frame.visible.astype(np.float32))
+        if options.stills and name != CLIP_ID and number == 0:
+            write_still(folder / "stills" / f"{name}.png", frame.image)
+        if options.masks:
+            file = masks / f"{number:06d}.png"
+            cv2.imwrite(str(file), (frame.person_ids + 1).astype(np.uint8))
+        yield frame.image
+        if advance is not None:
+            advance(name, number + 1, len(stage.scene.truth.frames))
+    file = folder / "reference" / "boxes" / f"{name}.npz"
+    write_archive(file, {"boxes": np.array(boxes), "visible": np.array(visible)})
 
 
-CLIP_ID = "clip"
 BROADCAST_ID = "broadcast"
 
 
@@ -304,8 +161,7 @@ class MatchOptions:
     """If the scenario has key frames, add the broadcast camera's video, about 0.1 s per frame,
     annotated key frames, and bodies from a simulated monocular method (`estimates/`)."""
     render: bool = False
-    """Film all cameras (`worldpose.simulation.matches.film_scene`), and write no detections, so
-    that pixels are the only input. Stills are first frames."""
+    """Film all cameras, and write no detections, so that pixels are the only input."""
     masks: bool = False
     """Add person masks of all filmed frames."""
 
@@ -320,23 +176,7 @@ def simulate_match(
 ) -> MatchSpec:
     """Write a synthetic match folder with its ground truth; the same arguments give the same bytes.
 
-    In addition to the files of a match folder to be calibrated (match.yaml, pitch.json,
-    detections/, annotations/, stills/) it holds, under reference/:
-
-    - joints.npz (`worldpose.formats.write_joints`), and defined_joints.npz, the same joints where
-      the detector takes them to be;
-    - poses/clip.npz, the bodies that these joints are keypoints of, in the WorldPose release's
-      format: betas (N, 10), global_orient (N, T, 3), body_pose (N, T, 69), transl (N, T, 3) in
-      single precision, and the name of the `body_model`;
-    - calibration.toml and cameras/<camera>.npz (`worldpose.formats.write_static_camera`) and, with
-      one row per frame, cameras/clip.npz of the broadcast camera;
-    - pitch.json of the painted pitch;
-    - clicks.json: of every static camera, `wrong` clicks (`Clicks.wrong`), and whether they are
-      `clustered` in one part of the image;
-    - identities/<camera or clip>.npz: `frame` (frames,) int64, `person` (frames, detections) int16,
-      the index into the joints file's `person_ids` of every detection, -1 for false positives and
-      padding, and `displaced` (frames, detections, 17) uint8, keypoints with gross errors;
-    - clocks.json: offset of each static camera behind its stated clock, in frames.
+    docs/explanation/simulation.md describes the files.
 
     Args:
         scenario: the scenario to simulate.
@@ -353,49 +193,11 @@ def simulate_match(
     """
     options = options or MatchOptions()
     scenario, changes, driven, clip = _apply_options(scenario, options)
-    scene = simulate_scene(scenario, seed, clip_id=CLIP_ID, driven=driven, clip=clip)
+    scene = simulate_scene(scenario, seed, driven=driven, clip=clip)
     given = scene.given if options.calibrated or scenario.calibration != CalibrationErrors() else {}
-    images = _stills(scenario, scene, seed) if options.stills and not options.render else {}
-    width, height = scenario.rig.image_size_px
-    specs = [
-        CameraSpec(
-            id=name,
-            width=width,
-            height=height,
-            still=f"stills/{name}.png" if options.stills else None,
-        )
-        for name in scene.cameras
-    ]
-    if scene.broadcast is not None:
-        specs.append(CameraSpec(id=BROADCAST_ID, kind="broadcast", width=width, height=height))
-    spec = MatchSpec(
-        match_id="-".join([scenario.name, str(seed), *changes]),
-        fps=scenario.fps,
-        cameras=tuple(specs),
-        clips=(
-            ClipSpec(
-                id=CLIP_ID,
-                frame_count=len(scene.truth.frames),
-                broadcast=None if scene.broadcast is None else BROADCAST_ID,
-            ),
-        ),
-    )
-
-    def write_further(folder: Path) -> None:
-        write_references(folder / "reference", scenario, scene, detected=not options.render)
-        if options.render:
-            film_scene(
-                scene,
-                scenario,
-                seed,
-                folder,
-                stills=options.stills,
-                masks=options.masks,
-                advance=advance,
-            )
-        elif scene.broadcast is not None and scenario.key_frames and options.video:
-            _write_broadcast(folder, scenario, scene.broadcast, scene, seed)
-
+    stage = _FilmSet(scene, scenario, seed)
+    images = _draw_stills(stage) if options.stills and not options.render else {}
+    spec = _describe_match(scenario, scene, "-".join([scenario.name, str(seed), *changes]), options)
     write_match(
         out,
         spec,
@@ -409,54 +211,91 @@ def simulate_match(
             else {},
         ),
         stills=images,
-        further=write_further,
+        further=lambda folder: _write_further(stage, folder, options, advance),
     )
     return spec
+
+
+def _describe_match(
+    scenario: Scenario, scene: Scene, match_id: str, options: MatchOptions
+) -> MatchSpec:
+    width, height = scenario.rig.image_size_px
+    stills = {name: f"stills/{name}.png" if options.stills else None for name in scene.cameras}
+    specs = [
+        CameraSpec(id=name, width=width, height=height, still=still)
+        for name, still in stills.items()
+    ]
+    broadcast = None
+    if scene.broadcast is not None:
+        broadcast = BROADCAST_ID
+        specs.append(CameraSpec(id=BROADCAST_ID, kind="broadcast", width=width, height=height))
+    return MatchSpec(
+        match_id=match_id,
+        fps=scenario.fps,
+        cameras=tuple(specs),
+        clips=(ClipSpec(id=CLIP_ID, frame_count=len(scene.truth.frames), broadcast=broadcast),),
+    )
+
+
+def _write_further(
+    stage: _FilmSet, folder: Path, options: MatchOptions, advance: Advance | None
+) -> None:
+    """Write ground truth, videos, and bodies of a monocular method."""
+    scene, scenario = stage.scene, stage.scenario
+    _write_truth(folder / "reference", scenario, scene, detected=not options.render)
+    if options.render:
+        _film_scene(stage, folder, options, advance)
+    elif scene.broadcast is not None and scenario.key_frames and options.video:
+        video = folder / "broadcast" / f"{CLIP_ID}.mp4"
+        video.parent.mkdir()
+        write_video(video, (frame.image for frame in stage.film(CLIP_ID)), scenario.fps)
+        poses, rng = scene.poses, np.random.default_rng([stage.seed, 5])
+        given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
+        bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
+        found = estimate_bodies(
+            load_open_body(), bodies, scene.broadcast, scenario.fps, MonocularErrors(), rng
+        )
+        write_archive(folder / "estimates" / f"{CLIP_ID}.npz", found)
 
 
 def _apply_options(
     scenario: Scenario, options: MatchOptions
 ) -> tuple[Scenario, list[str], list[GroundPath] | None, Clip | None]:
     """Return the changed scenario, names of the changes, tracked paths, and motion capture."""
-    changes = []
+    changes, updates, driven, clip = [], dict[str, object](), None, None
+    duration = scenario.duration
     if options.duration is not None:
-        scenario = scenario.model_copy(update={"duration": options.duration})
-        changes.append(f"{options.duration:g}s")
+        duration = options.duration
+        changes.append(f"{duration:g}s")
     if options.cameras is not None:
-        rig = scenario.rig.model_copy(update={"cameras": options.cameras})
-        scenario = scenario.model_copy(update={"rig": rig})
+        updates["rig"] = scenario.rig.model_copy(update={"cameras": options.cameras})
         changes.append(f"{options.cameras}cameras")
     if options.players is not None:
-        crowd = scenario.crowd.model_copy(update={"people": options.players})
-        scenario = scenario.model_copy(update={"crowd": crowd})
+        updates["crowd"] = scenario.crowd.model_copy(update={"people": options.players})
         changes.append(f"{options.players}players")
-    driven = None
     if options.trajectories is not None:
-        driven, length = read_trajectories(
-            options.trajectories, scenario.duration, max_people=options.players
-        )
-        scenario = scenario.model_copy(update={"duration": length})
-        changes.append(f"tracks{hashlib.sha256(options.trajectories.read_bytes()).hexdigest()[:8]}")
-    clip = None
+        driven, duration = read_trajectories(options.trajectories, duration, options.players)
+        changes.append(f"tracks{_digest(options.trajectories)}")
     if options.mocap is not None:
         clip = read_clip(options.mocap)
-        changes.append(f"mocap{hashlib.sha256(options.mocap.read_bytes()).hexdigest()[:8]}")
+        changes.append(f"mocap{_digest(options.mocap)}")
     if options.calibrated:
-        scenario = scenario.model_copy(update={"calibration": CalibrationErrors()})
+        updates["calibration"] = CalibrationErrors()
         changes.append("calibrated")
-    return scenario, changes, driven, clip
+    updates["duration"] = duration
+    return scenario.model_copy(update=updates), changes, driven, clip
 
 
-def _stills(scenario: Scenario, scene: Scene, seed: int) -> dict[str, NDArray[np.uint8]]:
-    """Return one image of every static camera."""
-    painted = PitchTemplate.from_spec(scenario.pitch)
-    people, drawn = scene.truth.joints[0], scene.cameras
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+
+
+def _draw_stills(stage: _FilmSet) -> dict[str, Image]:
+    """Return the first image of every static camera."""
+    names = list(stage.scene.cameras)
     with ThreadPoolExecutor() as pool:  # the renderer's kernels release the GIL
-        rendered = pool.map(
-            lambda camera: render_pitch(camera, painted, people, seed, scenario.look),
-            drawn.values(),
-        )
-        return dict(zip(drawn, rendered, strict=True))
+        drawn = pool.map(lambda name: next(stage.film(name, 1)).image, names)
+        return dict(zip(names, drawn, strict=True))
 
 
 def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFrames]:
@@ -471,61 +310,22 @@ def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFra
     return {CLIP_ID: clicked}
 
 
-def _write_broadcast(
-    folder: Path, scenario: Scenario, camera: Camera, scene: Scene, seed: int
-) -> None:
-    """Write the broadcast camera's video, and the bodies estimated from it."""
-    file = folder / "broadcast" / f"{CLIP_ID}.mp4"
-    file.parent.mkdir()
-    painted = PitchTemplate.from_spec(scenario.pitch)
-    images = render_broadcast(camera, painted, scene.truth.joints, seed)
-    write_video(file, images, scenario.fps)
-    estimates = folder / "estimates" / f"{CLIP_ID}.npz"
-    write_estimates(estimates, scene.poses, camera, scenario.fps, seed)
-
-
-def write_references(
-    folder: Path, scenario: Scenario, scene: Scene, *, detected: bool = True
-) -> None:
-    """Write the ground truth of a scene: joints, cameras, clocks, pitch and detections' persons.
-
-    Args:
-        folder: reference/ of the match.
-        scenario: scenario of the scene.
-        scene: the ground truth.
-        detected: whether the match includes the scene's detections.
-    """
-    write_joints(folder / "joints.npz", scene.truth)
-    if detected:
-        write_joints(folder / "defined_joints.npz", replace(scene.truth, joints=scene.defined))
-    write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
-    for name, camera in scene.cameras.items():
-        write_static_camera(folder / "cameras" / f"{name}.npz", camera.to_calibration(name))
-    if scene.broadcast is not None:
-        write_moving_camera(folder / "cameras" / f"{CLIP_ID}.npz", scene.broadcast)
-    for name, identities in scene.identities.items() if detected else ():
-        write_archive(
-            folder / "identities" / f"{name}.npz",
-            {
-                "frame": scene.observations[name].frame,
-                "person": identities.person,
-                "displaced": identities.displaced.astype(np.uint8),
-            },
-        )
-    write_calibration_toml(
-        folder / "calibration.toml",
-        {name: camera.to_calibration(name) for name, camera in scene.cameras.items()},
-    )
-    painted = PitchTemplate.from_spec(scenario.pitch).points
-    pitch = scenario.pitch.model_copy(update={"points": {n: tuple(p) for n, p in painted.items()}})
-    (folder / "pitch.json").write_text(pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    _write_json(folder / "clocks.json", scene.clocks)
+def _write_truth(folder: Path, scenario: Scenario, scene: Scene, *, detected: bool) -> None:
+    """Write the ground truth of a scene, with or without its detections' persons."""
+    points = {n: tuple(p) for n, p in PitchTemplate.from_spec(scenario.pitch).points.items()}
     clicks = {
         name: {"wrong": dict(each.wrong), "clustered": each.clustered}
         for name, each in scene.clicks.items()
     }
-    _write_json(folder / "clicks.json", clicks)
-
-
-def _write_json(path: Path, content: object) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_reference(
+        folder,
+        scene.truth,
+        scene.defined if detected else None,
+        scene.cameras,
+        scene.identities if detected else {},
+        {"clocks": scene.clocks, "clicks": clicks},
+        scenario.pitch.model_copy(update={"points": points}),
+    )
+    write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
+    if scene.broadcast is not None:
+        write_moving_camera(folder / "cameras" / f"{CLIP_ID}.npz", scene.broadcast)

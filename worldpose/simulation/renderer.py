@@ -5,12 +5,11 @@ edges, people on the lines, their shadows and that of a stand.
 
 A camera that turns and zooms about a fixed center always stays within one panorama from there: all
 static content is rendered once, finer than any frame, and every frame samples it through its own
-lens. People are drawn frame by frame; they cast no shadows.
+lens.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -19,51 +18,104 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image, Singles
+from data_contracts.arrays import Floats, Image
+from worldpose.body.model import BODY_POSE, BodyParameters
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.capsules import draw_things, goal_capsules, person_capsules
-from worldpose.simulation.image_formation import Moment, RenderedFrame, expose, sensor_grain
+from worldpose.simulation.cast import Cast, dress_people
+from worldpose.simulation.image_formation import (
+    Moment,
+    RenderedFrame,
+    expose,
+    sensor_grain,
+)
+from worldpose.simulation.mannequins import Surfaces
 from worldpose.simulation.settings import RenderingSettings
-from worldpose.simulation.venues import Venue, build_venue, draw_capsules, paint_empty, paint_venue
+from worldpose.simulation.venues import (
+    CELL,
+    Venue,
+    build_venue,
+    grid_pixels,
+    paint_empty,
+    paint_venue,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A static camera before an empty stadium.
+
+    Attributes:
+        venue: the stadium.
+        camera: a single camera.
+        scene: (height, width, 3) RGB, before the lens; without goals.
+        grain: noise of the sensor.
+    """
+
+    venue: Venue
+    camera: Camera
+    scene: Image
+    grain: NDArray[np.int8]
+
+
+def open_view(
+    camera: Camera, pitch: PitchTemplate, seed: int, settings: RenderingSettings | None = None
+) -> View:
+    """Return a static camera's view of a stadium, about a second for 1920 x 1080.
+
+    Args:
+        camera: a single camera.
+        pitch: the painted pitch; the surface follows its crown.
+        seed: seed of the stadium's look, the same for all its cameras, and of the sensor's noise.
+        settings: the defaults if None.
+    """
+    venue = build_venue(pitch, seed, settings or RenderingSettings())
+    return View(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
+
+
+def render_frame(
+    view: View,
+    cast: Cast,
+    opened: Surfaces,
+    closed: Surfaces | None = None,
+    *,
+    frame: int = 0,
+) -> RenderedFrame:
+    """Return one image of people; the same arguments give the same bytes.
+
+    Args:
+        view: a static camera.
+        cast: the people.
+        opened: their surfaces when the shutter opens.
+        closed: their surfaces when it closes; None = no motion.
+        frame: index of the image, which seeds its noise.
+    """
+    moment = Moment(cast, opened, closed or opened)
+    return expose(view.venue, view.camera, view.scene.copy(), view.grain, moment, frame)
 
 
 def render_pitch(
     camera: Camera,
     pitch: PitchTemplate,
-    people: NDArray[np.float64] | None,
+    people: BodyParameters | None,
     seed: int,
     settings: RenderingSettings | None = None,
-) -> NDArray[np.uint8]:
+) -> Image:
     """Return one image (height, width, 3) in RGB; the same arguments give the same bytes.
 
     Painted lines are `LINE_WIDTH` wide with the template's lines in their middle.
 
     Args:
         camera: a single camera.
-        pitch: the painted pitch; the surface follows its crown.
-        people: (persons, 17, 3) joints of COCO-17 [m], world; None = no people.
-        seed: seed of the stadium's look, the same for all its cameras, and of the sensor's noise.
+        pitch: the painted pitch.
+        people: bodies (persons,), world; None = no people.
+        seed: seed of the stadium's look, kits and noise.
         settings: the defaults if None.
 
     Raises:
-        InputError: a batch of cameras, or people of another shape.
+        InputError: a batch of cameras.
     """
-    settings = settings or RenderingSettings()
-    _check_inputs(camera, people)
-    venue = build_venue(pitch, seed, settings)
-    # The stadium's look must not depend on the people in it.
-    kits = np.random.default_rng([seed, 2])
-    limbs, colors = person_capsules(np.empty((0, 17, 3)) if people is None else people, kits)
-    goals, goal_colors = goal_capsules(pitch)
-    seen = paint_empty(venue, camera, (limbs, goals))
-    draw_capsules(venue, camera, seen.color, [*limbs, *goals], [*colors, *goal_colors])
-    venue.add_fog(seen.color, seen.distance)
-    return _develop(seen.color, camera, settings, seed)
-
-
-def _check_inputs(camera: Camera, people: NDArray[np.float64] | None) -> None:
     if camera.batch_shape:
         raise InputError(
             "render_pitch: camera",
@@ -71,35 +123,21 @@ def _check_inputs(camera: Camera, people: NDArray[np.float64] | None) -> None:
             found=f"a batch of shape {camera.batch_shape}",
             todo="Pass one camera of the batch, for example cameras[0].",
         )
-    if people is not None and people.shape[1:] != (17, 3):
-        raise InputError(
-            "render_pitch: people",
-            expected="shape (persons, 17, 3)",
-            found=f"shape {people.shape}",
-            todo="Pass the COCO-17 joints of one frame, for example joints[0].",
-        )
+    people = _NO_PEOPLE if people is None else people
+    cast = _dress(people.betas, seed)
+    return render_frame(open_view(camera, pitch, seed, settings), cast, cast.pose(people)).image
 
 
-def _develop(
-    color: Singles, camera: Camera, settings: RenderingSettings, seed: int
-) -> NDArray[np.uint8]:
-    """Return the light (height, width, 3) after lens and sensor."""
-    seen = np.asarray(255.0 * settings.brightness * color, dtype=np.float32)
-    if settings.blur_px > 0.0:
-        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), settings.blur_px), dtype=np.float32)
-    which = zlib.crc32(camera.cam_from_world.translation.tobytes())
-    rng = np.random.default_rng([seed, 0, which])
-    if settings.noise > 0.0:
-        grain = rng.standard_normal(seen.shape[:2], dtype=np.float32)
-        seen += np.float32(settings.noise) * grain[..., None]
-    np.clip(np.rint(seen, out=seen), 0.0, 255.0, out=seen)
-    return np.asarray(seen.astype(np.uint8))
+_NO_PEOPLE: Final = BodyParameters(*(np.empty((0, n)) for n in (10, 3, BODY_POSE, 3)))
 
 
-_CELL: Final = 4
-"""Spacing of a panorama's grid [px], for `paint_scene`."""
+def _dress(betas: Floats, seed: int) -> Cast:
+    """Return people (persons, 10) of two teams."""
+    return dress_people(betas, [("first", "second")[n % 2] for n in range(len(betas))], seed)
+
+
 _STRIP: Final = 512
-"""Width of a panorama's strips [px]: their rays are straight lines within 4 px."""
+"""Width of the strips that are painted one after the other, to save memory [px]."""
 _GRID: Final = 8
 """Grid spacing of a frame's lens inversion [px]: between the nodes its error is 0.005 px."""
 _MARGIN: Final = 0.01
@@ -127,13 +165,12 @@ class Panorama:
     center: Floats
 
 
-def render_panorama(cameras: Camera, venue: Venue, *, lit: bool = False) -> Panorama:
+def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
     """Return a turning camera's panorama of pitch, boards and stands.
 
     Args:
         cameras: a batch (frames,) with one center.
         venue: the stadium.
-        lit: with its lights and through its fog; else in even light.
 
     Raises:
         InputError: the cameras have different centers.
@@ -151,26 +188,19 @@ def render_panorama(cameras: Camera, venue: Venue, *, lit: bool = False) -> Pano
     left, top = pan[0] - _MARGIN, rise[1] + _MARGIN
     width = int(np.ceil((pan[1] + _MARGIN - left) * scale))
     height = int(np.ceil((top - rise[0] + _MARGIN) * scale))
-    whole = np.empty((height, width, 3), dtype=np.uint8)
-    rows = np.arange(-_CELL, height + 2 * _CELL, _CELL)
-    for begin in range(0, width, _STRIP):
-        count = min(_STRIP, width - begin)
-        columns = np.arange(-_CELL, count + 2 * _CELL, _CELL)
-        middle = left + (begin + 0.5 * count) / scale
-        angle = left + (begin + columns + 0.5) / scale - middle
-        down = (rows + 0.5) / scale - top
-        x = np.broadcast_to(np.tan(angle), (len(rows), len(columns)))
-        y = down[:, None] / np.cos(angle)
-        cos, sin = np.cos(middle), np.sin(middle)
-        # Columns: right, down and ahead of a level camera that looks along this strip.
-        turn = np.array([[cos, 0.0, sin], [-sin, 0.0, cos], [0.0, -1.0, 0.0]])
-        seen = paint_venue(venue, np.stack([x, y], axis=-1), center, turn, (count, height))
-        color = seen.color
-        if lit:
-            color *= 1.0 - venue.shade * venue.in_shadow(seen.ground[..., 1])[..., None]
-            venue.add_fog(color, seen.distance)
-            color *= venue.settings.brightness
-        whole[:, begin : begin + count] = np.clip(np.rint(255.0 * color), 0.0, 255.0)
+    columns, rows = grid_pixels(width, height)
+    angle, up = left + (columns + 0.5) / scale, top - (rows + 0.5) / scale
+    grid = np.stack([np.sin(angle), np.cos(angle), up], axis=-1)
+    strips = [
+        paint_venue(
+            venue,
+            np.ascontiguousarray(grid[:, begin // CELL : (begin + _STRIP) // CELL + 3]),
+            center,
+            (min(_STRIP, width - begin), height),
+        )
+        for begin in range(0, width, _STRIP)
+    ]
+    whole = np.concatenate(strips, axis=1)
     levels = [whole]
     while scale / 2 ** len(levels) > 0.5 * float(cameras.focal.min()):
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
@@ -180,7 +210,7 @@ def render_panorama(cameras: Camera, venue: Venue, *, lit: bool = False) -> Pano
 def render_broadcast(
     cameras: Camera,
     pitch: PitchTemplate,
-    people: Floats | None,
+    people: BodyParameters | None,
     seed: int,
     settings: RenderingSettings | None = None,
 ) -> Iterator[Image]:
@@ -189,64 +219,42 @@ def render_broadcast(
     Args:
         cameras: a batch (frames,) with one center.
         pitch: the painted pitch.
-        people: (frames, persons, 17, 3) joints of COCO-17 [m], world; None = no people.
-        seed: seed of the stadium's look and the sensor's noise.
-        settings: the defaults if None; their light is ignored.
+        people: bodies (persons, frames), world; None = no people.
+        seed: seed of the stadium's look, kits and noise.
+        settings: the defaults if None.
 
     Raises:
         InputError: the cameras have different centers.
     """
-    settings = settings or RenderingSettings()
-    panorama = render_panorama(cameras, build_venue(pitch, seed, settings))
-    kits = np.random.default_rng([seed, 2]).integers(1 << 31)
-    goals, goal_colors = goal_capsules(pitch)
-    noise = np.random.default_rng([seed, 3])
-    width, height = (int(n) for n in cameras.image_size.reshape(-1, 2)[0])
-    # One field of noise, with another offset for every frame.
-    field = settings.noise * noise.standard_normal((height + 256, width + 256), dtype=np.float32)
-    for frame in range(len(cameras.focal)):
-        camera = cameras[frame]
-        color = np.asarray(_sample_panorama(panorama, camera, width, height), dtype=np.float32)
-        color *= np.float32(1.0 / 255.0)
-        joints = np.empty((0, 17, 3)) if people is None else people[frame]
-        limbs, colors = person_capsules(joints, np.random.default_rng(kits))
-        draw_things(
-            color,
-            camera,
-            [*limbs, *goals],
-            [*colors, *goal_colors],
-            [1.0] * (len(limbs) + len(goals)),
-        )
-        color *= np.float32(255.0)
-        if settings.blur_px > 0.0:
-            color = np.asarray(cv2.GaussianBlur(color, (0, 0), settings.blur_px), dtype=np.float32)
-        down, right = (int(n) for n in noise.integers(0, 256, 2))
-        color += field[down : down + height, right : right + width, None]
-        yield np.asarray(cv2.convertScaleAbs(np.maximum(color, 0.0)), dtype=np.uint8)
+    venue = build_venue(pitch, seed, settings or RenderingSettings())
+    cast = _dress(np.empty((0, 10)) if people is None else people.betas[:, 0], seed)
+    posed = (
+        cast.pose(_NO_PEOPLE if people is None else people[:, frame])
+        for frame in range(len(cameras.focal))
+    )
+    moments = (Moment(cast, surfaces, surfaces) for surfaces in posed)
+    return (each.image for each in film_broadcast(cameras, venue, moments))
 
 
 def film_broadcast(
     cameras: Camera, venue: Venue, moments: Iterable[Moment]
 ) -> Iterator[RenderedFrame]:
-    """Yield a clip's frames, like `worldpose.simulation.matches.render_frame`.
+    """Yield a clip's frames, like `render_frame`.
 
     Args:
         cameras: a batch (frames,) with one center.
         venue: the stadium.
-        moments: people and things in every frame.
+        moments: people in every frame.
 
     Raises:
         InputError: the cameras have different centers.
     """
-    panorama = render_panorama(cameras, venue, lit=True)
+    panorama = render_panorama(cameras, venue)
     grain = sensor_grain(venue, cameras[0])
     width, height = (int(n) for n in cameras.image_size.reshape(-1, 2)[0])
     for frame, moment in enumerate(moments):
-        sharp = _sample_panorama(panorama, cameras[frame], width, height)
-        blurred = sharp.copy()
-        if venue.settings.blur_px > 0.0:
-            blurred = np.asarray(cv2.GaussianBlur(sharp, (0, 0), venue.settings.blur_px))
-        yield expose(venue, cameras[frame], sharp, blurred, grain, moment, frame)
+        scene = _sample_panorama(panorama, cameras[frame], width, height)
+        yield expose(venue, cameras[frame], scene, grain, moment, frame)
 
 
 def _field_of_view(cameras: Camera) -> tuple[tuple[float, float], tuple[float, float]]:

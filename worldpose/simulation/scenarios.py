@@ -77,7 +77,6 @@ _MATCH: Final = Scenario(
     rig=_STADIUM,
     broadcast=BroadcastSettings(),
     noise=ObservationNoise(),
-    look=RenderingSettings(bystanders=8),
 )
 _BOX: Final = CrowdSettings(
     people=6,

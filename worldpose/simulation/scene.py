@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17, FEET
+from data_contracts.arrays import Flags, Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from worldpose.body.body_file import load_open_body
-from worldpose.body.keypoints import fold_keypoints, point_segments
-from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
+from worldpose.body.model import BodyParameters
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -23,21 +20,17 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import Clicks, add_calibration_errors, click, every, survey
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.detector_errors import (
-    MAX_FALSE_POSITIVES,
-    Bodies,
-    Detections,
-    Projections,
-    Report,
     SystematicErrors,
     detect,
     draw_false_positives,
     draw_systematic_errors,
-    perceived_bias,
     project_bodies,
     report,
 )
 from worldpose.simulation.paths import Clip, GroundPath, bursts, drift
+from worldpose.simulation.reference import CLIP_ID, Report
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
+from worldpose.simulation.visibility import facing_axes
 
 STANDARD_PERSON: Final = 1.8
 """Body height for `RigSettings.person_height_px` [m]."""
@@ -199,20 +192,6 @@ Seed = np.random.SeedSequence
 
 
 @dataclass(frozen=True, eq=False)
-class Identities:
-    """Person of each detection of one camera.
-
-    Attributes:
-        person: (frames, detections) int16 index into the truth's `person_ids`; -1 for false
-            positives and padding.
-        displaced: (frames, detections, 17) bool, keypoints with deliberate gross errors.
-    """
-
-    person: NDArray[np.int16]
-    displaced: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
 class StaticViews:
     """Detections of static cameras per frame, the input of tracking.
 
@@ -264,7 +243,7 @@ class Scene:
     given: dict[str, Camera]
     broadcast: Camera | None
     observations: dict[str, KeypointDetections]
-    identities: dict[str, Identities]
+    identities: dict[str, Report]
     clocks: dict[str, float]
     clicks: dict[str, Clicks]
     surveyed: PitchSpec
@@ -284,85 +263,7 @@ class Scene:
             person[rows, c, :last] = self.identities[name].person
             displaced[rows, c, :last] = self.identities[name].displaced
         detections = KeypointDetections.from_keypoints(keypoints, confidence, frame=frames)
-        if seen[0].points:
-            whole = KeypointDetections.stack(seen)
-            assert whole.extra_keypoints is not None and whole.extra_confidence is not None
-            detections = detections.add_points(
-                whole.points, whole.extra_keypoints, whole.extra_confidence
-            )
         return StaticViews(detections, person, displaced)
-
-
-POINT_DIFFICULTY: Final = 0.067 / 0.08
-"""Spread of heels and toes relative to an average joint: COCO-WholeBody's sigmas over 0.08."""
-
-
-def detect_points(
-    scene: Scene,
-    scenario: Scenario,
-    seed: int,
-    points: tuple[str, ...] = FEET,
-    difficulty: float = POINT_DIFFICULTY,
-) -> Scene:
-    """Return a scene whose detector also gives points of the people that static cameras detect.
-
-    A point is found with the joint that is nearest to it in the unposed body, and has white, slow
-    and systematic errors like those of joints, independent of other points. The detector's bias is
-    fixed to the segment, the same for all people and mirrored left to right. Other numbers of the
-    scene stay.
-
-    Args:
-        scene: the scene.
-        scenario: the scenario that it was made from.
-        seed: seed of these errors alone.
-        points: names of points of the body model, left and right ones in pairs.
-        difficulty: spread relative to an average joint [1].
-    """
-    noise, persons = scenario.noise, len(scene.truth.person_ids)
-    rng = np.random.default_rng((seed, len(points)))
-    model = load_open_body()
-    keypoints, segment = fold_keypoints(model, points), point_segments(model, points)
-    bias = noise.shared_bias_m * rng.standard_normal((len(points), 3))
-    for place, point in enumerate(points):
-        if point.startswith("right_"):
-            left = bias[points.index(point.replace("right_", "left_", 1))]
-            bias[place] = left * [-1.0, 1.0, 1.0]
-    own = bias + noise.own_bias_m * rng.standard_normal((persons, 1, len(points), 3))
-    joint = _nearest_joints(model, points)
-    observations = dict(scene.observations)
-    for name, camera in scene.cameras.items():
-        people, person = scene.observations[name], scene.identities[name].person
-        times = people.frame.astype(np.float64) / scenario.fps
-        times += scene.clocks[name] / scenario.fps
-        poses = scene.crowd.poses(times)
-        places = keypoints(poses)
-        turned = model.articulate(poses).rotations[..., segment, :, :]
-        seen_at = places + np.einsum("pfkab,pfkb->pfka", turned, np.broadcast_to(own, places.shape))
-        pixels = camera.project(seen_at.reshape(-1, 3)).reshape(*places.shape[:-1], 2)
-        depth = camera.cam_from_world.apply(places[..., 0, :])[..., 2]
-        size = camera.focal.mean() * scene.crowd.heights[:, None] / np.maximum(depth, 1e-3)
-        spread = (difficulty * size)[..., None, None]
-        slow = drift(pixels.swapaxes(0, 1).shape, noise.slow_time_s, scenario.fps, rng)
-        white = rng.standard_normal(pixels.shape)
-        pixels = pixels + np.hypot(noise.white * spread, noise.floor_px) * white
-        pixels = pixels + noise.slow * spread * slow.swapaxes(0, 1)
-        found = pixels[np.maximum(person, 0), np.arange(len(times))[:, None]]
-        sure = np.where(person[..., None] >= 0, people.confidence[..., joint], np.nan)
-        inside = ((found >= -0.5) & (found <= camera.image_size - 0.5)).all(axis=-1)
-        sure = np.where(inside, sure, np.nan)
-        found = np.where(np.isfinite(sure)[..., None], found, np.nan)
-        observations[name] = people.add_points(
-            points, found.astype(np.float32), sure.astype(np.float32)
-        )
-    return replace(scene, observations=observations)
-
-
-def _nearest_joints(model: BodyModel, points: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the joint of COCO-17 that is nearest to each point of the unposed body (points,)."""
-    rest = BodyParameters(np.zeros(model.shapes), np.zeros(3), np.zeros(BODY_POSE), np.zeros(3))
-    both = [fold_keypoints(model, names)(rest) for names in (points, COCO17)]
-    apart = np.linalg.norm(both[0][:, None] - both[1], axis=-1)
-    return np.asarray(apart.argmin(axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,34 +274,52 @@ class _World:
     crowd: Crowd
     pitch: PitchTemplate
     systematic: SystematicErrors
-    own_bias: NDArray[np.float64]
+    own_bias: Floats
 
-    def bodies(self, times: NDArray[np.float64]) -> Bodies:
-        joints, noise = self.crowd.joints(times), self.scenario.noise
-        bias = None
-        if noise.shared_bias_m > 0.0 or noise.own_bias_m > 0.0:
-            bias = perceived_bias(joints, self.systematic, noise, self.own_bias)
-        return Bodies(joints, self.crowd.heights, bias)
+    def perceive(self, joints: Floats) -> Floats:
+        """Return offsets (frames, persons, 17, 3) [m], world, to the detector's joints."""
+        noise = self.scenario.noise
+        front, left = facing_axes(joints)
+        up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
+        shared = noise.shared_bias_m * self.systematic.joint_bias
+        offsets = shared + noise.own_bias_m * self.own_bias
+        return np.asarray(offsets @ np.stack([front, left, up], axis=-2))
+
+    def film(self, camera: Camera, joints: Floats, seed: Seed) -> tuple[Report, Flags]:
+        """Return a camera's detections of people (frames, persons, 17, 3) [m] and false positives.
+
+        The second value tells the joints in the image that no other person occludes.
+        """
+        scenario, noise = self.scenario, self.scenario.noise
+        rng = np.random.default_rng(seed)
+        bias = self.perceive(joints)
+        projected = project_bodies(camera, joints, self.crowd.heights, bias)
+        real = detect(projected, noise, self.systematic, scenario.fps, rng)
+        figures = draw_false_positives(scenario, self.pitch, len(joints), rng)
+        unreal = project_bodies(camera, *figures)
+        false = detect(unreal, noise, self.systematic, scenario.fps, rng)
+        size = np.concatenate([projected.size, unreal.size], axis=1)
+        lost = (noise.dropped_share, noise.dropped_time_s, (len(joints),), scenario.fps)
+        dropped = bursts(*lost, rng)
+        found = report(real, false, size, noise.false_doubt, dropped, rng)
+        return found, projected.seen
 
 
 def simulate_scene(
     scenario: Scenario,
     seed: int,
     *,
-    clip_id: str = "clip",
     driven: Sequence[GroundPath] | None = None,
     clip: Clip | None = None,
 ) -> Scene:
     """Return a scene; the same scenario and seed give the same numbers.
 
     Every person and every camera draws from a separate stream: an additional camera changes no
-    existing number; an additional person, if people wander independently, changes only occlusions
-    and the order of detections.
+    existing number, and an additional person no motion of those who wander.
 
     Args:
         scenario: everything but the seed.
         seed: seed from 0.
-        clip_id: names the broadcast camera's detections.
         driven: paths of the people, instead of the scenario's movement.
         clip: motion capture for one of them.
     """
@@ -409,102 +328,61 @@ def simulate_scene(
     )
     pitch = PitchTemplate.from_spec(scenario.pitch)
     crowd = gather(scenario, pitch, people_seed, driven, clip)
-    persons = len(crowd.paths)
-    common, own = systematic_seed.spawn(2)
-    own_bias = np.array([_rng(each).standard_normal((17, 3)) for each in own.spawn(persons)])
+    common, *own = systematic_seed.spawn(1 + len(crowd.paths))
+    own_bias = np.array([_rng(each).standard_normal((17, 3)) for each in own]).reshape(-1, 17, 3)
     systematic = draw_systematic_errors(_rng(common))
-    world = _World(scenario, crowd, pitch, systematic, own_bias.reshape(persons, 17, 3))
+    world = _World(scenario, crowd, pitch, systematic, own_bias)
     times = np.arange(round(scenario.duration * scenario.fps)) / scenario.fps
-    bodies = world.bodies(times)
+    joints = crowd.joints(times)
     x, y = scenario.crowd.area_center_m
     target = np.array([x, y, float(pitch.height(x, y))])
 
-    cameras: dict[str, Camera] = {}
-    reports: dict[str, Report] = {}
-    clocks: dict[str, float] = {}
-    clicks: dict[str, Clicks] = {}
-    views = np.zeros(bodies.joints.shape[:3], dtype=np.int64)
+    cameras, reports = dict[str, Camera](), dict[str, Report]()
+    clocks, clicks = dict[str, float](), dict[str, Clicks]()
+    views = np.zeros(joints.shape[:3], dtype=np.int64)
     from_wrong, from_clustered = _rng(click_seed).random(2)
     for index, camera_seed in enumerate(rig_seed.spawn(scenario.rig.cameras)):
         name = f"cam{index:02d}"
-        place, clock, *errors, hand = camera_seed.spawn(7)
+        place, clock, detections, hand = camera_seed.spawn(4)
         camera = place_camera(scenario.rig, index, target, scenario.pitch, _rng(place))
-        clock_offset = scenario.rig.clock_std_frames * float(_rng(clock).standard_normal())
-        seen_bodies = (
-            bodies if clock_offset == 0.0 else world.bodies(times + clock_offset / scenario.fps)
-        )
-        projections = project_bodies(camera, seen_bodies)
-        views += projections.seen
+        clocks[name] = scenario.rig.clock_std_frames * float(_rng(clock).standard_normal())
+        late = clocks[name] / scenario.fps
+        seen = joints if late == 0.0 else crowd.joints(times + late)
+        reports[name], visible = world.film(camera, seen, detections)
+        views += visible
         clicks[name] = click(
             camera,
             pitch,
-            bodies.joints[0],
+            joints[0],
             scenario.clicks,
             clustered=every(scenario.clicks.clustered, index, from_clustered),
             mistaken=every(scenario.clicks.wrong, index, from_wrong),
             rng=_rng(hand),
         )
-        cameras[name], clocks[name] = camera, clock_offset
-        reports[name] = _report_detections(world, camera, projections, errors)
+        cameras[name] = camera
     broadcast = None
     if scenario.broadcast is not None:
-        place, *errors = broadcast_seed.spawn(5)
+        place, detections = broadcast_seed.spawn(2)
         size = scenario.rig.image_size_px
         broadcast = move_broadcast_camera(
             scenario.broadcast, times, crowd.action, crowd.action_times, size, _rng(place)
         )
-        reports[clip_id] = _report_detections(
-            world, broadcast, project_bodies(broadcast, bodies), errors
-        )
+        reports[CLIP_ID], _ = world.film(broadcast, joints, detections)
     return Scene(
-        truth=JointTracks(np.arange(len(times)), np.arange(persons), bodies.joints, views=views),
-        defined=bodies.joints if bodies.bias is None else bodies.joints + bodies.bias,
+        truth=JointTracks(np.arange(len(times)), np.arange(len(own)), joints, views=views),
+        defined=joints + world.perceive(joints),
         crowd=crowd,
         poses=crowd.poses(times),
         cameras=cameras,
         given=add_calibration_errors(cameras, scenario.calibration, _rng(error_seed)),
         broadcast=broadcast,
         observations={name: each.observations for name, each in reports.items()},
-        identities={name: _identities(each, persons) for name, each in reports.items()},
+        identities=reports,
         clocks=clocks,
         clicks=clicks,
         surveyed=survey(scenario.pitch, scenario.survey_error, _rng(survey_seed)),
     )
 
 
-def _report_detections(
-    world: _World, camera: Camera, projections: Projections, seeds: list[Seed]
-) -> Report:
-    """Return a camera's detections, false positives included; `seeds` are four."""
-    order, false_seed, errors, loss = seeds
-    scenario, noise = world.scenario, world.scenario.noise
-    frames, persons = projections.size.shape
-    real = detect(projections, noise, world.systematic, scenario.fps, _rngs(errors.spawn(persons)))
-    figures, *figure_errors = false_seed.spawn(1 + MAX_FALSE_POSITIVES)
-    projected = project_bodies(
-        camera, draw_false_positives(scenario, world.pitch, frames, _rng(figures))
-    )
-    false = detect(projected, noise, world.systematic, scenario.fps, _rngs(figure_errors))
-    merged = np.where(false.merged_into >= 0, false.merged_into + persons, -1)
-    together = Detections(
-        np.concatenate([real.keypoints, false.keypoints], axis=1),
-        np.concatenate([real.confidence, false.confidence * (1.0 - noise.false_doubt)], axis=1),
-        np.concatenate([real.displaced, false.displaced], axis=1),
-        np.concatenate([real.merged_into, merged], axis=1),
-    )
-    dropped = bursts(noise.dropped_share, noise.dropped_time_s, (frames,), scenario.fps, _rng(loss))
-    size = np.concatenate([projections.size, projected.size], axis=1)
-    return report(together, size, dropped, _rng(order))
-
-
-def _identities(given: Report, persons: int) -> Identities:
-    person = np.where(given.person < persons, given.person, -1).astype(np.int16)
-    return Identities(person, given.displaced)
-
-
 def _rng(seed: Seed) -> np.random.Generator:
     return np.random.default_rng(seed)
-
-
-def _rngs(seeds: list[Seed]) -> list[np.random.Generator]:
-    return [np.random.default_rng(seed) for seed in seeds]

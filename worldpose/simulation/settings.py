@@ -43,9 +43,6 @@ class RenderingSettings(Record):
     """Brightness of the whole image [1]."""
     patterns: tuple[Pattern, ...] = PATTERNS
     """Shirt patterns to draw from."""
-    bystanders: int = Field(default=0, ge=0, le=100)
-    """People who stand 2.5 to 3.3 m behind the lines and do not play [1]: ball boys, stewards,
-    photographers. The ground truth does not include them."""
     exposure_s: float = Field(default=0.004, ge=0, le=1)
     """Exposure time of every frame [s]: 1/250 s, usual for sport by day."""
     blur_px: float = Field(default=0.7, ge=0, le=100)
@@ -151,37 +148,6 @@ Value = Annotated[float, Field(ge=-1e6, le=1e6)]
 Range = tuple[Value, Value]
 
 
-class ActionRates(Record):
-    """Rates of actions that people perform while they move or stand.
-
-    Shares are of the ball's touches, 18 per minute. Rates and measurements in matches:
-    docs/explanation/simulation.md.
-    """
-
-    headers: float = Field(default=0.12, ge=0, le=1)
-    """Share of balls that two opponents jump for [1]: 9 headers per player and match."""
-    tackles: float = Field(default=0.06, ge=0, le=1)
-    """Share of balls that an opponent slides into [1]."""
-    tripped: float = Field(default=0.5, ge=0, le=1)
-    """Share of tackled players who fall [1]; the others hurdle the leg."""
-    shots: float = Field(default=0.12, ge=0, le=1)
-    """Share of balls within 28 m of a goal that are shot at it [1]."""
-    jumps_per_min: float = Field(default=3.0, ge=0, le=1000)
-    """Per wandering person [1/min]: as in a penalty area."""
-    falls_per_min: float = Field(default=0.4, ge=0, le=100)
-    """Per wandering person [1/min]."""
-    standing_about: float = Field(default=0.7, ge=0, le=1)
-    """Share of the time of standing, rests under 1.6 s left out, in which people shift their
-    weight, look around or rest their hands on their hips [1]."""
-
-    @classmethod
-    def none(cls) -> ActionRates:
-        """Return rates without actions: people only move and stand."""
-        return cls(
-            headers=0, tackles=0, shots=0, jumps_per_min=0, falls_per_min=0, standing_about=0
-        )
-
-
 class CrowdSettings(Record):
     """The people and the part of the pitch they move on."""
 
@@ -204,8 +170,6 @@ class CrowdSettings(Record):
     """Distance below which people avoid others [m]."""
     height_m: Range = (1.70, 1.95)
     """Shortest and tallest body height [m]: professional players."""
-    actions: ActionRates = ActionRates()
-    """Actions of the people."""
 
 
 class Seat(Record):

@@ -1,4 +1,4 @@
-"""Skeletons: body measures, joints from a pose, and bodies from joints by inverse kinematics.
+"""Body measures, and bodies from joints by inverse kinematics.
 
 Every frame is solved independently, in closed form and continuously: no rotation depends on a sign
 or an angle that jumps as limbs pass through straight. So a body depends on its time alone.
@@ -25,27 +25,42 @@ BUILD: Final = (-1.0, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Figure:
-    """One person's body before it is posed, in the open body's own frame: y up, facing z."""
+class Body:
+    """A person's constant measures [m], in the open body's own frame: y up, facing z."""
 
     model: BodyModel
     betas: Floats
     """(10,)"""
     height: float
-    """Sole to crown [m]."""
+    """Sole to crown."""
     joints: Floats
-    """(24, 3) [m], those of the model."""
+    """(24, 3), those of the model before it is posed."""
     head: Floats
-    """(5, 3) [m]: nose, eyes and ears."""
-    sole: float
-    """y of the lowest point [m]."""
+    """(5, 3): nose, eyes and ears."""
+    face: Floats
+    """(5, 3): the same forward, left and up from the mid-shoulder."""
     toe: float
-    """Length of the toes in front of their joint [m]."""
+    """Length of the toes in front of their joint."""
     heel: float
-    """Distance of the heel behind the ankle [m]."""
+    """Distance of the heel behind the ankle."""
+    ankle_height: float
+    """Height of the ankle above the sole."""
+    thigh: float
+    shank: float
+    hip_half_width: float
+    trunk: float
+    """Mid-hip to mid-shoulder."""
+    shoulder_half_width: float
+    upper_arm: float
+    forearm: float
+
+    @property
+    def leg(self) -> float:
+        """Return the length from hip to ankle when stretched [m]."""
+        return self.thigh + self.shank
 
 
-def draw_figure(height: tuple[float, float], rng: np.random.Generator) -> Figure:
+def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
     """Return a person of random height [m] within bounds and of random build.
 
     Proportions are the open body's: all betas but the first are random, the first sets the height.
@@ -59,18 +74,32 @@ def draw_figure(height: tuple[float, float], rng: np.random.Generator) -> Figure
     rising = directions[-2, 1] - directions[-1, 1]
     middle = points[-2, 1] - points[-1, 1]
     betas[0] = (tall - middle - rising[1:] @ betas[1:]) / rising[0]
-    shaped = points + directions @ betas
     joints = model.joint_template + model.joint_directions @ betas
-    *head, toe, heel, _, lowest = shaped
-    return Figure(
+    *face, toe, heel, _, lowest = points + directions @ betas
+    head = np.array(face)
+    hips, shoulders = joints[1:3].mean(axis=0), joints[16:18].mean(axis=0)
+
+    def length(a: int, b: int) -> float:
+        return float(np.linalg.norm(joints[a] - joints[b]))
+
+    return Body(
         model=model,
         betas=betas,
         height=tall,
         joints=joints,
-        head=np.array(head),
-        sole=float(lowest[1]),
+        head=head,
+        # The model faces z with y up and its left along x.
+        face=(head - shoulders)[:, (2, 0, 1)],
         toe=float(toe[2] - joints[10, 2]),
         heel=float(joints[7, 2] - heel[2]),
+        ankle_height=float(joints[7, 1] - lowest[1]),
+        thigh=length(1, 4),
+        shank=length(4, 7),
+        hip_half_width=0.5 * length(1, 2),
+        trunk=float(np.linalg.norm(shoulders - hips)),
+        shoulder_half_width=0.5 * length(16, 17),
+        upper_arm=length(16, 18),
+        forearm=length(18, 20),
     )
 
 
@@ -84,106 +113,9 @@ def _reference_points() -> tuple[BodyModel, Floats, Floats]:
     return model, model.template[vertices], model.shape_directions[vertices]
 
 
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A person's constant measures [m]."""
-
-    figure: Figure
-    """Source of the measures."""
-    height: float
-    thigh: float
-    shank: float
-    ankle_height: float
-    """Height of the ankle above the sole."""
-    hip_half_width: float
-    trunk: float
-    """Mid-hip to mid-shoulder."""
-    shoulder_half_width: float
-    upper_arm: float
-    forearm: float
-    head: Floats
-    """(5, 3): nose, eyes and ears forward, left and up from the mid-shoulder."""
-
-    @property
-    def leg(self) -> float:
-        """Return the length from hip to ankle when stretched [m]."""
-        return self.thigh + self.shank
-
-
-def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
-    """Return a person of random height [m] and build, with the open body's proportions."""
-    figure = draw_figure(height, rng)
-    joints = figure.joints
-    hips, shoulders = joints[1:3].mean(axis=0), joints[16:18].mean(axis=0)
-
-    def length(a: int, b: int) -> float:
-        return float(np.linalg.norm(joints[a] - joints[b]))
-
-    return Body(
-        figure=figure,
-        height=figure.height,
-        thigh=length(1, 4),
-        shank=length(4, 7),
-        ankle_height=float(joints[7, 1]) - figure.sole,
-        hip_half_width=0.5 * length(1, 2),
-        trunk=float(np.linalg.norm(shoulders - hips)),
-        shoulder_half_width=0.5 * length(16, 17),
-        upper_arm=length(16, 18),
-        forearm=length(18, 20),
-        # The model faces z with y up and its left along x.
-        head=(figure.head - shoulders)[:, (2, 0, 1)],
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """A person's pose per frame, world; direction vectors have length one.
-
-    Attributes:
-        pelvis: (frames, 3) mid-hip [m].
-        hips_left: (frames, 3) vector from the mid-hip to the left hip.
-        trunk: (frames, 3) vector from mid-hip to mid-shoulder.
-        shoulders_left: (frames, 3) vector from mid-shoulder to the left shoulder.
-        head: (frames, 3, 3), rows: forward, left, up of the head.
-        arms: (frames, 2, 2, 3): left and right; upper arm and forearm.
-        ankles: (frames, 2, 3) desired ankles [m]; a leg extends at most to its reach.
-        knees: (frames, 2, 3) directions of the knees, of any length.
-        feet: (frames, 2) directions of standing feet, from the x axis towards y [rad].
-    """
-
-    pelvis: Floats
-    hips_left: Floats
-    trunk: Floats
-    shoulders_left: Floats
-    head: Floats
-    arms: Floats
-    ankles: Floats
-    knees: Floats
-    feet: Floats
-
-
-def pose_joints(body: Body, pose: Pose) -> Floats:
-    """Return joints (frames, 17, 3) [m], world; distances between them are the body's own."""
-    joints = np.empty((len(pose.pelvis), 17, 3))
-    neck = pose.pelvis + body.trunk * pose.trunk
-    joints[:, :5] = neck[:, None] + body.head @ pose.head
-    for side, sign in enumerate((1.0, -1.0)):
-        shoulder = neck + sign * body.shoulder_half_width * pose.shoulders_left
-        joints[:, 5 + side] = shoulder
-        joints[:, 7 + side] = shoulder + body.upper_arm * pose.arms[:, side, 0]
-        joints[:, 9 + side] = joints[:, 7 + side] + body.forearm * pose.arms[:, side, 1]
-        hip = pose.pelvis + sign * body.hip_half_width * pose.hips_left
-        joints[:, 11 + side] = hip
-        joints[:, 13 + side], joints[:, 15 + side] = _place_leg(
-            body, hip, pose.ankles[:, side], pose.knees[:, side]
-        )
-    return joints
-
-
 def unit(vectors: Floats) -> Floats:
     """Return vectors (..., 3) of length one in the same direction."""
-    of_length_one: Floats = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return of_length_one
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def level_axes(heading: Floats) -> tuple[Floats, Floats]:
@@ -193,23 +125,8 @@ def level_axes(heading: Floats) -> tuple[Floats, Floats]:
     return forward, np.stack([-np.sin(heading), np.cos(heading), zero], axis=-1)
 
 
-def _place_leg(body: Body, hip: Floats, ankle: Floats, forward: Floats) -> tuple[Floats, Floats]:
-    """Return knee and ankle (frames, 3); an ankle out of reach moves to the hip: the heel rises."""
-    along = ankle - hip
-    far = np.linalg.norm(along, axis=-1, keepdims=True)
-    along = along / far
-    # Reach ends smoothly and short of a straight leg, whose knee would snap.
-    free, spare = 0.965 * body.leg, 0.03 * body.leg
-    beyond = np.maximum(far - free, 0.0)
-    reach = np.minimum(far, free) + spare * (1.0 - np.exp(-beyond / spare))
-    to_knee = (body.thigh**2 - body.shank**2 + reach**2) / (2.0 * reach)
-    aside = np.sqrt(body.thigh**2 - to_knee**2)
-    front = unit(forward - (forward * along).sum(-1, keepdims=True) * along)
-    return hip + to_knee * along + aside * front, hip + reach * along
-
-
 Ground = Callable[[Floats, Floats], Floats]
-
+"""Height of the ground [m] at x and y [m], world."""
 BIAS: Final = 0.1
 """Weight of a limb's natural bend in its plane, relative to the sine of its actual bend [1]: nearly
 straight limbs keep their twist."""
@@ -229,7 +146,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 class PosedBody:
     """A body in motion."""
 
-    figure: Figure
+    body: Body
     rotations: Floats
     """(frames, 24, 3, 3), rotation of every joint, world from model."""
     pelvis: Floats
@@ -237,7 +154,7 @@ class PosedBody:
 
     def joints(self) -> Floats:
         """Return the model's joints (frames, 24, 3) [m], world."""
-        rest, parents = self.figure.joints, self.figure.model.parents
+        rest, parents = self.body.joints, self.body.model.parents
         joints = np.empty((len(self.pelvis), len(rest), 3))
         joints[:, 0] = self.pelvis
         for joint, parent in enumerate(parents[1:], start=1):
@@ -253,7 +170,7 @@ class PosedBody:
         """
         joints = self.joints()
         keypoints = np.empty((len(joints), 17, 3))
-        face = self.figure.head - self.figure.joints[15]
+        face = self.body.head - self.body.joints[15]
         keypoints[:, :5] = joints[:, None, 15] + face @ self.rotations[:, 15].swapaxes(-1, -2)
         keypoints[:, 5:11] = joints[:, 16:22]
         keypoints[:, 11:] = joints[:, (1, 2, 4, 5, 7, 8)]
@@ -261,21 +178,19 @@ class PosedBody:
 
     def parameters(self) -> BodyParameters:
         """Return shape, angles and place of the body, a batch (frames,)."""
-        parents = self.figure.model.parents[1:]
+        parents = self.body.model.parents[1:]
         local = self.rotations.copy()
         local[:, 1:] = self.rotations[:, parents].swapaxes(-1, -2) @ self.rotations[:, 1:]
         angles = Rigid(local, np.zeros(3)).rotvec
         return BodyParameters(
-            betas=self.figure.betas,
+            betas=self.body.betas,
             global_orient=angles[:, 0],
             body_pose=angles[:, 1:].reshape(len(angles), BODY_POSE),
-            transl=self.pelvis - self.figure.joints[0],
+            transl=self.pelvis - self.body.joints[0],
         )
 
 
-def solve_body(
-    figure: Figure, joints: Floats, ground: Ground, courses: Floats | None = None
-) -> PosedBody:
+def solve_body(body: Body, joints: Floats, ground: Ground, courses: Floats) -> PosedBody:
     """Return the body that follows the motion of a skeleton.
 
     Hips match the skeleton's, and ankles match its ankles, as far as the legs reach; knees and arms
@@ -284,13 +199,13 @@ def solve_body(
     continue forearms, feet are flat where they stand and stay above the ground elsewhere.
 
     Args:
-        figure: the person.
-        joints: (frames, 17, 3) [m], world, COCO-17, of bones about as long as the figure's.
+        body: the person.
+        joints: (frames, 17, 3) [m], world, COCO-17, of bones about as long as the body's.
         ground: height of the ground at x and y [m], world.
         courses: (frames, 2) [rad] from the x axis towards y, direction of left and right foot when
-            they tread, within what a hip can turn; without, the knees' direction.
+            they tread, within what a hip can turn.
     """
-    rest = figure.joints
+    rest = body.joints
     turns = np.empty((len(joints), len(rest), 3, 3))
     across, trunk = joints[:, 11] - joints[:, 12], joints[:, 5:7].sum(1) - joints[:, 11:13].sum(1)
     upward = rest[16:18].sum(axis=0) - rest[1:3].sum(axis=0)
@@ -300,37 +215,36 @@ def solve_body(
         _interpolate_rotations(turns[:, 0], turns[:, 9], s) for s in (1 / 3, 2 / 3)
     )
     turns[:, 13] = turns[:, 14] = turns[:, 9]
-    turns[:, 15] = _rotations(*_face_vectors(figure.head), *_face_vectors(joints))
+    turns[:, 15] = _rotations(*_face_vectors(body.head), *_face_vectors(joints))
     turns[:, 12] = _interpolate_rotations(turns[:, 9], turns[:, 15], 0.5)
     pelvis = joints[:, 11:13].mean(axis=1) - turns[:, 0] @ (rest[1:3].mean(axis=0) - rest[0])
 
     for side in (0, 1):
-        upper, fore = (_unit(joints[:, k + side] - joints[:, k - 2 + side]) for k in (7, 9))
-        hinge = _elbow_axis(figure, side, turns[:, 9], upper, fore)
+        upper, fore = (unit(joints[:, k + side] - joints[:, k - 2 + side]) for k in (7, 9))
+        hinge = _elbow_axis(body, side, turns[:, 9], upper, fore)
         for joint, along in ((16 + side, upper), (18 + side, fore)):
             bone = rest[joint + 2] - rest[joint]
             turns[:, joint] = _rotations(bone, _cross(bone, _Z), along, hinge)
         turns[:, 20 + side] = turns[:, 22 + side] = turns[:, 18 + side]
 
         hip = pelvis + turns[:, 0] @ (rest[1 + side] - rest[0])
-        thigh, shank, hinge = _solve_leg(figure, side, hip, joints, turns[:, 0] @ _Z)
+        thigh, shank, hinge = _solve_leg(body, side, hip, joints, turns[:, 0] @ _Z)
         for joint, along in ((1 + side, thigh), (4 + side, shank)):
             turns[:, joint] = _rotations(rest[joint + 3] - rest[joint], _X, along, hinge)
         ankle = hip + thigh + shank
-        clear = ankle[:, 2] - ground(ankle[:, 0], ankle[:, 1]) - (rest[7, 1] - figure.sole)
-        course = None if courses is None else courses[:, side]
+        clear = ankle[:, 2] - ground(ankle[:, 0], ankle[:, 1]) - body.ankle_height
         turns[:, 7 + side], turns[:, 10 + side] = _rotate_foot(
-            figure, turns[:, 4 + side], shank, clear, course
+            body, turns[:, 4 + side], shank, clear, courses[:, side]
         )
-    return PosedBody(figure, turns, pelvis)
+    return PosedBody(body, turns, pelvis)
 
 
-def _elbow_axis(figure: Figure, side: int, chest: Floats, upper: Floats, fore: Floats) -> Floats:
+def _elbow_axis(body: Body, side: int, chest: Floats, upper: Floats, fore: Floats) -> Floats:
     """Return the axis (frames, 3) about which an elbow bends.
 
     A straight arm takes the axis of the unposed arm, rotated along the shortest way.
     """
-    straight = chest @ _unit(figure.joints[18 + side] - figure.joints[16 + side])
+    straight = chest @ unit(body.joints[18 + side] - body.joints[16 + side])
     ahead, both = chest @ _Z, straight + upper
     # Both cancel only in an arm that points straight through the chest.
     share = (ahead * both).sum(-1) / np.maximum(0.5 * (both**2).sum(-1), 0.1)
@@ -338,48 +252,48 @@ def _elbow_axis(figure: Figure, side: int, chest: Floats, upper: Floats, fore: F
 
 
 def _solve_leg(
-    figure: Figure, side: int, hip: Floats, joints: Floats, forward: Floats
+    body: Body, side: int, hip: Floats, joints: Floats, forward: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return thigh and shank (frames, 3) [m] from hip to ankle, and the knee's axis."""
-    bones = figure.joints[[4 + side, 7 + side]] - figure.joints[[1 + side, 4 + side]]
-    upper, lower = np.linalg.norm(bones, axis=-1)
+    upper, lower = body.thigh, body.shank
     along = joints[:, 15 + side] - hip
-    far = _length(along)
+    far = np.linalg.norm(along, axis=-1, keepdims=True)
     along = along / far
-    reach = np.clip(far, abs(upper - lower) + 1e-3, (1.0 - 1e-6) * (upper + lower))
+    # Reach ends smoothly and short of a straight leg, whose knee would snap.
+    free, spare = 0.965 * body.leg, 0.03 * body.leg
+    reach = np.minimum(far, free) + spare * -np.expm1(-np.maximum(far - free, 0.0) / spare)
+    reach = np.maximum(reach, abs(upper - lower) + 1e-3)
     down = (upper**2 - lower**2 + reach**2) / (2.0 * reach)
     aside = np.sqrt(upper**2 - down**2)
     front = (joints[:, 13 + side] - hip) / upper + BIAS * forward
-    front = _unit(front - (front * along).sum(-1, keepdims=True) * along)
+    front = unit(front - (front * along).sum(-1, keepdims=True) * along)
     thigh = down * along + aside * front
     return thigh, reach * along - thigh, _cross(front, along)
 
 
 def _rotate_foot(
-    figure: Figure, turned: Floats, shank: Floats, clear: Floats, course: Floats | None
+    body: Body, turned: Floats, shank: Floats, clear: Floats, course: Floats
 ) -> tuple[Floats, Floats]:
     """Return rotations of foot and toes (frames, 3, 3).
 
     Args:
-        figure: the person.
+        body: the person.
         turned: (frames, 3, 3), rotation of the shank.
         shank: (frames, 3) [m].
         clear: (frames,) [m], height of the ankle above that of a flat foot.
         course: (frames,) [rad], direction of the foot when it treads.
     """
-    down = _unit(shank)
+    down = unit(shank)
     hanging = np.cos(POINTED) * (turned @ _Z) + np.sin(POINTED) * down
     treads = _smooth((-down[:, 2] - TREADING[0]) / (TREADING[1] - TREADING[0]))
     free, clear = 4.0 * (1.0 - treads), np.maximum(clear, 0.0)
-    ball = float(figure.joints[10, 2] - figure.joints[7, 2])
-    rise = _soft_limit(hanging[:, 2], clear / ball + free, clear / figure.heel + free)
+    ball = float(body.joints[10, 2] - body.joints[7, 2])
+    rise = _soft_limit(hanging[:, 2], clear / ball + free, clear / body.heel + free)
     # Toes stay down while the heel rises.
     under = np.maximum(clear + ball * np.minimum(rise, 0.0), 0.0)
-    toe_rise = _soft_limit(rise, under / figure.toe + free, np.inf)
+    toe_rise = _soft_limit(rise, under / body.toe + free, np.inf)
     level = (treads * (1.0 - _smooth(clear / LEVELLED)))[:, None]
-    ahead = _unit(hanging * [1.0, 1.0, 0.0])
-    if course is not None:
-        ahead = _turn_towards(ahead, course, treads)
+    ahead = _turn_towards(unit(hanging * [1.0, 1.0, 0.0]), course, treads)
     turns = []
     for slope in (rise, toe_rise):
         pointing = np.sqrt(1.0 - slope**2)[:, None] * ahead + slope[:, None] * _UP
@@ -432,8 +346,8 @@ def _rotations(bone: Floats, side: Floats, to_bone: Floats, to_side: Floats) -> 
 
 def _orthonormal_frame(first: Floats, second: Floats) -> Floats:
     """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
-    along = _unit(first)
-    third = _unit(_cross(along, second))
+    along = unit(first)
+    third = unit(_cross(along, second))
     return np.stack([along, _cross(third, along), third], axis=-1)
 
 
@@ -441,12 +355,3 @@ def _cross(a: Floats, b: Floats) -> Floats:
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     u, v, w = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
-
-
-def _length(vectors: Floats) -> Floats:
-    length: Floats = np.sqrt(np.einsum("...c,...c->...", vectors, vectors))[..., None]
-    return length
-
-
-def _unit(vectors: Floats) -> Floats:
-    return vectors / _length(vectors)

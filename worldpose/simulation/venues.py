@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Singles
+from data_contracts.arrays import Flags, Floats, Image, Singles
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.capsules import draw_shadows, draw_things
+from worldpose.simulation.mannequins import Surfaces
 from worldpose.simulation.settings import RenderingSettings
 from worldpose.simulation.surroundings import (
     BOARD_HEIGHT,
@@ -25,37 +25,30 @@ from worldpose.simulation.surroundings import (
     wear,
 )
 
-_CELL: Final = 4
-"""Grid spacing of the lens inversion [px]: between the nodes, straight lines have errors of k1 /
-focal length of a pixel, a few ten-thousandths."""
+CELL: Final = 4
+"""Grid spacing of rays [px]: between the nodes, straight lines have errors of k1 / focal length of
+a pixel, a few ten-thousandths."""
 
 
-def plane_grid(camera: Camera, width: int, height: int) -> Floats:
-    """Return undistorted coordinates (rows, columns, 2) of every fourth pixel, from (-4, -4)."""
-    u = np.arange(-_CELL, width + 2 * _CELL, _CELL, dtype=np.float64)
-    v = np.arange(-_CELL, height + 2 * _CELL, _CELL, dtype=np.float64)
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    return camera.normalize(pixels.reshape(-1, 2)).reshape(*pixels.shape)
+def grid_pixels(width: int, height: int) -> tuple[Floats, Floats]:
+    """Return column and row (rows, columns) of every fourth pixel, from (-4, -4)."""
+    u = np.arange(-CELL, width + 2 * CELL, CELL, dtype=np.float64)
+    v = np.arange(-CELL, height + 2 * CELL, CELL, dtype=np.float64)
+    columns, rows = np.meshgrid(u, v)
+    return columns, rows
 
 
 @compile_kernel
-def _interpolate_plane(
-    grid: Floats, u: float, v: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return undistorted coordinates at a pixel, and their changes to the right and down."""
-    gu, gv = u / _CELL + 1.0, v / _CELL + 1.0
+def _interpolate_ray(grid: Floats, u: float, v: float, ray: Floats) -> None:
+    """Write the direction at a pixel, and its changes to the right and down (3, 3)."""
+    gu, gv = u / CELL + 1.0, v / CELL + 1.0
     i, j = int(gu), int(gv)
     fu, fv = gu - i, gv - j
-    ax, ay, bx, by = grid[j, i, 0], grid[j, i, 1], grid[j, i + 1, 0], grid[j, i + 1, 1]
-    cx, cy = grid[j + 1, i, 0], grid[j + 1, i, 1]
-    dx, dy = grid[j + 1, i + 1, 0], grid[j + 1, i + 1, 1]
-    x = (1 - fv) * ((1 - fu) * ax + fu * bx) + fv * ((1 - fu) * cx + fu * dx)
-    y = (1 - fv) * ((1 - fu) * ay + fu * by) + fv * ((1 - fu) * cy + fu * dy)
-    xu = ((1 - fv) * (bx - ax) + fv * (dx - cx)) / _CELL
-    yu = ((1 - fv) * (by - ay) + fv * (dy - cy)) / _CELL
-    xv = ((1 - fu) * (cx - ax) + fu * (dx - bx)) / _CELL
-    yv = ((1 - fu) * (cy - ay) + fu * (dy - by)) / _CELL
-    return x, y, xu, yu, xv, yv
+    for k in range(3):
+        a, b, c, d = grid[j, i, k], grid[j, i + 1, k], grid[j + 1, i, k], grid[j + 1, i + 1, k]
+        ray[0, k] = (1 - fv) * ((1 - fu) * a + fu * b) + fv * ((1 - fu) * c + fu * d)
+        ray[1, k] = ((1 - fv) * (b - a) + fv * (d - c)) / CELL
+        ray[2, k] = ((1 - fu) * (c - a) + fu * (d - b)) / CELL
 
 
 class SceneRows(NamedTuple):
@@ -78,47 +71,35 @@ class SceneRows(NamedTuple):
 
 @compile_kernel
 def paint_scene(
-    grid: Floats,
-    o: Floats,
-    r: Floats,
-    stadium: SceneRows,
-    color: Singles,
-    ground: Singles,
-    distance: Singles,
+    grid: Floats, o: Floats, stadium: SceneRows, color: Singles, ground: Singles, distance: Singles
 ) -> None:
     """Write the colour of every pixel, and its place on the pitch; NaN beyond the boards.
 
     Args:
-        grid: grid of `plane_grid`.
-        o: (3,) the camera's center.
-        r: (3, 3) world from camera.
+        grid: (rows, columns, 3) directions of rays at `grid_pixels`, world.
+        o: (3,) origin of the rays.
         stadium: pitch, boards and look.
         color: (height, width, 3), written.
         ground: (height, width, 2), written.
-        distance: (height, width) distance from the camera [m], written; infinite in the sky.
+        distance: (height, width) distance from the origin [m], written; infinite in the sky.
     """
     paint, table, scene, half, look = stadium
-    place = np.empty(8)
+    place, ray = np.empty(8), np.empty((3, 3))
     bend = scene[2:4]
     for v in range(color.shape[0]):
         for u in range(color.shape[1]):
-            x, y, xu, yu, xv, yv = _interpolate_plane(grid, u, v)
-            dx = r[0, 0] * x + r[0, 1] * y + r[0, 2]
-            dy = r[1, 0] * x + r[1, 1] * y + r[1, 2]
-            dz = r[2, 0] * x + r[2, 1] * y + r[2, 2]
+            _interpolate_ray(grid, u, v, ray)
+            dx, dy, dz = ray[0]
             s = surface_hit(o, dx, dy, dz, bend)
             place[0], place[1] = o[0] + s * dx, o[1] + s * dy
             slope_x, slope_y = 2.0 * bend[0] * place[0], 2.0 * bend[1] * place[1]
             sink = slope_x * dx + slope_y * dy + dz
             step = np.sqrt(dx * dx + dy * dy + dz * dz)
             distance[v, u] = s * step
-            for k in range(2):
-                a, b = (xu, yu) if k == 0 else (xv, yv)
-                ex, ey = r[0, 0] * a + r[0, 1] * b, r[1, 0] * a + r[1, 1] * b
-                ez = r[2, 0] * a + r[2, 1] * b
-                ds = -s * (slope_x * ex + slope_y * ey + ez) / sink
-                place[2 + 2 * k] = s * ex + ds * dx
-                place[3 + 2 * k] = s * ey + ds * dy
+            for k in (1, 2):
+                ds = -s * (slope_x * ray[k, 0] + slope_y * ray[k, 1] + ray[k, 2]) / sink
+                place[2 * k] = s * ray[k, 0] + ds * dx
+                place[2 * k + 1] = s * ray[k, 1] + ds * dy
             place[6], place[7] = dx / sink, dy / sink
             inside = min(half[0] - abs(place[0]), half[1] - abs(place[1]))
             # A board hides the ground behind it as far as the ray is below its top; pixels that see
@@ -133,20 +114,11 @@ def paint_scene(
             on_ground = 0
             for part in range(4):
                 du, dv = 0.5 * (part % 2) - 0.25, 0.5 * (part // 2) - 0.25
-                a, b = x + du * xu + dv * xv, y + du * yu + dv * yv
-                red, green, blue, far = scenery(
-                    o,
-                    r[0, 0] * a + r[0, 1] * b + r[0, 2],
-                    r[1, 0] * a + r[1, 1] * b + r[1, 2],
-                    r[2, 0] * a + r[2, 1] * b + r[2, 2],
-                    half,
-                    bend,
-                    look,
-                )
+                x, y, z = ray[0] + du * ray[1] + dv * ray[2]
+                red, green, blue, far = scenery(o, x, y, z, half, bend, look)
                 distance[v, u] = min(distance[v, u], far * step)
-                if red < 0.0:
-                    on_ground += 1
-                else:
+                on_ground += red < 0.0
+                if red >= 0.0:
                     color[v, u, 0] += 0.25 * red
                     color[v, u, 1] += 0.25 * green
                     color[v, u, 2] += 0.25 * blue
@@ -177,6 +149,66 @@ def _paint_turf(paint: Floats, table: Floats, place: Floats, scene: Floats, colo
         color[2] += cover * (white - color[2])
 
 
+POST: Final = 0.06
+"""Radius of posts and crossbar [m] (Law 1: at most 12 cm across)."""
+_CORNERS: Final = 8
+"""Corners of a tube's cross section."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prop:
+    """An object with one surface.
+
+    Attributes:
+        faces: (triangles, 3), counter-clockwise seen from outside.
+        backs: (triangles,) which of the two images has their colours.
+        texels: (vertices, 2) column and row in the image.
+        image: (1, 2, rows, columns, 3) RGB.
+        surfaces: its position, a batch of 1.
+    """
+
+    faces: NDArray[np.int32]
+    backs: Flags
+    texels: Singles
+    image: Image
+    surfaces: Surfaces
+
+
+def goals(pitch: PitchTemplate) -> Prop:
+    """Return posts and crossbars of both goals: tubes between their ends."""
+    ends = []
+    for side in ("left", "right"):
+        near, far = f"goal_post_{side}_near", f"goal_post_{side}_far"
+        names = (f"{near}_bottom", f"{near}_top", f"{far}_top", f"{far}_bottom")
+        a, b, c, d = pitch.positions(names)
+        ends += [(a, b), (b, c), (d, c)]
+    tubes = np.array(ends)
+    way = tubes[:, 1] - tubes[:, 0]
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    aside = np.cross(way, np.where(np.abs(way[:, 2:]) > 0.9, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    above = np.cross(way, aside)
+    turn = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
+    out = np.cos(turn)[:, None] * aside[:, None] + np.sin(turn)[:, None] * above[:, None]
+    vertices = tubes[:, :, None] + POST * out[:, None]
+    normals = np.broadcast_to(out[:, None], vertices.shape)
+    k = np.arange(_CORNERS)
+    n = (k + 1) % _CORNERS
+    corners = ((k, n, n + _CORNERS), (k, n + _CORNERS, k + _CORNERS))
+    halves = [np.stack(half, axis=1) for half in corners]
+    faces = np.concatenate(halves) + 2 * _CORNERS * np.arange(len(tubes))[:, None, None]
+    return Prop(
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        backs=np.zeros(faces.shape[0] * faces.shape[1], dtype=np.bool_),
+        texels=np.zeros((normals.size // 3, 2), dtype=np.float32),
+        image=np.full((1, 2, 1, 1, 3), 240, dtype=np.uint8),
+        surfaces=Surfaces(
+            vertices.reshape(1, -1, 3).astype(np.float32),
+            normals.reshape(1, -1, 3).astype(np.float32),
+        ),
+    )
+
+
 FOG_COLOR: Final = np.array([0.74, 0.76, 0.78])
 """RGB; a little blue."""
 SKY_COLOR: Final = np.array([0.66, 0.74, 0.84])
@@ -200,6 +232,7 @@ class Venue:
     """Distance of the shadow's edge from the long axis [m]."""
     lights: tuple[Floats, ...]
     """(4,) each: direction down from the light, z = -1, and its share of all light."""
+    goals: Prop
 
     @property
     def bend(self) -> Floats:
@@ -227,13 +260,6 @@ class Venue:
         dark = np.clip(past / np.float32(0.5) + np.float32(0.5), 0.0, 1.0)
         return np.where(np.isnan(dark), np.float32(0.0), dark)
 
-    def add_fog(self, color: Singles, distance: Singles) -> None:
-        """Add fog to colours (..., 3) at distances (...) [m]; in place."""
-        if self.settings.fog_per_m > 0.0:
-            clear = np.exp(np.float32(-self.settings.fog_per_m) * distance)[..., None]
-            color *= clear
-            color += (np.float32(1.0) - clear) * FOG_COLOR.astype(np.float32)
-
 
 def build_venue(pitch: PitchTemplate, seed: int, settings: RenderingSettings) -> Venue:
     """Return the stadium of a seed."""
@@ -242,9 +268,8 @@ def build_venue(pitch: PitchTemplate, seed: int, settings: RenderingSettings) ->
     look, side = int(looks.integers(1 << 20)), float(looks.choice([-1.0, 1.0]))
     edge = float(looks.uniform(0.1, 0.8)) * 0.5 * pitch.width
     turn = float(looks.uniform(0.0, 2.0 * np.pi))
-    return Venue(
-        pitch, seed, settings, look, table, side, edge, _lights(settings.light, turn, side)
-    )
+    lights = _lights(settings.light, turn, side)
+    return Venue(pitch, seed, settings, look, table, side, edge, lights, goals(pitch))
 
 
 def _lights(kind: str, turn: float, side: float) -> tuple[Floats, ...]:
@@ -256,31 +281,13 @@ def _lights(kind: str, turn: float, side: float) -> tuple[Floats, ...]:
     return tuple(np.array([0.9 * x, 0.7 * y, -1.0, 0.13]) for x, y in corners)
 
 
-@dataclass(frozen=True, eq=False)
-class EmptyScene:
-    """A camera's image of grass and surroundings, without people.
-
-    Attributes:
-        color: (height, width, 3) RGB, 1 = white.
-        ground: (height, width, 2) place on the pitch [m]; NaN beyond the boards.
-        distance: (height, width) [m]; infinite in the sky.
-    """
-
-    color: Singles
-    ground: Singles
-    distance: Singles
-
-
-def paint_venue(
-    venue: Venue, grid: Floats, center: Floats, world_from_cam: Floats, size: tuple[int, int]
-) -> EmptyScene:
-    """Return the scene along rays, under even light.
+def paint_venue(venue: Venue, grid: Floats, origin: Floats, size: tuple[int, int]) -> Image:
+    """Return the empty stadium along rays (height, width, 3), RGB, with the stand's shadow.
 
     Args:
         venue: the stadium.
-        grid: (rows, columns, 2) grid of `plane_grid`.
-        center: (3,) origin of the rays [m], world.
-        world_from_cam: (3, 3).
+        grid: (rows, columns, 3) directions of rays at `grid_pixels`, world.
+        origin: (3,) of the rays [m], world.
         size: width and height of the image [px].
     """
     width, height = size
@@ -288,69 +295,27 @@ def paint_venue(
     color = np.empty((height, width, 3), dtype=np.float32)
     ground = np.empty((height, width, 2), dtype=np.float32)
     distance = np.empty((height, width), dtype=np.float32)
-    paint_scene(
-        grid,
-        center,
-        np.ascontiguousarray(world_from_cam),
-        SceneRows(
-            paint=paint_rows(pitch),
-            table=venue.table,
-            scene=np.array(
-                [pitch.length, pitch.width, *venue.bend, settings.stripes, settings.paint]
-            ),
-            half=venue.half,
-            look=venue.look,
-        ),
-        color,
-        ground,
-        distance,
-    )
+    scene = [pitch.length, pitch.width, *venue.bend, settings.stripes, settings.paint]
+    rows = SceneRows(paint_rows(pitch), venue.table, np.array(scene), venue.half, venue.look)
+    paint_scene(grid, origin, rows, color, ground, distance)
     if settings.light == "sun":
         color[np.isinf(distance)] = SKY_COLOR
-    return EmptyScene(color, ground, distance)
-
-
-def paint_empty(venue: Venue, camera: Camera, throwing: Sequence[Floats] = ()) -> EmptyScene:
-    """Return a camera's image of grass and surroundings, with shadows on the grass.
-
-    Args:
-        venue: the stadium.
-        camera: a single camera.
-        throwing: (things, limbs, 8) capsules that cast shadows in addition to the stand [m], world.
-    """
-    width, height = (int(n) for n in camera.image_size)
-    seen = paint_venue(
-        venue,
-        plane_grid(camera, width, height),
-        camera.center,
-        camera.cam_from_world.rotation.T,
-        (width, height),
-    )
-    shade = np.ones((height, width), dtype=np.float32)
     if venue.shade > 0.0:
-        shade -= np.float32(venue.shade) * venue.in_shadow(seen.ground[..., 1])
-    for light in venue.lights:
-        for things in throwing:
-            draw_shadows(shade, seen.ground, camera, things, light, venue.bend)
-    seen.color[...] *= shade[..., None]
-    return seen
+        dark = np.float32(venue.shade) * venue.in_shadow(ground[..., 1])
+        color *= (np.float32(1.0) - dark)[..., None]
+    if settings.fog_per_m > 0.0:
+        clear = np.exp(np.float32(-settings.fog_per_m) * distance)[..., None]
+        color *= clear
+        color += (np.float32(1.0) - clear) * FOG_COLOR.astype(np.float32)
+    color *= np.float32(255.0 * settings.brightness)
+    return np.asarray(np.clip(np.rint(color), 0.0, 255.0), dtype=np.uint8)
 
 
-def draw_capsules(
-    venue: Venue, camera: Camera, color: Singles, things: list[Floats], colors: list[Floats]
-) -> None:
-    """Draw things made of capsules over an image.
-
-    Args:
-        venue: the stadium.
-        camera: a single camera.
-        color: (height, width, 3) RGB, 1 = white; changed in place.
-        things: (limbs, 8) each [m], world.
-        colors: (limbs, 3) colors of each.
-    """
-    lit = []
-    for thing in things:
-        y = thing[:, 1][np.isfinite(thing[:, 1])]
-        in_shadow = len(y) > 0 and venue.side * y.mean() > venue.edge
-        lit.append(1.0 - venue.shade * float(in_shadow))
-    draw_things(color, camera, things, colors, lit)
+def paint_empty(venue: Venue, camera: Camera) -> Image:
+    """Return a single camera's image of the empty stadium (height, width, 3)."""
+    width, height = (int(n) for n in camera.image_size)
+    pixels = np.stack(grid_pixels(width, height), axis=-1)
+    plane = camera.normalize(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    rays = np.concatenate([plane, np.ones((*plane.shape[:2], 1))], axis=-1)
+    grid = np.ascontiguousarray(rays @ camera.cam_from_world.rotation)
+    return paint_venue(venue, grid, camera.center, (width, height))

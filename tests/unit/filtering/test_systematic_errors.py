@@ -20,7 +20,7 @@ from worldpose.filtering.systematic_errors import (
     watch_motion,
 )
 from worldpose.geometry.rigid import Rigid
-from worldpose.simulation.detector_errors import facing_axes
+from worldpose.simulation.visibility import facing_axes
 
 ROWS = 3000
 

@@ -99,18 +99,11 @@ def angles(cameras, given):
     return np.arccos(np.clip([(np.trace(turn) - 1.0) / 2.0 for turn in turned], -1.0, 1.0))
 
 
-def test_rotations_err_as_stated_about_an_unmoved_center(cameras):
-    given = misjudged(cameras, rotation_rad=0.001)
-    # 18 angles, chi with 3 degrees of freedom: mean 1.6 of the spread per axis, give or take 10 %.
-    assert angles(cameras, given).mean() == pytest.approx(0.0016, rel=0.35)
-    for name, camera in given.items():
-        np.testing.assert_allclose(camera.center, cameras[name].center, atol=1e-9)
-        np.testing.assert_array_equal(camera.focal, cameras[name].focal)
-
-
 def test_bad_cameras_are_as_many_and_as_bad_as_stated(cameras):
     usual = angles(cameras, misjudged(cameras, rotation_rad=0.0001))
     some = angles(cameras, misjudged(cameras, rotation_rad=0.0001, bad_cameras=3, bad_factor=100.0))
+    # 18 angles, chi with 3 degrees of freedom: mean 1.6 of the spread per axis, give or take 10 %.
+    assert usual.mean() == pytest.approx(0.00016, rel=0.35)
     ratio = some / usual
     assert np.sort(ratio)[-3:] == pytest.approx(100.0, rel=0.01)
     assert np.sort(ratio)[:-3] == pytest.approx(1.0, rel=0.01)

@@ -7,7 +7,6 @@ from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import (
     DIFFICULTY,
     MIRRORED,
-    Bodies,
     SystematicErrors,
     detect,
     project_bodies,
@@ -41,12 +40,9 @@ def standing(x, y):
 EVEN = SystematicErrors(np.zeros((17, 3)), np.ones((17, 2, 2)))
 
 
-def bodies(*people, frames=1):
-    return Bodies(np.tile(np.stack(people), (frames, 1, 1, 1)), np.full(len(people), 1.8))
-
-
-def rngs(count, seed=0):
-    return [np.random.default_rng([seed, i]) for i in range(count)]
+def projected(camera, *people, frames=1):
+    joints = np.tile(np.stack(people), (frames, 1, 1, 1))
+    return project_bodies(camera, joints, np.full(len(people), 1.8))
 
 
 def one_setting(**settings):
@@ -54,13 +50,13 @@ def one_setting(**settings):
 
 
 def detected(camera, noise, *people, frames=FRAMES):
-    projections = project_bodies(camera, bodies(*people, frames=frames))
-    found = detect(projections, noise, EVEN, FPS, rngs(len(people)))
+    projections = projected(camera, *people, frames=frames)
+    found = detect(projections, noise, EVEN, FPS, np.random.default_rng(0))
     return projections, found.keypoints, found.confidence
 
 
 def test_pixels_and_size_of_a_person_straight_ahead(camera):
-    projections = project_bodies(camera, bodies(standing(0.0, 20.0)))
+    projections = projected(camera, standing(0.0, 20.0))
     # Left ankle: 0.1 m to the right, 0.9 m down, at 100 px per metre.
     assert projections.keypoints[0, 0, 15].tolist() == pytest.approx([969.5, 629.5], abs=1e-9)
     assert projections.size[0, 0] == pytest.approx(180.0, abs=1e-9)
@@ -68,10 +64,10 @@ def test_pixels_and_size_of_a_person_straight_ahead(camera):
 
 
 def test_a_person_right_behind_another_is_hidden(camera):
-    projections = project_bodies(camera, bodies(standing(0.0, 40.0), standing(0.0, 20.0)))
-    # Half as large about the camera's height, all of it fits into the nearer one's box.
-    assert projections.hidden[0, 0].all()
-    assert not projections.hidden[0, 1].any()
+    projections = projected(camera, standing(0.0, 40.0), standing(0.0, 20.0))
+    # Half as large about the camera's height, most of it fits into the nearer one's outline.
+    assert (projections.hider[0, 0] == 1).mean() > 0.7
+    assert (projections.hider[0, 1] == -1).all()
 
 
 def test_without_noise_detections_are_the_projections(camera):

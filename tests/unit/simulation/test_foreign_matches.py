@@ -19,12 +19,9 @@ from worldpose.simulation.foreign.detectors import (
     detect_people,
     draw_detector,
 )
-from worldpose.simulation.foreign.matches import (
-    FOREIGN_SCENARIOS,
-    simulate_foreign_match,
-    simulate_foreign_scene,
-)
+from worldpose.simulation.foreign.matches import simulate_foreign_match, simulate_foreign_scene
 from worldpose.simulation.foreign.rigs import view_people
+from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 
 SOURCES = Path(foreign_rigs.__file__).parent
 LAB, MIXED = FOREIGN_SCENARIOS["foreign-lab"], FOREIGN_SCENARIOS["foreign-mixed"]
@@ -48,8 +45,11 @@ def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
         if isinstance(node, ast.ImportFrom)
     }
     first = {name for name in imported if name.startswith("worldpose.simulation.")}
-    assert first
-    assert all(name.startswith("worldpose.simulation.foreign") for name in first)
+    shared = {
+        f"worldpose.simulation.{name}" for name in ("recorded_files", "reference", "visibility")
+    }
+    assert first > shared
+    assert all(name.startswith("worldpose.simulation.foreign") for name in first - shared)
     assert not any(
         name.startswith(("worldpose.body", "worldpose.body_fitting")) for name in imported
     )
@@ -140,27 +140,6 @@ def test_every_scenario_makes_a_match_that_the_factory_takes(tmp_path, name):
         file = tmp_path / "match" / "reference" / "cameras" / f"{camera.id}.npz"
         pixels = read_camera(file, size).project(truth.joints.reshape(-1, 3))
         assert np.isfinite(pixels).any()
-
-
-def test_identities_name_whose_every_detection_is(tmp_path):
-    simulate_foreign_match(LAB, 2, tmp_path / "match", duration=0.4)
-    match = read_match(tmp_path / "match")
-    truth = read_joints(tmp_path / "match" / "reference" / "joints.npz")
-    for camera in match.spec.cameras:
-        seen = np.load(tmp_path / "match" / "detections" / f"{camera.id}.npz")
-        file = tmp_path / "match" / "reference" / "identities" / f"{camera.id}.npz"
-        identities = np.load(file)
-        assert (identities["frame"] == seen["frame"]).all()
-        assert seen["frame"][0] == camera.offset_frames
-        place = tmp_path / "match" / "reference" / "cameras" / f"{camera.id}.npz"
-        projected = read_camera(place, (camera.width, camera.height)).project(
-            truth.joints.reshape(-1, 3)
-        )
-        projected = projected.reshape(*truth.joints.shape[:3], 2)
-        frame, index = np.nonzero(identities["person"] >= 0)
-        true = projected[frame, identities["person"][frame, index]]
-        off = np.linalg.norm(seen["keypoints"][frame, index] - true, axis=-1)
-        assert np.nanmedian(off) < 0.1 * np.ptp(true[..., 1], axis=1).max()
 
 
 def test_clicked_cameras_have_clicks_near_the_named_points():

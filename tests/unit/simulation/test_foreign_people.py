@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_scene
+from worldpose.simulation.foreign.matches import simulate_foreign_scene
 from worldpose.simulation.foreign.recordings import JOINTS, play_motion, read_recordings
+from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 from worldpose.simulation.foreign.skeletons import draw_skeleton, place_joints
 from worldpose.simulation.foreign.trajectories import LEAD
 
@@ -23,8 +24,8 @@ def write_motion(folder, frames=90):
     """Write a recording of a standing person who swings the left arm."""
     names = [options[0] for options in JOINTS.values()]
     places = {
-        **{"neck": (0.0, 0.0, 1.45), "chest": (0.0, 0.0, 1.2), "head": (0.0, 0.0, 1.55)},
-        **{"l": 1.0, "r": -1.0},
+        "neck": (0.0, 0.0, 1.45),
+        "head": (0.0, 0.0, 1.55),
     }
     rows = {}
     for name, options in JOINTS.items():

@@ -3,7 +3,6 @@ import json
 import numpy as np
 import pytest
 
-from worldpose.errors import InputError
 from worldpose.formats.joints_file import read_joints
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import read_still, read_unit
@@ -117,10 +116,3 @@ def test_an_empty_pitch_is_a_match(tmp_path):
         TINY, 0, tmp_path / "m", MatchOptions(duration=0.4, cameras=2, players=0, stills=False)
     )
     assert read_joints(tmp_path / "m" / "reference" / "joints.npz").joints.shape == (10, 0, 17, 3)
-
-
-def test_a_folder_with_files_is_left_alone(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="left as it was"):
-        simulate_match(TINY, 0, tmp_path, MatchOptions(duration=0.4, cameras=1, players=1))
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

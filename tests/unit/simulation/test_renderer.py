@@ -3,19 +3,17 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import SKELETONS, fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.cast import dress_people, goals
+from worldpose.simulation.cast import dress_people
 from worldpose.simulation.image_formation import Moment
-from worldpose.simulation.matches import open_view, render_frame
-from worldpose.simulation.renderer import (
-    RenderingSettings,
-    film_broadcast,
-    render_pitch,
-)
+from worldpose.simulation.renderer import film_broadcast, open_view, render_frame, render_pitch
 from worldpose.simulation.scene import look_at
+from worldpose.simulation.settings import RenderingSettings
 from worldpose.simulation.venues import build_venue
 
 PITCH = PitchTemplate.standard()
@@ -45,11 +43,10 @@ def cv_pixels(view, points):
 
 
 def standing(x, y):
-    """Return the joints (17, 3) [m] of an upright person at a pitch position."""
-    up = [1.6, 1.63, 1.63, 1.6, 1.6, 1.4, 1.4, 1.1, 1.1, 0.85, 0.85, 0.9, 0.9, 0.5, 0.5, 0.08, 0.08]
-    side = [0.0, 0.03, -0.03, 0.07, -0.07, 0.18, -0.18, 0.2, -0.2, 0.2, -0.2] + [0.1, -0.1] * 3
-    joints = np.stack([np.full(17, x) + side, np.full(17, y), np.array(up)], axis=-1)
-    return joints + [0.0, 0.0, float(PITCH.height(x, y))]
+    """Return an upright body (1,) in T-pose at a place of the pitch, its pelvis at 1.2 m."""
+    place = np.array([[x, y, 1.2 + float(PITCH.height(x, y))]])
+    upright = np.array([[np.pi / 2.0, 0.0, 0.0]])
+    return BodyParameters(np.zeros((1, 10)), upright, np.zeros((1, 69)), place)
 
 
 def paint_middle(pixel, normal, fresh, bare):
@@ -93,14 +90,15 @@ def test_paint_lies_where_opencv_projects_the_template(surveyed):
 
 
 def test_people_are_drawn_where_they_project_and_throw_shadows():
-    view, joints = camera(), standing(-36.0, -5.0)[None]
+    view, people = camera(), standing(-36.0, -5.0)
+    joints = fold_keypoints(load_open_body(), SKELETONS["coco17"])(people)[0]
     empty = render_pitch(view, PITCH, None, 0, PLAIN).astype(int)
-    changed = np.abs(render_pitch(view, PITCH, joints, 0, PLAIN) - empty).max(axis=-1) > 5
+    changed = np.abs(render_pitch(view, PITCH, people, 0, PLAIN) - empty).max(axis=-1) > 5
     rows, columns = np.nonzero(changed)
-    body = cv_pixels(view, joints[0])
+    body = cv_pixels(view, joints)
     assert changed[tuple(np.rint(body[[5, 6, 11, 12]].mean(0)).astype(int)[::-1])]
     assert rows.min() == pytest.approx(body[:, 1].min(), abs=4)  # hair, 0.14 m above the eyes
-    # Shadows of four lights reach beyond the arms on both sides.
+    # Shadows of four lights reach beyond the hands on both sides.
     assert columns.min() < body[:, 0].min() - 3
     assert columns.max() > body[:, 0].max() + 3
 
@@ -127,10 +125,8 @@ def test_people_of_a_clip_are_those_of_a_static_camera_with_the_same_lens():
     cameras = turning((2000.0, 2000.0))
     venue = build_venue(PITCH, 3, NOISELESS)
     cast = dress_people(np.zeros((1, 10)), ["first"], 3)
-    upright = np.array([[np.pi / 2.0, 0.0, 0.0]])
-    stands = BodyParameters(np.zeros((1, 10)), upright, np.zeros((1, 69)), np.array([[0, 2, 1.4]]))
-    posed = cast.pose(stands)
-    moments = [Moment(cast, posed, posed, goals(PITCH))] * 2
+    posed = cast.pose(standing(0.0, 2.0))
+    moments = [Moment(cast, posed, posed)] * 2
     for index, frame in enumerate(film_broadcast(cameras, venue, moments)):
         alone = render_frame(open_view(cameras[index], PITCH, 3, NOISELESS), cast, posed)
         assert (frame.person_ids == 0).sum() > 300

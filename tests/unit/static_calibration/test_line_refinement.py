@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
@@ -47,10 +48,11 @@ def camera(aim=(-33.0, -2.0, 0.0), focal=1000.0):
 
 
 def standing(x, y):
-    up = [1.6, 1.63, 1.63, 1.6, 1.6, 1.4, 1.4, 1.1, 1.1, 0.85, 0.85, 0.9, 0.9, 0.5, 0.5, 0.08, 0.08]
-    side = [0.0, 0.03, -0.03, 0.07, -0.07, 0.18, -0.18, 0.2, -0.2, 0.2, -0.2] + [0.1, -0.1] * 3
-    joints = np.stack([np.full(17, x) + side, np.full(17, y), np.array(up)], axis=-1)
-    return joints + [0.0, 0.0, float(PITCH.height(x, y))]
+    """Return upright people at places (n,) of the pitch."""
+    place = np.stack([x, y, 1.2 + PITCH.height(x, y)], axis=-1)
+    nothing = np.zeros((len(place), 1))
+    upright = np.array([[np.pi / 2.0, 0.0, 0.0]])
+    return BodyParameters(nothing * np.zeros(10), nothing + upright, nothing * np.zeros(69), place)
 
 
 @cache
@@ -58,7 +60,7 @@ def picture(people=0, light="sun", paint=1.0, focal=1000.0):
     """A still; `people` stand on the penalty area's line, from the near corner on."""
     crowd = None
     if people:
-        crowd = np.stack([standing(-36.0, -19.0 + 1.1 * place) for place in range(people)])
+        crowd = standing(np.full(people, -36.0), -19.0 + 1.1 * np.arange(people))
     return render_pitch(
         camera(focal=focal), PITCH, crowd, 1, RenderingSettings(light=light, paint=paint)
     )

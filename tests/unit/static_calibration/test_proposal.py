@@ -81,7 +81,7 @@ def test_a_tilted_camera_is_found_where_a_level_one_fits_half_of_the_paint():
     settings = SCENARIOS["tiny"].model_copy(update={"duration": 0.2, "broadcast": None})
     scene = simulate_scene(settings, 1051)
     true = scene.cameras["cam01"]
-    still = render_pitch(true, PitchTemplate.from_spec(settings.pitch), scene.truth.joints[0], 1051)
+    still = render_pitch(true, PitchTemplate.from_spec(settings.pitch), scene.poses[:, 0], 1051)
     found = propose_camera(still, PitchTemplate.from_spec(scene.surveyed), side="left")
     assert found.is_clear
     assert np.linalg.norm(found.camera.center - true.center) < 0.2  # seen: 0.03

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
-from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
-from worldpose.simulation.foreign.rigs import View, facing_axes
+from worldpose.simulation.foreign.rigs import View
+from worldpose.simulation.reference import Report, list_detections
+from worldpose.simulation.visibility import facing_axes
 
 
 class DetectorProfile(Record):
@@ -180,21 +181,6 @@ class Detector:
     height_bias: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class Report:
-    """A camera's detections and the person of each.
-
-    Attributes:
-        observations: input of the factory.
-        person: (frames, detections) int16, -1 for false positives and padding.
-        displaced: (frames, detections, 17), joints with gross errors.
-    """
-
-    observations: KeypointDetections
-    person: NDArray[np.int16]
-    displaced: Flags
-
-
 def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detector:
     """Return a detector of this profile; left and right are mirror images."""
     definition = profile.definition * rng.standard_normal((17, 3))
@@ -292,7 +278,15 @@ def detect_people(
     there &= found[..., None]
     keypoints = np.where(there[..., None], keypoints, np.nan)
     confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
-    return _list_detections(keypoints, confidence, whose, displaced & there, rng)
+
+    def box(order: NDArray[np.int64], places: Floats, found: Flags) -> Floats:
+        low = np.where(np.isfinite(places), places, np.inf).min(axis=2, initial=np.inf)
+        high = np.where(np.isfinite(places), places, -np.inf).max(axis=2, initial=-np.inf)
+        tall = np.where(found[..., None], high - low, 0.0)
+        room = rng.uniform(0.02, 0.12, (*found.shape, 2)) * tall + 1.0
+        return np.concatenate([low - room, high + room], axis=-1)
+
+    return list_detections(keypoints, confidence, displaced & there, whose, box, rng)
 
 
 def _draw_errors(
@@ -447,40 +441,6 @@ def _draw_false_positives(
     outside = ((places < 0.0) | (places > image_size - 1.0)).any(axis=-1)
     places[outside] = np.nan
     return places, rng.uniform(0.15, 0.8, places.shape[:3])
-
-
-def _list_detections(
-    keypoints: Floats,
-    confidence: Floats,
-    whose: NDArray[np.int64],
-    displaced: Flags,
-    rng: np.random.Generator,
-) -> Report:
-    """Return detections in random order, with boxes and scores."""
-    found: Flags = np.asarray(np.isfinite(confidence).any(axis=-1))
-    order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
-    order = order[:, : int(found.sum(axis=1).max(initial=0))]
-    rows = np.arange(len(found))[:, None]
-    keypoints, confidence = keypoints[rows, order], confidence[rows, order]
-    found = found[rows, order]
-    low = np.where(np.isfinite(keypoints), keypoints, np.inf).min(axis=2, initial=np.inf)
-    high = np.where(np.isfinite(keypoints), keypoints, -np.inf).max(axis=2, initial=-np.inf)
-    room = (
-        rng.uniform(0.02, 0.12, (*found.shape, 2)) * np.where(found[..., None], high - low, 0.0)
-        + 1.0
-    )
-    boxes = np.where(found[..., None], np.concatenate([low - room, high + room], axis=-1), np.nan)
-    joints = np.maximum(np.isfinite(confidence).sum(axis=-1), 1)
-    score = np.where(found, np.nansum(confidence, axis=-1) / joints, np.nan)
-    observations = KeypointDetections(
-        frame=np.arange(len(found), dtype=np.int64),
-        keypoints=keypoints.astype(np.float32),
-        confidence=confidence.astype(np.float32),
-        boxes=boxes.astype(np.float32),
-        score=np.clip(score, 0.01, 1.0).astype(np.float32),
-    )
-    person = np.where(found, whose[order], -1).astype(np.int16)
-    return Report(observations, person, displaced[rows, order] & found[..., None])
 
 
 def _draw_bursts(

@@ -1,41 +1,33 @@
 """Recordings to replay: motion capture and tracking data, from a folder of npz files.
 
-A motion capture file has `joints` (frames, joints, 3) [m], z up, `joint_names` and `fps`; tracking
-data have `xy` (frames, players, 2) [m], `time` or `fps`, and optionally `segment`. Other files are
-ignored.
+`worldpose.simulation.recorded_files` describes the files; others are ignored. Motion capture is in
+metres with z up.
 """
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Floats
-from worldpose.errors import InputError
-from worldpose.parsing import read_npz_members
 from worldpose.simulation.foreign.skeletons import Posture, Skeleton
 from worldpose.simulation.foreign.trajectories import LEAD, Trajectory
+from worldpose.simulation.recorded_files import (
+    LIMBS,
+    Tracking,
+    read_archive,
+    read_capture,
+    read_tracking,
+    refuse,
+)
 
-JOINTS: Final = {
-    **{"neck": ("neck",), "chest": ("chest",), "head": ("head",)},
-    **{f"{side}_shoulder": (f"{side[0]}Shldr", f"{side.title()}Arm") for side in ("left", "right")},
-    **{
-        f"{side}_elbow": (f"{side[0]}ForeArm", f"{side.title()}ForeArm")
-        for side in ("left", "right")
-    },
-    **{f"{side}_wrist": (f"{side[0]}Hand", f"{side.title()}Hand") for side in ("left", "right")},
-    **{f"{side}_hip": (f"{side[0]}Thigh", f"{side.title()}UpLeg") for side in ("left", "right")},
-    **{f"{side}_knee": (f"{side[0]}Shin", f"{side.title()}Leg") for side in ("left", "right")},
-    **{f"{side}_ankle": (f"{side[0]}Foot", f"{side.title()}Foot") for side in ("left", "right")},
-}
-"""Names of a skeleton's joints in conversions of the CMU database, by the names used here."""
+JOINTS: Final = {"neck": ("neck",), "head": ("head",), **LIMBS}
+"""Joints of a motion and their names."""
 PLANTED: Final = (0.55, 0.06)
 """An ankle slower than this [m/s] and at most this far above its lowest place [m] is planted."""
 TEMPO: Final = (0.8, 1.15)
@@ -65,23 +57,6 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracking:
-    """A chunk of tracking data without gaps.
-
-    Attributes:
-        name: name of the file.
-        clock: (rows,) [s], from 0.
-        xy: (rows, players, 2) [m].
-        players: their numbers in the file.
-    """
-
-    name: str
-    clock: Floats
-    xy: Floats
-    players: NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
 class Recordings:
     """Contents of a folder of recordings."""
 
@@ -95,104 +70,38 @@ def read_recordings(folder: Path) -> Recordings:
     Raises:
         InputError: there is no such folder, a file cannot be read, or none has recordings.
     """
+    expected = "a folder with npz files of motion capture or tracking data"
     if not folder.is_dir():
-        raise InputError(
-            str(folder),
-            expected="a folder with npz files of motion capture or tracking data",
-            found="no folder",
-            todo="Pass an existing folder, or omit --recordings.",
+        raise refuse(
+            folder, expected, "no folder", "Pass an existing folder, or omit --recordings."
         )
     motions: list[Motion] = []
     tracks: list[Tracking] = []
     for path in sorted(folder.rglob("*.npz")):
-        content = _read(path)
+        content = read_archive(path)
         if {"joints", "joint_names", "fps"} <= content.keys():
-            motions.append(_motion(path, content))
+            capture = read_capture(path, content)
+            points = capture.select(path, JOINTS)
+            if len(points) < 10:
+                raise refuse(path, "10 frames or more", f"{len(points)} frames")
+            speed = np.linalg.norm(np.diff(capture.positions, axis=0), axis=-1).max(axis=1)
+            early = np.flatnonzero(speed[: len(speed) // 4] > _JUMP / capture.fps)
+            points = points[early[-1] + 2 :] if len(early) else points
+            joints = dict(zip(JOINTS, np.moveaxis(points, 1, 0), strict=True))
+            motions.append(Motion(path.stem, capture.fps, joints))
         elif "xy" in content and content["xy"].ndim == 3:
-            tracks += _read_tracking(path, content)
+            tracks += [each for each in read_tracking(path, content) if _has_players(each)]
     if not motions and not tracks:
-        raise InputError(
-            str(folder),
-            expected="npz files with joints, joint_names and fps, or with xy and time or fps",
-            found="none",
-            todo="See docs/explanation/simulation.md for the layouts.",
-        )
+        raise refuse(folder, expected, "none")
     return Recordings(tuple(motions), tuple(tracks))
 
 
-def _read(path: Path) -> dict[str, NDArray[np.generic]]:
-    names = ("joints", "joint_names", "fps", "xy", "time", "segment")
-    try:
-        return read_npz_members(path, names)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(
-            str(path),
-            expected="an npz file without pickled objects",
-            found=str(error),
-            todo="Save the arrays with numpy.savez, or take the file out of the folder.",
-        ) from error
-
-
-def _motion(path: Path, content: dict[str, NDArray[np.generic]]) -> Motion:
-    names = [str(name) for name in content["joint_names"]]
-    joints = np.asarray(content["joints"], dtype=np.float64)
-    fps = float(np.asarray(content["fps"], dtype=np.float64))
-    found = {
-        name: next((names.index(one) for one in options if one in names), -1)
-        for name, options in JOINTS.items()
-    }
-    lacking = [name for name, index in found.items() if index < 0]
-    if lacking or joints.shape[1:] != (len(names), 3) or len(joints) < 10 or not fps > 0.0:
-        raise InputError(
-            str(path),
-            expected="joints (frames from 10, joints, 3), names of the CMU database, fps above 0",
-            found=f"joints {joints.shape}, fps {fps:g}, missing: {', '.join(lacking) or 'none'}",
-            todo="Rename the joints, or take the file out of the folder.",
-        )
-    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1) * fps
-    early = np.flatnonzero(speed[: len(speed) // 4] > _JUMP)
-    joints = joints[early[-1] + 2 :] if len(early) else joints
-    return Motion(path.stem, fps, {name: joints[:, index] for name, index in found.items()})
-
-
-def _read_tracking(path: Path, content: dict[str, NDArray[np.generic]]) -> list[Tracking]:
-    xy = np.asarray(content["xy"], dtype=np.float64)
-    if "time" in content:
-        clock = np.asarray(content["time"], dtype=np.float64)
-    elif "fps" in content:
-        clock = np.arange(len(xy)) / float(np.asarray(content["fps"], dtype=np.float64))
-    else:
-        clock = np.empty(0)
-    segment = np.asarray(content.get("segment", np.zeros(len(xy))), dtype=np.float64)
-    if xy.shape[-1] != 2 or clock.shape != (len(xy),) or segment.shape != (len(xy),):
-        raise InputError(
-            str(path),
-            expected="xy (frames, players, 2), and time (frames,) or fps",
-            found=f"xy {xy.shape}, time {clock.shape}, segment {segment.shape}",
-            todo="Correct the file, or take it out of the folder.",
-        )
-    edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(clock) <= 0.0)) + 1
-    found = []
-    for rows in np.split(np.arange(len(xy)), edges):
-        there = np.isfinite(xy[rows]).all(axis=(0, 2))
-        if len(rows) > 3 and there.any():
-            found.append(
-                Tracking(
-                    path.stem,
-                    clock[rows] - clock[rows[0]],
-                    xy[rows][:, there],
-                    np.flatnonzero(there),
-                )
-            )
-    return found
+def _has_players(track: Tracking) -> bool:
+    return len(track.clock) > 3 and bool(np.isfinite(track.xy).all(axis=(0, 2)).any())
 
 
 def play_motion(
-    motion: Motion,
-    skeleton: Skeleton,
-    times: Floats,
-    place: Floats,
-    rng: np.random.Generator,
+    motion: Motion, skeleton: Skeleton, times: Floats, place: Floats, rng: np.random.Generator
 ) -> tuple[Trajectory, Posture]:
     """Return the trajectory and posture of a person who replays a motion.
 

@@ -9,8 +9,8 @@ survey of 1988. No body model is involved.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any, Final, Literal
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
@@ -97,10 +97,6 @@ class Skeleton:
         """Length of the shorter leg [m]."""
         return min(t + s for t, s in zip(self.thigh, self.shank, strict=True))
 
-    def record(self) -> dict[str, Any]:
-        """Return the measures by name, for the reference."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, eq=False)
 class Posture:
@@ -163,12 +159,7 @@ def draw_skeleton(kind: Kind, rng: np.random.Generator) -> Skeleton:
 
 
 def place_joints(
-    skeleton: Skeleton,
-    posture: Posture,
-    root: Floats,
-    heading: Floats,
-    fps: float,
-    ground: Ground,
+    skeleton: Skeleton, posture: Posture, root: Floats, heading: Floats, fps: float, ground: Ground
 ) -> Floats:
     """Return anatomical joints (frames, 17, 3) [m], world, in COCO-17 order.
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Floats
+from worldpose.simulation.recorded_files import FACING_SPEED, turn_along
 
 Role = Literal["roam", "duel", "cross", "stand", "sprint"]
 
@@ -22,8 +23,6 @@ LEAD: Final = 2.0
 """Time before the first frame and after the last in which people already move [s]."""
 TRACK_SMOOTHING: Final = 0.3
 """Standard deviation in time of the smoothing of tracking data [s]."""
-FASTEST: Final = 9.0
-"""[m/s]"""
 _RELAXATION: Final = 0.45
 """Time constant of a person's velocity [s]."""
 _PUSH: Final = (12.0, 0.25)
@@ -57,44 +56,6 @@ class Trajectory:
     root: Floats
     heading: Floats
     source: str
-
-
-def follow_tracks(
-    times: Floats, clock: Floats, xy: Floats, scale: Floats, source: str
-) -> Trajectory:
-    """Return the trajectory of a tracked player.
-
-    Args:
-        times: (samples,) desired [s].
-        clock: (rows,) clock of the tracking data [s].
-        xy: (rows, 2) [m].
-        scale: (2,) scale of this pitch to the pitch of the data [1].
-        source: source of the data, for the reference.
-    """
-    step = times[1] - times[0]
-    place = np.stack(
-        [np.interp(times, clock, column) * s for column, s in zip(xy.T, scale, strict=True)], -1
-    )
-    # Beyond the data people coast to a stop.
-    for part, edge in ((times < clock[0], 0), (times > clock[-1], -1)):
-        if part.any():
-            near = np.abs(clock - clock[edge]) <= 0.6
-            speed = np.array([np.polyfit(clock[near], c[near], 1)[0] for c in xy.T]) * scale
-            beyond = times[part] - clock[edge]
-            place[part] += (
-                np.sign(beyond)[:, None] * 0.5 * speed * -np.expm1(-np.abs(beyond)[:, None] / 0.5)
-            )
-    place = gaussian_filter1d(place, TRACK_SMOOTHING / step, axis=0, mode="nearest")
-    velocity = np.gradient(place, step, axis=0)
-    speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
-    velocity *= np.minimum(1.0, FASTEST / np.maximum(speed, 1e-9))
-    middle = len(times) // 2
-    place = (
-        place[middle]
-        + np.cumsum(velocity, axis=0) * step
-        - np.cumsum(velocity, axis=0)[middle] * step
-    )
-    return Trajectory(times, place, _headings(velocity, step, None), source)
 
 
 def wander(
@@ -212,18 +173,13 @@ def _limit_length(vectors: Floats, most: float) -> Floats:
 
 
 def _headings(
-    velocity: Floats, step: float, towards: Floats | None, rng: np.random.Generator | None = None
+    velocity: Floats, step: float, towards: Floats | None, rng: np.random.Generator
 ) -> Floats:
     """Return the heading (samples,) [rad]: direction of motion, or of `towards` while slow."""
     speed = np.linalg.norm(velocity, axis=-1)
-    begin = 0.0 if rng is None else float(rng.uniform(-np.pi, np.pi))
-    aim = velocity + 1e-9
-    if towards is not None:
-        share = np.clip((2.5 - speed) / 1.5, 0.0, 1.0)[:, None]
-        aim = (1.0 - share) * velocity + share * 2.0 * towards
-    going = speed > 0.45 if towards is None else np.ones(len(speed), bool)
-    heading = np.full(len(speed), begin)
-    if going.any():
-        course = np.unwrap(np.arctan2(aim[going, 1], aim[going, 0]))
-        heading = np.interp(np.arange(len(speed)), np.flatnonzero(going), course)
-    return np.asarray(gaussian_filter1d(heading, 0.22 / step, mode="nearest"))
+    begin = float(rng.uniform(-np.pi, np.pi))
+    if towards is None:
+        return turn_along(velocity + 1e-9, speed > FACING_SPEED, begin, step)
+    share = np.clip((2.5 - speed) / 1.5, 0.0, 1.0)[:, None]
+    aim = (1.0 - share) * velocity + share * 2.0 * towards
+    return turn_along(aim, np.ones(len(speed), bool), begin, step)
