@@ -76,10 +76,11 @@ def test_offsets_are_found_without_a_hint_and_with_wrong_cameras(scene, pitch):
     assert np.abs(peaks - found.late).max() < 4.0
 
 
-def test_where_nothing_moves_no_offset_is_told(scene, pitch):
+@pytest.mark.parametrize("seed", [1, 8])  # chance makes one shift in 200 stand out most
+def test_where_nothing_moves_no_offset_is_told(scene, pitch, seed):
     noise = 2.0
     still = with_rows(scene.static_views().detections, np.full((FRAMES, 5), 60))
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed)
     moved = still.keypoints + rng.normal(0.0, noise, still.keypoints.shape)
     found = synchronize(turned(scene, 0.0), replace(still, keypoints=moved), FPS, pitch=pitch)
     assert np.isnan(found.late).all()
