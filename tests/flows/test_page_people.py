@@ -87,7 +87,7 @@ def test_other_cameras_say_where_they_expect_a_keypoint(reader, tiny_run):
             target = cameras[each["camera"]]
             along = np.linalg.norm(ray.origins[0] - target.center)
             shown = target.project(
-                ray.origins[0] + along * np.linspace(0.01, 4, 4000)[:, None] * ray.directions[0]
+                ray.origins[0] + along * np.linspace(0.01, 4, 40_000)[:, None] * ray.directions[0]
             )
             assert np.nanmin(np.linalg.norm(shown - curve[len(curve) // 2], axis=1)) < 3.0
         assert least <= np.median(distances) <= most

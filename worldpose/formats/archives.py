@@ -86,7 +86,9 @@ def read_archive(
         }
 
 
-def wrong(where: str, expected: str, found: str, todo: str = "Write the file again.") -> InputError:
+def wrong(
+    where: str, expected: str, found: str, todo: str = "Write or export it again."
+) -> InputError:
     """Return the error about one place of a file."""
     return InputError(where, expected=expected, found=found, todo=todo)
 
