@@ -457,8 +457,8 @@ class _Table:
         ] * self.count
         clearness = {pair: _contrast(curves[pair][0], drawn[pair]) for pair in curves}
         best = max(clearness, key=lambda pair: clearness[pair])
-        # Least peak of a camera's matches above the median shift, in standard errors [1]. By chance
-        # one of some 200 shifts of 153 pairs of cameras is higher than 5.4 once in a thousand clips.
+        # Least peak of a camera's matches above the median shift, in standard errors [1]. By
+        # chance one of 200 shifts of 153 pairs of cameras passes 5.4 in one of a thousand clips.
         min_contrast = 6.0
         order = [best[0]] if clearness[best] >= min_contrast else []
         while order and len(order) < self.count:
