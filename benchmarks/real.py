@@ -457,7 +457,7 @@ def measure(data: Path, only: Sequence[str], frames: int | None) -> dict[str, An
             found="none of them" if data.is_dir() else "no such folder",
             todo="Name the folder that holds them; benchmarks/real.py says how each is laid out.",
         )
-    skipped = {name: f"{data / name} is absent" for name in chosen if name not in there}
+    skipped = {name: f"{name} is absent" for name in chosen if name not in there}
     result: dict[str, Any] = {}
     for name in there:
         print(f"{name} ...", file=sys.stderr, flush=True)

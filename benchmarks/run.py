@@ -75,7 +75,8 @@ def list_versions() -> dict[str, str]:
 
 
 def record(name: str, words: Sequence[str], tables: Tables, seconds: float) -> dict[str, Any]:
-    """Return what `--json` writes."""
+    """Return what `--json` writes; folders of this machine appear by their last part alone."""
+    words = [Path(word).name if Path(word).is_absolute() else word for word in words]
     return {
         "benchmark": name,
         "command": shlex.join(["python", "benchmarks/run.py", *words]),
