@@ -186,6 +186,15 @@ def test_a_hall_without_a_pitch(hall, tmp_path):
     assert hall.median_error(tmp_path / "out") < 0.03
 
 
+def test_a_second_match_does_not_replace_the_first_one_s_export(hall, pitch, tmp_path):
+    file = hall.export("joints", tmp_path / "out") / "joints.npz"
+    before = file.read_bytes()
+    answer = pitch.command("export", "--format", "joints", "--out", tmp_path / "out")
+    assert answer.code == 1
+    assert str(tmp_path / "out") in answer.err
+    assert file.read_bytes() == before
+
+
 def test_two_cameras_on_a_mast(pitch, tmp_path):
     truth = np.load(pitch.folder / "truth.npy")
     import_people(tmp_path / "mast", truth, MAST, focal=2500.0)
