@@ -67,6 +67,13 @@ def test_without_gates_nothing_waits_and_nothing_is_asked(store):
     assert store.blobs.entries("reviews") == []
 
 
+def test_a_setting_given_while_all_waits_is_that_of_the_run_after_the_review(store):
+    run(store, "always")
+    asked = RunRequest({"body_fitting": {"loss_scale": 3.0}}, gates="always")
+    assert run_match(store, open_match(store, TINY), asked).executed == ()
+    assert latest_run(store, TINY).overrides == {"body_fitting": {"loss_scale": 3.0}}
+
+
 def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_approved(store):
     record = run(store, "auto")
     assert (record.run_id, record.state, record.gates) == ("0002", "waiting", "auto")

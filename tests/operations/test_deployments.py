@@ -338,12 +338,16 @@ def hundreds(plan):
     """
     prefect = MatchRuns.of_plan(plan)
     deployment = prefect.deployment(plan.match_deployment)["id"]
-    for match, count, state in HUNDREDS:
+    for part, (match, count, state) in enumerate(HUNDREDS):
         run = {
             "state": {"type": state, "message": "made"},
             "parameters": {"project": plan.project, "match_id": match},
         }
-        missing = [{**run, "name": f"{match}, {number}"} for number in range(count)]
+        # A request whose answer came too late is sent again; by its key a run is made once.
+        missing = [
+            {**run, "name": f"{match}, {number}", "idempotency_key": f"{part}, {number}"}
+            for number in range(count)
+        ]
         while missing:  # SQLite's one writer was busy
             made = prefect.ask(f"/deployments/{deployment}/create_flow_run/bulk", missing)
             done = [each["status"] == "CREATED" for each in made["results"]]
