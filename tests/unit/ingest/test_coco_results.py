@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.formats import files, keypoint_files
+from worldpose.formats import files
 from worldpose.formats.keypoint_files import read_coco_results
 
 
@@ -59,14 +59,6 @@ def test_joint_without_confidence_is_missing(read):
     assert np.all(np.isnan(people.keypoints[0, 0, 4]))
     assert np.isnan(people.confidence[0, 0, 4])
     assert np.isfinite(people.keypoints).sum() == 2 * 16
-
-
-def test_box_and_score_of_found_joints_stand_in(read):
-    # Joint 0, the lowest corner, is missing, so the box starts at joint 1.
-    people = read([with_joint(0, 0, 0, 0, bbox=None), person(bbox=[0, 0, 1, 1], score=0.25)])
-    np.testing.assert_array_equal(people.boxes[0, 0], [101, 202, 116, 232])
-    np.testing.assert_array_equal(people.boxes[0, 1], [0, 0, 1, 1])
-    np.testing.assert_array_equal(people.score[0], [0.5, 0.25])
 
 
 def test_person_without_joints_keeps_their_place_and_box(read):
@@ -138,15 +130,6 @@ def test_crowd_that_would_fill_the_memory_is_refused(read, refusal, monkeypatch)
     assert read(results[:10]).keypoints.shape == (10, 1, 17, 2)
     monkeypatch.setattr("worldpose.formats.keypoint_files.ARRAY_BYTES", 100 << 20)
     assert "200 people in frame 0" in refusal(results).found
-
-
-def test_results_of_several_batches_keep_their_places(read, refusal, monkeypatch):
-    monkeypatch.setattr(keypoint_files, "BATCH", 3)
-    results = [person(frame, score=0.1 * frame + 0.1) for frame in range(8)]
-    np.testing.assert_allclose(read(results).score[:, 0], 0.1 * np.arange(1, 9), rtol=1e-6)
-    for index, wrong in ((4, person(keypoints=[1.0] * 3)), (5, person(score=-1)), (7, 3)):
-        error = refusal([*results[:index], wrong, *results[index + 1 :]])
-        assert f"result {index}" in error.where
 
 
 @pytest.mark.parametrize("entry", ["{}", "[]", '{"image_id":0,"keypoints":[]}', '""', "0"])
