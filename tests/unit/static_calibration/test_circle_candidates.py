@@ -19,7 +19,6 @@ PITCH = PitchTemplate.standard()
 SIZE = (1280, 720)
 FOCALS = np.geomspace(0.45, 5.0, 13)
 VIEWS = {
-    "halfway line and circle": ((0.0, 1.0), 2300.0, ("halfway_line", "center_circle")),
     "touch line and half a circle": ((-17.0, 18.0), 2300.0, ("touch_line_far", "center_circle")),
     "area and arc": ((-33.0, 0.0), 2600.0, ("penalty_area_left_front", "penalty_arc_left")),
 }

@@ -45,16 +45,20 @@ def misplaced(found, true):
     return np.linalg.norm(met - places[seen], axis=-1)
 
 
-def test_a_rendered_still_gives_its_camera_without_a_click():
-    found = calibrate_without_clicks(PITCH, still(), side="near")
+@pytest.fixture(scope="module")
+def proposal():
+    return propose_camera(still(), PITCH, side="near")
+
+
+def test_a_rendered_still_gives_its_camera_without_a_click(proposal):
+    found = calibrate_proposal(PITCH, proposal, still(), where="image of cam3")
     off = misplaced(found.estimate.camera, camera())
     assert len(off) > 20
     assert np.median(off) < 0.05
     assert found.report.decisions[0].startswith("markings proposed from the image")
 
 
-def test_a_proposal_whose_markings_are_not_in_the_image_is_refused():
-    proposal = propose_camera(still(), PITCH, side="near")
+def test_a_proposal_whose_markings_are_not_in_the_image_is_refused(proposal):
     other = still((-20.0, -64.0, 19.0))
     with pytest.raises(InputError, match=r"lines where the proposed camera projects.*Click four"):
         calibrate_proposal(PITCH, proposal, other, where="image of cam3")

@@ -36,7 +36,10 @@ def test_parts_share_nothing_and_neighbours_stay_together(tmp_path):
         assert len(holders) == 1
 
 
-@pytest.mark.parametrize(("kind", "net"), [("people", PeopleNet), ("keypoints", KeypointNet)])
+@pytest.mark.parametrize(
+    ("kind", "net"),
+    [pytest.param("people", PeopleNet, marks=pytest.mark.slow), ("keypoints", KeypointNet)],
+)
 def test_a_version_that_is_no_better_is_told_apart(tmp_path, kind, net):
     torch.manual_seed(0)
     start, weights = tmp_path / "start.safetensors", tmp_path / "new.safetensors"
