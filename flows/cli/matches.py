@@ -289,8 +289,8 @@ def import_command(
             todo="Read the help: worldpose import --help.",
         )
     else:
-        spec = import_match(calibration, detections, fps, out, match_id=match_id)
-        _print_match(spec, out, [], as_json=as_json)
+        spec, notes = import_match(calibration, detections, fps, out, match_id=match_id)
+        _print_match(spec, out, notes, as_json=as_json)
 
 
 ALONE: Final = {

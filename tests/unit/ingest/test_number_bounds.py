@@ -7,7 +7,9 @@ import pytest
 import yaml
 
 from worldpose.errors import InputError
-from worldpose.formats.keypoint_files import PEOPLE_LIMIT, read_coco_results, read_keypoint_arrays
+from worldpose.formats.coco_results import read_coco_results
+from worldpose.formats.keypoint_files import read_keypoint_arrays
+from worldpose.formats.keypoint_sets import PEOPLE_LIMIT
 from worldpose.ingest.match_folder import read_match
 
 
@@ -82,7 +84,5 @@ def test_an_npz_has_at_most_1000_people_per_frame(tmp_path):
 def test_coco_results_have_at_most_1000_people_per_frame(tmp_path):
     person = {"image_id": 7, "keypoints": [5.0, 5.0, 1.0] * 17}
     (tmp_path / "a.json").write_text(json.dumps([person] * (PEOPLE_LIMIT + 1)))
-    with pytest.raises(
-        InputError, match="at most 1000 people per frame, found 1001 with image_id 7"
-    ):
+    with pytest.raises(InputError, match="at most 1000 people per frame, found 1001 in frame 7"):
         read_coco_results(tmp_path / "a.json")

@@ -14,7 +14,8 @@ from test_coco_results import person
 
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
-from worldpose.formats.keypoint_files import read_coco_results, read_keypoint_arrays
+from worldpose.formats.coco_results import read_coco_results
+from worldpose.formats.keypoint_files import read_keypoint_arrays
 from worldpose.ingest.match_folder import read_match
 
 MATCH_YAML = """contract: 1
@@ -84,6 +85,6 @@ def test_any_value_of_a_result_is_read_or_refused(tmp_path, key, value):
     path = tmp_path / "cam1.json"
     path.write_text(json.dumps([person(), person(1, **{key: value})]))
     try:
-        assert np.all(np.diff(read_coco_results(path).frame) > 0)
+        assert np.all(np.diff(read_coco_results(path).people.frame) > 0)
     except InputError as error:
         assert str(path) in error.where
