@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17, FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import BODY25
@@ -151,7 +151,7 @@ def _plain(name: str) -> str:
     return "_".join([*side[:1], *part])
 
 
-def order_by_points(where: str, points: Floats, stated: str | None = None) -> PointOrder:
+def order_by_points(where: str, points: AnyFloats, stated: str | None = None) -> PointOrder:
     """Return the order of points whose number alone is known, and perhaps a model.
 
     Args:
@@ -198,10 +198,11 @@ def unknown_size(where: str, size: int) -> InputError:
 
 
 def _pairs(order: PointOrder) -> NDArray[np.int64]:
-    return np.array(order.joints)[np.array(list(_BONES.values()))]
+    pairs: NDArray[np.int64] = np.array(order.joints)[np.array(list(_BONES.values()))]
+    return pairs
 
 
-def _misfit(points: Floats, pairs: NDArray[np.int64], lengths: Floats) -> float:
+def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> float:
     """Return the mean deviation of people's lengths [log] from the usual ones; NaN if unknown.
 
     Args:
@@ -275,11 +276,14 @@ def people_by_frame(
     Raises:
         InputError: too many people in a frame, or arrays that are too large.
     """
-    found = points[..., 2] > 0
-    seen = found[:, : len(COCO17)].any(axis=1)
-    boxed = np.zeros(len(seen), np.bool_) if boxes is None else np.isfinite(boxes).all(axis=1)
+    found: Flags = np.asarray(points[..., 2] > 0)
+    seen: Flags = np.asarray(found[:, : len(COCO17)].any(axis=1))
+    boxed: Flags = np.zeros(len(seen), np.bool_)
+    if boxes is not None:
+        boxed = np.asarray(np.isfinite(boxes).all(axis=1))
     kept = seen | boxed
-    points, found, seen, boxed, frames = (a[kept] for a in (points, found, seen, boxed, frames))
+    points, found, seen = points[kept], found[kept], seen[kept]
+    boxed, frames = boxed[kept], frames[kept]
     found &= seen[:, None]
     values = np.where(found[..., None], points, np.float32(np.nan))
     joints = values[:, : len(COCO17)]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
-from worldpose.broadcast_calibration.normal_equations import flow_row, point_row, undistort_point
+from worldpose.broadcast_calibration.normal_equations import flow_row, point_row
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import Problem, equations_at
@@ -19,21 +18,6 @@ def pixel_and_rows(camera, point=POINT):
     image, rows = np.empty(2), np.empty((2, 12))
     assert point_row(camera.rotation[0], camera.center, camera.lens(0), point, image, rows)
     return image, rows
-
-
-def test_a_point_is_where_the_camera_projects_it():
-    camera = clip.moving(2)
-    # Both are double precision on numbers of a thousand.
-    np.testing.assert_allclose(
-        pixel_and_rows(camera)[0], camera.camera[0].project(POINT[None])[0], atol=1e-9
-    )
-
-
-def test_a_point_behind_the_camera_has_no_pixel():
-    camera = clip.moving(2)
-    image, rows = np.empty(2), np.empty((2, 12))
-    behind = camera.center - camera.rotation[0, 2]
-    assert not point_row(camera.rotation[0], camera.center, camera.lens(0), behind, image, rows)
 
 
 def test_a_pixel_moves_with_the_step_as_derived():
@@ -65,15 +49,6 @@ def test_a_followed_point_moves_with_both_frames_as_derived():
         size = 1e-6 if number < 14 else 1e-4
         numeric = (predicted(size * unit)[0] - predicted(-size * unit)[0]) / (2.0 * size)
         np.testing.assert_allclose(rows[:, number], numeric, rtol=1e-6, atol=1e-4)
-
-
-def test_the_lens_is_inverted_exactly():
-    k = np.array([0.4, 1.5, -0.2])
-    for x, y in ((0.0, 0.0), (0.2, -0.1), (-0.05, 0.13)):
-        s = x * x + y * y
-        radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
-        # Newton ends at rounding.
-        assert undistort_point(x * radial, y * radial, k)[:2] == pytest.approx((x, y), abs=1e-14)
 
 
 def test_the_gradient_is_the_slope_of_the_cost():
@@ -110,13 +85,3 @@ def test_the_gradient_is_the_slope_of_the_cost():
     )
     # Differences of a cost of 1e3 known to 1e-13, over 2e-8; the slope is 1e5.
     assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)
-
-
-def test_evidence_of_nothing_costs_nothing():
-    camera = clip.moving(3)
-    prior = build_prior(BroadcastPrior(), camera.focal, camera.image_size)
-    problem = Problem(PointEvidence.none(), FlowEvidence.none(), prior)
-    bare = equations_at(camera, np.zeros((0, 3)), problem)
-    # The remaining residuals are the prior's: 5 of the clip, 4 of each frame.
-    assert np.count_nonzero(bare.system.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
-    assert not bare.system.border.any()

@@ -85,18 +85,6 @@ def test_the_gradient_is_the_slope_of_the_cost(scene, scale):
         assert slope == pytest.approx(gradient[1, parameter], rel=1e-4, abs=1e-2)
 
 
-def test_cost_of_one_observation_by_hand(scene):
-    problem, _, points = scene(cameras=2, markings=1, joints=0, seen=1.0)
-    two_off = problem.image + np.array([[3.0, 4.0], [0.0, 0.0]])
-    problem = replace(problem, image=two_off, weight=np.array([0.25, 1.0]))
-    # 5 px at a standard deviation of 2 px.
-    assert cost(problem.cameras.numbers, points, evidence_of(problem)) == pytest.approx(6.25)
-    robust = replace(problem, scale=np.full(2, 2.5))
-    # Cauchy: s^2 ln(1 + 6.25 / s^2).
-    expected = 6.25 * np.log(2.0)
-    assert cost(problem.cameras.numbers, points, evidence_of(robust)) == pytest.approx(expected)
-
-
 def test_a_point_behind_a_camera_costs_infinitely_much(scene):
     problem, _, points = scene(cameras=2, markings=1, joints=0, seen=1.0)
     behind = problem.cameras.center[0] + (problem.cameras.center[0] - points[0])

@@ -50,22 +50,6 @@ def test_ezc3d_finds_the_joints_within_a_tenth_of_a_millimetre(tracks, tmp_path)
     assert " ".join(about["LICENCE"]["value"]).split() == NOTES["licence"].split()
 
 
-@pytest.mark.filterwarnings("ignore:No analog data")
-def test_residuals_are_standard_deviations_or_flags(tracks, tmp_path):
-    # By c3d: ezc3d takes the two halves of the fourth number apart, also in files of floats.
-    c3d = pytest.importorskip("c3d")
-
-    def residuals(written):
-        write_c3d(tmp_path / "p.c3d", written, 1, 50.0, {})
-        with (tmp_path / "p.c3d").open("rb") as file:
-            return np.array([row[:, 3].copy() for _, row, _ in c3d.Reader(file).read_frames()])
-
-    found = residuals(tracks)
-    assert (found[2, 5], found[3, 7], found[3, 8]) == (-1.0, 0.0, 17.0)
-    found = residuals(JointTracks(tracks.frames, tracks.person_ids, tracks.joints))
-    assert (found[2, 5], found[3, 7]) == (-1.0, 1.0), "unknown covariance and views"
-
-
 def test_what_the_format_cannot_hold_is_refused(tracks, tmp_path):
     path = tmp_path / "p.c3d"
     with pytest.raises(InputError, match=r"WORLDPOSE:LICENCE: expected a text of at most 255"):

@@ -80,18 +80,3 @@ def test_the_loop_ends_when_the_damping_passes_its_limit():
     )
     # 1, 8 and 64 are tried; 512 is beyond the limit.
     assert found.iterations == 3 and not found.converged
-
-
-def test_an_accepted_step_divides_the_damping_down_to_its_limit():
-    asked = []
-
-    def step(point, damping):
-        asked.append(damping)
-        return Point(point.x, 0.5 * point.cost)
-
-    minimize(
-        Point(np.zeros(1), 1.0),
-        step,
-        schedule(damping=1.0, decrease=4.0, min_damping=0.1, iterations=4),
-    )
-    assert asked == [1.0, 0.25, 0.1, 0.1]

@@ -135,30 +135,6 @@ def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, 
     assert read_pitch(folder, read_spec(folder)).points.keys() == report.own_points.keys()
 
 
-def test_a_label_clicked_twice_gives_two_points_at_one_place(tmp_path):
-    folder = match(tmp_path / "m")
-    clicks = [*CLICKS.items(), ("halfway_far", (10.0, 20.0))]
-    report = import_clicks(cvat(tmp_path / "c.xml", clicks), folder)
-    (repeated,) = report.repeated
-    assert (repeated.owner, repeated.image, repeated.label) == ("east", "east.png", "halfway_far")
-    assert repeated.names == ("halfway_far", "halfway_far.again")
-    assert repeated.pixels == (CLICKS["halfway_far"], (10.0, 20.0))
-    assert clicked(folder)[0]["halfway_far.again"] == (10.0, 20.0)
-    assert report.own_points == {"halfway_far.again": (0.0, 34.0, -0.2)}
-
-
-def test_own_points_of_pitch_json_stay_and_are_labels(tmp_path):
-    own = {"width": 66.0, "points": {"stripe_3": [11.0, 33.0, -0.2]}}
-    folder = match(tmp_path / "m", pitch=own)
-    places = [(-9, 4), (3, -8), (8, 9), (1, 1)]
-    labels = [(f"({x},{y})", tuple(seen([(x, y)])[0])) for x, y in places]
-    import_clicks(cvat(tmp_path / "c.xml", [("stripe_3", (5.0, 6.0)), *labels]), folder)
-    pitch = json.loads((folder / "pitch.json").read_text())
-    assert pitch["width"] == 66.0
-    assert pitch["points"]["stripe_3"] == [11.0, 33.0, -0.2]
-    assert "at_-9.00_4.00" in pitch["points"]
-
-
 def test_images_of_a_clip_become_key_frames(tmp_path):
     folder = match(tmp_path / "m")
     file = cvat(tmp_path / "c.xml", CLICKS.items(), name="frame_000084.png")
@@ -192,14 +168,6 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
     with pytest.raises(InputError, match=found):
         import_clicks(file, folder, owner)
     assert {each.name for each in folder.iterdir()} == {"match.yaml"}
-
-
-def test_present_clicks_are_not_overwritten(tmp_path):
-    folder = match(tmp_path / "m")
-    file = cvat(tmp_path / "c.xml", CLICKS.items())
-    import_clicks(file, folder)
-    with pytest.raises(InputError, match="no clicks there yet"):
-        import_clicks(file, folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])

@@ -4,7 +4,6 @@ import unicodedata
 import numpy as np
 import pytest
 
-from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.ingest.footage import read_unit
@@ -57,34 +56,6 @@ def test_frames_keep_their_numbers_in_one_clip_over_all_cameras(tmp_path, source
         found = np.isfinite(people.score[:, 0])
         np.testing.assert_array_equal(people.frame[found], seen)
         np.testing.assert_array_equal(people.keypoints[found, 0, 0, 0], seen)
-
-
-def test_a_camera_that_saw_nobody_is_kept(tmp_path, source):
-    (source / "detections" / "left.json").write_text("[]")
-    spec = run(source, tmp_path / "m", match_id="final", pitch=None)
-    assert (spec.match_id, read_match(tmp_path / "m").pitch) == ("final", PitchSpec())
-    assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (300, 3)
-    people, _ = read_unit(read_match(tmp_path / "m"), "left")
-    assert people.keypoints.shape == (3, 0, 17, 2)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda folder: (folder / "left.json").unlink(),
-        lambda folder: (folder / "left.json").rename(folder / "middle.json"),
-        lambda folder: (folder / "further.json").write_text("[]"),
-        lambda folder: (folder / "left.npz").write_bytes(b""),
-    ],
-)
-def test_files_that_are_not_one_a_camera_are_listed_beside_the_cameras(tmp_path, source, change):
-    change(source / "detections")
-    with pytest.raises(InputError) as caught:
-        run(source, tmp_path / "m")
-    assert caught.value.expected.endswith("calibration.toml: right, left")
-    names = sorted(path.name for path in (source / "detections").iterdir())
-    assert caught.value.found == ", ".join(names)
-    assert not (tmp_path / "m").exists()
 
 
 @pytest.mark.parametrize(

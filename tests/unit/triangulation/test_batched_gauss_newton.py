@@ -5,7 +5,6 @@ import pytest
 from worldpose.triangulation import batched_gauss_newton
 from worldpose.triangulation.batched_gauss_newton import LANES, ROWS, STATE
 from worldpose.triangulation.observations import Observations, Rig, gather, linearize
-from worldpose.triangulation.solving import consensus
 
 POINT = np.array([0.7, -1.1, 1.3])
 NOISE = (2.0, 0.0)
@@ -84,41 +83,3 @@ def test_normal_equations_are_the_gradient_of_half_the_weighted_cost(views):
         behind, _ = cost_and_right(POINT - step * np.eye(3)[axis])
         # Central differences of a cost of about 10 with third derivatives of order 1e3.
         assert right[axis] == pytest.approx(-(ahead - behind) / (2 * step), rel=1e-5, abs=1e-3)
-
-
-def test_leverages_of_all_views_sum_to_three(views):
-    camera, image = views
-    rig, tiles = tiles_of(camera, image)
-    state = state_at(POINT)
-    consensus(tiles, rig.depths, (10.0, 0.0), 12.0, state)
-    for tile, depth in zip(tiles, rig.depths, strict=True):
-        batched_gauss_newton.weigh(tile, depth, (10.0, 0.0), state)
-    # Three unknowns; the matrix is that before a last step of under a micrometre.
-    assert tiles[:, batched_gauss_newton.LEVERAGE].sum() == pytest.approx(3.0, rel=1e-6)
-
-
-def test_consensus_uses_the_views_that_agree(ring):
-    wrong = [1, 3]
-    camera = ring(7)
-    image = camera.project(POINT[None])[:, 0]
-    image[wrong] += np.array([[70.0, -40.0], [-90.0, 55.0], [30.0, 120.0]])[: len(wrong)]
-    rig, tiles = tiles_of(camera, image)
-    state = state_at(POINT)
-    consensus(tiles, rig.depths, NOISE, 12.0, state)
-    np.testing.assert_allclose(state[: 3 * LANES], np.repeat(POINT, LANES), atol=1e-9)
-    used = tiles[:, batched_gauss_newton.USED]
-    np.testing.assert_array_equal(used, [n not in wrong for n in range(7)])
-
-
-def test_lane_without_observations_leaves_the_others_alone(ring):
-    camera = ring(4)
-    rig, tiles = tiles_of(camera, camera.project(POINT[None])[:, 0])
-    for row in (batched_gauss_newton.A, batched_gauss_newton.B):
-        for k in range(4):
-            tiles[:, row + k * LANES + 5] = 0.0
-    tiles[:, batched_gauss_newton.PRECISION + 5] = 0.0
-    state = state_at(POINT)
-    consensus(tiles, rig.depths, NOISE, 12.0, state)
-    points = state[: 3 * LANES].reshape(3, LANES)
-    assert np.isnan(points[:, 5]).all()
-    np.testing.assert_allclose(np.delete(points, 5, axis=1).T - POINT, 0.0, atol=1e-9)

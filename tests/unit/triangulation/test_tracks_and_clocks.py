@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
@@ -7,36 +6,11 @@ from worldpose.triangulation.chunking import reconstruct_joints
 from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import segments, smooth_joints
-from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
+from worldpose.triangulation.smoothing import smooth_joints
 
 as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
-
-
-def test_banded_solution_and_inverse_are_the_dense_ones():
-    rng = np.random.default_rng(0)
-    lower = np.triu(np.tril(rng.normal(size=(30, 30))), -6)
-    lower[np.diag_indices(30)] = 2.0 + rng.random(30)
-    matrix = lower @ lower.T
-    band = np.array([[matrix[i, i - k] if i >= k else 0.0 for k in range(7)] for i in range(30)])
-    right = rng.normal(size=30)
-    solution = right.copy()
-    _factorize(band)
-    _substitute(band, solution)
-    np.testing.assert_allclose(matrix @ solution, right, atol=1e-12)
-    _invert(band)
-    inverse = np.linalg.inv(matrix)
-    for i in range(30):
-        for k in range(min(6, i) + 1):
-            assert band[i, k] == pytest.approx(inverse[i, i - k], abs=1e-12)
-
-
-def test_segments_break_at_long_gaps_only():
-    there = np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 1, 0], dtype=bool)
-    assert segments(there, 2) == [slice(1, 6), slice(9, 10)]
-    assert segments(there[:1], 2) == []
 
 
 def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
@@ -110,15 +84,6 @@ def test_late_clocks_are_found(ring):
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
     )
-
-
-def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
-    camera = ring(4)
-    still = np.broadcast_to(runner(1), (60, 2, 17, 3))
-    clocks = estimate_clocks(camera, as_detections(*detections(camera, still, 1.0)), FPS, SETTINGS)
-    assert not clocks.determined.any()
-    assert np.isnan(clocks.late).all()
-    assert clocks.report.clock_late_frames == (None,) * 4
 
 
 def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):

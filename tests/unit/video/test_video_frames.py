@@ -18,24 +18,11 @@ def numbered(count):
     return [np.full((*SIZE, 3), 10 + 4 * n, dtype=np.uint8) for n in range(count)]
 
 
-def number_of(picture):
-    return round((float(picture.mean()) - 10.0) / 4.0)
-
-
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
     assert write_video(path, numbered(55), 25.0, quality=5) == 55
     return path
-
-
-def test_times_and_rate_follow_from_the_stamps(clip):
-    index = index_frames(clip)
-    assert index.fps == pytest.approx(25.0)
-    # Stamps are whole units of the time base.
-    np.testing.assert_allclose(index.times, np.arange(55) / 25.0, atol=1e-3)
-    assert index.size == (SIZE[1], SIZE[0])
-    assert index.key[0] and 2 <= index.key.sum() <= 4
 
 
 def test_the_same_pictures_give_the_same_bytes(tmp_path):
