@@ -15,12 +15,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
-from data_contracts.broadcast_pooling import BROADCAST_POOLING
-from data_contracts.broadcast_tracking import BROADCAST_TRACKING
+from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, BROADCAST_POOLING, KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from data_contracts.tracking import Track
+from data_contracts.tracking import BROADCAST_TRACKING, Track
 from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
 from tasks.unit import UnitInputs, unit_task

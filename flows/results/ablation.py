@@ -88,10 +88,6 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     result without held-out validation. Every row is triangulated from the same tracks; the last one
     fits bodies to our triangulation after adjustment.
 
-    Args:
-        seed: random seed of the trial.
-        clicks: simulated click noise.
-
     Note:
         Paper, table of the Vicon trial.
     """

@@ -104,10 +104,7 @@ class Draft(Record):
 class Drafts:
     """The drafts of an inbox.
 
-    Attributes:
-        inbox: folder of arriving matches.
-        folders: folders whose videos people can pick.
-        store: the project, whose ids are taken.
+    People can pick videos from the folders; ids of the store's matches are taken.
     """
 
     inbox: Path
@@ -491,11 +488,7 @@ def _choose_name(title: str, taken: set[str]) -> str:
 
 
 def _still_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of a still.
-
-    Raises:
-        InputError: no image.
-    """
+    """Return width and height [px] of a still."""
     size = declared_size(np.fromfile(path, dtype=np.uint8, count=HEADER_BYTES)) or (0, 0)
     read_still(path, size)
     return size

@@ -140,7 +140,8 @@ def looped(monkeypatch):
             return record(request.iteration, errors[request.iteration - 1], state)
 
         monkeypatch.setattr(iterate, "run_match", run)
-        monkeypatch.setattr(iterate, "_plan", lambda *_: SimpleNamespace(missing=[]))
+        monkeypatch.setattr(iterate, "Gatekeeper", lambda *_: None)
+        monkeypatch.setattr(iterate, "plan_ahead", lambda *_: SimpleNamespace(missing=[]))
         monkeypatch.setattr(iterate, "_recorded_run", lambda *_: None)
         monkeypatch.setattr(iterate, "keep_settings", lambda *given: given[-1])
         monkeypatch.setattr(

@@ -7,18 +7,17 @@ import shutil
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Final, Literal
 
 from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import camera_id
-from worldpose.formats.calibration_forms import (
-    read_calibration,
-)
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.files import whole_file
-from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
+from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
+from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
@@ -35,7 +34,7 @@ def import_match(
     out: Path,
     match_id: str | None = None,
     pitch: Literal["none"] | None = "none",
-) -> MatchSpec:
+) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and their detections.
 
     The only clip, `clip`, spans the first to the last frame with a person; frames keep their
@@ -43,29 +42,72 @@ def import_match(
 
     Args:
         calibration: a file or folder that `read_calibration` reads.
-        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration.
+        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration, or
+            with a folder of OpenPose's files for each.
         fps: frame rate of all cameras [1/s].
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
         pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
 
     Returns:
-        Content of match.yaml.
+        Content of match.yaml, and sentences about what was found and what was changed.
 
     Raises:
         InputError: a file is invalid, names do not match, there are no people, or `out` is not
             empty; nothing is written then.
     """
     cameras = read_calibration(calibration)
-    files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
-    people = {name: read_observations(file) for name, file in files.items()}
+    files = detections_by_camera(detections, list(cameras), calibration)
+    read = {name: read_people(file) for name, file in files.items()}
+    people = {name: found.people for name, found in read.items()}
     first, stop = find_people(detections, people)
     sizes = {name: camera.image_size for name, camera in cameras.items()}
     spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
     write_match(out, spec, calibrations=cameras, observations=people)
-    return spec
+    return spec, describe_people(read)
+
+
+_CHANGES: Final = {
+    "clamped": "confidences above 1 count as 1",
+    "nobody": "entries without a known joint count as nobody",
+    "empty": "empty files count as frames without people",
+}
+
+
+def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
+    """Return sentences about the points of cameras' 2D poses, and what was changed in them."""
+    notes = []
+    for kind in sorted({found.kind for found in read.values() if found.kind} - {"COCO-17"}):
+        which = [name for name, found in read.items() if found.kind == kind]
+        kept = "the 17 keypoints of COCO"
+        kept += " and heels and toes" if read[which[0]].people.points else ""
+        whose = "" if len(which) == len(read) else f" of {', '.join(which)}"
+        notes.append(f"2D poses{whose}: {kind}; kept are {kept}; the others are left out")
+    for key, what in _CHANGES.items():
+        counts = {name: getattr(found.changes, key) for name, found in read.items()}
+        if total := sum(counts.values()):
+            notes.append(f"{total} {what} ({', '.join(name for name in counts if counts[name])})")
+    return notes
+
+
+def detections_by_camera(
+    folder: Path, cameras: Sequence[str], calibration: Path
+) -> dict[str, Path]:
+    """Return each camera's file of 2D poses, or its folder `<camera>` or `<camera>_json`.
+
+    Raises:
+        InputError: a camera lacks its file, or a file its camera.
+    """
+    folders = {
+        camera_id(each.name.removesuffix("_json")): each
+        for each in sorted(folder.glob("[!.]*"))
+        if each.is_dir()
+    }
+    if sorted(folders) == sorted(cameras):
+        return {name: folders[name] for name in cameras}
+    return files_by_camera(folder, cameras, calibration, (".json", ".npz"))
 
 
 def import_lenses(

@@ -21,12 +21,14 @@ from worldpose.formats.calibration_forms import (
     find_calibration,
     read_calibration,
 )
-from worldpose.formats.detection_files import OpenPoseFolder, read_openpose_folder
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.files import read_toml
 from worldpose.formats.keypoint_files import on_frames
+from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.importing import (
     build_spec,
     copy_videos,
+    describe_people,
     find_people,
     list_videos,
     video_size_error,
@@ -38,6 +40,8 @@ from worldpose.video.pictures import FrameIndex
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
+_SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
+"""Entries of Config.toml that hold."""
 MAX_BLACK: Final = 16.0
 """Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
@@ -177,7 +181,8 @@ def import_pose2sim(
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
-    read = {name: read_openpose_folder(place) for name, place in poses.items()}
+    model = settings.get("pose_model")
+    read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
     first, stop = find_people(folder, people) if people else (0, min(counts, default=0))
     first, stop = settings.get("frame_range", (first, stop))
@@ -193,20 +198,15 @@ def import_pose2sim(
     return spec, notes + _describe_poses(folder, read)
 
 
-def _describe_poses(folder: Path, read: Mapping[str, OpenPoseFolder]) -> list[str]:
+def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:
     """Return sentences about the 2D poses of cameras and what of them is kept."""
     if not read:
         return [
             f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
             "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
         ]
-    kinds = {found.kind: found.people.points for found in read.values() if found.kind}
-    return [
-        f"2D poses: {folder}, {kind}; kept are the 17 keypoints of COCO"
-        + (" and heels and toes" if points else "")
-        + ("" if kind == "COCO-17" else "; those of hands, face and trunk are left out")
-        for kind, points in sorted(kinds.items())
-    ]
+    kinds = sorted({found.kind for found in read.values() if found.kind})
+    return [f"2D poses: {folder}, {' and '.join(kinds)}", *describe_people(read)]
 
 
 def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
@@ -222,7 +222,7 @@ def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
 
 
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
-    """Return `frame_rate` and `frame_range` where Config.toml sets them, and that file.
+    """Return `frame_rate`, `frame_range`, `pose_model` where Config.toml sets them, and that file.
 
     As in Pose2Sim, the file of the folder above gives what the trial's file lacks.
     """
@@ -236,13 +236,19 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
     files = [place / "Config.toml" for place in (project, project.resolve().parent)]
     given: dict[str, Any] = {}
     for file in reversed(files):
-        table = read_toml(file).get("project", {}) if file.is_file() else {}
-        if not isinstance(table, dict):
-            raise InputError(
-                f"{file}: project", expected="a table", found=f"{table!r:.40}", todo="Correct it."
-            )
-        given |= {key: (table[key], file) for key in ("frame_rate", "frame_range") if key in table}
-    settings: dict[str, Any] = {}
+        content = read_toml(file) if file.is_file() else {}
+        for name in ("project", "pose"):
+            table = content.get(name, {})
+            if not isinstance(table, dict):
+                raise InputError(
+                    f"{file}: {name}",
+                    expected="a table",
+                    found=f"{table!r:.40}",
+                    todo="Correct it.",
+                )
+            given |= {key: (table[key], file) for key in _SETTINGS if key in table}
+    model, _ = given.get("pose_model", (None, files[0]))
+    settings: dict[str, Any] = {"pose_model": model} if isinstance(model, str) else {}
     rate, place = given.get("frame_rate", ("auto", files[0]))
     if rate != "auto":
         if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:

@@ -31,7 +31,8 @@ def source(tmp_path, make_camera):
 
 
 def run(source, out, **options):
-    return import_match(source / "calibration.toml", source / "detections", 25.0, out, **options)
+    folder = source / "detections"
+    return import_match(source / "calibration.toml", folder, 25.0, out, **options)[0]
 
 
 def test_other_tools_files_become_a_match(tmp_path, source):
