@@ -79,6 +79,7 @@ def test_the_clip_alone_gives_a_camera_and_people_on_the_pitch(bench, tmp_path):
     assert all(20.0 < float(row["x_m"]) < 55.0 for row in rows if row["frame"] == "25")
 
 
+@pytest.mark.slow
 @needs_pair
 def test_a_low_camera_with_a_short_lens_over_a_pitch_that_falls_to_its_ends(bench, tmp_path):
     """A camera 8 m up, unlike those of large stadiums that the prior has, on a club's pitch."""

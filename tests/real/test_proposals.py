@@ -21,6 +21,7 @@ from worldpose.video.folder import median_picture, open_video
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not (DATA / "static_pair").is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair"
 )
@@ -39,6 +40,7 @@ def test_a_wide_static_camera_is_found_without_a_click_and_without_its_lens():
     assert still.shape == (static_pair.SIZE[1], static_pair.SIZE[0], 3)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not (DATA / "static_pair").is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair"
 )
@@ -54,6 +56,7 @@ def test_both_static_cameras_of_a_match_are_calibrated_from_their_videos_alone(t
     assert left_out == [{}, {}]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not ((DATA / "wc14").is_dir() and (DATA / "sn22_lines").is_dir()),
     reason="WORLDPOSE_TEST_DATA has no drawn lines",

@@ -68,6 +68,7 @@ def test_a_pitch_in_yards_is_told_by_hand_clicks_of_points_of_the_laws(side):
             calibrate_camera(pitch, markings, (3072, 1728))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("server")
 def test_cameras_on_one_mast_place_people_on_the_pitch_and_say_why(tmp_path):
     write_static_pair(DATA, tmp_path / "pair", frame_count=4)

@@ -180,6 +180,7 @@ def test_other_files_are_refused(tmp_path, content):
 REAL = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair")
 def test_real_cvat_clicks_with_places_become_a_match(tmp_path):
     folder = match(tmp_path / "m", pitch={"crown": 0.1, "stripes": {"spacing": 5.5}})
