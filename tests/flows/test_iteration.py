@@ -207,6 +207,7 @@ def test_a_part_of_the_method_has_no_iterations():
         iterate_match(None, None, RunRequest({}, until_stage="tracking"), 2)
 
 
+@pytest.mark.slow  # with a server and workers of its own
 def test_the_command_runs_two_iterations_on_the_workers_of_one_run(tmp_path):
     short = tmp_path / "match"
     succeed("simulate", "--scenario", "tiny", "--duration", 0.3, "--no-stills", "--out", short)

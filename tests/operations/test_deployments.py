@@ -17,7 +17,7 @@ from prefect.client.schemas.objects import FlowRun
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 from service import wait_until
 
-from flows.orchestration import suspension
+from flows.orchestration import prefect_api, suspension
 from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError
 from flows.service import recovery, watching
 from flows.service.deployed import release_folder
@@ -153,6 +153,27 @@ def test_runs_have_readable_names_of_their_own(plan, prefect):
     assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", name)
 
 
+def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
+    plan, prefect, monkeypatch
+):
+    monkeypatch.setattr(app_context, "match_runs_of", lambda url: prefect)
+    continuing = Continuing(Store.create(plan.project))
+    first = continuing.go_on("clicked", gates="never")
+    assert (first["state"], first["how"]) == ("running", "the deployment")
+    assert "waits for its turn" in continuing.go_on("clicked")["how"]
+    state = continuing.state("clicked")
+    assert (state["state"], state["prefect"]) == ("running", first["prefect"])
+    continuing.go_on("clicked too")
+    assert "before it" in continuing.state("clicked too")["lines"][0]
+    (run,) = (run for run in prefect.active() if run.match_id == "clicked")
+    prefect.set_state(run.id, "RUNNING", "")
+    assert "once more" in continuing.go_on("clicked")["how"]
+    runs = [run for run in prefect.active() if run.match_id.startswith("clicked")]
+    assert [run.match_id for run in runs].count("clicked") == 2
+    for each in runs:  # no other test finds them
+        prefect.set_state(each.id, "CANCELLED", "")
+
+
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
     installed = install(plan)
     ids = {each.flow.name: number for number, each in installed.items()}
@@ -267,6 +288,7 @@ def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, prefect):
     assert (failed["poison"].state, failed["poison"].message) == ("crashed", "killed")
 
 
+@pytest.mark.slow  # a worker, and the processes of two runs
 def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, monkeypatch):
     own = {"project": str(tmp_path), "state": tmp_path / "operations", "name": "worked"}
     plan = plan.model_copy(update=own)
@@ -294,52 +316,42 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
     assert "absent" in prefect.ask(f"/flow_runs/{absent.id}")["state"]["message"]
 
 
-HUNDREDS = (
-    ("old-match", 1, "FAILED"),
-    ("crashed-match", 40, "CRASHED"),
-    *[("failed-match", 70, "FAILED")] * 3,
-    *[("paused-match", 70, "PAUSED")] * 3,
-)
+PAGES = {
+    "old-match": (1, "FAILED"),
+    "crashed-match": (6, "CRASHED"),
+    "failed-match": (11, "FAILED"),
+    "paused-match": (11, "PAUSED"),
+}
+"""Number and state of the runs that are made of a match."""
 
 
-@pytest.fixture(scope="module")
-def hundreds(plan):
-    """Give the server 210 failed runs of a match, 40 crashed and 210 suspended ones of others.
-
-    Prefect lists them by random ids, so that a page of 200 lacks some of each.
-    """
-    prefect = MatchRuns.of_plan(plan)
-    deployment = prefect.deployment(plan.match_deployment)["id"]
-    for part, (match, count, state) in enumerate(HUNDREDS):
+@pytest.fixture
+def pages_of_runs(plan, prefect, monkeypatch):
+    """Give the server more runs than an answer of Prefect holds, which lists them by random ids."""
+    monkeypatch.setattr(prefect_api, "PAGE", 5)
+    for match, (count, state) in PAGES.items():
         run = {
             "state": {"type": state, "message": "made"},
             "parameters": {"project": plan.project, "match_id": match},
         }
-        # A request whose answer came too late is sent again; by its key a run is made once.
-        missing = [
-            {**run, "name": f"{match}, {number}", "idempotency_key": f"{part}, {number}"}
-            for number in range(count)
-        ]
-        while missing:  # SQLite's one writer was busy
-            made = prefect.ask(f"/deployments/{deployment}/create_flow_run/bulk", missing)
-            done = [each["status"] == "CREATED" for each in made["results"]]
-            missing = [each for each, is_there in zip(missing, done, strict=True) if not is_there]
+        for name in (f"{match}, {number}" for number in range(count)):
+            prefect.create_run("match", name=name, idempotency_key=name, **run)
 
 
-def test_runs_are_found_among_hundreds(plan, prefect, hundreds, monkeypatch):
+def test_runs_are_found_on_all_pages(plan, prefect, pages_of_runs, monkeypatch):
     def failed_by_match():
         failed = failed_runs(plan, datetime.now(UTC))
         return Counter(each.match_id for each in failed), failed
 
     counts, _ = failed_by_match()
-    assert (counts["failed-match"], counts["crashed-match"]) == (210, 0)
+    assert (counts["failed-match"], counts["crashed-match"]) == (11, 0)
     monkeypatch.setattr(watching, "RESTART_PATIENCE", timedelta(0))
     counts, failed = failed_by_match()
-    assert (counts["failed-match"], counts["crashed-match"]) == (210, 40)
+    assert (counts["failed-match"], counts["crashed-match"]) == (11, 6)
     (message,) = {each.message for each in failed if each.match_id == "crashed-match"}
     assert message == "made; it was not restarted"
     again = restart_lost_runs(plan)
-    assert sorted(again) == sorted(f"crashed-match, {number}" for number in range(40))
+    assert sorted(again) == sorted(f"crashed-match, {number}" for number in range(6))
     ask, resumed = PrefectApi.ask, set()
 
     def note_resumed(api, path, *body, **method):
@@ -351,14 +363,14 @@ def test_runs_are_found_among_hundreds(plan, prefect, hundreds, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(PrefectApi, "ask", note_resumed)
         suspension.resume_suspended(plan.project, "paused-match")
-    assert len(resumed) == 210
+    assert len(resumed) == 11
     # The pages show the last run of every match; their second look asks for later runs alone.
     monkeypatch.setattr(app_context, "match_runs_of", lambda url: prefect)
     monkeypatch.setattr(app_context, "FRESH_SECONDS", 0.0)
     continuing = Continuing(Store.create(plan.project))
     for _ in range(2):
         assert continuing.state("old-match")["lines"] == ["made"]
-        assert continuing.links().keys() >= {match for match, _, _ in HUNDREDS}
+        assert continuing.links().keys() >= PAGES.keys()
 
 
 def test_a_server_that_refuses_or_is_gone_is_named(plan):

@@ -85,6 +85,7 @@ def require_one_after_another(served, store, names, runs):
         assert store.unfinished_runs(name) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_matches_started_on_pages_run_one_after_another(served, matches):
     store, names = matches(2)
