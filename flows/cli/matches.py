@@ -197,7 +197,8 @@ def import_command(
         out: Match folder to create or to extend.
         calibration: Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys,
             Vicon, OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera.
-        detections: Folder of COCO keypoint results, <camera>.json.
+        detections: Folder of COCO or AlphaPose results, <camera>.json, or of a folder of
+            OpenPose JSON for each camera.
         videos: Folder of videos in place of 2D poses, <camera>.mp4.
         boxes: With --videos, or for the videos of a match folder: people's boxes, in which only
             poses are estimated: folder of MOTChallenge lines, <camera>.txt.
@@ -206,12 +207,12 @@ def import_command(
         fps: Frames per second.
         match_id: Id of the match; the folder's name by default.
         pitch: Survey of the markings (CSV); writes only pitch.json.
-        clicks: Clicks from CVAT (XML), Label Studio or COCO (JSON). A label is the name of a
-            point or marking of the pitch, or a position in metres.
+        clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
+            name of a point or marking of the pitch, or a position in metres.
         camera: With --clicks or --lens: the camera, or the clip of the broadcast camera; by
             default, images and lenses are named after cameras.
-        lens: Lens without a pose: OpenCV XML or YAML, npz, matrix and distortion as two .npy
-            files, or TOML.
+        lens: Lens without a pose: OpenCV XML or YAML, ROS YAML, npz, matrix and distortion as
+            two .npy files, or TOML.
         left_handed: The survey's x, y and height are left-handed.
     """
     options = {
@@ -246,8 +247,10 @@ def import_command(
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id)
         _print_match(spec, out, notes, as_json=as_json)
     elif videos is not None and detections is None:
-        spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes)
-        _print_match(spec, out, [], as_json=as_json)
+        spec, notes = import_videos(
+            calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes
+        )
+        _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",

@@ -104,7 +104,7 @@ def test_an_incomplete_lens_is_refused_with_what_it_lacks(case, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("lens.yml", b"matrix: [1, 2", "FileStorage"),
+        ("lens.yml", b"matrix: [1, 2", "expected YAML"),
         (
             "lens.xml",
             b'<?xml version="1.0"?><opencv_storage><a>1</a></opencv_storage>',

@@ -7,6 +7,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.errors import InputError
@@ -112,6 +113,24 @@ def test_a_camera_neither_given_nor_clicked_is_named_with_what_to_do(folder):
     assert str(file_of(folder)) in caught.value.todo
 
 
+@pytest.mark.parametrize("form", ["JPEG", "PNG", "TIFF", "BMP", "WEBP"])
+def test_a_still_of_every_kind_is_read_as_it_is_shown(tmp_path, form):
+    picture = np.random.default_rng(1).integers(0, 255, (18, 32, 3), dtype=np.uint8)
+    path = tmp_path / f"cam.{form.lower()}"
+    more = {"quality": 95} if form == "JPEG" else {"lossless": True} if form == "WEBP" else {}
+    Image.fromarray(picture).save(path, form, **more)
+    stored = read_still(path, (32, 18))
+    if form != "JPEG":
+        np.testing.assert_array_equal(stored, picture)
+        return
+    tag = Image.Exif()
+    tag[0x0112] = 6  # shown after a quarter turn clockwise
+    Image.fromarray(picture).save(path, form, exif=tag, **more)
+    np.testing.assert_array_equal(read_still(path, (18, 32)), np.rot90(stored, -1))
+    with pytest.raises(InputError, match="found 18 x 32 as shown, with the turn of its EXIF tag"):
+        read_still(path, (32, 18))
+
+
 def test_a_small_file_that_declares_a_huge_still_is_refused_unread(tmp_path):
     """A PNG of 60,000 x 60,000 pixels takes 254 bytes, and would take 10.8 GB of memory."""
     path = tmp_path / "cam.png"
@@ -125,7 +144,7 @@ def test_a_small_file_that_declares_a_huge_still_is_refused_unread(tmp_path):
         )
     )
     assert path.stat().st_size < 300
-    with pytest.raises(InputError, match=r"cam.png.*1920 x 1080 px.*found 60000 x 60000"):
+    with pytest.raises(
+        InputError, match=r"cam.png.*at most .* pixels, found .* bytes that are none"
+    ):
         read_still(path, (1920, 1080))
-    with pytest.raises(InputError, match="bytes that are none"):
-        read_still(path, (60_000, 60_000))

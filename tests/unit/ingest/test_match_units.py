@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import yaml
 
 from worldpose.errors import InputError
 from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
@@ -30,16 +29,6 @@ def test_a_broadcast_camera_covers_its_clip(match_folder, make_people):
     np.testing.assert_array_equal(people.frame, [5, 6, 7])
     np.testing.assert_array_equal(people.keypoints, make_people(0, 3, seed=3).keypoints)
     assert calibration is None
-
-
-def test_a_broken_broadcast_offset_is_taken_to_the_nearest_frame(match_folder, make_people):
-    path = match_folder / "match.yaml"
-    content = yaml.safe_load(path.read_text())
-    content["clips"][0]["broadcast_offset_frames"] = 0.6
-    path.write_text(yaml.safe_dump(content))
-    people, _ = read_unit(read_match(match_folder), "goal")
-    np.testing.assert_array_equal(people.keypoints[0], make_people(0, 3, seed=3).keypoints[1])
-    assert np.all(np.isnan(people.keypoints[2]))
 
 
 @pytest.mark.parametrize("unit_id", ["cam9", "main", "corner"])

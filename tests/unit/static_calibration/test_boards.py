@@ -85,6 +85,18 @@ def test_corners_are_found_where_they_were_drawn(charuco):
     assert (len(views), size) == (1, SIZE)
 
 
+def test_boards_of_the_pattern_before_opencv_4_6_are_found():
+    side, board = 60, Board(8, 6, 0.06, "DICT_4X4_50", 0.045)
+    old = board._charuco()
+    old.setLegacyPattern(True)
+    print_ = old.generateImage((8 * side, 6 * side), marginSize=0)
+    page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
+    image, _ = drawn(page, np.random.default_rng(1))
+    found = board.find(image)
+    assert len(found.pixels) == 35
+    assert found.bend < 0.02
+
+
 def test_a_wrong_dictionary_or_marker_is_told():
     blank = np.full((48, 64), 255, np.uint8)
     with pytest.raises(InputError, match=r"board: dictionary: expected one of OpenCV's: DICT_"):

@@ -3,7 +3,7 @@ from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation.chunking import reconstruct_joints
-from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
+from worldpose.triangulation.clocks import estimate_clocks
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import smooth_joints
@@ -84,19 +84,3 @@ def test_late_clocks_are_found(ring):
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
     )
-
-
-def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
-    keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
-    index[4, 1, 0] = -1
-    late = np.array([0.0, 2.0, -0.5])
-    shifted = shift_in_time(as_detections(keypoints, confidence, index), late)
-    pixels, moved = shifted.keypoints, shifted.detection_index
-    np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
-    np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
-    assert (moved[:2, 1] == -1).all()
-    assert moved[6, 1, 0] == -1
-    np.testing.assert_allclose(
-        pixels[:-1, 2], 0.5 * (keypoints[:-1, 2] + keypoints[1:, 2]), atol=1e-9
-    )
-    assert (moved[-1, 2] == -1).all()

@@ -52,6 +52,18 @@ def test_pictures_of_other_sizes_and_no_picture_are_no_video(tmp_path):
         write_video(tmp_path / "clip.mp4", [], 25.0)
 
 
+def test_pixels_that_are_not_square_are_refused_with_their_ratio(tmp_path):
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        stream = container.add_stream("libx264", 25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for picture in numbered(2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    with pytest.raises(InputError, match="square pixels, found a sample aspect ratio of 4:3"):
+        index_frames(tmp_path / "clip.mp4")
+
+
 CODECS = {
     "h264": ("libx264", "yuv420p", {"x264-params": "bframes=2:b-adapt=0"}),
     "h264_open": ("libx264", "yuv420p", {"x264-params": "bframes=2:b-adapt=0:open-gop=1"}),
