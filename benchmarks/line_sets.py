@@ -29,7 +29,7 @@ from worldpose.errors import InputError, WorldposeError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.paint import Ridges, guess_lens, straighten_paint
 from worldpose.static_calibration.from_paint.proposal import (
     calibrate_without_clicks,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from tasks.clip_inputs import ClipInputs, open_frames, open_venue, select_frames
 from tasks.unit import UnitInputs, unit_task
-from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks, Clip
-from worldpose.bundle_adjustment.report import adjustment_arrays
+from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.report import BundleAdjustment, adjustment_arrays
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import UsageError
 from worldpose.pitch.template import PitchTemplate

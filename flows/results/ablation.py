@@ -11,8 +11,8 @@ import numpy as np
 from worldpose.body.body_file import find_body
 from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.bundle_adjustment.adjustment import adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.report import marking_errors
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import InputError
@@ -24,7 +24,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.tracking.settings import TrackingSettings

@@ -166,7 +166,7 @@ def _residuals(
     for first in range(0, total, LANES):
         gather(observations, first, tiles)
         for camera in range(len(cameras)):
-            linearize(tiles[camera], cameras[camera])
+            linearize(tiles[camera], cameras, camera)
         consensus(tiles, depths, noise, limit, state)
         for camera in range(len(cameras)):
             tile, depth = tiles[camera], depths[camera]

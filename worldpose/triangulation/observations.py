@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import projection
+from worldpose.geometry.camera_model import is_finite
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.projection import distort, fold_radius
+from worldpose.geometry.lens_models import LensModel, distort, distort_brown, load_camera, undistort
+from worldpose.geometry.rays import RayStatus
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,
@@ -25,13 +26,16 @@ from worldpose.triangulation.batched_gauss_newton import (
     B,
 )
 
+_BROWN = int(LensModel.BROWN)
+_OK = int(RayStatus.OK)
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Cameras in the memory layout of the kernels.
 
     Attributes:
-        cameras: (cameras, 22) parameters as in `worldpose.geometry.projection`.
+        cameras: (cameras, WIDTH) rows as in `worldpose.geometry.camera_model`.
         depths: (cameras, 4), depth of (x, y, z, 1) [m]; 1 where a camera is missing.
         centers: (cameras, 3) [m], world.
     """
@@ -44,18 +48,10 @@ class Rig:
     def from_cameras(cls, cameras: Camera) -> Rig:
         """Return the rig of a batch (cameras,)."""
         pose = cameras.cam_from_world
-        parts = (
-            cameras.focal,
-            cameras.principal_point,
-            cameras.distortion,
-            pose.rotation.reshape(-1, 9),
-            pose.translation,
-            fold_radius(cameras.distortion)[:, None],
-        )
-        rows = np.concatenate(parts, axis=-1)
+        rows = cameras.numbers
         depths = np.concatenate([pose.rotation[:, 2], pose.translation[:, 2:]], axis=-1)
         # 0 x NaN is NaN: a camera of weight 0 needs a finite depth nevertheless.
-        missing = ~np.isfinite(rows[:, :-1]).all(axis=-1)
+        missing = [not is_finite(rows, c) for c in range(len(rows))]
         depths[missing] = [0.0, 0.0, 0.0, 1.0]
         return cls(rows, depths, np.ascontiguousarray(cameras.center))
 
@@ -75,7 +71,7 @@ class Observations(NamedTuple):
         detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         shift: (frames, cameras, persons, 3), subtracted from pixels [px], and additional variance
             [px^2]; no frames = no shift.
-        cameras: (cameras, 22) parameters as in `Rig`.
+        cameras: (cameras, WIDTH) rows as in `Rig`.
         depths: (cameras, 4) rows as in `Rig`.
         centers: (cameras, 3) centers as in `Rig`.
     """
@@ -206,28 +202,29 @@ def gather(observations: Observations, first: int, tiles: Floats) -> None:
 
 
 @compile_kernel
-def linearize(tile: Floats, c: Floats) -> None:
-    """Turn one camera's pixels into equations.
+def linearize(tile: Floats, cameras: Floats, camera: int) -> None:
+    """Turn the pixels of one of the cameras into equations.
 
     Observations are dropped where the lens model has no inverse, and for a missing camera.
     """
-    if not projection.is_finite(c):
+    if not is_finite(cameras, camera):
         tile[:] = 0.0
         return
+    c, is_brown = cameras[camera], cameras[camera, 25] == _BROWN
     over_u, over_v = 1.0 / c[0], 1.0 / c[1]
     for j in range(LANES):
         xd, yd = (tile[A + j] - c[2]) * over_u, (tile[B + j] - c[3]) * over_v
         square = xd * xd + yd * yd
         over = 1.0 / (1.0 + square * (c[4] + square * c[5]))
         x, y = xd * over, yd * over
-        # Newton steps that invert most lens models to rounding; the others are inverted one by one.
+        # Newton steps that invert most of Brown's lenses to rounding; others are inverted below.
         for _ in range(2):
-            fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+            fx, fy, dxx, dxy, dyy = distort_brown(x, y, c[4], c[5], c[6], c[7], c[8])
             over = 1.0 / (dxx * dyy - dxy * dxy)
             fx, fy = fx - xd, fy - yd
             x -= (dyy * fx - dxy * fy) * over
             y -= (dxx * fy - dxy * fx) * over
-        fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        fx, fy, dxx, dxy, dyy = distort_brown(x, y, c[4], c[5], c[6], c[7], c[8])
         misfit = max(abs(fx - xd), abs(fy - yd))
         # Largest accepted misfit of an inverse on the plane z = 1.
         inside = misfit <= 1e-13 and x * x + y * y < c[21] * c[21]
@@ -236,15 +233,14 @@ def linearize(tile: Floats, c: Floats) -> None:
         tile[A + LANES + j], tile[B + LANES + j] = x, y
         tile[A + 2 * LANES + j], tile[A + 3 * LANES + j], tile[B + 2 * LANES + j] = dxx, dxy, dyy
     for j in range(LANES):
-        if tile[SQUARED + j] > 0.0:
-            pixel, plane = np.empty((1, 1, 2)), np.empty((1, 1, 2))
-            pixel[0, 0, 0], pixel[0, 0, 1] = tile[A + j], tile[B + j]
-            projection.normalize(c.reshape(1, 22), pixel, plane, np.empty((1, 1), np.uint8))
-            if not math.isfinite(plane[0, 0, 0]):
-                plane[:] = 0.0
-                tile[PRECISION + j] = 0.0
-            x, y = plane[0, 0, 0], plane[0, 0, 1]
-            _, _, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        if tile[SQUARED + j] > 0.0 or not is_brown:
+            numbers = load_camera(cameras, camera)
+            x, y, status = undistort(
+                numbers, (tile[A + j] - c[2]) / c[0], (tile[B + j] - c[3]) / c[1]
+            )
+            if status != _OK:
+                x = y = tile[PRECISION + j] = 0.0
+            _, _, dxx, dxy, dyy = distort(numbers, x, y)
             tile[A + LANES + j], tile[B + LANES + j] = x, y
             tile[A + 2 * LANES + j], tile[A + 3 * LANES + j] = dxx, dxy
             tile[B + 2 * LANES + j] = dyy

@@ -17,7 +17,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import projection
+from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -197,7 +197,7 @@ def estimate_midhip_shift(
     joints = solve_joints(observed, settings).joints[:, :, 0]
     image = np.empty((len(rig.cameras), joints[..., 0].size, 2))
     points = np.ascontiguousarray(np.broadcast_to(joints.reshape(1, -1, 3), (*image.shape[:2], 3)))
-    projection.project(rig.cameras, points, image)
+    camera_model.project(rig.cameras, points, image)
     image = image.reshape(-1, *joints.shape[:2], 2).swapaxes(0, 1)
     place = np.maximum(index, 0).astype(np.int64)[..., None]
     pixels = np.take_along_axis(middle[..., 0, :], place, axis=2)
@@ -246,7 +246,7 @@ def _body_offsets(
             gather(observations, (t * persons + n) * joint_count, tiles)
             size = 0
             for c in range(count):
-                linearize(tiles[c], cameras[c])
+                linearize(tiles[c], cameras, c)
                 tiles[c, USED : USED + LANES] = 0.0
                 some = False
                 for j in range(joint_count):

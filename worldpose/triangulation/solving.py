@@ -238,7 +238,7 @@ def _solve_all(
     for first in range(0, total, LANES):
         gather(observations, first, tiles)
         for camera in range(count):
-            linearize(tiles[camera], cameras[camera])
+            linearize(tiles[camera], cameras, camera)
         consensus(tiles, depths, noise, limit, state)
         sums[:] = state
         measure(tiles, depths, centers, sums, rays)

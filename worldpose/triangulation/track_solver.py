@@ -101,7 +101,7 @@ def _write_tiles(observations: Observations, tiles: Floats) -> None:
     for part in range(len(tiles)):
         gather(observations, part * LANES, tiles[part])
         for camera in range(len(cameras)):
-            linearize(tiles[part, camera], cameras[camera])
+            linearize(tiles[part, camera], cameras, camera)
             tiles[part, camera, USED : USED + LANES] = 1.0
 
 

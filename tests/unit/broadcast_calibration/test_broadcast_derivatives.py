@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.normal_equations import flow_row, point_row
+from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
+from worldpose.broadcast_calibration.evidence import PLAYER
 from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.residuals import flow_row, linearize, point_row
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.solver import Problem, equations_at
+from worldpose.geometry.lens_models import CameraNumbers
 
 POINT = np.array([6.0, -9.0, 1.2])
 
 
 def pixel_and_rows(camera, point=POINT):
-    image, rows = np.empty(2), np.empty((2, 12))
-    assert point_row(camera.rotation[0], camera.center, camera.lens(0), point, image, rows)
+    image, rows, room = np.empty(2), np.empty((2, 12)), (np.empty((2, 12)), np.empty((2, 3)))
+    assert point_row(CameraNumbers(*camera.rows[0]), point, image, rows, *room)
     return image, rows
 
 
@@ -40,8 +42,8 @@ def test_a_followed_point_moves_with_both_frames_as_derived():
     def predicted(step):
         moved = camera.take_step(step[:14].reshape(2, 7), [0.0, 0.0, 0.0, *step[14:]])
         image, rows = np.empty(2), np.empty((2, 16))
-        lens = moved.principal_point, moved.focal, moved.rotation, moved.distortion
-        assert flow_row(*lens, start, image, rows)
+        before, after = (CameraNumbers(*row) for row in moved.rows)
+        assert flow_row(before, after, start[0], start[1], image, rows)
         return image, rows
 
     rows = predicted(np.zeros(16))[1]
@@ -62,22 +64,22 @@ def test_the_gradient_is_the_slope_of_the_cost():
     by_size[:, 1, :2] = 0.0  # the end fall moves places along z alone
     known = {"ends": ends, "shares": shares, "by_size": by_size}
     robust = replace(points, loss=np.full(len(points), 3.0), **known)
-    problem = Problem(
+    problem = ClipProblem(
         robust,
         flow,
         build_prior(BroadcastPrior(), true.focal, true.image_size),
+        TermWeights(field=1.3, player=0.4, flow=0.7),
         np.array([np.inf] * 3 + [1e-3, 1e-2, 1e-2, 1e-2]),
-        0.7,
         2.0,
     )
     camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
     beside = 0.3 * rng.standard_normal((problem.paint_count, 3))
-    here = equations_at(camera, beside, problem)
+    here = linearize(camera, beside, problem)
     step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
     paint = rng.standard_normal(beside.shape)
     size = 1e-8
     ahead, behind = (
-        equations_at(camera.take_step(by * step, by * shared), beside + by * paint, problem).cost
+        linearize(camera.take_step(by * step, by * shared), beside + by * paint, problem).cost
         for by in (size, -size)
     )
     slope = float(
@@ -85,3 +87,24 @@ def test_the_gradient_is_the_slope_of_the_cost():
     )
     # Differences of a cost of 1e3 known to 1e-13, over 2e-8; the slope is 1e5.
     assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)
+
+
+@pytest.mark.parametrize("term", ["field", "player", "flow"])
+def test_a_weight_multiplies_its_own_term_alone(term):
+    rng = np.random.default_rng(5)
+    true = clip.moving(6)
+    points = clip.ground_points(true, rng, each=8)
+    some = rng.random(len(points)) < 0.4
+    points = replace(points, kind=np.where(some, PLAYER, points.kind))
+    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
+    camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), np.zeros(5))
+
+    def cost(weight):
+        weights = TermWeights()._replace(**{term: weight})
+        problem = ClipProblem(
+            points, clip.followed_points(true, np.random.default_rng(6)), prior, weights
+        )
+        return linearize(camera, np.zeros((0, 3)), problem).cost
+
+    assert cost(1.0) > cost(0.0)
+    assert cost(3.0) - cost(0.0) == pytest.approx(3.0 * (cost(1.0) - cost(0.0)))

@@ -7,13 +7,14 @@ import pytest
 import turning_clip as clip
 from scipy.optimize import least_squares
 
+from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     PointEvidence,
 )
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.solver import Problem, solve
+from worldpose.broadcast_calibration.solver import solve
 from worldpose.errors import DegenerateError
 
 SMOOTH = np.array([np.inf] * 3 + [1e-4, 1e-3, 1e-2, 1e-2])
@@ -24,7 +25,7 @@ def problem_of(true, rng, frames=None, noise=0.3, smooth=SMOOTH):
     if frames is not None:
         points = points[np.isin(points.frame, frames)]
     prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
-    return Problem(points, clip.followed_points(true, rng), prior, smooth, 1.0, np.inf)
+    return ClipProblem(points, clip.followed_points(true, rng), prior, smoothness=smooth)
 
 
 def off(true, rng):
@@ -53,7 +54,9 @@ def test_exact_evidence_gives_the_exact_camera():
 def test_scipy_finds_no_lower_cost():
     rng = np.random.default_rng(3)
     true = clip.moving(5)
-    problem = replace(problem_of(true, rng), smoothness=np.full(7, np.inf), flow_weight=0.0)
+    problem = replace(
+        problem_of(true, rng), smoothness=np.full(7, np.inf), weights=TermWeights(flow=0.0)
+    )
     start = off(true, rng)
     found = solve(start, problem, 60)
     points, prior = problem.points, problem.prior
@@ -80,4 +83,4 @@ def test_a_frame_with_neither_evidence_nor_prior_is_named_as_undetermined():
     true = clip.moving(4)
     prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
     with pytest.raises(DegenerateError, match="neither evidence nor prior"):
-        solve(true, Problem(PointEvidence.none(), FlowEvidence.none(), prior), 5)
+        solve(true, ClipProblem(PointEvidence.none(), FlowEvidence.none(), prior), 5)

@@ -9,12 +9,7 @@ from data_contracts.broadcast_calibration import (
     KeyFrame,
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.broadcast_calibration import calibration
-from worldpose.broadcast_calibration.calibration import (
-    BroadcastClip,
-    calibrate_broadcast,
-)
-from worldpose.broadcast_calibration.evidence import CLICK, MARKING
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
@@ -111,27 +106,6 @@ def test_proposed_key_frames_start_the_fit_and_do_not_bias_it(true, pictures):
     }
     assert errors[True] < 0.7
     assert errors[True] < errors[False]
-
-
-def test_the_weight_of_the_field_applies_to_points_drawn_markings_and_painted_lines(
-    true, pictures, monkeypatch
-):
-    weights = {}
-
-    def note(camera, problem, *further, **options):
-        for kind in np.unique(problem.points.kind):
-            weights[int(kind)] = np.unique(problem.points.weight[problem.points.kind == kind])
-        return solve(camera, problem, *further, **options)
-
-    solve = calibration.solve
-    monkeypatch.setattr(calibration, "solve", note)
-    settings = SETTINGS.model_copy(update={"field_weight": 0.25})
-    whole = BroadcastClip([clicks(true, 3), clicks(true, 12)], lambda: iter(pictures), FPS)
-    calibrate_broadcast(clip.PITCH, whole, settings)
-    assert {kind: found.tolist() for kind, found in weights.items()} == {
-        CLICK: [0.25],
-        MARKING: [0.25],
-    }
 
 
 def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):

@@ -4,7 +4,7 @@ from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clicks, Clip
-from worldpose.bundle_adjustment.solver import Problem
+from worldpose.bundle_adjustment.residuals import AdjustmentProblem
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import PARAMETERS, step_camera
 from worldpose.triangulation.passes import triangulate_joints
@@ -49,7 +49,7 @@ def scene():
         image = true.project(points)[camera_of, point_of]
         free = np.ones((cameras, len(PARAMETERS)), dtype=bool)
         free[:, PARAMETERS.index("k3")] = False
-        problem = Problem(
+        problem = AdjustmentProblem(
             cameras=true,
             free=free,
             camera_information=np.zeros((cameras, len(PARAMETERS), len(PARAMETERS))),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from lab import errors
 
-from worldpose.bundle_adjustment.adjustment import adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks
+from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
 
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))

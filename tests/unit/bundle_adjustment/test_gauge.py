@@ -5,11 +5,11 @@ import pytest
 from lab import ring
 
 from worldpose.bundle_adjustment.uncertainty import (
-    Similarity,
+    move_cameras,
     relative_covariance,
     similarity_steps,
 )
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
 
 ORIGIN = np.array([0.3, -0.2, 1.0])
@@ -21,13 +21,15 @@ def rng():
 
 
 def turned(scale=1.1):
-    return Similarity(scale, Rigid.from_rotvec([0.2, -0.5, 0.9], np.zeros(3)).rotation, ORIGIN)
+    return Similarity(
+        np.array(scale), Rigid.from_rotvec([0.2, -0.5, 0.9], np.zeros(3)).rotation, ORIGIN
+    )
 
 
 def test_cameras_that_follow_a_transform_see_it_nowhere(rng):
     cameras, points = ring(3, rng), rng.normal(0.0, 0.5, (10, 3))
     moved = turned()
-    seen = moved.move_cameras(cameras).project(moved.move_points(points))
+    seen = move_cameras(moved, cameras).project(moved.apply(points))
     np.testing.assert_allclose(seen, cameras.project(points), atol=1e-9)
 
 

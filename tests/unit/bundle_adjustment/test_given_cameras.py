@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from lab import joint_error, make_lab, triangulated
 
-from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation.passes import triangulate_joints

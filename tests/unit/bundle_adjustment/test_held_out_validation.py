@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lab import errors
 
-from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.held_out_validation import (
     held_out_errors,
 )

@@ -4,7 +4,7 @@ import pytest
 
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 PITCH, SIZE = people.PITCH, people.SIZE

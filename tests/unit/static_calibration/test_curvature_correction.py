@@ -8,12 +8,12 @@ from data_contracts.pitch import PitchSpec
 from worldpose.pitch.template import Surface
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
-from worldpose.static_calibration.adjustment import build_problem
 from worldpose.static_calibration.curvature_correction import (
     ClicksAndBars,
     free_on_pitch,
 )
 from worldpose.static_calibration.evidence import gather_evidence
+from worldpose.static_calibration.fit import build_problem
 from worldpose.static_calibration.line_samples import PaintNoise, project_lines, sample_markings
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import step_camera

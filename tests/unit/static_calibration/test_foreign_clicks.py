@@ -7,14 +7,13 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.adjustment import build_problem, camera_row
-from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.click_outliers import (
-    compute_residuals,
     fit_given_inliers,
     held_out_error,
 )
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.evidence import gather_evidence
+from worldpose.static_calibration.fit import build_problem, compute_residuals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
@@ -40,7 +39,7 @@ def test_a_point_beyond_the_fold_has_its_image_outwards_not_back_in_the_picture(
     (_, clicked, _), *_ = cameras(1, 9, noise=0.0, focal=(0.6, 0.7))
     evidence = gather_evidence(rig.PITCH, rig.markings(clicked), rig.SIZE, 0.5, "test")
     problem = build_problem(evidence, rig.SIZE, StaticCalibrationSettings())
-    row = camera_row(calibrated(clicked).estimate.camera)
+    row = calibrated(clicked).estimate.camera.numbers
     row[4:9] = [-0.3, 0.0, 0.0, 0.0, 0.0]
     # Turned until a clicked point is 76 degrees off the axis: the fold is at 46 degrees.
     pose = row[9:18].reshape(3, 3)
@@ -75,7 +74,7 @@ def fit_to_all(clicked, drawn):
     settings = StaticCalibrationSettings()
     evidence = gather_evidence(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
     problem = build_problem(evidence, rig.SIZE, settings)
-    start = camera_row(calibrated(clicked, drawn).estimate.camera)
+    start = calibrated(clicked, drawn).estimate.camera.numbers
     every = np.ones(len(clicked), dtype=bool), np.ones(len(evidence.markings), dtype=bool)
     return problem, fit_given_inliers(problem, start, *every)
 

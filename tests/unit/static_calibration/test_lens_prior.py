@@ -13,7 +13,7 @@ from clicking_people import (
     wide_camera,
 )
 
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 
 
 def test_a_known_lens_lowers_the_ground_error_of_few_clicks():

@@ -22,7 +22,7 @@ def tiles_of(camera, image, confidence=None):
     index = np.zeros((1, count, 1), np.int64)
     gather(Observations.from_rig(rig, keypoints, precision, index), 0, tiles)
     for tile, one in zip(tiles, rig.cameras, strict=True):
-        linearize(tile, one)
+        linearize(tile, one[None], 0)
     return rig, tiles
 
 

@@ -1,4 +1,4 @@
-"""Calibration of one static camera from clicks in its image (C1-C5)."""
+"""Explanations of clicks that contradict each other: wrong names, a crop, another pitch (C3)."""
 
 from __future__ import annotations
 
@@ -8,19 +8,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from data_contracts.arrays import Floats, Image
-from data_contracts.cameras import LensCalibration
-from data_contracts.static_calibration import ClickedMarkings
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.laws import law_points
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.adjustment import (
-    Problem,
-    adjust,
-    build_problem,
-    camera_row,
-)
 from worldpose.static_calibration.click_outliers import (
     CLEAR_GAIN,
     Explanation,
@@ -32,10 +23,12 @@ from worldpose.static_calibration.click_outliers import (
     scale_noise,
 )
 from worldpose.static_calibration.evidence import (
-    check_amount,
     describe_clicks,
-    gather_evidence,
     has_enough_points,
+)
+from worldpose.static_calibration.fit import (
+    CameraProblem,
+    fit_cameras,
 )
 from worldpose.static_calibration.ground_error import points_off_line, propose_clicks
 from worldpose.static_calibration.initialization import (
@@ -44,9 +37,7 @@ from worldpose.static_calibration.initialization import (
     fit_from_starts,
     plausible_cameras,
 )
-from worldpose.static_calibration.line_refinement import refine_and_judge
 from worldpose.static_calibration.parameters import PARAMETERS
-from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _COMPARISON_LOSS: Final = 9.0
@@ -55,69 +46,7 @@ _MAX_OUTLIER_SHARE: Final = 0.1
 """Maximum share of outliers of a camera that rests on an assumption [1]."""
 
 
-def calibrate_camera(
-    pitch: PitchTemplate,
-    clicked: ClickedMarkings,
-    image_size: tuple[int, int],
-    *,
-    picture: Image | None = None,
-    settings: StaticCalibrationSettings | None = None,
-    where: str = "clicked markings",
-    lens: LensCalibration | None = None,
-    start: Camera | None = None,
-) -> StaticCalibration:
-    """Return the camera of an image, its covariance and its report.
-
-    Stage 1 finds starts: homographies of the flattened pitch, or plausible cameras where clicks
-    are too few for one. Stage 2 fits pose, focal length, principal point and distortion on the
-    crowned pitch, and excludes outliers among the clicks. Stage 3 refines on the painted lines of
-    the image, if there is one.
-
-    Args:
-        pitch: the stadium's template.
-        clicked: named points, and pixels along named markings.
-        image_size: width, height [px].
-        picture: (height, width) or (height, width, 3); without it there is no stage 3.
-        settings: noise, prior and thresholds; the defaults if None.
-        where: file or camera, for messages.
-        lens: a lens that was calibrated before, the prior of focal length, principal point and
-            distortion; its k1, k2 and k3 are then all solved for. None = not known.
-        start: a camera near the answer, which replaces stage 1. Where the markings are their own
-            image after half a turn, it decides the side.
-
-    Raises:
-        InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
-            clicks contradict each other, or they do not determine the camera; the message says
-            which clicks to add.
-
-    Note:
-        C1-C5; paper section "Static Camera Calibration".
-    """
-    stated = settings or StaticCalibrationSettings()
-    if lens is not None:
-        stated = stated.model_copy(update={"distortion": "k1_k2_k3"})
-    evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
-    check_amount(evidence, pitch, where)
-    problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
-    if start is None:
-        near = find_start(problem, stated)
-    else:
-        near, _ = fit_from_starts(problem, camera_row(start)[None], stated.wrong_click)
-    found = fit_inliers_at_best_noise(problem, near, stated)
-    found = _find_explanation(found, pitch, stated)
-    check_determined(found, pitch)
-    found = _try_k3(found)
-    estimate, lines = found.estimate, None
-    if picture is not None and stated.lines:
-        found, lines = refine_and_judge(found, pitch, picture)
-        if lines.venue is not None:
-            estimate = lines.estimate.estimate
-            pitch = pitch.with_surface(lines.estimate.surface)
-    report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
-    return StaticCalibration(estimate, report)
-
-
-def _find_explanation(
+def find_explanation(
     found: Explanation, pitch: PitchTemplate, stated: StaticCalibrationSettings
 ) -> Explanation:
     """Return the most probable explanation of consistent clicks.
@@ -163,8 +92,8 @@ def _find_explanation(
     return best
 
 
-def _other_starts(problem: Problem, settings: StaticCalibrationSettings) -> list[Floats]:
-    """Return starts (22,) that leave out one click each.
+def _other_starts(problem: CameraProblem, settings: StaticCalibrationSettings) -> list[Floats]:
+    """Return starts (WIDTH,) that leave out one click each.
 
     A single click under a wrong name may hold the robust fit in another minimum.
     """
@@ -182,7 +111,7 @@ def _other_starts(problem: Problem, settings: StaticCalibrationSettings) -> list
 
 
 def _extend_to_all(
-    problem: Problem, assumed: Problem, found: Explanation, factor: float
+    problem: CameraProblem, assumed: CameraProblem, found: Explanation, factor: float
 ) -> Explanation:
     """Return an explanation applied to the whole problem: markings that it lacks are outliers."""
     if len(assumed.evidence.drawn_image) == len(problem.evidence.drawn_image):
@@ -193,7 +122,9 @@ def _extend_to_all(
     return replace(found, problem=whole, fit=replace(found.fit, markings=none))
 
 
-def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierFit], str]]]:
+def _alternatives(
+    problem: CameraProblem,
+) -> Iterator[tuple[CameraProblem, Callable[[InlierFit], str]]]:
     """Yield alternative problems, each with a function that describes its assumption."""
     evidence, prior = problem.evidence, problem.prior.copy()
     # In widths: covers crops of half the size.
@@ -217,7 +148,7 @@ def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierF
         yield replace(problem, prior=prior), shift
 
 
-def _try_k3(found: Explanation) -> Explanation:
+def try_k3(found: Explanation) -> Explanation:
     """Return the explanation with k3 if it lowers the held-out error, and the decisions (C5)."""
     min_residuals = 24  # twice the parameters
     problem, fit, settings = found.problem, found.fit, found.settings
@@ -294,7 +225,7 @@ def _size_in_yards(pitch: PitchTemplate) -> _PitchSize:
 
 
 def check_unit(
-    problem: Problem,
+    problem: CameraProblem,
     best: Explanation,
     pitch: PitchTemplate,
     settings: StaticCalibrationSettings,
@@ -322,7 +253,7 @@ def check_unit(
         raise _size_error(problem, pitch, size)
 
 
-def _size_error(problem: Problem, pitch: PitchTemplate, size: _PitchSize) -> InputError:
+def _size_error(problem: CameraProblem, pitch: PitchTemplate, size: _PitchSize) -> InputError:
     return InputError(
         "pitch.json: length, width",
         expected=f"the size of the pitch in metres; the clicks of {problem.where} fit "
@@ -337,7 +268,7 @@ def _outlier_share(fit: InlierFit) -> float:
 
 
 def _find_size(
-    problem: Problem, pitch: PitchTemplate, settings: StaticCalibrationSettings
+    problem: CameraProblem, pitch: PitchTemplate, settings: StaticCalibrationSettings
 ) -> _PitchSize | None:
     """Return another size that explains the clicked points, if there is one."""
     sizes = (_size_in_yards(pitch), _PitchSize(105.0, 68.0, "it seems to be another pitch's"))
@@ -361,9 +292,9 @@ def _find_size(
 
 
 def _start_on_pitch(
-    problem: Problem, size: _PitchSize, settings: StaticCalibrationSettings
-) -> tuple[Problem, Floats] | None:
-    """Return the clicked points on a pitch of another size, and a camera (22,) near the answer.
+    problem: CameraProblem, size: _PitchSize, settings: StaticCalibrationSettings
+) -> tuple[CameraProblem, Floats] | None:
+    """Return the clicked points on a pitch of another size, and a camera (WIDTH,) near the answer.
 
     Returns:
         None if a point is not in the Laws, or the points determine no camera.
@@ -379,7 +310,7 @@ def _start_on_pitch(
     rows = cameras_from_homographies(other, settings.prior, leave_out=False)
     if not len(rows):
         return None
-    start = adjust(other, rows, click_loss=_COMPARISON_LOSS)
+    start = fit_cameras(other, rows, click_loss=_COMPARISON_LOSS)
     return other, start.rows[np.argmin(start.cost)]
 
 
@@ -419,8 +350,8 @@ def _is_mirrored(found: Explanation) -> bool:
     rows = cameras_from_homographies(mirrored, settings.prior, leave_out=False)
     if not len(rows):
         rows = plausible_cameras(mirrored, settings.prior)
-        weighed = adjust(mirrored, rows, click_loss=_COMPARISON_LOSS, iterations=0)
+        weighed = fit_cameras(mirrored, rows, click_loss=_COMPARISON_LOSS, iterations=0)
         rows = rows[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
-    best = adjust(mirrored, rows, click_loss=_COMPARISON_LOSS).cost.min()
-    given = adjust(problem, found.fit.row[None], click_loss=_COMPARISON_LOSS).cost[0]
+    best = fit_cameras(mirrored, rows, click_loss=_COMPARISON_LOSS).cost.min()
+    given = fit_cameras(problem, found.fit.row[None], click_loss=_COMPARISON_LOSS).cost[0]
     return bool(best < 0.25 * given)
