@@ -393,7 +393,7 @@ def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrame
 
 def _pixel_slopes(found: BroadcastCalibration, frame: int, place: Floats) -> Floats:
     """Return the slopes (2, 12) of a place's pixel by the parameters of its frame."""
-    return found.camera.project_with_jacobian(frame, place[None])[1][0]
+    return np.asarray(found.camera.project_with_jacobian(frame, place[None])[1][0])
 
 
 def calibrate_cut(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from pathlib import Path
-from typing import Final, TypeVar, cast
+from typing import Final, Literal, TypeVar, cast
 
 from numba import njit
 from numba.core import config
@@ -46,14 +46,15 @@ def inline_kernel(function: Function) -> Function:
     return _compile(function, "always")
 
 
-def _compile(function: Function, inline: str) -> Function:
+def _compile(function: Function, inline: Literal["never", "always"]) -> Function:
     given = config.CACHE_DIR  # type: ignore[attr-defined]
     folder = given or _cache_folder(_module_of(function))
     # Numba reads this setting while it decorates.
     config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
-    options = {"cache": folder is not None, "inline": inline}
+    cached = folder is not None
     try:
-        return cast(Function, njit(nogil=True, error_model="numpy", **options)(function))
+        compiled = njit(cache=cached, nogil=True, error_model="numpy", inline=inline)(function)
+        return cast(Function, compiled)
     finally:
         config.CACHE_DIR = given  # type: ignore[attr-defined]
 

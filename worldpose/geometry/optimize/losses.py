@@ -22,7 +22,8 @@ def cauchy_loss(squared: Number, scale: float) -> Number:
     """Return c^2 log(1 + e^2 / c^2)."""
     if scale == np.inf:
         return squared + 0.0
-    return scale * scale * np.log1p(squared / (scale * scale))
+    loss: Number = scale * scale * np.log1p(squared / (scale * scale))
+    return loss
 
 
 @inline_kernel

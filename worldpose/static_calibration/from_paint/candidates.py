@@ -305,7 +305,7 @@ def project_markings(paint: PaintMap, samples: LineSamples, candidates: Candidat
     step = 0.25
     cameras = candidates.cameras
     pixels, ahead = cameras.project(places), cameras.project(places + step * samples.along_world)
-    seen = np.isfinite(pixels).all(-1) & np.isfinite(ahead).all(-1)
+    seen = np.asarray(np.isfinite(pixels).all(-1) & np.isfinite(ahead).all(-1))
     pixels, ahead = np.where(seen[..., None], pixels, 0.0), np.where(seen[..., None], ahead, 0.0)
     way = ahead - pixels
     normals = np.arctan2(way[..., 1], way[..., 0]) + 0.5 * np.pi
