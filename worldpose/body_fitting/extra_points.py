@@ -25,31 +25,15 @@ from worldpose.body.keypoints import (
     point_segments,
 )
 from worldpose.body.model import SMPL_VERTICES, BodyModel, BodyParameters
-from worldpose.body_fitting.objective import Evidence
-from worldpose.body_fitting.solver import Shapes, Solver
+from worldpose.body_fitting.evidence import PersonEvidence
+from worldpose.body_fitting.poses import PoseSolver
+from worldpose.body_fitting.results import ExtraFit
+from worldpose.body_fitting.shapes import Shapes
 from worldpose.compiled import map_in_threads
-from worldpose.triangulation.passes import ExtraJoints
+from worldpose.triangulation.results import ExtraJoints
 
 MIRROR: Final = np.array([-1.0, 1.0, 1.0])
 """Of vectors in the axes of the unposed body: left, up, forward."""
-
-
-@dataclass(frozen=True, eq=False)
-class ExtraFit:
-    """Points besides COCO-17 of fitted bodies.
-
-    Attributes:
-        points: (points,) names.
-        joints: (frames, persons, points, 3) [m], world, where the body model has them.
-        covariance: (frames, persons, points, 3, 3) [m^2].
-        offsets: (points, 3) [m] left, up and forward in the axes of the point's segment: from the
-            body's point to the detector's.
-    """
-
-    points: tuple[str, ...]
-    joints: Floats
-    covariance: Floats
-    offsets: Floats
 
 
 def known_points(model: BodyModel, points: Sequence[str]) -> tuple[str, ...]:
@@ -71,13 +55,13 @@ def select_points(extra: ExtraJoints, points: tuple[str, ...]) -> ExtraJoints:
     )
 
 
-def with_points(solver: Solver, points: tuple[str, ...]) -> Solver:
+def with_points(solver: PoseSolver, points: tuple[str, ...]) -> PoseSolver:
     """Return the solver of poses that also knows these points, and bends ankles and toes."""
     chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
     return replace(solver, chained=chained, prior=solver.prior.add_feet())
 
 
-def move_points(solver: Solver, points: tuple[str, ...], offsets: Floats) -> Solver:
+def move_points(solver: PoseSolver, points: tuple[str, ...], offsets: Floats) -> PoseSolver:
     """Return the solver of `with_points` with the points where the detector has them."""
     its = point_segments(solver.chained.model, points)
     return replace(solver, chained=solver.chained.move_points(len(COCO17), its, offsets))
@@ -100,9 +84,9 @@ def perceived_points(
 
 
 def learn_point_offsets(
-    solver: Solver,
+    solver: PoseSolver,
     points: tuple[str, ...],
-    people: Mapping[int, Evidence],
+    people: Mapping[int, PersonEvidence],
     shapes: Shapes,
     fps: float,
 ) -> tuple[Floats, Floats, Floats]:
@@ -208,7 +192,7 @@ def densest_interval(known: NDArray[np.integer], fps: float) -> slice:
 
 
 def feet_determined(
-    model: BodyModel, points: tuple[str, ...], evidence: Evidence, fps: float
+    model: BodyModel, points: tuple[str, ...], evidence: PersonEvidence, fps: float
 ) -> NDArray[np.bool_]:
     """Return the frames in which points determine the left and right foot (frames, 2)."""
     its = point_segments(model, points)
@@ -238,13 +222,15 @@ class PointModel:
         systematic: (points, 3, 3) [m^2], covariance of the offsets and of the common bias.
     """
 
-    solver: Solver
+    solver: PoseSolver
     points: tuple[str, ...]
     offsets: Floats
     modelled: Floats
     systematic: Floats
 
-    def add(self, person: int, own: Evidence, extra: ExtraJoints, fps: float) -> Evidence:
+    def add(
+        self, person: int, own: PersonEvidence, extra: ExtraJoints, fps: float
+    ) -> PersonEvidence:
         """Return a person's evidence with the points, in the frames of both."""
         covariance = extra.covariance[:, person] - self.modelled[..., None] * np.eye(3)
         return own.add_points(extra.joints[:, person], covariance, fps, self.solver.settings)
@@ -294,8 +280,8 @@ class PointArrays:
 
 
 def learn_points(
-    solver: Solver,
-    people: Mapping[int, tuple[Evidence, ExtraJoints]],
+    solver: PoseSolver,
+    people: Mapping[int, tuple[PersonEvidence, ExtraJoints]],
     shapes: Shapes,
     fps: float,
 ) -> PointModel:

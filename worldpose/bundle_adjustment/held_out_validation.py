@@ -18,7 +18,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import SIZE
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
 

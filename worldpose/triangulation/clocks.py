@@ -20,9 +20,9 @@ from worldpose.compiled import map_in_threads
 from worldpose.geometry import projection
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import solve_joints
+from worldpose.triangulation.solve import solve_joints
 
 GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
 """Deviations accepted in each pass: clocks three frames apart put a runner's rays half a metre
@@ -201,7 +201,7 @@ class MovingJoints:
         """Return the joints with a velocity, of detections by person on the common clock."""
         pixels, index = people.keypoints, people.detection_index
         precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
-        observations = Observations.from_rig(rig, pixels, precision, index)
+        observations = Observations.of(rig, pixels, precision, index)
         joints = solve_joints(observations, settings).joints
         # Half the time over which velocity is computed is 0.06 s.
         half = max(1, round(0.06 * fps))

@@ -23,9 +23,9 @@ from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import projection
 from worldpose.geometry.projection import project_point
-from worldpose.triangulation.observations import Observations
+from worldpose.triangulation.residuals import Observations
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import Solution, solve_joints
+from worldpose.triangulation.solve import SolvedJoints, solve_joints
 
 PAIRS: Final = np.array(
     [
@@ -58,7 +58,7 @@ def find_swaps(
     observations: Observations,
     noise: tuple[float, float],
     limit: float,
-    found: Solution,
+    found: SolvedJoints,
 ) -> Flags:
     """Return the left-right swaps of body parts (frames, cameras, persons, parts).
 
@@ -133,14 +133,15 @@ def _find_swaps(
     observations: Observations,
     noise: tuple[float, float],
     limit: float,
-    found: Solution,
+    found: SolvedJoints,
     pairs: NDArray[np.int64],
     part_of: NDArray[np.int64],
     exchanged: Flags,
 ) -> None:
     """Write `exchanged` (frames, cameras, persons, parts)."""
     keypoints, precision = observations.keypoints, observations.precision
-    index, shift, cameras = observations.detection_index, observations.shift, observations.cameras
+    index, shift = observations.detection_index, observations.shift
+    cameras = observations.rig.cameras
     joints, covariance = found.joints, found.covariance
     seen, inliers = found.seen, found.inliers
     frames, count, persons = index.shape
@@ -209,7 +210,7 @@ STRANGE: Final = 4.0
 """Squared deviation of a length from which other pairs are tried [variances]."""
 
 
-def limb_lengths(found: Solution) -> Floats:
+def limb_lengths(found: SolvedJoints) -> Floats:
     """Return the limb lengths of all persons (persons, limbs) [m]; NaN where unknown.
 
     A length is the median over the frames with three inlier views of both ends, or over all frames
@@ -237,7 +238,7 @@ def limb_lengths(found: Solution) -> Floats:
 def repair_limb_lengths(
     observations: Observations,
     settings: TriangulationSettings,
-    found: Solution,
+    found: SolvedJoints,
     lengths: Floats,
 ) -> None:
     """Re-triangulate, in place, ends with few inlier views of limbs of wrong length.
@@ -286,7 +287,7 @@ class _Points:
 
 
 def _select_end(
-    observations: Observations, found: Solution, end: tuple[int, int, int], doubtful: bool
+    observations: Observations, found: SolvedJoints, end: tuple[int, int, int], doubtful: bool
 ) -> Observations:
     """Return one limb end's observations: one frame, one detection per camera, one joint."""
     frame, person, joint = end
@@ -315,13 +316,13 @@ class _Choices:
 
     points: _Points
     cost: Floats
-    tried: Solution | None
+    tried: SolvedJoints | None
 
 
 def _list_choices(
     observations: Observations,
     settings: TriangulationSettings,
-    found: Solution,
+    found: SolvedJoints,
     end: tuple[int, int, int],
 ) -> _Choices:
     """Return the positions of an end from pairs of views and their inliers."""
@@ -338,7 +339,7 @@ def _list_choices(
         detection_index=np.zeros((*used.shape, 1), np.int64),
     )
 
-    def solve_from(views: NDArray[np.bool_]) -> tuple[Solution, Floats]:
+    def solve_from(views: NDArray[np.bool_]) -> tuple[SolvedJoints, Floats]:
         some = np.where(views, weights, 0.0)[:, :, None, None]
         solution = solve_joints(repeated._replace(precision=some), settings)
         return solution, _misfit(observations, settings.noise, solution.joints[:, 0, 0])
@@ -359,7 +360,7 @@ def _choose(
     choices: list[_Choices],
     long: Floats,
     limit: float,
-    found: Solution,
+    found: SolvedJoints,
     chain: tuple[int, int, int, int],
 ) -> None:
     """Set the two ends of an arm or a leg to their best candidates, in place."""
@@ -414,7 +415,8 @@ def _deviation(upper: _Points, lower: _Points, long: Floats | float) -> tuple[Fl
 def _misfit(observations: Observations, noise: tuple[float, float], points: Floats) -> Floats:
     """Return squared errors of views (points, cameras) [variances]; 0 without an observation."""
     pixels, weights = observations.keypoints[0, :, 0, 0], observations.precision[0, :, 0, 0]
-    cameras, depths, shift = observations.cameras, observations.depths, observations.shift
+    cameras, depths, _ = observations.rig
+    shift = observations.shift
     at = np.broadcast_to(points, (len(weights), *points.shape))
     image = np.empty((*at.shape[:-1], 2))
     projection.project(cameras, np.ascontiguousarray(at), image)

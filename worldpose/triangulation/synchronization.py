@@ -34,7 +34,7 @@ from worldpose.triangulation.clocks import (
     choose_intervals,
     shift_in_time,
 )
-from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 
 MAX_SPAN: Final = 30

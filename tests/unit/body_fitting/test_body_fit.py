@@ -5,10 +5,11 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.model import BodyParameters
-from worldpose.body_fitting import body_fit, windows
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.fit_quality import FitMetrics, report_fit
-from worldpose.body_fitting.objective import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting import estimate
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.evidence import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.report import FitMetrics, report_fit
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
 
@@ -81,7 +82,7 @@ def test_long_tracks_are_solved_in_windows_with_the_same_result(monkeypatch):
     joints[1200:1230, 0, :9] = np.nan
     evidence = ClipEvidence(joints, covariance, 50.0)
     whole = fit_bodies(MODEL, evidence, SETTINGS)
-    monkeypatch.setattr(windows, "WINDOW_FRAMES", 300)
+    monkeypatch.setattr(estimate, "WINDOW_FRAMES", 300)
     fit = fit_bodies(MODEL, evidence, SETTINGS)
     gone = np.isnan(fit.joints[:, 0, 0, 0])
     np.testing.assert_array_equal(gone, np.isnan(whole.joints[:, 0, 0, 0]))
@@ -190,8 +191,8 @@ def test_a_long_clip_is_read_by_windows(monkeypatch):
 
         read = read_joints
 
-    monkeypatch.setattr(windows, "WINDOW_FRAMES", 300)
-    parts = list(body_fit.fit_in_windows(MODEL, Source(), SETTINGS))
+    monkeypatch.setattr(estimate, "WINDOW_FRAMES", 300)
+    parts = list(estimate.fit_in_windows(MODEL, Source(), SETTINGS))
     assert [part.start for part, _ in parts] == [0, 300, 600, 900, 1200]
     assert [part.stop for part, _ in parts] == [300, 600, 900, 1200, 1300]
     # A window with three seconds before and after it.

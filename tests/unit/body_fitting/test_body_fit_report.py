@@ -8,8 +8,9 @@ from test_monocular import broadcast
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.fit_quality import report_fit
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.report import report_fit
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 
 from data_contracts.conventions import COCO17
-from worldpose.body_fitting.fit_quality import far_offsets
+from worldpose.body_fitting.report import far_offsets
 
 
 def test_offsets_that_no_detector_usually_has_are_named_once_for_both_sides():

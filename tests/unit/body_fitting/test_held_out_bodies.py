@@ -8,13 +8,14 @@ from walking_bodies import KEYPOINTS, MODEL, walker
 
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.fit_quality import SeenClip, _clustered_variance, compare_held_out
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.held_out import SeenClip, _clustered_variance, compare_held_out
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.scene import look_at
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 SETTINGS = BodyFittingSettings()

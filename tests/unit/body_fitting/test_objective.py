@@ -7,15 +7,14 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.objective import (
+from worldpose.body_fitting.evidence import (
     MIRRORED_OFFSETS,
     Contacts,
-    Evidence,
-    Pose,
-    Track,
+    PersonEvidence,
     find_contacts,
 )
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
+from worldpose.body_fitting.residuals import PersonObjective, Pose
 from worldpose.body_fitting.settings import BodyFittingSettings
 
 
@@ -27,9 +26,11 @@ def track():
     joints[1, 0, 4] = np.nan
     settings = BodyFittingSettings()
     contacts = Contacts(np.ones((5, 2)), np.ones((4, 2)), np.full((5, 2), 0.07))
-    evidence = Evidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
+    evidence = PersonEvidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
     chained = ChainedKeypoints.of(KEYPOINTS)
-    made = Track(chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts)
+    made = PersonObjective(
+        chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts
+    )
     angles = truth.body_pose @ GATHER.T + 0.1 * rng.standard_normal((5, 30))
     pose = Pose(truth.transl + 0.01, truth.global_orient, angles, truth.betas[0])
     return made, pose
@@ -95,7 +96,7 @@ def test_a_track_of_two_intervals_has_the_equations_of_both(track):
 
     moved = replace(pose, transl=pose.transl + [0.05, 0.0, 0.0])
     apart = [equations([each], made.evidence) for each in (pose, moved)]
-    both = Evidence(
+    both = PersonEvidence(
         np.concatenate([made.evidence.joints] * 2), np.concatenate([made.evidence.information] * 2)
     )
     joined = equations([pose, moved], both, starts=(5,))

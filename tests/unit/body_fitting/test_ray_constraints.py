@@ -9,14 +9,15 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.model import BodyParameters
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.objective import Evidence
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.evidence import PersonEvidence
 from worldpose.body_fitting.ray_constraints import (
     constrain_to_rays,
     find_ray_constraints,
     identify_people,
     shift_frames,
 )
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 
 CAMERA = broadcast(1)
@@ -121,7 +122,7 @@ def test_lines_of_a_moving_camera_pass_through_what_it_sees():
 
 def test_two_lines_make_a_joint_and_one_more_makes_it_surer():
     settings = BodyFittingSettings()
-    nothing = Evidence(np.full((1, 17, 3), np.nan), np.zeros((1, 17, 3, 3)))
+    nothing = PersonEvidence(np.full((1, 17, 3), np.nan), np.zeros((1, 17, 3, 3)))
     across_x, across_y = np.diag([0.0, 1.0, 1.0]), np.diag([1.0, 0.0, 1.0])
 
     def line(point, across):

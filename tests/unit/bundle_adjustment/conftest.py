@@ -8,7 +8,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.parameters import PARAMETERS, step_camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 

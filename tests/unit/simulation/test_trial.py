@@ -13,7 +13,7 @@ from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 

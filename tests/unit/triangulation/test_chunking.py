@@ -6,13 +6,13 @@ import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import (
+from worldpose.triangulation.estimate import (
     MARGIN,
     learn_clip,
     reconstruct_chunks,
     reconstruct_joints,
 )
-from worldpose.triangulation.reports import Histogram
+from worldpose.triangulation.report import Histogram
 from worldpose.triangulation.settings import TriangulationSettings
 
 as_detections = KeypointDetections.from_keypoints

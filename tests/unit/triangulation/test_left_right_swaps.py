@@ -7,11 +7,11 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.limb_lengths import find_swaps
-from worldpose.triangulation.observations import Observations, Rig
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import Solution
+from worldpose.triangulation.solve import SolvedJoints
 
 as_detections = KeypointDetections.from_keypoints
 
@@ -85,7 +85,7 @@ def test_an_exchange_needs_as_much_evidence_as_it_is_rare(aside, legs_fit, parts
     keypoints[..., wrist, 0] = aside
     precision = np.zeros((1, 1, 1, 17))
     precision[..., wrist], precision[..., ankle] = 1.0, legs_fit
-    found = Solution(
+    found = SolvedJoints(
         joints=joints,
         covariance=np.zeros((1, 1, 17, 3, 3)),
         views=np.zeros((1, 1, 17), np.uint8),
@@ -95,7 +95,7 @@ def test_an_exchange_needs_as_much_evidence_as_it_is_rare(aside, legs_fit, parts
         seen=np.ones((1, 1, 1, 17), np.bool_),
     )
     index, noise = np.zeros((1, 1, 1), np.int64), (1.0, 0.0)
-    observed = Observations.from_rig(Rig.from_cameras(camera), keypoints, precision, index)
+    observed = Observations.of(Rig.from_cameras(camera), keypoints, precision, index)
     # The squared residual, minus that with sides swapped, both at most 25.
     flags = find_swaps(observed, noise, 25.0, found)
     assert np.flatnonzero(flags).tolist() == parts

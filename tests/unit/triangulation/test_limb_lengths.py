@@ -3,14 +3,14 @@ import pytest
 
 from data_contracts.conventions import COCO17, COCO17_LIMBS
 from data_contracts.keypoints import KeypointDetections
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.limb_lengths import (
     FEWEST,
     limb_lengths,
 )
-from worldpose.triangulation.observations import Observations, Rig
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import solve_joints
+from worldpose.triangulation.solve import solve_joints
 
 as_detections = KeypointDetections.from_keypoints
 
@@ -95,7 +95,7 @@ def test_lengths_need_five_frames(ring, seen, frames):
     camera, joints = ring(3), walker(frames)
     keypoints, confidence, index = seen(camera, joints)
     found = solve_joints(
-        Observations.from_rig(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
+        Observations.of(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
     )
     lengths = limb_lengths(found)
     assert lengths.shape == (1, len(COCO17_LIMBS))
@@ -111,7 +111,7 @@ def test_frames_that_three_views_agree_in_tell_how_long_a_limb_is(ring, seen):
     camera, joints = ring(3), walker()
     keypoints, confidence, index = seen(camera, joints)
     found = solve_joints(
-        Observations.from_rig(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
+        Observations.of(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
     )
     # Two views alone put the ankle 2 cm lower in seven frames of twelve.
     found.joints[:7, 0, ANKLE, 2] -= 0.02

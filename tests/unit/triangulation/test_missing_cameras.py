@@ -7,7 +7,7 @@ import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 GONE = 2

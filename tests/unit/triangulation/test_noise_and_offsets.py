@@ -5,7 +5,7 @@ from running_samples import detections, runner
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.person_offsets import stated_errors
 from worldpose.triangulation.settings import TriangulationSettings
 

@@ -3,9 +3,8 @@ import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import reconstruct_joints
 from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import segments, smooth_joints
 from worldpose.triangulation.track_solver import _factorize, _invert, _substitute

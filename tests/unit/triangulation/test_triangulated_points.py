@@ -5,9 +5,13 @@ import pytest
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import learn_clip, reconstruct_chunks, reconstruct_joints
+from worldpose.triangulation.estimate import (
+    learn_clip,
+    reconstruct_chunks,
+    reconstruct_joints,
+    triangulate_joints,
+)
 from worldpose.triangulation.limb_lengths import undo_swaps
-from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 NOISE = 2.0
