@@ -14,7 +14,7 @@ P_tj(theta, t, beta) of the body, and second differences D_tj = P_t+2,j - 2 P_t+
     E_limit     = 1/2 sum_t |theta_t beyond the joint limits|^2 / limit_std^2
     E_monocular : see `monocular.MonocularPrior`
     E_shape     = 1/2 (beta - beta_0)^T B (beta - beta_0)
-    E_offset    = 1/2 n |o|^2 / bias_std^2
+    E_offset    = 1/2 n |u|^2 / sigma^2,   o = o(u), mirrored left to right
 
     rho(e; c) = c / 2 log(1 + e / c), the loss of Cauchy
 
@@ -24,8 +24,9 @@ joint and W_tj the inverse of its covariance, which represents the reprojections
 to first order; lines of sight of single cameras are part of W_tj, too. A_t has the axes of the body
 as columns. Losses are robust, and the paper's weights lambda_1 to lambda_3 are inverse variances
 with units: of the joints, of accelerations s_j fps^2, and of betas (B = shape_weight before other
-clips are known). The poses of all frames are solved with fixed beta and o (`poses`); beta and o are
-estimated before, with coarse poses (`shapes`).
+clips are known). sigma starts as `bias_std_m` and is learned; n grows with the observed time, since
+errors of the model are alike in all frames. The poses of all frames are solved with fixed beta and
+o (`poses`); beta and o are estimated before, with coarse poses (`shapes`).
 """
 
 from __future__ import annotations

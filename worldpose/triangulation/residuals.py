@@ -13,7 +13,8 @@ the inlier views; while these are searched, it is the loss of Geman and McClure.
 variant, `offsets="midhip"`, takes o_c from the mid-hip: then e_c is (pi_c(X) - pi_c(X_midhip)) -
 (x_c - x_midhip,c).
 
-The same joint in all frames t of its track, with penalty lambda = (fps^2 / acceleration)^2:
+The same joint in all frames t of its track, where rho is the loss of Geman and McClure, with the
+penalty lambda = (fps^2 / acceleration)^2:
 
     E_track(X_1 ... X_T) = sum_t E_data(X_t) + lambda E_smooth
     E_smooth = sum_t |(X_t+1 - X_t) - (X_t - X_t-1)|^2

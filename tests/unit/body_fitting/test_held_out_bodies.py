@@ -9,7 +9,7 @@ from walking_bodies import KEYPOINTS, MODEL, walker
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body_fitting.estimate import fit_bodies
-from worldpose.body_fitting.held_out import SeenClip, _clustered_variance, compare_held_out
+from worldpose.body_fitting.held_out import SeenClip, compare_held_out
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.geometry.cameras import Camera
@@ -105,12 +105,3 @@ def test_two_cameras_leave_none_to_hold_out(fit, clip):
     )
     pair = replace(clip, cameras=clip.cameras[:2], detections=two)
     assert compare_held_out(MODEL, SETTINGS, None, pair, fit) is None
-
-
-def test_values_that_all_belong_together_count_once():
-    rng = np.random.default_rng(2)
-    people = rng.standard_normal(40)
-    values = np.repeat(people, 50)
-    together, camera = np.repeat(np.arange(40), 50), np.tile(np.arange(50), 40)
-    variance = _clustered_variance(values, together, camera)
-    assert variance == pytest.approx(people.var(ddof=1) / 40, rel=0.05)

@@ -17,7 +17,6 @@ from worldpose.body_fitting.monocular import (
     MonocularPrior,
     carry_errors,
     learn_precision,
-    left_jacobian,
     parse_monocular,
     place_monocular_poses,
     read_monocular,
@@ -176,18 +175,6 @@ RNG = np.random.default_rng(2)
 
 def rotation(vectors):
     return Rigid.from_rotvec(vectors, np.zeros(3)).rotation
-
-
-def test_left_jacobian_agrees_with_finite_differences():
-    vectors = RNG.normal(0.0, 1.0, (6, 3))
-    vectors[0] = 0.0
-    exact = left_jacobian(vectors)
-    for axis in range(3):
-        step = 1e-6 * np.eye(3)[axis]
-        turned = rotation(vectors + step) @ rotation(vectors - step).swapaxes(-1, -2)
-        slope = Rigid(turned, np.zeros(3)).rotvec / 2e-6
-        # Central differences: 1e-12, over a step of 1e-6 rounding of 1e-10.
-        np.testing.assert_allclose(exact[:, :, axis], slope, atol=1e-8)
 
 
 def test_the_pull_is_the_gradient_of_its_cost():

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
@@ -7,29 +6,10 @@ from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
 from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import segments, smooth_joints
-from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
 
 as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
-
-
-def test_banded_solution_and_inverse_are_the_dense_ones():
-    rng = np.random.default_rng(0)
-    lower = np.triu(np.tril(rng.normal(size=(30, 30))), -6)
-    lower[np.diag_indices(30)] = 2.0 + rng.random(30)
-    matrix = lower @ lower.T
-    band = np.array([[matrix[i, i - k] if i >= k else 0.0 for k in range(7)] for i in range(30)])
-    right = rng.normal(size=30)
-    solution = right.copy()
-    _factorize(band)
-    _substitute(band, solution)
-    np.testing.assert_allclose(matrix @ solution, right, atol=1e-12)
-    _invert(band)
-    inverse = np.linalg.inv(matrix)
-    for i in range(30):
-        for k in range(min(6, i) + 1):
-            assert band[i, k] == pytest.approx(inverse[i, i - k], abs=1e-12)
 
 
 def test_segments_break_at_long_gaps_only():
