@@ -84,7 +84,7 @@ while (Date.now() < end) {
       seen.out = await page.locator('[data-outlier="0"] td').allTextContents();
       await shot("outliers");
       // The question needs no verdict now, and stays open for more corrections.
-      await page.locator("article.open button >> text=Continue the run").click();
+      await page.locator("article.open button >> text=Recompute").click();
       while (Date.now() < end && (await now()).at_work?.state !== "running") await page.waitForTimeout(250);
       continue;
     }

@@ -101,7 +101,7 @@ async function correct() {
   await page.goto(matchPage);
   await page.waitForSelector("text=Corrected, will be computed again");
   await shootSizes(page, seen, "corrected");
-  await page.click("button >> text=Continue the run");
+  await page.click("button >> text=Recompute");
   await until("the run at work", async () => (await state()).at_work?.state === "running");
 }
 
