@@ -28,7 +28,6 @@ from worldpose.body.model import BodyModel
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.evidence import Ground, PersonEvidence, random_covariance
 from worldpose.body_fitting.extra_points import (
-    PointArrays,
     PointModel,
     densest_interval,
     feet_determined,
@@ -205,19 +204,18 @@ class _ClipBodies:
             if (last := min(span.stop, window.stop)) > max(span.start, window.start)
         }
         people, present = _gather_evidence(evidence, covariance, spans, settings)
-        extra = points = None
+        model = self.solver.chained.model
+        result = FittedArrays.empty(model, *evidence.size)
         if self.points is not None and evidence.extra is not None:
-            extra = PointArrays.empty(self.points, *evidence.size)
-            points = select_points(evidence.extra, self.points.points)
+            result = replace(result, extra=self.points.empty_fit(*evidence.size))
+            extra = select_points(evidence.extra, self.points.points)
             people = {
-                person: self.points.add(person, own, points[spans[person]], fps)
+                person: self.points.add(person, own, extra[spans[person]], fps)
                 for person, own in people.items()
             }
         core = slice(kept.start - window.start, kept.stop - window.start)
         spans, people = trim_people(spans, people, core.start, core.stop)
         solver = self.solver if self.points is None else self.points.solver
-        model = self.solver.chained.model
-        result = FittedArrays.empty(model, *evidence.size)
 
         def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
             own, span = people[person], spans[person]
@@ -231,8 +229,10 @@ class _ClipBodies:
             bodies = result.put(
                 solver, person, span, pose, (places[:, :17], spread), self.shapes, determined
             )
-            if extra is not None:
-                extra.put(person, span, bodies, random[:, 17:])
+            if self.points is not None and result.extra is not None:
+                keypoints = fold_keypoints(model, self.points.points)
+                result.extra.joints[span, person] = keypoints(bodies)
+                result.extra.covariance[span, person] = random[:, 17:] + self.points.systematic
 
         for _ in map_in_threads(fit_person, spans):
             pass
@@ -253,15 +253,15 @@ class _ClipBodies:
             gone = long_gaps(present[span, person], settings.max_filled_gap_s * fps)
             shared = evidence.shared_covariance
             moving = None if shared is None else nearest_matrices(shared[span, person])[:, None]
-            for arrays in (result,) if extra is None else (result, extra):
-                arrays.drop(person, span, gone)
-                if moving is not None:
-                    arrays.covariance[span, person] += moving
+            result.drop(person, span, gone)
+            if moving is not None:
+                result.covariance[span, person] += moving
+                if result.extra is not None:
+                    result.extra.covariance[span, person] += moving
         for person in self.spans:  # also of people who are not in this window
             result.betas[person] = self.shapes.people[person].betas
             result.betas_covariance[person] = self.shapes.people[person].covariance
         fit = BodyFit.of(result, self.shapes)
-        fit = fit if extra is None else replace(fit, extra=extra.fit())
         return fit if kept == window else fit[core]
 
 

@@ -55,14 +55,8 @@ def select_points(extra: ExtraJoints, points: tuple[str, ...]) -> ExtraJoints:
     )
 
 
-def with_points(solver: PoseSolver, points: tuple[str, ...]) -> PoseSolver:
-    """Return the solver of poses that also knows these points, and bends ankles and toes."""
-    chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
-    return replace(solver, chained=chained, prior=solver.prior.add_feet())
-
-
 def move_points(solver: PoseSolver, points: tuple[str, ...], offsets: Floats) -> PoseSolver:
-    """Return the solver of `with_points` with the points where the detector has them."""
+    """Return a solver that knows these points with them where the detector has them."""
     its = point_segments(solver.chained.model, points)
     return replace(solver, chained=solver.chained.move_points(len(COCO17), its, offsets))
 
@@ -96,7 +90,7 @@ def learn_point_offsets(
     time, from the median absolute deviation: errors that views share and that differ by pose.
 
     Args:
-        solver: result of `with_points`.
+        solver: solver that knows the points.
         points: names of the points.
         people: joints and points of each person in some seconds.
         shapes: betas of each person, and offsets of the joints.
@@ -235,48 +229,12 @@ class PointModel:
         covariance = extra.covariance[:, person] - self.modelled[..., None] * np.eye(3)
         return own.add_points(extra.joints[:, person], covariance, fps, self.solver.settings)
 
-
-@dataclass(frozen=True, eq=False)
-class PointArrays:
-    """Points besides COCO-17 of a fit in progress.
-
-    Attributes:
-        model: points of the clip.
-        joints: (frames, persons, points, 3) [m], world.
-        covariance: (frames, persons, points, 3, 3) [m^2].
-    """
-
-    model: PointModel
-    joints: Floats
-    covariance: Floats
-
-    @classmethod
-    def empty(cls, model: PointModel, frames: int, persons: int) -> PointArrays:
+    def empty_fit(self, frames: int, persons: int) -> ExtraFit:
         """Return arrays without any point."""
-        shape = (frames, persons, len(model.points), 3)
-        return cls(model, np.full(shape, np.nan), np.full((*shape, 3), np.nan))
-
-    def put(self, person: int, span: slice, bodies: BodyParameters, random: Floats) -> None:
-        """Write one person's points.
-
-        Args:
-            person: index of the person.
-            span: frames of the person.
-            bodies: (frames,) with their feet.
-            random: (frames, points, 3, 3) [m^2], covariance of the poses.
-        """
-        keypoints = fold_keypoints(self.model.solver.chained.model, self.model.points)
-        self.joints[span, person] = keypoints(bodies)
-        self.covariance[span, person] = random + self.model.systematic
-
-    def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
-        """Remove a person from frames of a span."""
-        self.joints[span, person][gone] = np.nan
-        self.covariance[span, person][gone] = np.nan
-
-    def fit(self) -> ExtraFit:
-        """Return the complete points."""
-        return ExtraFit(self.model.points, self.joints, self.covariance, self.model.offsets)
+        shape = (frames, persons, len(self.points), 3)
+        return ExtraFit(
+            self.points, np.full(shape, np.nan), np.full((*shape, 3), np.nan), self.offsets
+        )
 
 
 def learn_points(
@@ -295,7 +253,9 @@ def learn_points(
     """
     found = next(iter(people.values()))[1]
     points, settings = found.points, solver.settings
-    solver = with_points(solver, points)
+    # It also bends ankles and toes.
+    chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
+    solver = replace(solver, chained=chained, prior=solver.prior.add_feet())
     # With the bias in their covariance the points hardly move the bodies: residuals show it.
     whole = {
         person: own.add_points(extra.joints[:, 0], extra.covariance[:, 0], fps, settings)

@@ -249,9 +249,9 @@ def add_data(
     weight = 1.0 / (1.0 + deviation)
     sums.cost += 0.5 * loss_scale**2 * float(np.log1p(deviation).sum())
     sums.information = weight[..., None, None] * evidence.information
-    weighted = weight[..., None] * weighted
-    sums.force += weighted
-    return weighted
+    force: Floats = weight[..., None] * weighted
+    sums.force += force
+    return force
 
 
 def acceleration_scale(points: int) -> Floats:

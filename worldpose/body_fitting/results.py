@@ -175,6 +175,7 @@ class BodyFit:
             arrays.filled,
             arrays.guided,
             shapes.offsets,
+            arrays.extra,
         )
 
     def __getitem__(self, frames: slice) -> BodyFit:
@@ -223,6 +224,7 @@ class FittedArrays:
     covariance: Floats
     filled: NDArray[np.bool_]
     guided: NDArray[np.bool_]
+    extra: ExtraFit | None = None
 
     @classmethod
     def empty(cls, model: BodyModel, frames: int, persons: int) -> FittedArrays:
@@ -278,7 +280,10 @@ class FittedArrays:
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Remove a person from frames of a span."""
-        for array in (self.orient, self.body_pose, self.transl, self.joints, self.covariance):
+        arrays = [self.orient, self.body_pose, self.transl, self.joints, self.covariance]
+        if self.extra is not None:
+            arrays += [self.extra.joints, self.extra.covariance]
+        for array in arrays:
             array[span, person][gone] = np.nan
         self.filled[span, person] &= ~gone
         self.guided[span, person] &= ~gone

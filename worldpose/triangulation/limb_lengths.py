@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_LIMBS
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
@@ -87,33 +87,30 @@ def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDete
     """
     if not exchanged.any():
         return detections
-    keypoints, confidence = detections.keypoints.copy(), detections.confidence.copy()
+    joints = detections.keypoints.copy(), detections.confidence.copy()
     for part in range(exchanged.shape[-1]):
-        frame, camera, person = np.nonzero(exchanged[..., part])
-        detection = detections.detection_index[frame, camera, person]
-        place = tuple(each[:, None] for each in (frame, camera, detection))
-        of_part = PAIRS[part == PART_OF]
-        for right, seen in ((keypoints, detections.keypoints), (confidence, detections.confidence)):
-            right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
-    swapped = replace(detections, keypoints=keypoints, confidence=confidence)
+        _swap(joints, detections.detection_index, exchanged[..., part], PAIRS[part == PART_OF])
+    swapped = replace(detections, keypoints=joints[0], confidence=joints[1])
     if detections.extra_keypoints is None or detections.extra_confidence is None:
         return swapped
-    points = detections.points
-    extra, sure = detections.extra_keypoints.copy(), detections.extra_confidence.copy()
+    extra = detections.extra_keypoints.copy(), detections.extra_confidence.copy()
     names = list(EXCHANGED_PARTS)
     limbs = exchanged[..., [names.index(part) for part in ("arms", "legs")]].all(axis=-1)
     for name in (*names, ""):
-        of_part = _point_pairs(points, name)
         its = exchanged[..., names.index(name)] if name else limbs
-        frame, camera, person = np.nonzero(its)
-        detection = detections.detection_index[frame, camera, person]
-        place = tuple(each[:, None] for each in (frame, camera, detection))
-        for right, seen in (
-            (extra, detections.extra_keypoints),
-            (sure, detections.extra_confidence),
-        ):
-            right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
-    return swapped.add_points(points, extra, sure)
+        pairs = _point_pairs(detections.points, name)
+        _swap(extra, detections.detection_index, np.asarray(its), pairs)
+    return swapped.add_points(detections.points, *extra)
+
+
+def _swap(
+    arrays: tuple[AnyFloats, ...], index: NDArray[np.integer], its: Flags, pairs: NDArray[np.int64]
+) -> None:
+    """Swap pairs (pairs, 2) of keypoints in place, of the detections of marked people."""
+    frame, camera, person = np.nonzero(its)
+    place = frame[:, None], camera[:, None], index[frame, camera, person][:, None]
+    for array in arrays:
+        array[(*place, pairs.ravel())] = array[(*place, pairs[:, ::-1].ravel())]
 
 
 def _point_pairs(points: tuple[str, ...], part: str) -> NDArray[np.int64]:
