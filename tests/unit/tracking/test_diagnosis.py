@@ -64,7 +64,7 @@ def test_detections_with_too_few_keypoints(ring, people, seen):
     keypoints[..., 4:, :] = np.nan
     found = reason(ring(4), keypoints, confidence)
     assert found.cause == "too_few_keypoints"
-    assert "320 detections has 4 keypoints" in found.message
+    assert "1280 detections has 4 keypoints" in found.message
     assert "min_joints asks for 5" in found.message
 
 
