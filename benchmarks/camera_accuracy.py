@@ -18,14 +18,13 @@ from scipy.stats import chi2
 import worldpose
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
-from worldpose.broadcast_calibration.calibration import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.bundle_adjustment.adjustment import adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.errors import InputError
 from worldpose.evaluation.cameras import surface_points
 from worldpose.formats.challenge import read_camera
@@ -39,7 +38,7 @@ from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import Scenario
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
 from worldpose.static_calibration.report import StaticCalibration, calibration_arrays
 from worldpose.static_calibration.venue import join_cameras
@@ -419,11 +418,12 @@ def distances(
         "ti,ti->t", step[:, judged], np.linalg.solve(whole, step[:, judged, None])[..., 0]
     )
     feet, inside = feet_in_picture(true, joints)
-    pixel, rows, places = np.empty(2), np.empty((2, 12)), []
+    places = []
     for t in range(0, len(found), 5):
-        for place in feet[t, inside[t]]:
-            point_row(found.rotation[t], found.center, found.lens(t), place, pixel, rows)
-            off = true.camera[t].project(place[None])[0] - pixel
+        pixels, slopes = found.project_with_jacobian(t, feet[t, inside[t]])
+        for off, rows in zip(
+            true.camera[t].project(feet[t, inside[t]]) - pixels, slopes, strict=True
+        ):
             places.append(off @ np.linalg.solve(rows @ known.frame[t] @ rows.T, off))
     return {
         "centers": chi2.cdf([center], 3),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from camera_accuracy import ground_errors
@@ -26,10 +26,11 @@ from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError, WorldposeError
+from worldpose.formats.annotations.marked_images import SOCCERNET_MARKINGS
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.paint import Ridges, guess_lens, straighten_paint
 from worldpose.static_calibration.from_paint.proposal import (
     calibrate_without_clicks,
@@ -142,29 +143,6 @@ def score_key_frames(options: Namespace) -> Tables:
     columns = ["cameras", "of", "nearest [m]", "farthest [m]", "lowest [m]", "highest [m]"]
     columns += [f"JaC@{pixels} [%]" for pixels in PIXELS]
     return {"cameras": Table("cameras of single key frames", columns, [row])}
-
-
-def _names() -> dict[str, str]:
-    names = {
-        "Side line top": "touch_line_far",
-        "Side line bottom": "touch_line_near",
-        "Middle line": "halfway_line",
-        "Circle central": "center_circle",
-    }
-    for side, left_post, right_post in (("left", "near", "far"), ("right", "far", "near")):
-        names[f"Side line {side}"] = f"goal_line_{side}"
-        names[f"Circle {side}"] = f"penalty_arc_{side}"
-        for theirs, ours in (("Big", "penalty_area"), ("Small", "goal_area")):
-            for part, place in (("main", "front"), ("top", "far"), ("bottom", "near")):
-                names[f"{theirs} rect. {side} {part}"] = f"{ours}_{side}_{place}"
-        names[f"Goal {side} crossbar"] = f"crossbar_{side}"
-        names[f"Goal {side} post left"] = f"goal_post_{side}_{left_post}"
-        names[f"Goal {side} post right"] = f"goal_post_{side}_{right_post}"
-    return names
-
-
-SOCCERNET_MARKINGS: Final = _names()
-"""Names of the pitch template by SoccerNet's names."""
 
 
 def soccernet_markings(

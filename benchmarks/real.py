@@ -50,14 +50,14 @@ from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.broadcast_calibration.calibration import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.detection.models import load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import read_json
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.line_refinement import LineRefinement
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.venue import join_cameras

@@ -28,13 +28,9 @@ from registry import DATA, Table, Tables, benchmark, option
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrames
-from worldpose.broadcast_calibration.calibration import (
-    BroadcastCalibration,
-    BroadcastClip,
-    calibrate_broadcast,
-)
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.key_frames import propose_key_frames
-from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.report import BroadcastCalibration
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.validation import validate_record
@@ -397,10 +393,7 @@ def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrame
 
 def _pixel_slopes(found: BroadcastCalibration, frame: int, place: Floats) -> Floats:
     """Return the slopes (2, 12) of a place's pixel by the parameters of its frame."""
-    camera, pixel, by_step = found.camera, np.empty(2), np.empty((2, 12))
-    lens = camera.lens(frame)
-    point_row(camera.rotation[frame], camera.center, lens, place, pixel, by_step)
-    return by_step
+    return found.camera.project_with_jacobian(frame, place[None])[1][0]
 
 
 def calibrate_cut(

@@ -20,6 +20,7 @@ from registry import Table, Tables, benchmark, integer, option
 from speed_people import draw_match
 
 from data_contracts.arrays import Floats, Image
+from worldpose.broadcast_calibration.clip_problem import ClipProblem
 from worldpose.broadcast_calibration.evidence import (
     PLAYER,
     FlowEvidence,
@@ -28,12 +29,13 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.residuals import linearize
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.solver import Problem as ClipProblem
-from worldpose.broadcast_calibration.solver import descend, equations_at
+from worldpose.broadcast_calibration.solver import descend
 from worldpose.broadcast_calibration.solver import solve as solve_clip
+from worldpose.bundle_adjustment.residuals import AdjustmentProblem
 from worldpose.bundle_adjustment.settings import SolverSettings
-from worldpose.bundle_adjustment.solver import Problem, solve
+from worldpose.bundle_adjustment.solver import solve
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
@@ -287,7 +289,7 @@ def compare_adjusters(options: Namespace) -> Tables:
     """
     problem = make_problem(*((300, 22) if options.large else (40, 6)))
     solve(make_problem(4, 2, 3))  # compiles
-    sides: dict[str, Callable[[Problem], Run]] = {"ours": ours}
+    sides: dict[str, Callable[[AdjustmentProblem], Run]] = {"ours": ours}
     if importlib.util.find_spec("pycolmap"):
         sides["pycolmap"] = pycolmap_side
     else:
@@ -314,7 +316,7 @@ def compare_adjusters(options: Namespace) -> Tables:
     }
 
 
-def make_problem(frames: int, players: int, cameras: int = 16) -> Problem:
+def make_problem(frames: int, players: int, cameras: int = 16) -> AdjustmentProblem:
     """Return the common problem of all sides."""
     rng, work = np.random.default_rng(5), draw_match(frames)
     true = work.cameras[:cameras]
@@ -341,7 +343,7 @@ def make_problem(frames: int, players: int, cameras: int = 16) -> Problem:
     free[:, FREE:] = False
     fixed = np.arange(len(points)) < len(surveyed)
     off = points + 0.2 * rng.standard_normal(points.shape)
-    return Problem(
+    return AdjustmentProblem(
         cameras=base,
         free=free,
         camera_information=np.zeros((cameras, len(PARAMETERS), len(PARAMETERS))),
@@ -355,7 +357,7 @@ def make_problem(frames: int, players: int, cameras: int = 16) -> Problem:
     )
 
 
-def cost(problem: Problem, solution: Solution) -> float:
+def cost(problem: AdjustmentProblem, solution: Solution) -> float:
     """Return the sum of squared residuals of a solution [px^2]."""
     cameras, points = solution
     total = 0.0
@@ -367,7 +369,7 @@ def cost(problem: Problem, solution: Solution) -> float:
     return float(total)
 
 
-def ours(problem: Problem) -> Run:
+def ours(problem: AdjustmentProblem) -> Run:
     """Return the solver of this package."""
 
     def run() -> Solution:
@@ -377,7 +379,7 @@ def ours(problem: Problem) -> Run:
     return run
 
 
-def pycolmap_side(problem: Problem) -> Run:
+def pycolmap_side(problem: AdjustmentProblem) -> Run:
     """Return COLMAP's bundle adjuster on a reconstruction of the same cameras and points."""
     import pycolmap
 
@@ -430,7 +432,7 @@ def pycolmap_side(problem: Problem) -> Run:
     return run
 
 
-def _solution_of(problem: Problem, scene: Any, ids: dict[int, int]) -> Solution:
+def _solution_of(problem: AdjustmentProblem, scene: Any, ids: dict[int, int]) -> Solution:
     """Return cameras and points of a COLMAP reconstruction."""
     cameras, count = problem.cameras, len(problem.cameras.focal)
     points = problem.points.copy()
@@ -468,11 +470,11 @@ def compare_solvers(options: Namespace) -> Tables:
     true, points = draw_clip(options.frames, rng)
     start = start_of(true, rng)
     prior = build_prior(BroadcastPrior(), start.focal, start.image_size)
-    problem = ClipProblem(points, FlowEvidence.none(), prior, SMOOTH)
+    problem = ClipProblem(points, FlowEvidence.none(), prior, smoothness=SMOOTH)
     few = replace(problem, points=points[points.frame < 5])
     few = replace(few, prior=build_prior(BroadcastPrior(), start.focal[:5], start.image_size))
     solve_clip(start.frames(slice(0, 5)), few, 2)  # compiles
-    first = equations_at(start, np.zeros((0, 4)), problem).cost
+    first = linearize(start, np.zeros((0, 4)), problem).cost
     rows: list[list[Any]] = [["start", None, None, None, first, *figures(start, true, points)]]
     begin = time.perf_counter()
     mine = solve_clip(start, problem, 60)
@@ -511,7 +513,6 @@ def draw_clip(frames: int, rng: np.random.Generator) -> tuple[MovingCamera, Poin
         image[inside],
         whiten_points(np.full(len(frame), NOISE)),
         source=source,
-        weight=1.0,
         loss=LOSS,
     )
 

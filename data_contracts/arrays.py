@@ -7,6 +7,7 @@ reader needs no other source to know what the numbers are.
 from __future__ import annotations
 
 import re
+import textwrap
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -89,11 +90,8 @@ _FORM = re.compile(r"\(([\w, *]*)\) (\w+) \[([^\]]+)\](?:, missing (\S+))?")
 def array_layout(name: str, form: str, about: str) -> ArrayLayout:
     """Return the layout of an array.
 
-    Args:
-        name: its name.
-        form: dimensions, type, unit and missing value, such as
-            `(*frame, person, joint) float32 [px], missing nan`; a star marks `chunk_dim`.
-        about: meaning of the numbers, with their coordinate frame.
+    The form has dimensions, type, unit and missing value, such as
+    `(*frame, person, joint) float32 [px], missing nan`; a star marks `chunk_dim`.
 
     Raises:
         ValueError: the form is not of this kind, or has an unknown type or missing value.
@@ -113,6 +111,20 @@ def array_layout(name: str, form: str, about: str) -> ArrayLayout:
             "chunk_dim": next((dim[1:] for dim in dims if dim.startswith("*")), None),
         }
     )
+
+
+def array_layouts(table: str) -> tuple[ArrayLayout, ...]:
+    """Return the layouts of a table.
+
+    Each array has a line with its name, the form of `array_layout` and a colon. Indented lines
+    below it state the meaning of its numbers.
+    """
+    layouts = []
+    for entry in re.split(r"\n(?=\S)", textwrap.dedent(table).strip()):
+        head, _, about = entry.partition(":\n")
+        name, _, form = head.partition(" ")
+        layouts.append(array_layout(name, form, " ".join(about.split())))
+    return tuple(layouts)
 
 
 class GroupLayout(Record):

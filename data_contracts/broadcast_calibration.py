@@ -1,4 +1,4 @@
-"""Clicks in a clip's key frames, and the result of stage `broadcast_calibration`."""
+"""Clicks in a clip's key frames, and results of `broadcast_calibration` and `broadcast_pooling`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layout, array_layouts
 from data_contracts.cameras import CAMERA_LABELS
 from data_contracts.keypoints import FRAME
 from data_contracts.records import CONTRACT_VERSION, FRAME_LIMIT, Record
@@ -49,46 +49,30 @@ BROADCAST_CALIBRATION = GroupLayout(
     about="The broadcast camera in every frame of a clip, with covariance and evidence.",
     coordinates=(FRAME,),
     arrays=(
-        array_layout("focal", "(*frame, axis) float64 [px], missing nan", "focal lengths fx, fy"),
-        array_layout(
-            "principal_point",
-            "(*frame, axis) float64 [px], missing nan",
-            "principal point, one for the clip",
-        ),
-        array_layout(
-            "distortion",
-            "(*frame, coefficient) float64 [1], missing nan",
-            "k1, k2, p1, p2, k3 in OpenCV's order",
-        ),
-        array_layout(
-            "rotation",
-            "(*frame, cam_coordinate, coordinate) float64 [1], missing nan",
-            "R in x_cam = R x_world + t",
-        ),
-        array_layout(
-            "translation",
-            "(*frame, cam_coordinate) float64 [m], missing nan",
-            "t in x_cam = R x_world + t",
-        ),
-        array_layout("image_size", "(axis) int64 [px]", "width, height"),
-        array_layout(
-            "center", "(coordinate) float64 [m]", "the camera's center, world, one for the clip"
-        ),
-        array_layout(
-            "covariance",
-            "(*frame, parameter, parameter_) float64 [1], missing nan",
-            "covariance of a step of the frame's camera, in the units of its parameters; zero for "
-            "parameters that were not solved for",
-        ),
-        array_layout(
-            "shared_covariance",
-            "(*frame, parameter, clip_parameter) float64 [1], missing nan",
-            "covariance of a step of the frame's camera with what all frames share",
-        ),
-        array_layout(
-            "clip_covariance",
-            "(clip_parameter, clip_parameter_) float64 [1]",
-            "covariance of what all frames share",
+        *array_layouts(
+            """
+            focal (*frame, axis) float64 [px], missing nan:
+                focal lengths fx, fy
+            principal_point (*frame, axis) float64 [px], missing nan:
+                principal point, one for the clip
+            distortion (*frame, coefficient) float64 [1], missing nan:
+                k1, k2, p1, p2, k3 in OpenCV's order
+            rotation (*frame, cam_coordinate, coordinate) float64 [1], missing nan:
+                R in x_cam = R x_world + t
+            translation (*frame, cam_coordinate) float64 [m], missing nan:
+                t in x_cam = R x_world + t
+            image_size (axis) int64 [px]:
+                width, height
+            center (coordinate) float64 [m]:
+                the camera's center, world, one for the clip
+            covariance (*frame, parameter, parameter_) float64 [1], missing nan:
+                covariance of a step of the frame's camera, in the units of its parameters; zero for
+                parameters that were not solved for
+            shared_covariance (*frame, parameter, clip_parameter) float64 [1], missing nan:
+                covariance of a step of the frame's camera with what all frames share
+            clip_covariance (clip_parameter, clip_parameter_) float64 [1]:
+                covariance of what all frames share
+            """
         ),
         array_layout("focal_before", "(*frame, axis) float64 [px], missing nan", _BEFORE),
         array_layout("principal_point_before", "(*frame, axis) float64 [px], missing nan", _BEFORE),
@@ -103,40 +87,23 @@ BROADCAST_CALIBRATION = GroupLayout(
         array_layout(
             "translation_before", "(*frame, cam_coordinate) float64 [m], missing nan", _BEFORE
         ),
-        array_layout(
-            "status",
-            "(frame) uint8 [1], missing 0",
-            "evidence for the frame's camera, an index into the attribute `status_names`",
-        ),
-        array_layout(
-            "reprojection_error",
-            "(*frame) float64 [px], missing nan",
-            "expected image error of a player's position, root mean square over the visible pitch",
-        ),
-        array_layout(
-            "marking_rms",
-            "(*frame) float64 [px], missing nan",
-            "rms distance of detected painted lines, across them",
-        ),
-        array_layout(
-            "player_rms",
-            "(*frame) float64 [px], missing nan",
-            "rms residual of the keypoints of matched players",
-        ),
-        array_layout(
-            "marking_count",
-            "(frame) int32 [1], missing 0",
-            "samples of painted lines used in the frame",
-        ),
-        array_layout(
-            "player_count",
-            "(frame) int32 [1], missing 0",
-            "players matched with people from the static cameras",
-        ),
-        array_layout(
-            "flow_count",
-            "(frame) int32 [1], missing 0",
-            "points tracked from this frame to the next",
+        *array_layouts(
+            """
+            status (frame) uint8 [1], missing 0:
+                evidence for the frame's camera, an index into the attribute `status_names`
+            reprojection_error (*frame) float64 [px], missing nan:
+                expected image error of a player's position, root mean square over the visible pitch
+            marking_rms (*frame) float64 [px], missing nan:
+                rms distance of detected painted lines, across them
+            player_rms (*frame) float64 [px], missing nan:
+                rms residual of the keypoints of matched players
+            marking_count (frame) int32 [1], missing 0:
+                samples of painted lines used in the frame
+            player_count (frame) int32 [1], missing 0:
+                players matched with people from the static cameras
+            flow_count (frame) int32 [1], missing 0:
+                points tracked from this frame to the next
+            """
         ),
     ),
     labels={
@@ -167,5 +134,24 @@ BROADCAST_CALIBRATION = GroupLayout(
         "deviations of samples of `lines` and of `clicks` over their assumed ones",
         "decisions": "choices made, with the metrics that decided",
         "reasons": "reasons for a manual review; empty if none is needed",
+    },
+)
+
+_CAMERA = (
+    *("focal", "principal_point", "distortion", "rotation", "translation", "image_size"),
+    *("center", "covariance", "shared_covariance", "clip_covariance"),
+)
+
+BROADCAST_POOLING = GroupLayout(
+    stage="broadcast_pooling",
+    about="The broadcast camera of a clip, with the center that all clips of the match share.",
+    coordinates=BROADCAST_CALIBRATION.coordinates,
+    arrays=tuple(BROADCAST_CALIBRATION.layout(name) for name in _CAMERA),
+    labels=BROADCAST_CALIBRATION.labels,
+    attributes={
+        "clip_id": "clip of the match",
+        "clips": "clips of the same camera, including this one",
+        "distance": "distance of each clip's own center from the common one [standard deviations]",
+        "agree": "whether one center explains all clips; otherwise the camera is unchanged",
     },
 )

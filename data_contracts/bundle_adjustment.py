@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layout, array_layouts
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.static_calibration import CAMERA_STEP
 
@@ -10,16 +10,14 @@ _CAMERAS = tuple(
     array.model_copy(update={"dims": ("camera", *array.dims)}) for array in CAMERA_ARRAYS
 )
 _ACCEPTANCE = (
-    array_layout(
-        "camera_covariance",
-        "(camera, parameter, parameter_) float64 [1]",
-        "covariance of a step of each camera, in the units of its parameters; zero for a "
-        "given camera whose change was refused; relative to the rig if all cameras are given",
-    ),
-    array_layout(
-        "accepted",
-        "(camera) bool [1]",
-        "the adjusted camera was accepted; otherwise it is that of `static_calibration`",
+    *array_layouts(
+        """
+        camera_covariance (camera, parameter, parameter_) float64 [1]:
+            covariance of a step of each camera, in the units of its parameters; zero for a given
+            camera whose change was refused; relative to the rig if all cameras are given
+        accepted (camera) bool [1]:
+            the adjusted camera was accepted; otherwise it is that of `static_calibration`
+        """
     ),
     *(
         array_layout(f"moved_{name}", f"(camera) float64 [{unit}], missing 0", about)
@@ -29,28 +27,19 @@ _ACCEPTANCE = (
             ("focal", "1", "relative change of its focal length"),
         )
     ),
-    array_layout(
-        "judges",
-        "(camera) int64 [1], missing 0",
-        "keypoints of held-out people that validated the camera",
-    ),
-    array_layout(
-        "held_out_loss", "(camera, side) float64 [1], missing nan", "mean loss of these keypoints"
-    ),
-    array_layout(
-        "held_out_error",
-        "(camera, side) float64 [px], missing nan",
-        "median error of these keypoints",
-    ),
-    array_layout(
-        "marking_error",
-        "(camera, side) float64 [px], missing nan",
-        "root mean square error per axis of the clicked points that calibration uses",
-    ),
-    array_layout(
-        "weak_step",
-        "(camera, parameter) float64 [1]",
-        "one standard deviation along the least certain direction of the camera",
+    *array_layouts(
+        """
+        judges (camera) int64 [1], missing 0:
+            keypoints of held-out people that validated the camera
+        held_out_loss (camera, side) float64 [1], missing nan:
+            mean loss of these keypoints
+        held_out_error (camera, side) float64 [px], missing nan:
+            median error of these keypoints
+        marking_error (camera, side) float64 [px], missing nan:
+            root mean square error per axis of the clicked points that calibration uses
+        weak_step (camera, parameter) float64 [1]:
+            one standard deviation along the least certain direction of the camera
+        """
     ),
 )
 _REVIEW = (
@@ -71,28 +60,21 @@ _REVIEW = (
             ),
         )
     ),
-    array_layout(
-        "outlier_surprise",
-        "(outlier) float64 [1]",
-        "its Mahalanobis distance to the position from the other cameras",
+    *array_layouts(
+        """
+        outlier_surprise (outlier) float64 [1]:
+            its Mahalanobis distance to the position from the other cameras
+        click_camera (click) int64 [1]:
+            camera index of a clicked point, the largest Mahalanobis distance first
+        click_residual (click, axis) float64 [px], missing nan:
+            projected minus clicked, after adjustment; missing if the camera cannot image it
+        click_surprise (click) float64 [1], missing nan:
+            Mahalanobis distance of the residual, given all other evidence; missing if the camera
+            cannot image the point
+        click_wrong (click) bool [1]:
+            proposed for removal; a person decides
+        """
     ),
-    array_layout(
-        "click_camera",
-        "(click) int64 [1]",
-        "camera index of a clicked point, the largest Mahalanobis distance first",
-    ),
-    array_layout(
-        "click_residual",
-        "(click, axis) float64 [px], missing nan",
-        "projected minus clicked, after adjustment; missing if the camera cannot image it",
-    ),
-    array_layout(
-        "click_surprise",
-        "(click) float64 [1], missing nan",
-        "Mahalanobis distance of the residual, given all other evidence; missing if the "
-        "camera cannot image the point",
-    ),
-    array_layout("click_wrong", "(click) bool [1]", "proposed for removal; a person decides"),
 )
 
 BUNDLE_ADJUSTMENT = GroupLayout(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from data_contracts.arrays import array_layout
+from data_contracts.arrays import array_layouts
 from data_contracts.conventions import DISTORTION
 from data_contracts.records import ImageLength, Name, Record
 
@@ -14,10 +14,9 @@ Entry = Annotated[float, Field(ge=-1.01, le=1.01)]
 """Entry of a rotation matrix, which may be rounded."""
 Vector3 = tuple[Entry, Entry, Entry]
 
-_Pixels = Annotated[float, Field(ge=-1e7, le=1e7)]
-_Metres = Annotated[float, Field(ge=-1e7, le=1e7)]
-_Coefficient = Annotated[float, Field(ge=-1e7, le=1e7)]
+_Bounded = Annotated[float, Field(ge=-1e7, le=1e7)]
 _Focal = Annotated[float, Field(gt=0, le=1e7)]
+_Distortion = tuple[_Bounded, _Bounded, _Bounded, _Bounded, _Bounded]
 
 
 class CameraCalibration(Record):
@@ -28,15 +27,13 @@ class CameraCalibration(Record):
     """Width and height [px]."""
     focal_px: tuple[_Focal, _Focal]
     """fx, fy [px]."""
-    principal_point_px: tuple[_Pixels, _Pixels]
+    principal_point_px: tuple[_Bounded, _Bounded]
     """cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
-    distortion: tuple[_Coefficient, _Coefficient, _Coefficient, _Coefficient, _Coefficient] = (
-        *(0.0, 0.0, 0.0, 0.0, 0.0),
-    )
+    distortion: _Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3: OpenCV's order [1]."""
     rotation: tuple[Vector3, Vector3, Vector3]
     """Rows of R in x_cam = R x_world + t."""
-    translation: tuple[_Metres, _Metres, _Metres]
+    translation: tuple[_Bounded, _Bounded, _Bounded]
     """t in x_cam = R x_world + t [m]."""
 
 
@@ -48,11 +45,9 @@ class LensCalibration(Record):
     """Width and height [px]."""
     focal_px: _Focal
     """Focal length for square pixels [px]."""
-    principal_point_px: tuple[_Pixels, _Pixels]
+    principal_point_px: tuple[_Bounded, _Bounded]
     """cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
-    distortion: tuple[_Coefficient, _Coefficient, _Coefficient, _Coefficient, _Coefficient] = (
-        *(0.0, 0.0, 0.0, 0.0, 0.0),
-    )
+    distortion: _Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3: OpenCV's order [1]. p1 and p2 are kept as they are."""
     focal_std_px: Annotated[float, Field(gt=0, le=1e6)]
     """Standard deviation of the focal length [px]."""
@@ -70,18 +65,20 @@ CAMERA_LABELS: dict[str, tuple[str, ...]] = {
     "cam_coordinate": ("x_cam", "y_cam", "z_cam"),
 }
 
-CAMERA_ARRAYS = (
-    array_layout("focal", "(axis) float64 [px]", "focal lengths fx, fy"),
-    array_layout(
-        "principal_point",
-        "(axis) float64 [px]",
-        "principal point cx, cy; (0, 0) is the centre of the top-left pixel",
-    ),
-    array_layout("distortion", "(coefficient) float64 [1]", "k1, k2, p1, p2, k3 in OpenCV's order"),
-    array_layout(
-        "rotation", "(cam_coordinate, coordinate) float64 [1]", "R in x_cam = R x_world + t"
-    ),
-    array_layout("translation", "(cam_coordinate) float64 [m]", "t in x_cam = R x_world + t"),
-    array_layout("image_size", "(axis) int64 [px]", "width, height"),
+CAMERA_ARRAYS = array_layouts(
+    """
+    focal (axis) float64 [px]:
+        focal lengths fx, fy
+    principal_point (axis) float64 [px]:
+        principal point cx, cy; (0, 0) is the centre of the top-left pixel
+    distortion (coefficient) float64 [1]:
+        k1, k2, p1, p2, k3 in OpenCV's order
+    rotation (cam_coordinate, coordinate) float64 [1]:
+        R in x_cam = R x_world + t
+    translation (cam_coordinate) float64 [m]:
+        t in x_cam = R x_world + t
+    image_size (axis) int64 [px]:
+        width, height
+    """
 )
 """Arrays of one static camera."""

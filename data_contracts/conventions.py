@@ -7,25 +7,8 @@ from __future__ import annotations
 
 from data_contracts.records import CONTRACT_VERSION, Record
 
-COCO17 = (
-    "nose",
-    "left_eye",
-    "right_eye",
-    "left_ear",
-    "right_ear",
-    "left_shoulder",
-    "right_shoulder",
-    "left_elbow",
-    "right_elbow",
-    "left_wrist",
-    "right_wrist",
-    "left_hip",
-    "right_hip",
-    "left_knee",
-    "right_knee",
-    "left_ankle",
-    "right_ankle",
-)
+_PAIRED = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+COCO17 = ("nose", *(f"{side}_{joint}" for joint in _PAIRED for side in ("left", "right")))
 """Joint order of every `keypoints` and `joints` array."""
 
 COCO17_BONES = (
@@ -76,7 +59,7 @@ COCO17_FLIP = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 
 JOINT_GROUPS = {
     "head": ("nose", "eye", "ear"),
-    **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
+    **{name: (name,) for name in _PAIRED[2:]},
 }
 """Parts of the names in `COCO17`, by group of joints."""
 
@@ -91,25 +74,8 @@ FEET = (
 """Points of the feet, in the order of COCO-WholeBody: tips of the big toes, outer ends of the small
 toes, backs of the heels."""
 
-COCO17_SIGMAS = (
-    0.026,
-    0.025,
-    0.025,
-    0.035,
-    0.035,
-    0.079,
-    0.079,
-    0.072,
-    0.072,
-    0.062,
-    0.062,
-    0.107,
-    0.107,
-    0.087,
-    0.087,
-    0.089,
-    0.089,
-)
+_PAIRED_SIGMAS = (0.025, 0.035, 0.079, 0.072, 0.062, 0.107, 0.087, 0.089)
+COCO17_SIGMAS = (0.026, *(sigma for sigma in _PAIRED_SIGMAS for _ in ("left", "right")))
 """COCO's per-joint spread of human labels, as a fraction of person size."""
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")

@@ -1,8 +1,8 @@
-"""Result of stage `detection`: the people that nets find in one camera's images (D1-D5)."""
+"""Results of `detection` (D1-D5) and `redetection` (R2): people that nets find in images."""
 
 from __future__ import annotations
 
-from data_contracts.arrays import GroupLayout
+from data_contracts.arrays import GroupLayout, array_layouts
 from data_contracts.keypoints import (
     EXTRA_ARRAYS,
     FRAME,
@@ -30,3 +30,33 @@ DETECTION = GroupLayout(
 def detection_unit(camera_id: str, clip_id: str) -> str:
     """Return the name of the unit that detects people in one clip of a static camera."""
     return f"{camera_id}.{clip_id}"
+
+
+REDETECTION = GroupLayout(
+    stage="redetection",
+    about="The detections of `detection`, unchanged, followed by people found where the previous "
+    "iteration predicts them.",
+    coordinates=(FRAME,),
+    arrays=(
+        *KEYPOINT_ARRAYS,
+        *EXTRA_ARRAYS,
+        *array_layouts(
+            """
+            found_again (*frame, detection) int32 [1], missing -1:
+                person id of the previous iteration for a redetected person; missing for the
+                detections of `detection`
+            shift (*frame, detection, joint, axis) float32 [px], missing 0:
+                systematic error of the keypoints of redetected people, as in `filtering`
+            """
+        ),
+    ),
+    labels=KEYPOINT_LABELS,
+    attributes={"camera_id": "camera of the match", **POINT_ATTRIBUTE},
+    optional=OPTIONAL_POINTS,
+)
+
+
+def redetection_name(detections: str) -> str:
+    """Return the name of the redetection result of a detection result; empty for given poses."""
+    stage, _, unit = detections.partition("/")
+    return f"redetection/{unit}" if stage == "detection" else ""

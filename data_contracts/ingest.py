@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layouts
 from data_contracts.keypoints import (
     EXTRA_ARRAYS,
     FRAME,
@@ -12,18 +12,15 @@ from data_contracts.keypoints import (
     POINT_ATTRIBUTE,
 )
 
-VIDEO_ARRAYS = (
-    array_layout(
-        "picture_of_frame",
-        "(frame) int64 [1], missing -1",
-        "number of the video image that shows this match frame",
-    ),
-    array_layout(
-        "picture_stamp",
-        "(picture) int64 [1]",
-        "presentation time stamp of each image in display order, in units of the time base",
-    ),
-    array_layout("picture_key", "(picture) bool [1]", "whether decoding can begin at this image"),
+VIDEO_ARRAYS = array_layouts(
+    """
+    picture_of_frame (frame) int64 [1], missing -1:
+        number of the video image that shows this match frame
+    picture_stamp (picture) int64 [1]:
+        presentation time stamp of each image in display order, in units of the time base
+    picture_key (picture) bool [1]:
+        whether decoding can begin at this image
+    """
 )
 """The index of a video, and its mapping to match frames."""
 

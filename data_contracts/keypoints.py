@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
-from data_contracts.arrays import AnyFloats, ClipArray, Flags, Integers, array_layout
+from data_contracts.arrays import AnyFloats, ClipArray, Flags, Integers, array_layout, array_layouts
 from data_contracts.conventions import COCO17
 
 Array = TypeVar("Array", bound=ClipArray, default=AnyFloats, covariant=True)
@@ -88,9 +88,8 @@ class KeypointDetections(Generic[Array]):
     def from_arrays(stored: Mapping[Any, Any]) -> KeypointDetections:
         """Return stored detections.
 
-        Args:
-            stored: arrays by name, those of `KEYPOINT_ARRAYS` and `frame`; those of
-                `EXTRA_ARRAYS` with the names `point` if there are any.
+        The arrays are those of `KEYPOINT_ARRAYS` and `frame`, by name, and those of `EXTRA_ARRAYS`
+        with the names `point` if there are any.
         """
         names = [array.name for array in KEYPOINT_ARRAYS]
         points: tuple[str, ...] = ()
@@ -114,9 +113,8 @@ class KeypointDetections(Generic[Array]):
     def stack(cameras: Sequence[KeypointDetections]) -> KeypointDetections:
         """Return the detections of several cameras as (frames, cameras, detections).
 
-        Args:
-            cameras: (frames, detections) for each camera. The result has every frame that a camera
-                has; a camera's missing frames, detections and points are NaN.
+        Each camera has (frames, detections). The result has every frame that a camera has; a
+        camera's missing frames, detections and points are NaN.
         """
         points = tuple(dict.fromkeys(point for each in cameras for point in each.points))
         cameras = [each.with_points(points) for each in cameras]
@@ -214,10 +212,7 @@ class KeypointDetections(Generic[Array]):
     ) -> KeypointDetections:
         """Return the detections with these points besides COCO-17 and no others.
 
-        Args:
-            points: their names.
-            keypoints: (..., points, 2) [px]; NaN where not found.
-            confidence: (..., points); NaN where not found.
+        Keypoints are (..., points, 2) [px], their confidence (..., points); NaN where not found.
         """
         return replace(self, points=points, extra_keypoints=keypoints, extra_confidence=confidence)
 
@@ -274,39 +269,27 @@ KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {
 
 FRAME = array_layout("frame", "(frame) int64 [frame]", "match frame")
 
-KEYPOINT_ARRAYS = (
-    array_layout(
-        "keypoints",
-        "(*frame, detection, joint, axis) float32 [px], missing nan",
-        "detected 2D joints; the index of a detection in its frame identifies it",
-    ),
-    array_layout(
-        "confidence",
-        "(*frame, detection, joint) float32 [1], missing nan",
-        "the detector's confidence of each keypoint, in (0, 1]",
-    ),
-    array_layout(
-        "boxes", "(*frame, detection, corner) float32 [px], missing nan", "bounding boxes"
-    ),
-    array_layout(
-        "score",
-        "(*frame, detection) float32 [1], missing nan",
-        "the detector's confidence of each person",
-    ),
+KEYPOINT_ARRAYS = array_layouts(
+    """
+    keypoints (*frame, detection, joint, axis) float32 [px], missing nan:
+        detected 2D joints; the index of a detection in its frame identifies it
+    confidence (*frame, detection, joint) float32 [1], missing nan:
+        the detector's confidence of each keypoint, in (0, 1]
+    boxes (*frame, detection, corner) float32 [px], missing nan:
+        bounding boxes
+    score (*frame, detection) float32 [1], missing nan:
+        the detector's confidence of each person
+    """
 )
 """Arrays of the people one camera saw; the detection dimension is padded with missing values."""
 
-EXTRA_ARRAYS = (
-    array_layout(
-        "extra_keypoints",
-        "(*frame, detection, point, axis) float32 [px], missing nan",
-        "detected points besides COCO-17, such as heels and toes; attribute `point` names them",
-    ),
-    array_layout(
-        "extra_confidence",
-        "(*frame, detection, point) float32 [1], missing nan",
-        "the detector's confidence of each of these points, in (0, 1]",
-    ),
+EXTRA_ARRAYS = array_layouts(
+    """
+    extra_keypoints (*frame, detection, point, axis) float32 [px], missing nan:
+        detected points besides COCO-17, such as heels and toes; attribute `point` names them
+    extra_confidence (*frame, detection, point) float32 [1], missing nan:
+        the detector's confidence of each of these points, in (0, 1]
+    """
 )
 """Arrays of points besides COCO-17; absent where the detector gave none."""
 POINT_ATTRIBUTE = {"point": "names of the points besides COCO-17; absent without any"}

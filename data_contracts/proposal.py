@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layouts
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.keypoints import FRAME
+
+_PLACES = array_layouts(
+    """
+    place (frame, detection, coordinate_2d) float64 [m], missing nan:
+        x, y of people on the pitch, world, with the camera on the assumed side
+    place_covariance (frame, detection, coordinate_2d, coordinate_2d_) float64 [m^2], missing nan:
+        covariance of `place` by the error of feet in the image
+    """
+)
 
 PROPOSAL = GroupLayout(
     stage="proposal",
@@ -13,19 +22,7 @@ PROPOSAL = GroupLayout(
     "stated side is assumed on the near side. Without a camera there are no arrays; `problem` "
     "says why.",
     coordinates=(FRAME,),
-    arrays=(
-        *CAMERA_ARRAYS,
-        array_layout(
-            "place",
-            "(frame, detection, coordinate_2d) float64 [m], missing nan",
-            "x, y of people on the pitch, world, with the camera on the assumed side",
-        ),
-        array_layout(
-            "place_covariance",
-            "(frame, detection, coordinate_2d, coordinate_2d_) float64 [m^2], missing nan",
-            "covariance of `place` by the error of feet in the image",
-        ),
-    ),
+    arrays=(*CAMERA_ARRAYS, *_PLACES),
     labels={
         **CAMERA_LABELS,
         "coordinate_2d": ("x", "y"),

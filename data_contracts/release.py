@@ -12,7 +12,6 @@ from data_contracts.records import (
     CONTRACT_VERSION,
     Amount,
     Count,
-    Digest,
     Frame,
     FramesPerSecond,
     ImageLength,
@@ -23,6 +22,7 @@ from data_contracts.records import (
     Record,
     Share,
 )
+from data_contracts.run import StoredFile
 
 EXPORT_PURPOSES: Final[Mapping[str, str]] = {
     "joints": "joints with covariances for numpy",
@@ -48,16 +48,6 @@ EXPORT_PURPOSES: Final[Mapping[str, str]] = {
 """Format to what its files are for."""
 EXPORT_FORMATS: Final = tuple(EXPORT_PURPOSES)
 """Names that `worldpose export --format` accepts."""
-
-
-class ReleasedFile(Record):
-    """One file of a release."""
-
-    path: str
-    """Relative to the manifest, with forward slashes."""
-    size: Count
-    """[byte]"""
-    sha256: Digest
 
 
 class ReleasedClip(Record):
@@ -102,7 +92,8 @@ class ReleaseManifest(Record):
     """Stage to all its settings."""
     results: dict[str, Key]
     """Stored results in the release: `stage/unit` to key."""
-    files: tuple[ReleasedFile, ...]
+    files: tuple[StoredFile, ...]
+    """With paths relative to the manifest."""
 
 
 class Finding(Record):

@@ -64,58 +64,57 @@ class ReviewDecision(Record):
     decided_at: datetime
 
 
-class MovedPoint(Record):
-    """A clicked pitch point that is moved, added or removed."""
+class ClickedPlace(Record):
+    """A point, line or arc of the pitch template in one image."""
 
-    kind: Literal["moved_point"] = "moved_point"
     camera: Name
     """A static camera, or the clip of a moving one."""
     marking: Name
-    """Name of the point in the pitch template."""
+    """Its name in the pitch template."""
     frame: Frame | None = None
     """Frame of the clip's video; None for a static camera."""
+
+
+class MovedPoint(ClickedPlace):
+    """A clicked pitch point that is moved, added or removed."""
+
+    kind: Literal["moved_point"] = "moved_point"
     was: Pixel | None = None
     """Former pixel [px]; None if it was not clicked."""
     xy: Pixel | None
     """[px]; None removes it."""
 
 
-class RedrawnMarking(Record):
+class RedrawnMarking(ClickedPlace):
     """A drawn line or arc that is replaced, added or removed."""
 
     kind: Literal["redrawn_marking"] = "redrawn_marking"
-    camera: Name
-    """A static camera, or the clip of a moving one."""
-    marking: Name
-    """Name of the line or arc in the pitch template."""
-    frame: Frame | None = None
-    """Frame of the clip's video; None for a static camera."""
     was: tuple[Pixel, ...] = ()
     """Former pixels [px]; empty if it was not drawn."""
     xy: tuple[Pixel, ...]
     """[px]; empty removes it."""
 
 
-class DeletedDetection(Record):
+class Sighting(Record):
+    """One detection that identifies a person, independent of the tracker's ids."""
+
+    camera: Name
+    frame: Frame
+    """Match frame."""
+    detection: DetectionIndex
+    """Its index among the camera's detections of the frame; a free one for an added detection."""
+
+
+class DeletedDetection(Sighting):
     """A detection that is no person of the match."""
 
     kind: Literal["deleted_detection"] = "deleted_detection"
-    camera: Name
-    frame: Frame
-    """Match frame."""
-    detection: DetectionIndex
-    """Its index among the camera's detections of the frame."""
 
 
-class AddedDetection(Record):
+class AddedDetection(Sighting):
     """A person that the detector missed."""
 
     kind: Literal["added_detection"] = "added_detection"
-    camera: Name
-    frame: Frame
-    """Match frame."""
-    detection: DetectionIndex
-    """Index that the new detection takes among the camera's detections of the frame: a free one."""
     box: tuple[PixelCoordinate, PixelCoordinate, PixelCoordinate, PixelCoordinate]
     """x0, y0, x1, y1 [px]."""
     keypoints: tuple[Pixel | None, ...] = Field(default=(None,) * 17, min_length=17, max_length=17)
@@ -132,31 +131,16 @@ class ChosenFrames(Record):
     """Match frames."""
 
 
-class MovedKeypoint(Record):
+class MovedKeypoint(Sighting):
     """A keypoint that is moved; `xy` None marks it as invisible."""
 
     kind: Literal["moved_keypoint"] = "moved_keypoint"
-    camera: Name
-    frame: Frame
-    """Match frame."""
-    detection: DetectionIndex
-    """Its index among the camera's detections of the frame."""
     joint: Name
     """Name in COCO-17."""
     was: Pixel | None = None
     """Former pixel [px]; None if it was not detected."""
     xy: Pixel | None
     """[px]"""
-
-
-class Sighting(Record):
-    """One detection that identifies a person, independent of the tracker's ids."""
-
-    camera: Name
-    frame: Frame
-    """Match frame."""
-    detection: DetectionIndex
-    """Its index among the camera's detections of the frame."""
 
 
 class MergedTracks(Record):

@@ -30,10 +30,10 @@ class Project(Record):
 
 
 class StoredFile(Record):
-    """One file of a published result."""
+    """One file of a published result or a release."""
 
     path: str
-    """Relative to the result's group."""
+    """Relative to the result's group or the manifest, with forward slashes."""
     size: Count
     """[byte]"""
     sha256: Digest

@@ -11,15 +11,13 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
 from data_contracts.arrays import GroupLayout
-from data_contracts.body_fitting import BODY_FITTING
-from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrames
-from data_contracts.broadcast_pooling import BROADCAST_POOLING
-from data_contracts.broadcast_tracking import BROADCAST_TRACKING
+from data_contracts.body_fitting import BODY_FITTING, REFITTING
+from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, BROADCAST_POOLING, KeyFrames
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.camera_consistency import CAMERA_CONSISTENCY, CameraFault
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, Conventions
-from data_contracts.detection import DETECTION
+from data_contracts.detection import DETECTION, REDETECTION
 from data_contracts.evaluation import Evaluation, MethodScore
 from data_contracts.filtering import FILTERING
 from data_contracts.finetune import NetVersion
@@ -29,20 +27,17 @@ from data_contracts.pin import Pin
 from data_contracts.pitch import PitchSpec
 from data_contracts.proposal import PROPOSAL
 from data_contracts.records import Record, field_docstrings
-from data_contracts.redetection import REDETECTION
-from data_contracts.refitting import REFITTING
 from data_contracts.release import (
     BaselineSettings,
     CheckReport,
     DataSetStatistics,
     ReleaseManifest,
 )
-from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.review import Correction, JournalEntry, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
 from data_contracts.static_calibration import STATIC_CALIBRATION, ClickedMarkings
-from data_contracts.tracking import TRACKING, Join, Track
-from data_contracts.triangulation import TRIANGULATION
+from data_contracts.tracking import BROADCAST_TRACKING, TRACKING, Join, Track
+from data_contracts.triangulation import RETRIANGULATION, TRIANGULATION
 
 RECORDS: dict[str, type[Record]] = {
     "match": MatchSpec,

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layout, array_layouts
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.records import CONTRACT_VERSION, Name, PixelCoordinate, Record
 
@@ -47,18 +47,8 @@ class ClickedMarkings(Record):
 
 
 CAMERA_STEP = (
-    "rx",
-    "ry",
-    "rz",
-    "tx",
-    "ty",
-    "tz",
-    "log_focal",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "k3",
+    *("rx", "ry", "rz", "tx", "ty", "tz"),
+    *("log_focal", "cx", "cy", "k1", "k2", "k3"),
 )
 """A step of a camera: rotation about its center [rad] and shift [m] in its own axes, the
 logarithm of the focal length, principal point [px], distortion [1]."""
@@ -71,68 +61,47 @@ _GROUND = tuple(
     )
     for axis in ("x", "y")
 )
-_EVIDENCE = (
-    array_layout(
-        "covariance",
-        "(parameter, parameter_) float64 [1]",
-        "covariance of a step of the camera, in the units of its parameters; zero for "
-        "parameters that were not solved for",
-    ),
-    array_layout("point_pixel", "(point, axis) float64 [px]", "clicked pixel"),
-    array_layout(
-        "point_residual",
-        "(point, axis) float64 [px], missing nan",
-        "projected minus clicked; missing if the camera cannot image the point",
-    ),
-    array_layout(
-        "point_surprise",
-        "(point) float64 [1], missing nan",
-        "Mahalanobis distance of the residual, given the other evidence; missing if the "
-        "camera cannot image the point",
-    ),
-    array_layout("point_inlier", "(point) bool [1]", "the click is an inlier"),
-    array_layout(
-        "marking_rms",
-        "(marking) float64 [px]",
-        "root mean square distance of the drawn pixels to the projected marking",
-    ),
-    array_layout(
-        "marking_worst",
-        "(marking) float64 [px]",
-        "largest distance of a drawn pixel to the projected marking",
-    ),
-    array_layout("marking_inlier", "(marking) bool [1]", "the drawn marking is an inlier"),
-    array_layout(
-        "ground_error",
-        "(ground_y, ground_x) float64 [m], missing nan",
-        "expected distance on the surface between a place and the back-projection of its "
-        "true pixel; missing outside of the camera's view",
-    ),
+_EVIDENCE = array_layouts(
+    """
+    covariance (parameter, parameter_) float64 [1]:
+        covariance of a step of the camera, in the units of its parameters; zero for parameters that
+        were not solved for
+    point_pixel (point, axis) float64 [px]:
+        clicked pixel
+    point_residual (point, axis) float64 [px], missing nan:
+        projected minus clicked; missing if the camera cannot image the point
+    point_surprise (point) float64 [1], missing nan:
+        Mahalanobis distance of the residual, given the other evidence; missing if the camera cannot
+        image the point
+    point_inlier (point) bool [1]:
+        the click is an inlier
+    marking_rms (marking) float64 [px]:
+        root mean square distance of the drawn pixels to the projected marking
+    marking_worst (marking) float64 [px]:
+        largest distance of a drawn pixel to the projected marking
+    marking_inlier (marking) bool [1]:
+        the drawn marking is an inlier
+    ground_error (ground_y, ground_x) float64 [m], missing nan:
+        expected distance on the surface between a place and the back-projection of its true pixel;
+        missing outside of the camera's view
+    """
 )
-_VENUE = (
-    array_layout(
-        "venue_number",
-        "(unknown) int64 [1]",
-        "unknowns of the pitch that all cameras share: 3 p + axis = error of the template's "
-        "point p; from -1000000 down, uneven paint; the last two, crown and end fall",
-    ),
-    array_layout("venue_prior_mean", "(unknown) float64 [m]", "the unknowns before the image"),
-    array_layout(
-        "venue_prior",
-        "(unknown, unknown_) float64 [1/m^2]",
-        "information of `venue_prior_mean`",
-    ),
-    array_layout("venue_mean", "(unknown) float64 [m]", "the unknowns at this camera"),
-    array_layout(
-        "venue_information",
-        "(unknown, unknown_) float64 [1/m^2]",
-        "what the evidence of this camera alone tells about the unknowns",
-    ),
-    array_layout(
-        "venue_response",
-        "(parameter, unknown) float64 [1/m]",
-        "step of the camera per change of the unknowns, in the units of its parameters",
-    ),
+_VENUE = array_layouts(
+    """
+    venue_number (unknown) int64 [1]:
+        unknowns of the pitch that all cameras share: 3 p + axis = error of the template's point p;
+        from -1000000 down, uneven paint; the last two, crown and end fall
+    venue_prior_mean (unknown) float64 [m]:
+        the unknowns before the image
+    venue_prior (unknown, unknown_) float64 [1/m^2]:
+        information of `venue_prior_mean`
+    venue_mean (unknown) float64 [m]:
+        the unknowns at this camera
+    venue_information (unknown, unknown_) float64 [1/m^2]:
+        what the evidence of this camera alone tells about the unknowns
+    venue_response (parameter, unknown) float64 [1/m]:
+        step of the camera per change of the unknowns, in the units of its parameters
+    """
 )
 _ABOUT = {
     "point": "names of the clicked points, the largest Mahalanobis distance first",

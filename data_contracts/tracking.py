@@ -1,10 +1,10 @@
-"""Result of stage `tracking`: identities across cameras and over time (T1, T2)."""
+"""Results of stages `tracking` (T1, T2) and `broadcast_tracking`: who is who over time."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layout, array_layouts
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME
 from data_contracts.records import Amount, Count, Frame, Name, Number, PersonId, Record
@@ -15,44 +15,25 @@ TRACKING = GroupLayout(
     stage="tracking",
     about="The person of every camera's detections.",
     coordinates=(FRAME, PERSON),
-    arrays=(
-        array_layout(
-            "detection_index",
-            "(*frame, camera, person) int16 [1], missing -1",
-            "index among this camera's detections of the frame, in `ingest`, `detection` or, "
-            "from the second iteration on, `redetection`",
-        ),
-        array_layout(
-            "ray_distance",
-            "(*frame, camera, person) float32 [m], missing nan",
-            "mean distance of the detection's rays to the person's joints when matched",
-        ),
-        array_layout(
-            "joints",
-            "(*frame, person, joint, coordinate) float32 [m], missing nan",
-            "the tracker's fast 3D joints, world; those of `triangulation` are accurate",
-        ),
-        array_layout(
-            "ground",
-            "(*frame, person, axis) float32 [m], missing nan",
-            "place on the pitch from the feet, smoothed; finite exactly in the frames in "
-            "which the person is not triangulated but placed by the feet (kind `plane`)",
-        ),
-        array_layout(
-            "ground_velocity",
-            "(*frame, person, axis) float32 [m/s], missing nan",
-            "derivative of `ground`",
-        ),
-        array_layout(
-            "ground_covariance",
-            "(*frame, person, axis, axis_) float32 [m^2], missing nan",
-            "covariance of `ground`: noise of the feet, and calibration",
-        ),
-        array_layout(
-            "ground_height",
-            "(person) float32 [m], missing nan",
-            "height of people who are placed by their feet, by their boxes",
-        ),
+    arrays=array_layouts(
+        """
+        detection_index (*frame, camera, person) int16 [1], missing -1:
+            index among this camera's detections of the frame, in `ingest`, `detection` or, from the
+            second iteration on, `redetection`
+        ray_distance (*frame, camera, person) float32 [m], missing nan:
+            mean distance of the detection's rays to the person's joints when matched
+        joints (*frame, person, joint, coordinate) float32 [m], missing nan:
+            the tracker's fast 3D joints, world; those of `triangulation` are accurate
+        ground (*frame, person, axis) float32 [m], missing nan:
+            place on the pitch from the feet, smoothed; finite exactly in the frames in which the
+            person is not triangulated but placed by the feet (kind `plane`)
+        ground_velocity (*frame, person, axis) float32 [m/s], missing nan:
+            derivative of `ground`
+        ground_covariance (*frame, person, axis, axis_) float32 [m^2], missing nan:
+            covariance of `ground`: noise of the feet, and calibration
+        ground_height (person) float32 [m], missing nan:
+            height of people who are placed by their feet, by their boxes
+        """
     ),
     labels={
         "joint": COCO17,
@@ -106,3 +87,27 @@ class Join(Record):
     """Logarithm of the odds of this join against every other way [1]; None = beyond doubt."""
     decided: bool
     """Whether they were joined; otherwise a reviewer decides."""
+
+
+_GROUND = ("ground", "ground_velocity", "ground_covariance", "ground_height")
+
+BROADCAST_TRACKING = TRACKING.model_copy(
+    update={
+        "stage": "broadcast_tracking",
+        "about": "The people of a broadcast clip on the pitch, where no static camera films them.",
+        "arrays": (
+            array_layout(
+                "detection_index",
+                "(*frame, person) int16 [1], missing -1",
+                "index among the clip's detections of the frame, in `ingest` or `detection`",
+            ),
+            *(TRACKING.layout(name) for name in _GROUND),
+        ),
+        "labels": {"axis": ("x", "y"), "axis_": ("x", "y")},
+        "optional": (),
+        "attributes": {
+            "clip_id": "clip of the match",
+            "tracks": "one `track` record per person",
+        },
+    }
+)

@@ -1,8 +1,8 @@
-"""Result of stage `triangulation`: 3D joints with covariance (T3)."""
+"""Results of stages `triangulation` and `retriangulation`: 3D joints with covariance (T3)."""
 
 from __future__ import annotations
 
-from data_contracts.arrays import GroupLayout, array_layout
+from data_contracts.arrays import GroupLayout, array_layouts
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
 from data_contracts.tracking import PERSON
@@ -14,115 +14,73 @@ EXCHANGED_PARTS = {
 }
 """Parts of a body whose left and right sides a detector swaps together, and their joints."""
 
-EXTRA_JOINTS = (
-    array_layout(
-        "extra_joints",
-        "(*frame, person, point, coordinate) float64 [m], missing nan",
-        "points besides COCO-17, world; attribute `point` names them",
-    ),
-    array_layout(
-        "extra_covariance",
-        "(*frame, person, point, coordinate, coordinate_) float64 [m^2], missing nan",
-        "covariance of `extra_joints`, from the same errors as `covariance`",
-    ),
+EXTRA_JOINTS = array_layouts(
+    """
+    extra_joints (*frame, person, point, coordinate) float64 [m], missing nan:
+        points besides COCO-17, world; attribute `point` names them
+    extra_covariance (*frame, person, point, coordinate, coordinate_) float64 [m^2], missing nan:
+        covariance of `extra_joints`, from the same errors as `covariance`
+    """
 )
 """Points besides COCO-17 in 3D; absent where no detector gave any."""
 EXTRA_TRIANGULATION = (
     *EXTRA_JOINTS,
-    array_layout(
-        "extra_views",
-        "(*frame, person, point) uint8 [1], missing 0",
-        "number of inlier cameras of `extra_joints`",
-    ),
-    array_layout(
-        "extra_common_bias",
-        "(point) float64 [m]",
-        "as `common_bias`; `extra_covariance` contains it",
+    *array_layouts(
+        """
+        extra_views (*frame, person, point) uint8 [1], missing 0:
+            number of inlier cameras of `extra_joints`
+        extra_common_bias (point) float64 [m]:
+            as `common_bias`; `extra_covariance` contains it
+        """
     ),
 )
 """The same as triangulation gives them."""
+
+_ARRAYS = array_layouts(
+    """
+    joints (*frame, person, joint, coordinate) float64 [m], missing nan:
+        joints, world
+    covariance (*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan:
+        covariance of `joints`: the detector's noise as the residuals show it, calibration,
+        and the bias that all views share
+    shared_covariance (*frame, person, coordinate, coordinate_) float64 [m^2], missing nan:
+        the part of `covariance` that all joints of a person share: calibration moves the
+        whole person
+    common_bias (joint) float64 [m]:
+        standard deviation per axis of the error that all views of a joint share;
+        `covariance` contains it
+    views (*frame, person, joint) uint8 [1], missing 0:
+        number of inlier cameras
+    spread (*frame, person, joint) float32 [rad], missing nan:
+        widest angle between rays of inlier cameras, at most a right angle
+    reprojection_error (*frame, person, joint) float32 [px], missing nan:
+        root mean square over the inlier cameras
+    inliers (*frame, camera, person, joint) bool [1]:
+        this camera's observation is an inlier of the joint
+    exchanged (*frame, camera, person, part) bool [1]:
+        this camera's detection has left and right of this part swapped; joints and
+        `inliers` are computed after correction
+    offsets (*frame, camera, person, axis) float32 [px], missing 0:
+        common image offset of the person in this camera, from calibration errors
+    smoothed (*frame, person, joint, coordinate) float64 [m], missing nan:
+        joints smoothed over the whole track, world
+    smoothed_covariance (*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan:
+        covariance of `smoothed`; it grows inside gaps
+    filled (*frame, person, joint) bool [1]:
+        `smoothed` is present and `joints` is missing
+    clock_late (camera) float64 [frame], missing nan:
+        clock offset: frame t shows the time t + clock_late of the cameras' mean clock;
+        missing without enough motion
+    clock_error (camera) float64 [frame]:
+        standard error of `clock_late`
+    """
+)
 
 TRIANGULATION = GroupLayout(
     stage="triangulation",
     about="3D joints of every person, with covariance and inlier views.",
     coordinates=(FRAME, PERSON),
-    arrays=(
-        array_layout(
-            "joints",
-            "(*frame, person, joint, coordinate) float64 [m], missing nan",
-            "joints, world",
-        ),
-        array_layout(
-            "covariance",
-            "(*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan",
-            "covariance of `joints`: the detector's noise as the residuals show it, "
-            "calibration, and the bias that all views share",
-        ),
-        array_layout(
-            "shared_covariance",
-            "(*frame, person, coordinate, coordinate_) float64 [m^2], missing nan",
-            "the part of `covariance` that all joints of a person share: calibration moves "
-            "the whole person",
-        ),
-        array_layout(
-            "common_bias",
-            "(joint) float64 [m]",
-            "standard deviation per axis of the error that all views of a joint share; "
-            "`covariance` contains it",
-        ),
-        array_layout(
-            "views", "(*frame, person, joint) uint8 [1], missing 0", "number of inlier cameras"
-        ),
-        array_layout(
-            "spread",
-            "(*frame, person, joint) float32 [rad], missing nan",
-            "widest angle between rays of inlier cameras, at most a right angle",
-        ),
-        array_layout(
-            "reprojection_error",
-            "(*frame, person, joint) float32 [px], missing nan",
-            "root mean square over the inlier cameras",
-        ),
-        array_layout(
-            "inliers",
-            "(*frame, camera, person, joint) bool [1]",
-            "this camera's observation is an inlier of the joint",
-        ),
-        array_layout(
-            "exchanged",
-            "(*frame, camera, person, part) bool [1]",
-            "this camera's detection has left and right of this part swapped; joints and "
-            "`inliers` are computed after correction",
-        ),
-        array_layout(
-            "offsets",
-            "(*frame, camera, person, axis) float32 [px], missing 0",
-            "common image offset of the person in this camera, from calibration errors",
-        ),
-        array_layout(
-            "smoothed",
-            "(*frame, person, joint, coordinate) float64 [m], missing nan",
-            "joints smoothed over the whole track, world",
-        ),
-        array_layout(
-            "smoothed_covariance",
-            "(*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan",
-            "covariance of `smoothed`; it grows inside gaps",
-        ),
-        array_layout(
-            "filled",
-            "(*frame, person, joint) bool [1]",
-            "`smoothed` is present and `joints` is missing",
-        ),
-        array_layout(
-            "clock_late",
-            "(camera) float64 [frame], missing nan",
-            "clock offset: frame t shows the time t + clock_late of the cameras' mean clock; "
-            "missing without enough motion",
-        ),
-        array_layout("clock_error", "(camera) float64 [frame]", "standard error of `clock_late`"),
-        *EXTRA_TRIANGULATION,
-    ),
+    arrays=(*_ARRAYS, *EXTRA_TRIANGULATION),
     labels={
         "joint": COCO17,
         "part": tuple(EXCHANGED_PARTS),
@@ -132,4 +90,11 @@ TRIANGULATION = GroupLayout(
     },
     attributes={"camera": "camera ids in the order of the camera dimension", **POINT_ATTRIBUTE},
     optional=(*(array.name for array in EXTRA_TRIANGULATION), *POINT_ATTRIBUTE),
+)
+
+RETRIANGULATION = TRIANGULATION.model_copy(
+    update={
+        "stage": "retriangulation",
+        "about": "3D joints of every person, triangulated again with the adjusted cameras.",
+    }
 )

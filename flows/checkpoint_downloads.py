@@ -123,12 +123,7 @@ def _digest(path: Path) -> str:
 def _fetch_file(
     name: str, file: CheckpointFile, path: Path, draft: Path, progress: Progress
 ) -> None:
-    """Bring one file of a checkpoint to its path.
-
-    Raises:
-        InputError: it has another digest.
-        WorldposeError: the download failed.
-    """
+    """Bring one file of a checkpoint to its path."""
     url = resolve_address(file.url)
     part = draft / f"{file.name}.part"
     most = MAX_ARCHIVE_BYTES if file.member else file.size
@@ -192,11 +187,7 @@ def _require_safe(url: str) -> None:
 
 
 def _download(url: str, part: Path, most: int | None, progress: Callable[[int, int], None]) -> None:
-    """Download into `part`, going on where it ends; redirects may lead to safe addresses alone.
-
-    Raises:
-        OSError, httpx.HTTPError, UsageError: the download failed, or is longer than `most` bytes.
-    """
+    """Download into `part`, going on where it ends; redirects may lead to safe addresses alone."""
     there = part.stat().st_size if part.exists() else 0
     headers = {"User-Agent": "worldpose", "Accept-Encoding": "identity"}
     if there:
@@ -225,11 +216,7 @@ def _download(url: str, part: Path, most: int | None, progress: Callable[[int, i
 
 
 def _extract(name: str, file: CheckpointFile, archive: Path, path: Path) -> None:
-    """Write one file of a zip archive to `path`, at most as large as pinned.
-
-    Raises:
-        InputError: the archive is damaged, or has no or several such files; it is removed.
-    """
+    """Write one file of a zip archive to `path`, at most as large as pinned."""
     assert file.member is not None
     most = file.size or MAX_ARCHIVE_BYTES
     try:

@@ -31,13 +31,8 @@ def fine_tune_nets(
 ) -> list[NetVersion]:
     """Train each net in turn, and return the records of their new versions.
 
-    Args:
-        annotations: COCO keypoints.
-        pictures: the folder of their images; that of the annotations if None.
-        folder: folder of the versions.
-        nets: nets to train.
-        settings: steps, learning rate, sampling shares of images, seed.
-        starts: initial weights, if not the shipped ones.
+    The images are in `pictures`, or beside the annotations; `starts` are initial weights, if not
+    the shipped ones.
     """
     return [
         finetune(kind, annotations, pictures, folder, settings, starts.get(kind)) for kind in nets

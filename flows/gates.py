@@ -23,10 +23,6 @@ from worldpose.store.store import Store
 Figures = Mapping[str, float]
 
 
-def _as_they_are(figures: Figures) -> Figures:
-    return figures
-
-
 @dataclass(frozen=True)
 class Gate:
     """Gate that requests a review.
@@ -43,7 +39,7 @@ class Gate:
     stage: str
     question: str
     limits: Record
-    judged: Callable[[Figures], Figures] = _as_they_are
+    judged: Callable[[Figures], Figures] = lambda figures: figures
     warned: tuple[str, ...] = ()
 
     def warnings(self, figures: Figures) -> tuple[str, ...]:
@@ -223,77 +219,65 @@ def _of_bodies(figures: Figures) -> Figures:
     return {**figures, "filled_share": share, EXCESS: max(by_group, default=0.0)}
 
 
-CAMERAS = Gate(
-    "static_calibration",
-    "Do the projected markings match those in the image, in all parts of it?",
-    CameraLimits(),
-)
-PEOPLE = Gate(
-    "detection",
-    "Are exactly the people on the pitch detected?",
-    PeopleLimits(),
-    _of_people,
-)
-CONSISTENCY = Gate(
-    "camera_consistency",
-    "Are these cameras wrong, for this reason? If you approve, the run leaves them out.",
-    ConsistencyLimits(),
-)
-IDENTITIES = Gate(
-    "tracking",
-    "Is every person one track over the whole clip?",
-    IdentityLimits(),
-    warned=("unmatched_share", "mean_ray_distance_m"),
-)
-JOINTS = Gate(
-    "triangulation",
-    "Are the joints where the images show them?",
-    JointLimits(),
-    warned=("standard_deviation_m",),
-)
-ADJUSTMENT = Gate(
-    "bundle_adjustment",
-    "Did the adjustment improve the cameras, and are its outliers correct?",
-    AdjustmentLimits(),
-    _of_adjustment,
-)
-ACCEPTANCE = Gate(
-    "body_fitting",
-    "Is the clip good enough to be released?",
-    ClipLimits(),
-    _of_bodies,
-    warned=(EXCESS,),
-)
-BROADCAST = Gate(
-    "broadcast_calibration",
-    "Does the drawn pitch match the pitch in the image in every frame?",
-    BroadcastLimits(),
-)
-
-GATES: Final[tuple[Gate, ...]] = (
-    CAMERAS,
-    PEOPLE,
-    CONSISTENCY,
-    IDENTITIES,
-    JOINTS,
-    ADJUSTMENT,
-    ACCEPTANCE,
-    BROADCAST,
-)
-"""Review gates, with `--gates auto` or `always`; each follows the stage that it names."""
+GATES: Final[Mapping[str, Gate]] = {
+    gate.stage: gate
+    for gate in (
+        Gate(
+            "static_calibration",
+            "Do the projected markings match those in the image, in all parts of it?",
+            CameraLimits(),
+        ),
+        Gate(
+            "detection",
+            "Are exactly the people on the pitch detected?",
+            PeopleLimits(),
+            _of_people,
+        ),
+        Gate(
+            "camera_consistency",
+            "Are these cameras wrong, for this reason? If you approve, the run leaves them out.",
+            ConsistencyLimits(),
+        ),
+        Gate(
+            "tracking",
+            "Is every person one track over the whole clip?",
+            IdentityLimits(),
+            warned=("unmatched_share", "mean_ray_distance_m"),
+        ),
+        Gate(
+            "triangulation",
+            "Are the joints where the images show them?",
+            JointLimits(),
+            warned=("standard_deviation_m",),
+        ),
+        Gate(
+            "bundle_adjustment",
+            "Did the adjustment improve the cameras, and are its outliers correct?",
+            AdjustmentLimits(),
+            _of_adjustment,
+        ),
+        Gate(
+            "body_fitting",
+            "Is the clip good enough to be released?",
+            ClipLimits(),
+            _of_bodies,
+            warned=(EXCESS,),
+        ),
+        Gate(
+            "broadcast_calibration",
+            "Does the drawn pitch match the pitch in the image in every frame?",
+            BroadcastLimits(),
+        ),
+    )
+}
+"""Stage to its review gate, in the order of the method, for `--gates auto` and `always`."""
 
 ALWAYS: Final = "every result is asked about"
 
 
 @dataclass(frozen=True)
 class Gatekeeper:
-    """Decides which results pass and which need review.
-
-    Attributes:
-        store: the store of the results.
-        match: the match, with its journal as of the start of the run.
-        policy: when a review is requested.
-    """
+    """Decides which results pass and which need review."""
 
     store: Store
     match: Match
@@ -305,7 +289,7 @@ class Gatekeeper:
         A verdict applies to a result's bytes, and overrides metrics and policy: a rejected result
         waits for a correction, however good its metrics are.
         """
-        gate = {each.stage: each for each in GATES}.get(stage)
+        gate = GATES.get(stage)
         if gate is None or (self.policy == "never" and not self._has_refusals()):
             return ()
         waiting = []

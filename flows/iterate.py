@@ -57,13 +57,9 @@ class Iteration:
 class Iterations:
     """All iterations of a call.
 
-    Attributes:
-        passes: iterations in order.
-        kept: the accepted iteration: each is accepted only if it is better than the last accepted
-            one.
-        record: the latest run, which names the results of `kept`; the last iteration's run if that
-            did not complete.
-        ended: why there is no further iteration.
+    Each pass is accepted, `kept`, only if it is better than the last accepted one. The record is
+    that of the latest run, which names the results of `kept`, or of a last pass that did not
+    complete; `ended` says why there is no further pass.
     """
 
     passes: tuple[Iteration, ...]
@@ -77,13 +73,8 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
 
     Existing results are not computed again; after a kill, the next call resumes from the finished
     results. If the match is edited between two iterations, all restart with the edit, so that all
-    iterations use the same state of the match.
-
-    Args:
-        store: the store.
-        match: the match.
-        request: settings and machines, for every iteration.
-        most: number of iterations; None = until an iteration is no better than the best before it.
+    iterations use the same state of the match. None iterates until an iteration is no better than
+    the best before it.
 
     Raises:
         UsageError: only a part of the method was requested.
@@ -135,19 +126,15 @@ def _pass(
     machines_for: Callable[[Iterable[PlannedUnit]], RunRequest],
 ) -> Iteration:
     """Return the run that has all results of an iteration, or a new run."""
-    plan = _plan(store, match, request)
+    latest = latest_run(store, match.match_id)
+    gatekeeper = Gatekeeper(store, match, request.gate_policy(latest))
+    plan = plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
     record = _recorded_run(store, match, plan)
     if record is None:
         reporter().say(f"iteration {request.iteration}")
         machines = machines_for(plan.missing)
         record = run_match(store, match, replace(machines, iteration=request.iteration))
     return Iteration(request.iteration, record, held_out_error(record))
-
-
-def _plan(store: Store, match: Match, request: RunRequest) -> RunPlan:
-    latest = latest_run(store, match.match_id)
-    gatekeeper = Gatekeeper(store, match, request.gate_policy(latest))
-    return plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
 
 
 def _recorded_run(store: Store, match: Match, plan: RunPlan) -> RunRecord | None:

@@ -23,11 +23,7 @@ def left_out_cameras(
 ) -> dict[str, str]:
     """Return the static cameras that published results leave out, with reasons, in match order.
 
-    Args:
-        store: where the results are.
-        match: the whole match.
-        stages: stages whose results count.
-        results: `stage/unit` to key; a result that is not published yet leaves out no camera.
+    A result that is not published yet leaves out no camera.
     """
     judging = {stage.name for stage in stages if stage.leaves_out}
     said: dict[str, str] = {}

@@ -148,8 +148,9 @@ def compute(
     Raises:
         LostWorkersError: the Prefect server or Dask scheduler is gone.
     """
-    with _place_tasks(stage) if units else nullcontext():
-        tasks = task_count([short_seconds(unit) for unit in units], len(_workers(_client())))
+    client = _client()
+    with nullcontext() if client is None else on_workers_with(stage.worker_tag, client):
+        tasks = task_count([short_seconds(unit) for unit in units], len(_workers(client)))
         if tasks < len(units):
             yield from _in_batches(stage, units, work, tasks)
         else:
@@ -159,9 +160,7 @@ def compute(
 def task_count(seconds: list[float], workers: int) -> int:
     """Return the number of tasks of a stage.
 
-    Args:
-        seconds: processor time of each unit, infinite unless it is short [s].
-        workers: number of workers.
+    The processor time of a unit is infinite unless it is short [s].
     """
     units, workers = len(seconds), max(1, workers)
     if sum(seconds) < math.inf:
@@ -217,11 +216,6 @@ def task_of(stage: Stage) -> Task[..., Any]:
     """Return the task that computes one unit of a stage: the function of its name."""
     task: Task[..., Any] = getattr(importlib.import_module(stage.task_module), stage.name)
     return task
-
-
-def _place_tasks(stage: Stage) -> AbstractContextManager[Any]:
-    client = _client()
-    return nullcontext() if client is None else on_workers_with(stage.worker_tag, client)
 
 
 def _client() -> Client | None:

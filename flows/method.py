@@ -48,3 +48,10 @@ def task_modules(stages: Iterable[str]) -> list[str]:
     """Return the modules with the tasks of some stages, sorted."""
     names = set(stages)
     return sorted({stage.task_module for stage in METHOD if stage.name in names})
+
+
+def unit_order(name: str) -> tuple[int, str]:
+    """Return the sort key of a unit, `stage/unit`: in the order of the method, then by name."""
+    stage = name.partition("/")[0]
+    names = [each.name for each in METHOD]
+    return (names.index(stage) if stage in names else len(names), name)

@@ -21,7 +21,7 @@ from urllib.parse import unquote, urlsplit
 import httpx
 
 from data_contracts.run import RunRecord
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 LOG: Final = logging.getLogger("worldpose.run")
 URL: Final = "OPENLINEAGE_URL"
@@ -49,13 +49,16 @@ def tell_lineage(store: Store, record: RunRecord) -> None:
 def lineage_events(store: Store, record: RunRecord) -> Iterator[dict[str, Any]]:
     """Yield a START and a COMPLETE or FAIL event for each unit that a run computed or failed."""
     for name in record.executed:
-        stage, _, unit = name.partition("/")
-        manifest = store.manifest(record.match_id, stage, unit, record.results[name])
+        manifest = Run(store, record).manifest(name)
         end = manifest.created_at
         start = end - timedelta(seconds=manifest.seconds)
         used = manifest.recipe.inputs.items()
         inputs = [_dataset(store, record, name_of_input, key) for name_of_input, key in used]
-        inputs += [_source(record, each) for each in sorted(manifest.recipe.sources)]
+        # A file or value of the match folder, without its place: it may move.
+        inputs += [
+            {"namespace": "worldpose.match", "name": f"{record.match_id}/{source}"}
+            for source in sorted(manifest.recipe.sources)
+        ]
         output = _dataset(store, record, name, manifest.key)
         yield {**_event(store, record, name, "START", start), "inputs": inputs}
         yield {
@@ -99,11 +102,6 @@ def _dataset(store: Store, record: RunRecord, unit: str, key: str) -> dict[str, 
     namespace = store.url if "://" in store.url else f"file://{store.url}"
     name = f"results/{record.match_id}/{unit}"
     return {"namespace": namespace, "name": name, "facets": {"version": facet}}
-
-
-def _source(record: RunRecord, name: str) -> dict[str, Any]:
-    """Return a file or value of the match folder, without its place: it may move."""
-    return {"namespace": "worldpose.match", "name": f"{record.match_id}/{name}"}
 
 
 def _facet(name: str) -> dict[str, str]:

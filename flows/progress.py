@@ -27,9 +27,7 @@ MOST_TOLD: Final = 200
 class Progress:
     """How far something is.
 
-    Attributes:
-        share: done, from 0 to 1.
-        seconds_left: expected time to its end [s]; None before anything is done.
+    The time left is None before anything is done [s].
     """
 
     share: float
@@ -64,10 +62,6 @@ class Reporter:
     """Reports progress as log lines, which a Prefect server shows with the run.
 
     The command line installs its own reporter, which calls this one too.
-
-    Attributes:
-        left: units of the current stage that have not ended.
-        every: report every n-th finished unit.
     """
 
     left: int = 0
@@ -81,8 +75,7 @@ class Reporter:
     def run_planned(self, work: Mapping[str, float]) -> None:
         """Begin to measure a run.
 
-        Args:
-            work: stage to the expected computation time of its missing units, all workers [s].
+        `work` is the expected computation time of each stage's missing units, all workers [s].
         """
         self._work, self._reached, self._missing, self._began = dict(work), (), 0, None
 

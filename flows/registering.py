@@ -21,12 +21,8 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
     """Validate and register a match folder; return whether it was new or changed.
 
     The same content under another name is the same match. A known match with changed videos,
-    detections or pitch is another match and needs another id.
-
-    Args:
-        store: the project.
-        folder: the match folder.
-        unfinished: accept it without all cameras known; people click them on the pages.
+    detections or pitch is another match and needs another id. `unfinished` accepts it without all
+    cameras known; people click them on the pages.
 
     Raises:
         InputError: the folder is not a valid match, or its id or content is already registered.
@@ -97,10 +93,7 @@ def find_registration(store: Store, name: str) -> Registration:
 def find_match(store: Store, name: str, *, unfinished: bool = False) -> Match:
     """Open a match given by folder or id; a folder is registered first.
 
-    Args:
-        store: the project.
-        name: folder or id.
-        unfinished: accept it without all cameras known.
+    `unfinished` accepts it without all cameras known.
     """
     folder = Path(name)
     if (folder / "match.yaml").is_file() or (folder.is_dir() and name not in store.matches()):

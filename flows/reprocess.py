@@ -49,14 +49,8 @@ def reprocess_matches(
     """Run every match with stale results, up to the last stage of its latest run.
 
     A match is run with the settings, gates and iterations of its latest run. A failure is reported
-    for its match, and does not stop the others.
-
-    Args:
-        store: the project.
-        match_ids: registered matches; empty = all.
-        request: further settings for each, and the machines.
-        retry: retry failed units, even without an edit.
-        is_rehearsal: only determine what would be done.
+    for its match, and does not stop the others. No id means all matches. `retry` also retries
+    failed units without an edit; a rehearsal only determines what would be done.
     """
     with shared_machines(store, request) as machines_for:
         return [

@@ -110,13 +110,6 @@ class RunPlan:
         A run from the method's first stage uses the previous iteration with its own settings. Any
         other run continues the latest run: it takes that run's results of earlier stages, stale or
         not, and the previous iteration that they were computed from.
-
-        Args:
-            gatekeeper: gatekeeper with the store and the match.
-            stages: stages of the run.
-            overrides: settings that differ from their defaults.
-            latest: the match's latest run.
-            iteration: iteration number, if the run does not continue the latest run.
         """
         store, match = gatekeeper.store, gatekeeper.match
         results: dict[str, str] = {}
@@ -221,12 +214,7 @@ class RunPlan:
         self.results |= {unit.name: unit.key for unit in units}
 
     def hold(self, stage: Stage, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
-        """Hold back the results of a stage that need review; return these.
-
-        Args:
-            stage: the stage of these results.
-            results: `stage/unit` to key of existing results.
-        """
+        """Hold back the results of a stage that need review; return these."""
         held = (
             () if self.gatekeeper is None else self.gatekeeper.list_held_units(stage.name, results)
         )
@@ -253,13 +241,7 @@ def plan_ahead(
     """Plan all stages of a run.
 
     The plan assumes that every unit succeeds and that every missing result passes its gate.
-
-    Args:
-        gatekeeper: gatekeeper with the store and the match.
-        stages: stages of the run.
-        overrides: settings that differ from their defaults.
-        latest: the match's latest run.
-        iteration: iteration number, if the run does not continue the latest run.
+    `iteration` counts if the run does not continue the latest one.
 
     Raises:
         UsageError: the latest run lacks inputs of the stages.
@@ -286,15 +268,7 @@ def plan_run(
     stages: tuple[Stage, ...] = METHOD,
     iteration: int = 1,
 ) -> list[PlannedUnit]:
-    """Plan all units of the method's first `stages`, as if every unit succeeded.
-
-    Args:
-        store: store with existing results.
-        match: the match.
-        overrides: settings that differ from their defaults.
-        stages: the stages to plan, from the first.
-        iteration: iteration number, from 1.
-    """
+    """Plan all units of the method's first `stages`, as if every unit succeeded."""
     before = results_before(store, match, overrides, iteration)
     plan = RunPlan(store, match, overrides, stages, iteration, before=before)
     for stage in stages:

@@ -26,7 +26,7 @@ from data_contracts.run import (
 )
 from flows.gates import GATES, Gatekeeper
 from flows.left_out import left_out_cameras, left_out_warnings
-from flows.method import METHOD
+from flows.method import METHOD, unit_order
 from flows.progress import reporter
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.review.metric_words import all_reasons
@@ -73,12 +73,6 @@ def resolve_settings(
     """Return the settings of a match's next run: the requested ones over those of its latest run.
 
     A run that was killed counts too: the next run continues it.
-
-    Args:
-        store: the project.
-        match_id: the match.
-        latest: its latest finished run.
-        requested: stage to the settings that the next run states.
 
     Returns:
         The settings that differ from their defaults, and one line that names the kept ones; None
@@ -168,11 +162,7 @@ def expected_work(
 ) -> dict[str, float]:
     """Return the expected computation time of missing units by stage, from the latest run's [s].
 
-    Args:
-        store: the project.
-        match: the match; its sizes tell the time of a first run.
-        missing: planned units without results.
-        latest: the match's latest run; its units tell the time of one.
+    The sizes of the match tell the time of a first run.
     """
     spec = match.folder.spec
     cameras = {each.id: each for each in spec.cameras}
@@ -205,14 +195,7 @@ def _latest_seconds(store: Store, latest: RunRecord | None) -> dict[str, float]:
 def first_seconds(
     folder: MatchFolder, stage: str, camera: CameraSpec | None, clip: ClipSpec | None
 ) -> float:
-    """Return the expected computation time of a unit that has never been computed [s].
-
-    Args:
-        folder: the match, with its sizes and files.
-        stage: the stage.
-        camera: camera of the unit, if it is of one.
-        clip: clip of the unit, if it is of one.
-    """
+    """Return the expected computation time of a unit that has never been computed [s]."""
     spec = folder.spec
     if stage in ("detection", "redetection") and camera is not None and clip is not None:
         pixels = camera.width * camera.height / _FULL_HD
@@ -232,20 +215,9 @@ def first_seconds(
 class RunLog:
     """Units that a run has reused, computed and failed to compute so far.
 
-    `close` turns it into the stored record; until then the run counts as unfinished.
-
-    Attributes:
-        plan: the run's plan with its results.
-        gatekeeper: decides which results need review.
-        run_id: the run's number.
-        latest: the match's latest run before this one.
-        started_at: start of the run.
-        started: the same time by the monotonic clock [s].
-        executed: units that the run computed, as `stage/unit`.
-        reused: units whose results existed.
-        failed: units that failed.
-        figures: metrics by unit.
-        warnings: warnings by unit.
+    `close` turns it into the stored record; until then the run counts as unfinished. Units have the
+    name `stage/unit`; `latest` is the match's latest run before this one, and `started` is
+    `started_at` by the monotonic clock [s].
     """
 
     plan: RunPlan
@@ -297,17 +269,8 @@ class RunLog:
         """The match as it was when the run began."""
         return self.plan.match
 
-    @property
-    def results(self) -> dict[str, str]:
-        """`stage/unit` to key of all results of the run so far."""
-        return self.plan.results
-
     def run_stages(self, compute: ComputeUnits) -> RunRecord:
-        """Plan and compute the stages of the run in order; return its stored record.
-
-        Args:
-            compute: computes the units of a stage that have no result.
-        """
+        """Plan and compute the stages of the run in order; return its stored record."""
         for stage in self.plan.stages:
             units = self.plan.plan_stage(stage)
             self.reuse(unit for unit in units if unit.published)
@@ -319,7 +282,7 @@ class RunLog:
 
     def hold(self, stage: Stage) -> None:
         """Hold back results of a finished stage that need review."""
-        for unit in self.plan.hold(stage, self.results):
+        for unit in self.plan.hold(stage, self.plan.results):
             reporter().unit_waits(unit.unit, unit.reasons)
 
     def reuse(self, units: Iterable[PlannedUnit]) -> None:
@@ -349,7 +312,7 @@ class RunLog:
     def _read_manifest(self, name: str) -> ResultManifest:
         """Keep metrics and warnings of a result, and return its manifest."""
         stage, _, unit = name.partition("/")
-        manifest = self.store.manifest(self.match.match_id, stage, unit, self.results[name])
+        manifest = self.store.manifest(self.match.match_id, stage, unit, self.plan.results[name])
         self.figures[name] = manifest.figures
         self.warnings[name] = manifest.warnings
         return manifest
@@ -358,7 +321,7 @@ class RunLog:
         """Store the record: the run is then finished, and its review requests are created."""
         blocked = tuple(sorted(self.plan.blocked))  # without those of stages not asked for
         self._carry_over()
-        for name in self.results.keys() - self.figures.keys():
+        for name in self.plan.results.keys() - self.figures.keys():
             self._read_manifest(name)
         left_out = left_out_cameras(self.store, self.match, METHOD, self.plan.usable_results)
         settings, overrides = self._settings()
@@ -368,7 +331,7 @@ class RunLog:
             parent=None if self.latest is None else self.latest.run_id,
             iteration=self.plan.iteration,
             state=self._state(),
-            results=dict(sorted(self.results.items())),
+            results=dict(sorted(self.plan.results.items())),
             settings=settings,
             overrides=overrides,
             body_folder=given_body_folder(),
@@ -390,7 +353,7 @@ class RunLog:
             finished_at=datetime.now(UTC),
             seconds=round(time.monotonic() - self.started, 3),
         )
-        self.gatekeeper.ask(self.run_id, self.plan.waiting, self.results)
+        self.gatekeeper.ask(self.run_id, self.plan.waiting, self.plan.results)
         self.store.finish_run(record)
         if os.environ.get("OPENLINEAGE_URL"):
             from flows.openlineage import tell_lineage  # few runs need it
@@ -402,9 +365,8 @@ class RunLog:
         """Yield warnings of results that are probably wrong, at stages without an active gate."""
         if self.gatekeeper.policy != "never":
             return
-        gates = {gate.stage: gate for gate in GATES}
         for name in self._in_order():
-            gate = gates.get(name.partition("/")[0])
+            gate = GATES.get(name.partition("/")[0])
             lines = gate.warnings(self.figures[name]) if gate is not None else ()
             if lines:
                 yield (
@@ -413,9 +375,7 @@ class RunLog:
                 )
 
     def _in_order(self) -> list[str]:
-        """Return the units with results, in the order of the method."""
-        stages = [stage.name for stage in METHOD]
-        return sorted(self.results, key=lambda name: (stages.index(name.partition("/")[0]), name))
+        return sorted(self.plan.results, key=unit_order)
 
     def _carry_over(self) -> None:
         """Keep results of later stages that are still current and need no review."""
@@ -463,7 +423,7 @@ class RunLog:
         asked = [stage.name for stage in self.plan.stages if stage.units(self.match)]
         through = [stage.name for stage in METHOD[: METHOD.index(body_fitting.STAGE) + 1]]
         last = next((name for name in reversed(asked) if name in through), asked[-1])
-        there = any(name.startswith(f"{last}/") for name in self.results)
+        there = any(name.startswith(f"{last}/") for name in self.plan.results)
         return "partial" if there else "failed"
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from data_contracts.run import RunRecord, UnitFailure
+from data_contracts.run import RunRecord
 from data_contracts.work import Recipe
 from flows.gates import Gatekeeper
-from flows.method import METHOD
+from flows.method import METHOD, unit_order
 from flows.registering import open_match
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
 from flows.run_record import latest_run, resolve_settings
@@ -25,7 +25,7 @@ from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.store.recipes import RecipeDifference, recipe_differences
 from worldpose.store.runs import list_pins
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 TEMPORARY_ERRORS: Final = frozenset(
     name
@@ -64,11 +64,8 @@ Reason = Cause | RecipeDifference
 class UnitStatus:
     """A planned unit compared with a run.
 
-    Attributes:
-        planned: the unit with its current recipe, its key and its iteration.
-        state: its state relative to the run.
-        run_id: the run that has a result of the unit; None if no run has one.
-        reasons: causes of the state; if the unit is stale, differences of the recipe.
+    `run_id` is the run that has a result of the unit, None if no run has one. The reasons are
+    causes of the state, or differences of the recipe if the unit is stale.
     """
 
     planned: PlannedUnit
@@ -89,16 +86,17 @@ class UnitStatus:
     @property
     def own_reasons(self) -> tuple[Reason, ...]:
         """Causes in this unit itself; empty if only its inputs changed."""
-        return tuple(each for each in self.reasons if not _is_input(each))
+        return tuple(each for each in self.reasons if each not in self._input_changes)
 
     @property
     def changed_inputs(self) -> tuple[str, ...]:
         """Changed inputs, as `stage/unit`."""
-        return tuple(
-            each.name
-            for each in self.reasons
-            if isinstance(each, RecipeDifference) and each.kind == "input"
-        )
+        return tuple(each.name for each in self._input_changes)
+
+    @property
+    def _input_changes(self) -> list[RecipeDifference]:
+        differences = (each for each in self.reasons if isinstance(each, RecipeDifference))
+        return [each for each in differences if each.kind == "input"]
 
     def describe(self) -> tuple[str, ...]:
         """Return the reasons as lines for people."""
@@ -108,10 +106,6 @@ class UnitStatus:
         is_recorded = self.state == UnitState.CURRENT or Cause.WITHDRAWN in self.reasons
         header = f"run {self.run_id} has it" if is_recorded else f"since run {self.run_id}:"
         return (header, *lines)
-
-
-def _is_input(reason: Reason) -> bool:
-    return isinstance(reason, RecipeDifference) and reason.kind == "input"
 
 
 def unit_status(store: Store, unit: PlannedUnit, record: RunRecord | None) -> UnitStatus:
@@ -170,10 +164,9 @@ def recorded_differences(
 def recorded_recipe(store: Store, record: RunRecord, unit: str) -> Recipe | None:
     """Return the recipe of a run's result; None if the result was withdrawn or removed."""
     stage, _, name = unit.partition("/")
-    key = record.results[unit]
-    if not store.has(record.match_id, stage, name, key):
+    if not store.has(record.match_id, stage, name, record.results[unit]):
         return None
-    return store.manifest(record.match_id, stage, name, key).recipe
+    return Run(store, record).manifest(unit).recipe
 
 
 @dataclass(frozen=True)
@@ -209,13 +202,8 @@ def run_status(
     """Return what a match's latest run would recompute; None if the match never had a run.
 
     A failed unit with an unchanged recipe is skipped, and so are the units that depend on it,
-    unless a disk or a network failed.
-
-    Args:
-        store: the project.
-        match_id: a registered match.
-        settings: requested settings beyond those of the latest run.
-        retry: retry all failed units.
+    unless a disk or a network failed. `settings` go beyond those of the latest run; `retry` retries
+    all failed units.
 
     Raises:
         InputError: the match folder is invalid.
@@ -229,7 +217,8 @@ def run_status(
     stages = selected_stages(None, until)
     gatekeeper = Gatekeeper(store, match, latest.gates)
     units: list[UnitStatus] = []
-    hopeless = {} if retry else {f.unit: f.key for f in latest.failed if not _is_temporary(f)}
+    lasting = (each for each in latest.failed if each.error not in TEMPORARY_ERRORS)
+    hopeless = {} if retry else {each.unit: each.key for each in lasting}
     for number in range(1, latest.iteration + 1):
         plan = plan_ahead(gatekeeper, stages, requested, latest, number)
         is_last = number == latest.iteration
@@ -280,20 +269,12 @@ def _run_of_iteration(store: Store, latest: RunRecord, number: int) -> RunRecord
     return next(same, passes[0] if passes else None)
 
 
-def _is_temporary(failure: UnitFailure) -> bool:
-    """Return whether a recorded failure was a disk's or a network's."""
-    return failure.error in TEMPORARY_ERRORS
-
-
 @dataclass(frozen=True)
 class UnitChange:
     """Change of one unit between two runs.
 
-    Attributes:
-        unit: name as `stage/unit`.
-        state: same, changed, only in A, only in B.
-        reasons: differences between the recipes.
-        figures: name, value in A, value in B of the metrics that differ.
+    It is same, changed, only in A or only in B. The reasons are differences of the recipes; figures
+    are name, value in A and value in B of the metrics that differ.
     """
 
     unit: str
@@ -335,7 +316,7 @@ def find_run(store: Store, name: str) -> RunRecord:
 def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]:
     """Compare each unit between two runs, in the order of the method."""
     changes = []
-    for unit in sorted(a.results.keys() | b.results.keys(), key=_method_order):
+    for unit in sorted(a.results.keys() | b.results.keys(), key=unit_order):
         if unit not in b.results:
             changes.append(UnitChange(unit, "only in A", (), ()))
         elif unit not in a.results:
@@ -358,10 +339,7 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
 def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     """Return a unit's state and the reasons for it.
 
-    Args:
-        store: the store.
-        name: unit as `match/stage/unit`.
-        overrides: requested settings beyond those of the latest run.
+    The unit is `match/stage/unit`; the overrides go beyond the settings of the latest run.
 
     Raises:
         InputError: no such unit.
@@ -386,9 +364,3 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     )
     reasons = failures or status.describe()
     return Explanation(name, status.state.value, status.planned.key, reasons)
-
-
-def _method_order(unit: str) -> tuple[int, str]:
-    stage = unit.partition("/")[0]
-    names = [each.name for each in METHOD]
-    return (names.index(stage) if stage in names else len(names), unit)

@@ -88,12 +88,6 @@ def keep_settings(
     """Return the request with all settings of the run, and report the kept ones.
 
     Every way to start a run calls this: none may change a setting of the latest run silently.
-
-    Args:
-        store: the project.
-        match_id: the match.
-        latest: its latest finished run.
-        request: options of the run.
     """
     if request.default_settings:
         return request
@@ -107,10 +101,6 @@ def kept_iterations(latest: RunRecord | None, request: RunRequest) -> int:
     """Return the number of iterations of a run that states none: that of the latest run.
 
     A part of the method, or a run with default settings, has one.
-
-    Args:
-        latest: the match's latest finished run.
-        request: options of the run.
     """
     is_part = request.from_stage is not None or request.until_stage is not None
     if latest is None or latest.iteration == 1 or is_part or request.default_settings:
@@ -200,10 +190,6 @@ def shared_machines(
     Starting them takes seconds, and Prefect keeps its first server address. They start when the
     function first gets units to compute, as many workers as those need; more are added if later
     units need more.
-
-    Args:
-        store: the store.
-        request: options of every run.
     """
     with ExitStack() as stack:
         started: list[tuple[RunRequest, Callable[[int], None]]] = []

@@ -38,9 +38,7 @@ def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[St
 def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) -> Overrides:
     """Parse settings given as `stage.name=value`; values are JSON, or else text.
 
-    Args:
-        assignments: one for each setting.
-        stages: stages that will run; a setting of another would have no effect.
+    A setting of a stage that does not run would have no effect.
 
     Raises:
         UsageError: an unknown stage or setting, or an invalid value.

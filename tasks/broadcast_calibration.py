@@ -15,26 +15,23 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
-from data_contracts.broadcast_pooling import BROADCAST_POOLING
-from data_contracts.broadcast_tracking import BROADCAST_TRACKING
+from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, BROADCAST_POOLING, KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from data_contracts.tracking import Track
+from data_contracts.tracking import BROADCAST_TRACKING, Track
 from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
 from tasks.unit import UnitInputs, unit_task
-from worldpose.broadcast_calibration.calibration import (
-    BroadcastClip,
-    broadcast_arrays,
-    broadcast_attributes,
-    calibrate_broadcast,
-)
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES
 from worldpose.broadcast_calibration.players import People
-from worldpose.broadcast_calibration.report import BroadcastReport
+from worldpose.broadcast_calibration.report import (
+    BroadcastReport,
+    broadcast_arrays,
+    broadcast_attributes,
+)
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.uncertainty import (
     Uncertainty,

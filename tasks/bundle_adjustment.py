@@ -17,9 +17,9 @@ from tasks.clip_inputs import (
     triangulation_settings,
 )
 from tasks.unit import UnitInputs, unit_task
-from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks, Clip
-from worldpose.bundle_adjustment.report import adjustment_arrays
+from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.report import BundleAdjustment, adjustment_arrays
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import UsageError
 from worldpose.pitch.template import PitchTemplate

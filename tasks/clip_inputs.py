@@ -14,8 +14,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Flags, Integers, Singles
+from data_contracts.detection import redetection_name
 from data_contracts.keypoints import EXTRA_ARRAYS, KEYPOINT_ARRAYS, KeypointDetections
-from data_contracts.redetection import redetection_name
 from tasks.unit import UnitInputs
 from worldpose.filtering.feedback import Feedback, align_results, apply_feedback
 from worldpose.geometry.cameras import Camera, camera_from_arrays

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17
+from data_contracts.detection import REDETECTION
 from data_contracts.filtering import FILTERING
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.redetection import REDETECTION
 from tasks.clip_inputs import (
     ADJUSTED,
     ChunkedRows,

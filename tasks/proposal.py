@@ -20,7 +20,7 @@ from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.settings import ProposalSettings, StaticCalibrationSettings
 from worldpose.store.writer import ResultWriter

@@ -14,8 +14,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.body_fitting import REFITTING
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.refitting import REFITTING
 from tasks.body_fitting import (
     FurtherArrays,
     find_same_body,

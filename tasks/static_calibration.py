@@ -22,7 +22,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
 from worldpose.ingest.footage import read_still
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import Proposal, calibrate_proposal
 from worldpose.static_calibration.report import (
     CalibrationReport,

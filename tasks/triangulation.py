@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import GroupLayout
-from data_contracts.retriangulation import RETRIANGULATION
-from data_contracts.triangulation import TRIANGULATION
+from data_contracts.triangulation import RETRIANGULATION, TRIANGULATION
 from tasks.clip_inputs import ClipInputs, open_tracked_clip, triangulation_settings
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.store.writer import ResultWriter

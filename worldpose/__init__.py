@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from worldpose.body_fitting.ray_constraints import find_ray_constraints as find_ray_constraints
     from worldpose.body_fitting.results import ClipEvidence as ClipEvidence
     from worldpose.body_fitting.settings import BodyFittingSettings as BodyFittingSettings
-    from worldpose.broadcast_calibration.calibration import BroadcastClip as BroadcastClip
-    from worldpose.broadcast_calibration.calibration import (
+    from worldpose.broadcast_calibration.estimate import BroadcastClip as BroadcastClip
+    from worldpose.broadcast_calibration.estimate import (
         calibrate_broadcast as calibrate_broadcast,
     )
     from worldpose.broadcast_calibration.settings import (
         BroadcastCalibrationSettings as BroadcastCalibrationSettings,
     )
-    from worldpose.bundle_adjustment.adjustment import adjust_cameras as adjust_cameras
     from worldpose.bundle_adjustment.clip import Clicks as Clicks
     from worldpose.bundle_adjustment.clip import Clip as Clip
+    from worldpose.bundle_adjustment.estimate import adjust_cameras as adjust_cameras
     from worldpose.bundle_adjustment.settings import (
         BundleAdjustmentSettings as BundleAdjustmentSettings,
     )
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from worldpose.pipeline import Reconstruction as Reconstruction
     from worldpose.pipeline import reconstruct as reconstruct
     from worldpose.pitch.template import PitchTemplate as PitchTemplate
-    from worldpose.static_calibration.calibration import calibrate_camera as calibrate_camera
+    from worldpose.static_calibration.estimate import calibrate_camera as calibrate_camera
     from worldpose.static_calibration.settings import (
         StaticCalibrationSettings as StaticCalibrationSettings,
     )
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
 _MODULES: Final = {
     "BodyFittingSettings": "worldpose.body_fitting.settings",
     "BroadcastCalibrationSettings": "worldpose.broadcast_calibration.settings",
-    "BroadcastClip": "worldpose.broadcast_calibration.calibration",
+    "BroadcastClip": "worldpose.broadcast_calibration.estimate",
     "BundleAdjustmentSettings": "worldpose.bundle_adjustment.settings",
     "Camera": "worldpose.geometry.cameras",
     "ClickedMarkings": "data_contracts.static_calibration",
@@ -101,9 +101,9 @@ _MODULES: Final = {
     "StaticCalibrationSettings": "worldpose.static_calibration.settings",
     "TrackingSettings": "worldpose.tracking.settings",
     "TriangulationSettings": "worldpose.triangulation.settings",
-    "adjust_cameras": "worldpose.bundle_adjustment.adjustment",
-    "calibrate_broadcast": "worldpose.broadcast_calibration.calibration",
-    "calibrate_camera": "worldpose.static_calibration.calibration",
+    "adjust_cameras": "worldpose.bundle_adjustment.estimate",
+    "calibrate_broadcast": "worldpose.broadcast_calibration.estimate",
+    "calibrate_camera": "worldpose.static_calibration.estimate",
     "detect_people": "worldpose.detection.pipeline",
     "evaluate_joints": "worldpose.evaluation.metrics",
     "find_body": "worldpose.body.body_file",

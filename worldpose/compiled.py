@@ -35,13 +35,25 @@ def compile_kernel(function: Function) -> Function:
     No fast-math and no parallel loops: the same input gives the same bits on any number of
     threads. The interpreter lock is released, and division by zero gives infinity as in numpy.
     """
+    return _compile(function, "never")
+
+
+def inline_kernel(function: Function) -> Function:
+    """Return `function`, compiled as `compile_kernel` does, and into each kernel that calls it.
+
+    For short functions of scalars in inner loops: the call alone may take as long as they do.
+    """
+    return _compile(function, "always")
+
+
+def _compile(function: Function, inline: str) -> Function:
     given = config.CACHE_DIR  # type: ignore[attr-defined]
     folder = given or _cache_folder(_module_of(function))
     # Numba reads this setting while it decorates.
     config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
-    is_cached = folder is not None
+    options = {"cache": folder is not None, "inline": inline}
     try:
-        return cast(Function, njit(cache=is_cached, nogil=True, error_model="numpy")(function))
+        return cast(Function, njit(nogil=True, error_model="numpy", **options)(function))
     finally:
         config.CACHE_DIR = given  # type: ignore[attr-defined]
 

@@ -18,20 +18,18 @@ from worldpose.body.body_file import find_body
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.ray_constraints import find_ray_constraints
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
-from worldpose.broadcast_calibration.calibration import (
-    BroadcastCalibration,
-    BroadcastClip,
-    calibrate_broadcast,
-)
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.players import People
-from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
+from worldpose.broadcast_calibration.report import BroadcastCalibration
 from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.report import BundleAdjustment
 from worldpose.detection.pipeline import detect_people
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import read_still, read_unit, unit_frames
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.tracking.tracker import Tracking, track_people
 from worldpose.triangulation.estimate import reconstruct_joints

@@ -16,16 +16,18 @@ commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_mar
 
 @commands.command()
 def install(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="SMPL's .pkl or .npz.")],
-    name: Annotated[
-        str | None, typer.Option(help="Name of the body; from the file's name by default.")
-    ] = None,
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    name: str | None = None,
     body_folder: BodyFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Convert your licensed SMPL file once to a safe one; nothing in it is run.
 
     Example: worldpose body install SMPL_NEUTRAL.pkl
+
+    Options:
+        file: SMPL's .pkl or .npz.
+        name: Name of the body; from the file's name by default.
     """
     model = install_body(file, body_folder, name)
     path = body_path(model.name, body_folder)

@@ -21,40 +21,16 @@ FEW_FIELDS: Final = 0.4
 
 
 def calibrate(
-    boards: Annotated[
-        Path,
-        typer.Argument(
-            metavar="BOARDS",
-            help="Folder with a folder of images, or a video, for each camera; or images of one.",
-        ),
-    ],
-    columns: Annotated[
-        int, typer.Option(min=2, max=100, help="Inner corners along one side of the board.")
-    ],
-    rows: Annotated[int, typer.Option(min=2, max=100, help="Inner corners along the other side.")],
-    square: Annotated[float, typer.Option(min=1e-4, max=10.0, help="Side of a square [m].")],
-    out: Annotated[Path, typer.Option("--out", help="TOML file of lenses to write.")],
-    camera: Annotated[
-        str | None, typer.Option(help="Name of the camera, if BOARDS has images of one.")
-    ] = None,
-    charuco: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DICTIONARY",
-            help="The board is a ChArUco board with this dictionary, such as DICT_4X4_50; "
-            "--columns and --rows then count its squares.",
-        ),
-    ] = None,
-    marker: Annotated[
-        float | None, typer.Option(help="Side of a marker of a ChArUco board [m].")
-    ] = None,
-    every: Annotated[
-        float, typer.Option(min=0.01, max=60.0, help="Time between frames of a video [s].")
-    ] = 0.5,
-    plot: Annotated[
-        Path | None,
-        typer.Option(help="Plot of coverage and residuals to write: .svg, .pdf or .png."),
-    ] = None,
+    boards: Annotated[Path, typer.Argument(metavar="BOARDS")],
+    columns: Annotated[int, typer.Option(min=2, max=100)],
+    rows: Annotated[int, typer.Option(min=2, max=100)],
+    square: Annotated[float, typer.Option(min=0.0001, max=10.0)],
+    out: Annotated[Path, typer.Option()],
+    camera: str | None = None,
+    charuco: Annotated[str | None, typer.Option(metavar="DICTIONARY")] = None,
+    marker: float | None = None,
+    every: Annotated[float, typer.Option(min=0.01, max=60.0)] = 0.5,
+    plot: Path | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute the lenses of cameras from images or videos of a checkerboard or ChArUco board.
@@ -63,6 +39,19 @@ def calibrate(
     pose of a camera comes from clicks.
 
     Example: worldpose calibrate boards --columns 4 --rows 7 --square 0.06 --out lenses.toml
+
+    Options:
+        boards: Folder with a folder of images, or a video, for each camera; or images of one.
+        columns: Inner corners along one side of the board.
+        rows: Inner corners along the other side.
+        square: Side of a square [m].
+        out: TOML file of lenses to write.
+        camera: Name of the camera, if BOARDS has images of one.
+        charuco: The board is a ChArUco board with this dictionary, such as DICT_4X4_50;
+            --columns and --rows then count its squares.
+        marker: Side of a marker of a ChArUco board [m].
+        every: Time between frames of a video [s].
+        plot: Plot of coverage and residuals to write: .svg, .pdf or .png.
     """
     from flows.results.outputs import claim_file, require_new
     from worldpose.formats.files import whole_file
@@ -99,12 +88,7 @@ def calibrate(
 
 
 def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
-    """Return the folder or video of each camera.
-
-    Raises:
-        InputError: there are no images and no videos.
-        UsageError: images of one camera without its name, or a name with several cameras.
-    """
+    """Return the folder or video of each camera."""
     found = sorted(boards.glob("[!.]*"))
     if any(file.suffix.lower() in IMAGES for file in found) or boards.is_file():
         return {camera or _camera_name(boards): boards}
@@ -137,11 +121,7 @@ def _images(folder: Path) -> list[Path]:
 def _read_views(
     place: Path, board: Board, every: float
 ) -> tuple[list[BoardView | None], tuple[int, int], list[str]]:
-    """Return the board in each image of a folder, or in frames of a video, the size, and names.
-
-    Raises:
-        InputError: an image is unreadable, or images have several sizes.
-    """
+    """Return the board in each image of a folder, or in frames of a video, the size, and names."""
     from worldpose.static_calibration.boards import choose_views
     from worldpose.video.files import VideoReader, index_frames
 

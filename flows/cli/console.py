@@ -93,12 +93,7 @@ UNIT_WIDTH = 25
 
 
 class ConsoleReporter(Reporter):
-    """Progress as lines on standard error, one per unit, with a spinner on a terminal.
-
-    Attributes:
-        verbose: whether to print metrics too.
-        computed: number of results that are kept whatever happens.
-    """
+    """Progress as lines on standard error, one per unit, with a spinner on a terminal."""
 
     def __init__(self, *, verbose: bool = False) -> None:
         self.verbose, self.computed = verbose, 0

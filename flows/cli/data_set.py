@@ -16,23 +16,20 @@ FpsOption = Annotated[
 
 
 def statistics(
-    folders: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Folders of one exported data set.")
-    ],
-    picture: Annotated[
-        Path | None,
-        typer.Option("--picture", help="Histograms of trajectory and clip lengths, as a PNG."),
-    ] = None,
-    page: Annotated[
-        Path | None,
-        typer.Option("--page", help="Write an HTML page with statistics and check results."),
-    ] = None,
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...")],
+    picture: Path | None = None,
+    page: Path | None = None,
     fps: FpsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Count a data set as the paper does: clips, frames, poses, people, distances.
 
     Example: worldpose statistics exported --picture lengths.png
+
+    Options:
+        folders: Folders of one exported data set.
+        picture: Histograms of trajectory and clip lengths, as a PNG.
+        page: Write an HTML page with statistics and check results.
     """
     from flows.results.dataset import count
     from flows.results.outputs import claim_file
@@ -94,20 +91,20 @@ FAULTY = 1
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of an exported data set.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR")],
     fps: FpsOption = None,
-    body: Annotated[
-        str | None,
-        typer.Option("--body", help="Body model of pose files without one; the open body."),
-    ] = None,
-    pitch: Annotated[
-        bool, typer.Option("--pitch/--no-pitch", help="Whether the ground is a football pitch.")
-    ] = True,
+    body: str | None = None,
+    pitch: Annotated[bool, typer.Option("--pitch/--no-pitch")] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Check whether a data set is consistent, and which convention it violates if not.
 
     Example: worldpose check exported
+
+    Options:
+        folder: Folder of an exported data set.
+        body: Body model of pose files without one; the open body.
+        pitch: Whether the ground is a football pitch.
     """
     from flows.results.dataset import check as check_data_set
 

@@ -33,82 +33,43 @@ TableForm = Literal["text", "csv", "latex"]
 
 
 def evaluate(
-    prediction: Annotated[
-        str | None,
-        typer.Option(
-            "--prediction",
-            help="A joints file, a folder with joints.npz and cameras/, or a match of the project.",
-        ),
-    ] = None,
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            "--reference",
-            help="A joints file, a folder with joints.npz, cameras/ or both, or a .c3d or .trc.",
-        ),
-    ] = None,
+    prediction: str | None = None,
+    reference: str | None = None,
     run: RunOption = "latest",
     stage: StageOption = None,
-    match_in: Annotated[
-        str | None,
-        typer.Option(
-            "--match-in",
-            metavar="CAMERA",
-            help="Match whole tracks by their boxes in this camera of the reference, as the paper "
-            "does; by distance by default.",
-        ),
-    ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option("--fps", min=0.001, help="Frames per second; the match's by default."),
-    ] = None,
-    ablation: Annotated[
-        int,
-        typer.Option(
-            "--ablation",
-            metavar="SEEDS",
-            min=0,
-            help="Simulate N penalty-box trials and print the paper's ablation instead.",
-        ),
-    ] = 0,
-    method: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--method",
-            metavar="NAME=PATH",
-            help="Score another method's result (docs/how-to/baselines.md) instead of "
-            "--prediction; may be given more than once for one table.",
-        ),
-    ] = None,
-    body: Annotated[
-        str | None,
-        typer.Option("--body", help="Body model for the methods' poses; the open body by default."),
-    ] = None,
-    markers: Annotated[
-        Path | None,
-        typer.Option("--markers", help="YAML file that maps markers of a reference to joints."),
-    ] = None,
-    first_frame: Annotated[
-        int | None,
-        typer.Option("--first-frame", help="Match frame of the methods' first image."),
-    ] = None,
+    match_in: Annotated[str | None, typer.Option("--match-in", metavar="CAMERA")] = None,
+    fps: Annotated[float | None, typer.Option("--fps", min=0.001)] = None,
+    ablation: Annotated[int, typer.Option("--ablation", metavar="SEEDS", min=0)] = 0,
+    method: Annotated[list[str] | None, typer.Option("--method", metavar="NAME=PATH")] = None,
+    body: str | None = None,
+    markers: Path | None = None,
+    first_frame: int | None = None,
     method_fps: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--method-fps",
-            metavar="NAME=FPS",
-            help="Frames per second of a method's input video, if not the clip's.",
-        ),
+        list[str] | None, typer.Option("--method-fps", metavar="NAME=FPS")
     ] = None,
-    table: Annotated[
-        TableForm, typer.Option("--table", help="Table of methods: text, csv or latex.")
-    ] = "text",
+    table: TableForm = "text",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Score joints and cameras against a reference; definitions in docs/reference/metrics.md.
 
     Example: worldpose evaluate --prediction tiny-1 --reference matches/tiny/reference
+
+    Options:
+        prediction: A joints file, a folder with joints.npz and cameras/, or a match of the
+            project.
+        reference: A joints file, a folder with joints.npz, cameras/ or both, or a .c3d or .trc.
+        match_in: Match whole tracks by their boxes in this camera of the reference, as the
+            paper does; by distance by default.
+        fps: Frames per second; the match's by default.
+        ablation: Simulate N penalty-box trials and print the paper's ablation instead.
+        method: Score another method's result (docs/how-to/baselines.md) instead of
+            --prediction; may be given more than once for one table.
+        body: Body model for the methods' poses; the open body by default.
+        markers: YAML file that maps markers of a reference to joints.
+        first_frame: Match frame of the methods' first image.
+        method_fps: Frames per second of a method's input video, if not the clip's.
+        table: Table of methods: text, csv or latex.
     """
     if ablation:
         print_ablation(ablation, as_json=as_json)
@@ -213,9 +174,7 @@ def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object
 def print_ablation(seeds: int, *, as_json: bool) -> None:
     """Simulate trials and print every row's mean and standard deviation over them.
 
-    Args:
-        seeds: number of trials, with seeds from 0.
-        as_json: print every trial's metrics instead of a table.
+    Seeds count from 0; JSON has every trial's metrics.
     """
     from flows.results.ablation import PAPER, TRIANGULATIONS, Score, ablation
 

@@ -39,19 +39,23 @@ class _Lines(logging.Handler):
 
 
 def label(
-    videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...", help="Videos of one size.")],
-    out: Annotated[Path, typer.Option(help="Output folder; absent or empty.")],
-    every: Annotated[int, typer.Option(min=1, help="Step between labelled frames.")] = 50,
-    detectors: Annotated[
-        list[str] | None,
-        typer.Option("--detector", help="Value of detection.detector; repeated for an ensemble."),
-    ] = None,
-    pose: Annotated[str, typer.Option(help="Value of detection.pose.")] = "embedded",
+    videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...")],
+    out: Annotated[Path, typer.Option()],
+    every: Annotated[int, typer.Option(min=1)] = 50,
+    detectors: Annotated[list[str] | None, typer.Option("--detector")] = None,
+    pose: str = "embedded",
     as_json: JsonOption = False,
 ) -> None:
     """Propose labels for evenly spaced frames, for people to correct.
 
     Example: worldpose label cam00.mp4 cam01.mp4 --out labels
+
+    Options:
+        videos: Videos of one size.
+        out: Output folder; absent or empty.
+        every: Step between labelled frames.
+        detectors: Value of detection.detector; repeated for an ensemble.
+        pose: Value of detection.pose.
     """
     from worldpose.detection.settings import DetectionSettings
     from worldpose.training.labels import propose_labels
@@ -63,31 +67,24 @@ def label(
 
 
 def finetune(
-    annotations: Annotated[
-        Path, typer.Argument(metavar="LABELS", help="Reviewed labels: COCO keypoints, a JSON file.")
-    ],
-    pictures: Annotated[
-        Path | None, typer.Option(help="Folder of the images; that of LABELS by default.")
-    ] = None,
-    nets: Annotated[
-        list[str] | None, typer.Option("--net", help="people or keypoints; both by default.")
-    ] = None,
-    starts: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--start", metavar="NET=FILE", help="Initial weights; the shipped ones by default."
-        ),
-    ] = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A setting, such as training.steps=800."),
-    ] = None,
+    annotations: Annotated[Path, typer.Argument(metavar="LABELS")],
+    pictures: Path | None = None,
+    nets: Annotated[list[str] | None, typer.Option("--net")] = None,
+    starts: Annotated[list[str] | None, typer.Option("--start", metavar="NET=FILE")] = None,
+    assignments: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Train nets on labels; adopt a version only if it is better on held-out frames.
 
     Example: worldpose finetune labels/labels.json --project worldpose-data
+
+    Options:
+        annotations: Reviewed labels: COCO keypoints, a JSON file.
+        pictures: Folder of the images; that of LABELS by default.
+        nets: people or keypoints; both by default.
+        starts: Initial weights; the shipped ones by default.
+        assignments: A setting, such as training.steps=800.
     """
     from flows.orchestration.prefect_environment import prefect_server
 
@@ -165,11 +162,7 @@ def _split_assignment(assignment: str) -> tuple[str, str]:
 
 
 def _settings(assignments: list[str]) -> FineTuningSettings:
-    """Parse settings by name; those of the training have the prefix `training.`.
-
-    Raises:
-        UsageError: an unknown setting, or an invalid value.
-    """
+    """Parse settings by name; those of the training have the prefix `training.`."""
     from worldpose.training.settings import FineTuningSettings
 
     groups: dict[str, dict[str, JsonValue]] = {"": {}, "training": {}}

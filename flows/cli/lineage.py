@@ -34,8 +34,8 @@ from worldpose.store.store import Store
 
 
 def diff(
-    run_a: Annotated[str, typer.Argument(metavar="A", help="A run, as MATCH/NUMBER.")],
-    run_b: Annotated[str, typer.Argument(metavar="B", help="Another run, as MATCH/NUMBER.")],
+    run_a: Annotated[str, typer.Argument(metavar="A")],
+    run_b: Annotated[str, typer.Argument(metavar="B")],
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -47,6 +47,10 @@ def diff(
     case, and mixed if both occur.
 
     Example: worldpose diff tiny-1/0001 tiny-1/0002
+
+    Options:
+        run_a: A run, as MATCH/NUMBER.
+        run_b: Another run, as MATCH/NUMBER.
     """
     store = Store.open(project)
     a, b = find_run(store, run_a), find_run(store, run_b)
@@ -110,7 +114,7 @@ def _print_compared(compared: list[SubjectChange]) -> None:
 
 
 def why(
-    unit: Annotated[str, typer.Argument(metavar="UNIT", help="A unit, as MATCH/STAGE/UNIT.")],
+    unit: Annotated[str, typer.Argument(metavar="UNIT")],
     assignments: MoreSettingsOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -122,6 +126,9 @@ def why(
     is no result.
 
     Example: worldpose why tiny-1/triangulation/clip
+
+    Options:
+        unit: A unit, as MATCH/STAGE/UNIT.
     """
     found = explain_unit(Store.open(project), unit, parse_overrides(assignments or []))
     reasons = (f"  {reason}" for reason in found.reasons)

@@ -47,21 +47,13 @@ STATURE_STD_M: Final = 0.01
 
 def locate_cameras(
     match: MatchArgument,
-    stature: Annotated[
-        float | None,
-        typer.Option(min=0.5, max=2.5, help="Stature of the people, median if several [m]."),
-    ] = None,
+    stature: Annotated[float | None, typer.Option(min=0.5, max=2.5)] = None,
     distance: Annotated[
-        tuple[str, str, float] | None,
-        typer.Option(metavar="CAMERA CAMERA METRES", help="Measured distance of two cameras [m]."),
+        tuple[str, str, float] | None, typer.Option(metavar="CAMERA CAMERA METRES")
     ] = None,
-    clip: Annotated[
-        str | None, typer.Option(help="Clip whose people are used; the longest by default.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Calibration (TOML) to write.")] = None,
-    apply: Annotated[
-        bool, typer.Option("--apply", help="Write calibration.toml into the match folder.")
-    ] = False,
+    clip: str | None = None,
+    out: Path | None = None,
+    apply: Annotated[bool, typer.Option("--apply")] = False,
     workers: WorkersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -73,6 +65,13 @@ def locate_cameras(
     The scale comes from --stature or --distance, the vertical from feet and bodies.
 
     Example: worldpose locate-cameras matches/lab --stature 1.78 --apply
+
+    Options:
+        stature: Stature of the people, median if several [m].
+        distance: Measured distance of two cameras [m].
+        clip: Clip whose people are used; the longest by default.
+        out: Calibration (TOML) to write.
+        apply: Write calibration.toml into the match folder.
     """
     from worldpose.bundle_adjustment.people_cameras import KnownLength
     from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimate
@@ -158,11 +157,7 @@ def _lens(match: Match, camera: str) -> LensCalibration:
 
 
 def _distance(given: tuple[str, str, float], names: list[str]) -> KnownLength:
-    """Return the measured distance of two cameras.
-
-    Raises:
-        UsageError: an unknown camera, the same twice, or no positive distance.
-    """
+    """Return the measured distance of two cameras."""
     from worldpose.bundle_adjustment.people_cameras import KnownLength
 
     one, other, metres = given

@@ -35,50 +35,41 @@ from worldpose.store.store import Store
 
 
 def simulate(
-    scenario: Annotated[
-        str, typer.Option("--scenario", help="Name of a scenario; `list` shows all.")
-    ],
-    out: Annotated[Path | None, typer.Option("--out", help="Match folder to create.")] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Random seed; equal seeds give equal bytes.")
-    ] = 0,
-    duration: Annotated[float | None, typer.Option(min=0.2, help="Duration [s].")] = None,
-    cameras: Annotated[int | None, typer.Option(min=1, help="Number of static cameras.")] = None,
-    players: Annotated[int | None, typer.Option(min=0, help="Number of people.")] = None,
-    trajectories: Annotated[
-        Path | None, typer.Option(help="Tracking data (npz) that people follow.")
-    ] = None,
-    mocap: Annotated[
-        Path | None, typer.Option(help="Motion capture (BVH) that one person performs.")
-    ] = None,
-    calibrated: Annotated[
-        bool, typer.Option("--calibrated", help="Also write the exact static cameras.")
-    ] = False,
-    stills: Annotated[
-        bool, typer.Option(help="Draw one image per static camera, about 1 s each.")
-    ] = True,
-    video: Annotated[
-        bool,
-        typer.Option(help="Render the scenario's broadcast video: 0.1 s per frame."),
-    ] = True,
-    render: Annotated[
-        bool,
-        typer.Option("--render", help="Render videos of all cameras instead of detections."),
-    ] = False,
-    masks: Annotated[
-        bool, typer.Option("--masks", help="With --render, also write each pixel's person.")
-    ] = False,
-    recordings: Annotated[
-        Path | None,
-        typer.Option(
-            help="For foreign-*: folder of motion capture and tracking data (npz) to replay."
-        ),
-    ] = None,
+    scenario: Annotated[str, typer.Option()],
+    out: Path | None = None,
+    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    duration: Annotated[float | None, typer.Option(min=0.2)] = None,
+    cameras: Annotated[int | None, typer.Option(min=1)] = None,
+    players: Annotated[int | None, typer.Option(min=0)] = None,
+    trajectories: Path | None = None,
+    mocap: Path | None = None,
+    calibrated: Annotated[bool, typer.Option("--calibrated")] = False,
+    stills: bool = True,
+    video: bool = True,
+    render: Annotated[bool, typer.Option("--render")] = False,
+    masks: Annotated[bool, typer.Option("--masks")] = False,
+    recordings: Path | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
 
     Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
+
+    Options:
+        scenario: Name of a scenario; `list` shows all.
+        out: Match folder to create.
+        seed: Random seed; equal seeds give equal bytes.
+        duration: Duration [s].
+        cameras: Number of static cameras.
+        players: Number of people.
+        trajectories: Tracking data (npz) that people follow.
+        mocap: Motion capture (BVH) that one person performs.
+        calibrated: Also write the exact static cameras.
+        stills: Draw one image per static camera, about 1 s each.
+        video: Render the scenario's broadcast video: 0.1 s per frame.
+        render: Render videos of all cameras instead of detections.
+        masks: With --render, also write each pixel's person.
+        recordings: For foreign-*: folder of motion capture and tracking data (npz) to replay.
     """
     from worldpose.simulation.foreign.matches import simulate_foreign_match
     from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
@@ -183,71 +174,46 @@ def _show_rendering() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def import_command(
-    out: Annotated[Path, typer.Option("--out", help="Match folder to create or to extend.")],
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys, Vicon, "
-            "OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera."
-        ),
-    ] = None,
-    detections: Annotated[
-        Path | None, typer.Option(help="Folder of COCO keypoint results, <camera>.json.")
-    ] = None,
-    videos: Annotated[
-        Path | None, typer.Option(help="Folder of videos in place of 2D poses, <camera>.mp4.")
-    ] = None,
-    boxes: Annotated[
-        Path | None,
-        typer.Option(
-            help="With --videos, or for the videos of a match folder: people's boxes, in which "
-            "only poses are estimated: folder of MOTChallenge lines, <camera>.txt."
-        ),
-    ] = None,
-    pose2sim: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Trial of Pose2Sim: Config.toml, calibration/, pose/ with OpenPose JSON, videos/.",
-        ),
-    ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
-    match_id: Annotated[
-        str | None, typer.Option(help="Id of the match; the folder's name by default.")
-    ] = None,
-    pitch: Annotated[
-        Path | None,
-        typer.Option(help="Survey of the markings (CSV); writes only pitch.json."),
-    ] = None,
-    clicks: Annotated[
-        Path | None,
-        typer.Option(
-            help="Clicks from CVAT (XML), Label Studio or COCO (JSON). A label is the name of a "
-            "point or marking of the pitch, or a position in metres."
-        ),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            help="With --clicks or --lens: the camera, or the clip of the broadcast camera; by "
-            "default, images and lenses are named after cameras."
-        ),
-    ] = None,
-    lens: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Lens without a pose: OpenCV XML or YAML, npz, matrix and distortion as two .npy "
-            "files, or TOML."
-        ),
-    ] = None,
-    left_handed: Annotated[
-        bool, typer.Option("--left-handed", help="The survey's x, y and height are left-handed.")
-    ] = False,
+    out: Annotated[Path, typer.Option()],
+    calibration: Path | None = None,
+    detections: Path | None = None,
+    videos: Path | None = None,
+    boxes: Path | None = None,
+    pose2sim: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
+    fps: float | None = None,
+    match_id: str | None = None,
+    pitch: Path | None = None,
+    clicks: Path | None = None,
+    camera: str | None = None,
+    lens: list[Path] | None = None,
+    left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
+
+    Options:
+        out: Match folder to create or to extend.
+        calibration: Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys,
+            Vicon, OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera.
+        detections: Folder of COCO or AlphaPose results, <camera>.json, or of a folder of
+            OpenPose JSON for each camera.
+        videos: Folder of videos in place of 2D poses, <camera>.mp4.
+        boxes: With --videos, or for the videos of a match folder: people's boxes, in which only
+            poses are estimated: folder of MOTChallenge lines, <camera>.txt.
+        pose2sim: Trial of Pose2Sim: Config.toml, calibration/, pose/ with OpenPose JSON,
+            videos/.
+        fps: Frames per second.
+        match_id: Id of the match; the folder's name by default.
+        pitch: Survey of the markings (CSV); writes only pitch.json.
+        clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
+            name of a point or marking of the pitch, or a position in metres.
+        camera: With --clicks or --lens: the camera, or the clip of the broadcast camera; by
+            default, images and lenses are named after cameras.
+        lens: Lens without a pose: OpenCV XML or YAML, ROS YAML, npz, matrix and distortion as
+            two .npy files, or TOML.
+        left_handed: The survey's x, y and height are left-handed.
     """
     options = {
         "--calibration": calibration,
@@ -268,7 +234,9 @@ def import_command(
     if kind is not None:
         _require_alone(kind, given)
     if kind == "--boxes" and boxes is not None:
-        _import_boxes(boxes, out, as_json=as_json)
+        counts = import_boxes(boxes, out)
+        lines = (f"wrote {out / 'boxes' / name}.txt: {n} boxes" for name, n in counts.items())
+        answer(as_json, {"folder": str(out), "boxes": counts}, *lines)
     elif kind == "--lens" and lens is not None:
         _import_lenses(lens, out, camera, as_json=as_json)
     elif kind == "--clicks" and clicks is not None:
@@ -279,8 +247,10 @@ def import_command(
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id)
         _print_match(spec, out, notes, as_json=as_json)
     elif videos is not None and detections is None:
-        spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes)
-        _print_match(spec, out, [], as_json=as_json)
+        spec, notes = import_videos(
+            calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes
+        )
+        _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",
@@ -289,8 +259,8 @@ def import_command(
             todo="Read the help: worldpose import --help.",
         )
     else:
-        spec = import_match(calibration, detections, fps, out, match_id=match_id)
-        _print_match(spec, out, [], as_json=as_json)
+        spec, notes = import_match(calibration, detections, fps, out, match_id=match_id)
+        _print_match(spec, out, notes, as_json=as_json)
 
 
 ALONE: Final = {
@@ -335,13 +305,6 @@ def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool)
     )
     is_calibrated = (out / "calibration.toml").exists()
     line(f"next: worldpose {'run' if is_calibrated else 'ingest'} {out}")
-
-
-def _import_boxes(boxes: Path, out: Path, *, as_json: bool) -> None:
-    """Copy boxes into a match folder, and print how many there are."""
-    counts = import_boxes(boxes, out)
-    lines = (f"wrote {out / 'boxes' / name}.txt: {count} boxes" for name, count in counts.items())
-    answer(as_json, {"folder": str(out), "boxes": counts}, *lines)
 
 
 def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json: bool) -> None:
@@ -428,22 +391,24 @@ def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -
         line(f"{name}: {value:.3f} m{'' if name in fit.measured else ' (the survey cannot tell)'}")
     line(f"lengths of the survey over true ones: {fit.scale:.5f} (kept as they are)")
     line(f"levelled a slope of {100 * fit.slope[0]:.2f} % along x, {100 * fit.slope[1]:.2f} % in y")
-    shown = [(name, f"{1e3 * plan:.0f}", _millimetres(height)) for name, plan, height in rows]
+    shown = [
+        (name, f"{1e3 * plan:.0f}", "-" if isnan(height) else f"{1e3 * height:+.0f}")
+        for name, plan, height in rows
+    ]
     print_table("off the Laws of the Game", ("point", ">in plan mm", ">above surface mm"), shown)
 
 
-def _millimetres(height: float) -> str:
-    return "-" if isnan(height) else f"{1e3 * height:+.0f}"
-
-
 def ingest(
-    folders: Annotated[list[Path], typer.Argument(metavar="MATCH...", help="Match folders.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="MATCH...")],
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Validate match folders and register them in the project; repeating it is harmless.
 
     Example: worldpose ingest matches/tiny
+
+    Options:
+        folders: Match folders.
     """
     store = Store.open_or_new(project)
     rows = []

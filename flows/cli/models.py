@@ -101,7 +101,7 @@ def _describe(checkpoint: Checkpoint, is_pulled: bool) -> dict[str, object]:
 
 @commands.command(name="pull")
 def pull_model(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A name of `worldpose models list`.")],
+    name: Annotated[str, typer.Argument(metavar="NAME")],
     catalog: CatalogOption = None,
     folder: FolderOption = None,
     as_json: JsonOption = False,
@@ -111,6 +111,9 @@ def pull_model(
     The next call resumes an interrupted download. No other command downloads anything.
 
     Example: worldpose models pull rtdetr-v2-r18
+
+    Options:
+        name: A name of `worldpose models list`.
     """
     checkpoint = _find(name, read_catalog(catalog))
     place = folder or model_folder()
@@ -135,16 +138,16 @@ def pull_model(
 
 @commands.command(name="verify")
 def verify_models(
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="All pulled checkpoints by default."),
-    ] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...")] = None,
     folder: FolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare pulled checkpoints with their digests, and remove damaged ones.
 
     Example: worldpose models verify
+
+    Options:
+        names: All pulled checkpoints by default.
     """
     place = folder or model_folder()
     there = _read_all_pulled(place)

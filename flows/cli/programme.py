@@ -19,17 +19,10 @@ ANALYSED_WIDTH = 320
 
 
 def clips(
-    programme: Annotated[Path, typer.Argument(metavar="VIDEO", help="The programme feed.")],
-    sheet: Annotated[
-        Path | None, typer.Option("--sheet", help="PNG with sample frames of each proposed clip.")
-    ] = None,
-    take: Annotated[
-        str | None,
-        typer.Option("--take", metavar="FIRST:STOP", help="Cut out this range of frames instead."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="With --take: <match>/broadcast/<clip>.mp4.")
-    ] = None,
+    programme: Annotated[Path, typer.Argument(metavar="VIDEO")],
+    sheet: Path | None = None,
+    take: Annotated[str | None, typer.Option("--take", metavar="FIRST:STOP")] = None,
+    out: Path | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """Propose clips of a programme: shots of the main camera without a cut and with a pan.
@@ -37,6 +30,12 @@ def clips(
     Check the sheet and take the right ones; images are not encoded again.
 
     Example: worldpose clips feed.mp4 --sheet feed.png
+
+    Options:
+        programme: The programme feed.
+        sheet: PNG with sample frames of each proposed clip.
+        take: Cut out this range of frames instead.
+        out: With --take: <match>/broadcast/<clip>.mp4.
     """
     if (take is None) != (out is None) or (take is not None and sheet is not None):
         raise UsageError(
@@ -137,9 +136,11 @@ def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     first, _, stop = take.partition(":")
     if not (first.isdecimal() and stop.isdecimal()):
         raise UsageError(
-            "--take", expected="FIRST:STOP, numbers of pictures", found=repr(take),
+            "--take",
+            expected="FIRST:STOP, numbers of pictures",
+            found=repr(take),
             todo="Copy one from the table of proposed clips.",
-        )  # fmt: skip
+        )
     if out.exists():
         raise UsageError(
             str(out), expected="a new file", found="a file", todo="Choose another name."

@@ -33,25 +33,31 @@ from worldpose.store.store import Store
 
 
 def init(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Folder or s3:// URL to create.")],
+    folder: Annotated[str, typer.Argument(metavar="DIR")],
     as_json: JsonOption = False,
 ) -> None:
     """Create a project: the folder of registered matches and their results.
 
     Example: worldpose init worldpose-data
+
+    Options:
+        folder: Folder or s3:// URL to create.
     """
     store = Store.create(folder)
     answer(as_json, {"project": store.url}, f"created project {store.url}")
 
 
 def status(
-    match: Annotated[str | None, typer.Argument(metavar="[MATCH]", help="Match id.")] = None,
+    match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Show which results of each match are current, stale or missing.
 
     Example: worldpose status tiny-1
+
+    Options:
+        match: Match id.
     """
     store = Store.open(project)
     wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
@@ -153,20 +159,17 @@ def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
 
 
 def verify(
-    mend: Annotated[
-        bool,
-        typer.Option(
-            "--repair",
-            help="Withdraw damaged results, which a new run computes, and set damaged records "
-            "aside as *.damaged.",
-        ),
-    ] = False,
+    mend: Annotated[bool, typer.Option("--repair")] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Check every stored byte against its checksum; exit code 1 if any differs.
 
     Example: worldpose verify
+
+    Options:
+        mend: Withdraw damaged results, which a new run computes, and set damaged records aside
+            as *.damaged.
     """
     store = Store.open(project)
     with progress() as reporter:
@@ -198,24 +201,22 @@ def verify(
 
 
 def gc(
-    delete: Annotated[
-        bool, typer.Option("--delete", help="Remove the listed items; without it, only list them.")
-    ] = False,
-    keep_last: Annotated[
-        int | None, typer.Option(min=1, help="Also forget all but the last N runs of each match.")
-    ] = None,
-    forget: Annotated[
-        list[str] | None, typer.Option(metavar="MATCH/RUN", help="Also forget this run.")
-    ] = None,
-    older_than: Annotated[
-        float, typer.Option(min=0, help="Keep items younger than this [h].")
-    ] = 24.0,
+    delete: Annotated[bool, typer.Option("--delete")] = False,
+    keep_last: Annotated[int | None, typer.Option(min=1)] = None,
+    forget: Annotated[list[str] | None, typer.Option(metavar="MATCH/RUN")] = None,
+    older_than: Annotated[float, typer.Option(min=0)] = 24.0,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """List or remove (--delete) data that no run uses; pinned runs are always kept.
 
     Example: worldpose gc --keep-last 3 --delete
+
+    Options:
+        delete: Remove the listed items; without it, only list them.
+        keep_last: Also forget all but the last N runs of each match.
+        forget: Also forget this run.
+        older_than: Keep items younger than this [h].
     """
     store = Store.open(project)
     plan = plan_gc(
@@ -234,18 +235,22 @@ def gc(
 
 
 def pin(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="MATCH/NUMBER, or MATCH: its latest.")],
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the pin, such as v1.")],
-    who: Annotated[
-        str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; it is recorded.")
-    ],
-    why: Annotated[str, typer.Option(help="Reason for the pin; it is recorded.")] = "",
+    run: Annotated[str, typer.Argument(metavar="RUN")],
+    name: Annotated[str, typer.Argument(metavar="NAME")],
+    who: Annotated[str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER")],
+    why: str = "",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Name a run and keep it: gc never forgets a named run, and --run accepts the name.
 
     Example: worldpose pin tiny-1/0002 paper --who Ada --why "figures of the paper"
+
+    Options:
+        run: MATCH/NUMBER, or MATCH: its latest.
+        name: Name of the pin, such as v1.
+        who: Your name; it is recorded.
+        why: Reason for the pin; it is recorded.
     """
     store = Store.open(project)
     record = find_run(store, run)
@@ -264,13 +269,16 @@ def pin(
 
 
 def unpin(
-    named: Annotated[str, typer.Argument(metavar="MATCH/NAME", help="A name given by pin.")],
+    named: Annotated[str, typer.Argument(metavar="MATCH/NAME")],
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Remove the name of a run; gc may then forget the run like any other.
 
     Example: worldpose unpin tiny-1/paper
+
+    Options:
+        named: A name given by pin.
     """
     match_id, slash, name = named.partition("/")
     if not (match_id and slash and name):

@@ -35,16 +35,9 @@ JSON_STATES: Final = {"current": "untouched", "stale": "touched"}
 
 
 def reprocess(
-    matches: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[MATCH]...", help="Ids or folders; all matches by default."),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only list the units to compute, with reasons.")
-    ] = False,
-    retry: Annotated[
-        bool, typer.Option("--retry", help="Retry failed units, even without an edit.")
-    ] = False,
+    matches: Annotated[list[str] | None, typer.Argument(metavar="[MATCH]...")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run")] = False,
+    retry: Annotated[bool, typer.Option("--retry")] = False,
     assignments: MoreSettingsOption = None,
     dask: DaskOption = None,
     workers: WorkersOption = None,
@@ -60,6 +53,11 @@ def reprocess(
     review; 4: some failed.
 
     Example: worldpose reprocess --dry-run
+
+    Options:
+        matches: Ids or folders; all matches by default.
+        dry_run: Only list the units to compute, with reasons.
+        retry: Retry failed units, even without an edit.
     """
     overrides = parse_overrides(assignments or [])
     store = Store.open(project)

@@ -42,42 +42,15 @@ def export(
             "(docs/reference/formats.md); more than one may be given.",
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", help="Output folder; with --format viewer also FILE.html."),
-    ],
+    out: Annotated[Path, typer.Option()],
     run: RunOption = "latest",
     stage: StageOption = None,
-    definition: Annotated[
-        Literal["body", "detector"],
-        typer.Option(
-            "--definition",
-            help="Joints of bodies where the body model has them, or where the detector sees them.",
-        ),
-    ] = "body",
-    release: Annotated[
-        str | None,
-        typer.Option("--release", metavar="NAME", help="Freeze the run under this name."),
-    ] = None,
-    licence: Annotated[
-        Path | None,
-        typer.Option("--licence", help="Text of the data licence, for a release or the files."),
-    ] = None,
-    filled: Annotated[
-        bool,
-        typer.Option("--filled", help="Interpolate and flag joints that are missing for a while."),
-    ] = False,
-    surface: Annotated[
-        bool,
-        typer.Option(
-            "--surface",
-            help="With gltf, also write the surface of a licensed body model (needs --licence).",
-        ),
-    ] = False,
-    video: Annotated[
-        bool,
-        typer.Option("--video", help="With viewer, also embed the clip's overlay video."),
-    ] = False,
+    definition: Literal["body", "detector"] = "body",
+    release: Annotated[str | None, typer.Option("--release", metavar="NAME")] = None,
+    licence: Path | None = None,
+    filled: Annotated[bool, typer.Option("--filled")] = False,
+    surface: Annotated[bool, typer.Option("--surface")] = False,
+    video: Annotated[bool, typer.Option("--video")] = False,
     overwrite: OverwriteOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -87,6 +60,16 @@ def export(
     Files of an earlier export of the same match are replaced, those of another match are not.
 
     Example: worldpose export tiny-1 --format joints --out exported
+
+    Options:
+        out: Output folder; with --format viewer also FILE.html.
+        definition: Joints of bodies where the body model has them, or where the detector sees
+            them.
+        release: Freeze the run under this name.
+        licence: Text of the data licence, for a release or the files.
+        filled: Interpolate and flag joints that are missing for a while.
+        surface: With gltf, also write the surface of a licensed body model (needs --licence).
+        video: With viewer, also embed the clip's overlay video.
     """
     from flows.registering import find_registration, open_match
     from flows.results.best_results import Footage, Origin, describe_later_run, open_results
@@ -136,11 +119,7 @@ def export(
 
 
 def _read_licence(file: Path) -> str:
-    """Return the text of a data licence.
-
-    Raises:
-        InputError: the file is unreadable, empty, or no text.
-    """
+    """Return the text of a data licence."""
     try:
         text = file.read_text(encoding="utf-8-sig").strip()
     except (OSError, ValueError) as error:
@@ -159,37 +138,17 @@ def _read_licence(file: Path) -> str:
 
 _LISTED = "\n".join(f"  {name:15} {purpose}" for name, purpose in EXPORT_PURPOSES.items())
 # Click keeps the lines of a paragraph that begins with this sign.
-export.__doc__ = f"{inspect.getdoc(export)}\n\n\b\nFormats:\n{_LISTED}"
+_ABOUT, _, _OPTIONS = (inspect.getdoc(export) or "").partition("\n\nOptions:")
+export.__doc__ = f"{_ABOUT}\n\n\b\nFormats:\n{_LISTED}\n\nOptions:{_OPTIONS}"
 
 
 def report(
     match: MatchArgument,
-    out: Annotated[Path, typer.Option("--out", help="Output page.")] = Path("report.html"),
-    reference: Annotated[
-        str | None,
-        typer.Option("--reference", help="Ground truth; reference/ of the match by default."),
-    ] = None,
-    videos: Annotated[
-        bool,
-        typer.Option(
-            "--videos/--no-videos",
-            help="Also write videos with overlaid markings and bodies.",
-        ),
-    ] = True,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera", help="Static camera of a video; the one with most people by default."
-        ),
-    ] = None,
-    figures: Annotated[
-        Path | None,
-        typer.Option(
-            "--figures",
-            metavar="FOLDER",
-            help="Also write the page's figures as SVG and PDF, with their data as JSON.",
-        ),
-    ] = None,
+    out: Path = Path("report.html"),
+    reference: str | None = None,
+    videos: Annotated[bool, typer.Option("--videos/--no-videos")] = True,
+    camera: str | None = None,
+    figures: Annotated[Path | None, typer.Option("--figures", metavar="FOLDER")] = None,
     run: RunOption = "latest",
     overwrite: OverwriteOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
@@ -198,6 +157,13 @@ def report(
     """Write one HTML page about a run, with its settings, metrics and images.
 
     Example: worldpose report tiny-1 --out report.html
+
+    Options:
+        out: Output page.
+        reference: Ground truth; reference/ of the match by default.
+        videos: Also write videos with overlaid markings and bodies.
+        camera: Static camera of a video; the one with most people by default.
+        figures: Also write the page's figures as SVG and PDF, with their data as JSON.
     """
     from flows.registering import find_match
     from flows.reports.report import write_report

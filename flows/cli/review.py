@@ -15,6 +15,7 @@ from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
+    answer,
     errors,
     line,
     print_json,
@@ -34,7 +35,7 @@ from flows.cli.options import (
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
-from flows.review.descriptions import in_words, review_json, when
+from flows.review.descriptions import describe_corrections, in_words, review_json, when
 from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
@@ -58,27 +59,22 @@ Who = Annotated[
     str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; it is recorded.")
 ]
 Why = Annotated[str, typer.Option("--why", help="Your reason; it is recorded.")]
-Edits = Annotated[
-    Path | None,
-    typer.Option("--edits", help="JSON list of corrections; see docs/how-to/review.md."),
-]
-EditsFile = Annotated[
-    Path, typer.Option("--edits", help="JSON list of corrections; see docs/how-to/review.md.")
-]
+_EDITS = typer.Option("--edits", help="JSON list of corrections; see docs/how-to/review.md.")
 
 
 @commands.command("list")
 def list_reviews(
     match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Also list decided and superseded reviews.")
-    ] = False,
+    everything: Annotated[bool, typer.Option("--all")] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """List pending reviews of one match or of all; an unreadable match does not hide the others.
 
     Example: worldpose review list tiny-1
+
+    Options:
+        everything: Also list decided and superseded reviews.
     """
     store = Store.open(project)
     names = [find_registration(store, match).spec.match_id] if match else store.matches()
@@ -176,7 +172,7 @@ def reject(
     who: Who,
     why: Why,
     requests: Requests = None,
-    edits: Edits = None,
+    edits: Annotated[Path | None, _EDITS] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -191,7 +187,7 @@ def reject(
 def correct(
     match: MatchId,
     who: Who,
-    edits: EditsFile,
+    edits: Annotated[Path, _EDITS],
     why: Why = "",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -202,20 +198,14 @@ def correct(
     """
     store = Store.open(project)
     said = verdicts.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
-    if as_json:
-        print_json({"corrections": [each.model_dump(mode="json") for each in said]})
-        return
-    for each in said:
-        line(f"corrected: {in_words(each)} ({each.id})")
-    _say_next(match)
+    found = {"corrections": [each.model_dump(mode="json") for each in said]}
+    answer(as_json, found, *describe_corrections(said), _next_command(match))
 
 
 @commands.command()
 def withdraw(
     match: MatchId,
-    correction: Annotated[
-        str, typer.Argument(metavar="CORRECTION", help="Id of the correction, from `show`.")
-    ],
+    correction: Annotated[str, typer.Argument(metavar="CORRECTION")],
     who: Who,
     why: Why = "",
     project: ProjectOption = DEFAULT_PROJECT,
@@ -224,14 +214,14 @@ def withdraw(
     """Withdraw a correction; the journal keeps both records.
 
     Example: worldpose review withdraw tiny-1 moved_point.0a1b2c3d4e5f --who Ada
+
+    Options:
+        correction: Id of the correction, from `show`.
     """
     store = Store.open(project)
     verdicts.withdraw(store, open_match(store, match), [correction], who=who, why=why)
-    if as_json:
-        print_json({"withdrawn": correction})
-        return
-    line(f"withdrawn: {correction}")
-    _say_next(match)
+    told = f"withdrawn: {correction}"
+    answer(as_json, {"withdrawn": correction}, told, _next_command(match))
 
 
 @commands.command()
@@ -244,10 +234,8 @@ def resume(
     """
     store = Store.open(project)
     resumed = verdicts.resume(store, open_match(store, match))
-    if as_json:
-        print_json({"resumed": resumed})
-        return
-    line(f"resumed {len(resumed)} runs of {match}; a serving process takes them up")
+    told = f"resumed {len(resumed)} runs of {match}; a serving process takes them up"
+    answer(as_json, {"resumed": resumed}, told)
 
 
 @commands.command()
@@ -303,15 +291,14 @@ def _decide(
         why=why,
         edits=_read_edits(edits) if edits else (),
     )
-    if as_json:
-        said = [each.model_dump(mode="json") for each in corrections]
-        print_json({"verdict": verdict, "reviews": ids, "corrections": said})
-        return
-    for name in ids:
-        line(f"{verdict}: {name}")
-    for each in corrections:
-        line(f"corrected: {in_words(each)} ({each.id})")
-    _say_next(match)
+    said = [each.model_dump(mode="json") for each in corrections]
+    answer(
+        as_json,
+        {"verdict": verdict, "reviews": ids, "corrections": said},
+        *(f"{verdict}: {name}" for name in ids),
+        *describe_corrections(corrections),
+        _next_command(match),
+    )
 
 
 def _read_edits(file: Path) -> list[Edit]:
@@ -328,9 +315,9 @@ def _read_edits(file: Path) -> list[Edit]:
         ) from None
 
 
-def _say_next(match: str) -> None:
+def _next_command(match: str) -> str:
     resumes = f"; a suspended run: worldpose review resume {match}" if has_server() else ""
-    line(f"next: worldpose run {match}{resumes}")
+    return f"next: worldpose run {match}{resumes}"
 
 
 def _tell_damage(match: Match) -> None:

@@ -55,47 +55,17 @@ MAX_LISTED = 5
 
 def run(
     match: MatchArgument,
-    from_stage: Annotated[
-        str | None,
-        typer.Option("--from", help="First stage; earlier results come from the latest run."),
-    ] = None,
-    until_stage: Annotated[str | None, typer.Option("--until", help="Last stage.")] = None,
+    from_stage: Annotated[str | None, typer.Option("--from")] = None,
+    until_stage: Annotated[str | None, typer.Option("--until")] = None,
     assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="STAGE.NAME=VALUE",
-            help="A setting for this run and later ones; repeatable; `list` shows all settings. "
-            "A run keeps the settings of the match's latest run that it does not state.",
-        ),
+        list[str] | None, typer.Option("--set", metavar="STAGE.NAME=VALUE")
     ] = None,
-    default_settings: Annotated[
-        bool,
-        typer.Option(
-            "--default-settings",
-            help="Keep no setting of the latest run: what --set does not state has its default.",
-        ),
-    ] = False,
+    default_settings: Annotated[bool, typer.Option("--default-settings")] = False,
     dask: DaskOption = None,
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
-    gates: Annotated[
-        GatePolicy | None,
-        typer.Option(
-            metavar="POLICY",
-            help="When results need review: never (default), auto (metrics beyond limits) or "
-            "always. While the latest run waits for review, its policy is the default.",
-        ),
-    ] = None,
-    iterations: Annotated[
-        str | None,
-        typer.Option(
-            metavar="N",
-            help="Number of iterations. Each one leaves out the keypoints that the bodies of the "
-            "previous one contradict. With auto, the run iterates until the error in held-out "
-            "cameras stops decreasing. By default as many as the latest run.",
-        ),
-    ] = None,
+    gates: Annotated[GatePolicy | None, typer.Option(metavar="POLICY")] = None,
+    iterations: Annotated[str | None, typer.Option(metavar="N")] = None,
     body_folder: BodyFolderOption = None,
     verbose: VerboseOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
@@ -104,6 +74,19 @@ def run(
     """Compute a match's missing and stale results, and nothing else.
 
     Example: worldpose run matches/tiny --set triangulation.min_views=3
+
+    Options:
+        from_stage: First stage; earlier results come from the latest run.
+        until_stage: Last stage.
+        assignments: A setting for this run and later ones; repeatable; `list` shows all
+            settings. A run keeps the settings of the match's latest run that it does not state.
+        default_settings: Keep no setting of the latest run: what --set does not state has its
+            default.
+        gates: When results need review: never (default), auto (metrics beyond limits) or
+            always. While the latest run waits for review, its policy is the default.
+        iterations: Number of iterations. Each one leaves out the keypoints that the bodies of
+            the previous one contradict. With auto, the run iterates until the error in held-out
+            cameras stops decreasing. By default as many as the latest run.
     """
     started = time.monotonic()
     if assignments == ["list"]:
@@ -137,7 +120,7 @@ def run(
     warned = [
         *record.warnings,
         *clock_advice(record.figures, opened.folder.spec),
-        *click_advice(record.figures, _stated_click_noise(record)),
+        *click_advice(record.figures, record.settings),
     ]
     if as_json:
         print_json(
@@ -164,11 +147,6 @@ def run(
     for text in warned:
         line(f"warning: {text}", to=errors)
     raise typer.Exit(EXIT_CODES[record.state])
-
-
-def _stated_click_noise(record: RunRecord) -> float:
-    stated = record.settings.get("static_calibration", {}).get("click_noise_px")
-    return float(stated) if isinstance(stated, int | float) else 1.0
 
 
 def _print_settings(as_json: bool) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, errors, line, print_json
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, answer, errors, line
 from flows.cli.options import (
     PAGES_PORT,
     CertificateOption,
@@ -32,63 +32,28 @@ if TYPE_CHECKING:
 
 
 def serve(
-    inbox: Annotated[
-        Path | None,
-        typer.Option("--inbox", help="Folder of arriving matches; PROJECT/inbox by default."),
-    ] = None,
-    videos: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder whose videos people can pick on the pages, read-only; repeatable."
-        ),
-    ] = None,
-    bucket: Annotated[
-        str | None,
-        typer.Option("--bucket", help="s3:// URL of matches to copy to the inbox."),
-    ] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Report problems and their remedies, and exit.")
-    ] = False,
-    test_alerts: Annotated[
-        bool, typer.Option("--test-alerts", help="Send a test alert to every channel, and exit.")
-    ] = False,
-    max_concurrent: Annotated[
-        int, typer.Option(min=1, help="Matches that run at the same time.")
-    ] = 1,
+    inbox: Path | None = None,
+    videos: Annotated[list[Path] | None, typer.Option(exists=True, file_okay=False)] = None,
+    bucket: str | None = None,
+    check: Annotated[bool, typer.Option("--check")] = False,
+    test_alerts: Annotated[bool, typer.Option("--test-alerts")] = False,
+    max_concurrent: Annotated[int, typer.Option(min=1)] = 1,
     dask: DaskOption = None,
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
-    name: Annotated[
-        str, typer.Option(help="Name of the deployments, unique at a Prefect server.")
-    ] = "worldpose",
+    name: str = "worldpose",
     port: PortOption = PAGES_PORT,
-    prefect_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of Prefect's dashboard on this machine.")
-    ] = 4200,
-    metrics_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of the metrics for Prometheus.")
-    ] = 8573,
+    prefect_port: Annotated[int, typer.Option(min=1, max=65535)] = 4200,
+    metrics_port: Annotated[int, typer.Option(min=1, max=65535)] = 8573,
     host: HostOption = "127.0.0.1",
     names: NamesOption = None,
     certificate: CertificateOption = None,
     key: KeyOption = None,
-    settle_time: Annotated[
-        float,
-        typer.Option(min=0, help="Time without changes until a match counts as complete [s]."),
-    ] = 30.0,
-    poll_interval: Annotated[
-        float, typer.Option(min=0.1, help="Interval between scans of the inbox [min].")
-    ] = 15.0,
-    gate_hours: Annotated[
-        float, typer.Option(min=0.001, help="Age of a pending review that triggers an alert [h].")
-    ] = 24.0,
-    disk_gb: Annotated[
-        float, typer.Option(min=0, help="Free disk space below which an alert is sent [GB].")
-    ] = 10.0,
-    state: Annotated[
-        Path | None,
-        typer.Option(help="Folder of logs and Prefect's database; PROJECT/operations by default."),
-    ] = None,
+    settle_time: Annotated[float, typer.Option(min=0)] = 30.0,
+    poll_interval: Annotated[float, typer.Option(min=0.1)] = 15.0,
+    gate_hours: Annotated[float, typer.Option(min=0.001)] = 24.0,
+    disk_gb: Annotated[float, typer.Option(min=0)] = 10.0,
+    state: Path | None = None,
     token: TokenOption = None,
     users: UsersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
@@ -104,6 +69,22 @@ def serve(
     PREFECT_API_URL names a Prefect server that runs already.
 
     Example: worldpose serve --inbox /data/arriving
+
+    Options:
+        inbox: Folder of arriving matches; PROJECT/inbox by default.
+        videos: Folder whose videos people can pick on the pages, read-only; repeatable.
+        bucket: s3:// URL of matches to copy to the inbox.
+        check: Report problems and their remedies, and exit.
+        test_alerts: Send a test alert to every channel, and exit.
+        max_concurrent: Matches that run at the same time.
+        name: Name of the deployments, unique at a Prefect server.
+        prefect_port: Port of Prefect's dashboard on this machine.
+        metrics_port: Port of the metrics for Prometheus.
+        settle_time: Time without changes until a match counts as complete [s].
+        poll_interval: Interval between scans of the inbox [min].
+        gate_hours: Age of a pending review that triggers an alert [h].
+        disk_gb: Free disk space below which an alert is sent [GB].
+        state: Folder of logs and Prefect's database; PROJECT/operations by default.
     """
     # Imported here: no other command needs them.
     from flows.service.layout import state_folder
@@ -132,14 +113,6 @@ def serve(
             found="none, and a project on object storage",
             todo="Name a folder, as in --inbox /data/arriving.",
         )
-    for each in videos or ():
-        if not each.is_dir():
-            raise UsageError(
-                f"--videos {each}",
-                expected="a folder",
-                found="something else" if each.exists() else "nothing",
-                todo="Name a folder with videos, as in --videos /data/recordings.",
-            )
     given = os.environ.get("PREFECT_API_URL")
     plan = ServePlan(
         project=url,
@@ -181,13 +154,7 @@ def serve(
 
 
 def _print_addresses(plan: ServePlan, pages: str, *, asks_for_login: bool) -> None:
-    """Print the addresses, and where secrets are instead of the secrets.
-
-    Args:
-        plan: the served project.
-        pages: address of the pages, and where its token is.
-        asks_for_login: whether Prefect's dashboard asks for a login.
-    """
+    """Print the addresses, and where secrets are instead of the secrets."""
     from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
     from flows.service.service_secrets import METRICS_TOKEN
 
@@ -221,10 +188,10 @@ def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:
             todo="Write the file as docs/how-to/operations.md says.",
         )
     problems = send_test(channels)
-    if as_json:
-        print_json({"channels": problems})
-    for name, problem in {} if as_json else problems.items():
-        line(f"{name}: {f'failed: {problem}' if problem else 'accepted a test alert'}")
+    said = {
+        name: f"failed: {it}" if it else "accepted a test alert" for name, it in problems.items()
+    }
+    answer(as_json, {"channels": problems}, *(f"{name}: {text}" for name, text in said.items()))
     if any(problems.values()):
         raise typer.Exit(1)
 
@@ -233,19 +200,14 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
     from flows.service.health import check
 
     findings = check(folder)
-    if as_json:
-        print_json(
-            {
-                "healthy": all(finding.is_well for finding in findings),
-                "findings": [
-                    {"part": it.part, "well": it.is_well, "state": it.state, "mend": it.remedy}
-                    for it in findings
-                ],
-            }
-        )
-    for finding in [] if as_json else findings:
-        line(f"{'ok' if finding.is_well else 'UNHEALTHY':<10}{finding.part}: {finding.state}")
-        if not finding.is_well:
-            line(f"          fix: {finding.remedy}")
-    if not all(finding.is_well for finding in findings):
-        raise typer.Exit(1)
+    is_healthy = all(finding.is_well for finding in findings)
+    lines = []
+    for it in findings:
+        lines.append(f"{'ok' if it.is_well else 'UNHEALTHY':<10}{it.part}: {it.state}")
+        lines += [] if it.is_well else [f"          fix: {it.remedy}"]
+    rows = [
+        {"part": it.part, "well": it.is_well, "state": it.state, "mend": it.remedy}
+        for it in findings
+    ]
+    answer(as_json, {"healthy": is_healthy, "findings": rows}, *lines)
+    raise typer.Exit(0 if is_healthy else 1)

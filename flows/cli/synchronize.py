@@ -58,19 +58,10 @@ class Proposal(NamedTuple):
 
 def synchronize(
     match: MatchArgument,
-    clip: Annotated[
-        str | None, typer.Option(help="Clip whose people are compared; the longest by default.")
-    ] = None,
-    max_offset: Annotated[
-        float, typer.Option(min=0.1, max=60.0, help="Largest offset between two cameras [s].")
-    ] = 2.0,
-    plot: Annotated[
-        Path | None,
-        typer.Option(help="Plot of the matches by offset to write: .svg, .pdf or .png."),
-    ] = None,
-    apply: Annotated[
-        bool, typer.Option("--apply", help="Write the proposed offset_frames into match.yaml.")
-    ] = False,
+    clip: str | None = None,
+    max_offset: Annotated[float, typer.Option(min=0.1, max=60.0)] = 2.0,
+    plot: Path | None = None,
+    apply: Annotated[bool, typer.Option("--apply")] = False,
     workers: WorkersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -82,6 +73,12 @@ def synchronize(
     --apply writes the others.
 
     Example: worldpose synchronize matches/lab --plot clocks.svg --apply
+
+    Options:
+        clip: Clip whose people are compared; the longest by default.
+        max_offset: Largest offset between two cameras [s].
+        plot: Plot of the matches by offset to write: .svg, .pdf or .png.
+        apply: Write the proposed offset_frames into match.yaml.
     """
     from worldpose.reports.drawing import draw_synchronization, require_plot
     from worldpose.triangulation.synchronization import synchronize as estimate

@@ -19,9 +19,8 @@ class LostWorkersError(WorldposeError):
 def require_room(failure: BaseException, project: str) -> None:
     """Raise StoreError if a failure of Prefect was caused by a full disk; else return.
 
-    Args:
-        failure: the exception; Prefect reports database failures only as `500`.
-        project: folder or URL of the store; Prefect's database is there, or in a temporary folder.
+    Prefect reports database failures only as `500`. Its database is in the project, or in a
+    temporary folder.
 
     Raises:
         StoreError: the disk of the store or of Prefect's database is full.

@@ -29,9 +29,7 @@ KEEP_SECONDS = 5.0
 def start_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCluster:
     """Start workers on this machine, which at once import the modules that they will need.
 
-    Args:
-        asked: number of workers; None = as many as `workers_for`.
-        missing: units to compute first.
+    There are as many as asked for, or as `workers_for` the units to compute first.
     """
     import dask
 

@@ -39,10 +39,8 @@ class UnreachablePrefectError(WorldposeError):
 class PrefectApi:
     """A Prefect server.
 
-    Attributes:
-        api: address of its API, which ends with `/api`.
-        login: login at the server; None = it needs none.
-        tries: requests to a server that does not answer or whose database is busy.
+    Without a login it needs none; `tries` are the requests to a server that does not answer or
+    whose database is busy.
     """
 
     api: str

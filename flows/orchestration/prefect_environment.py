@@ -97,9 +97,7 @@ def authorization(login: str) -> str:
 def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) -> dict[str, str]:
     """Return an environment without the variables that hold secrets, selected by name.
 
-    Args:
-        environment: environment of a process.
-        keep: variables that its child needs; a name that ends with `*` is a prefix.
+    `keep` names variables that a child needs; a name that ends with `*` is a prefix.
     """
     kept = tuple(keep)
     exact = {name for name in kept if not name.endswith("*")}
@@ -114,9 +112,7 @@ def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) ->
 def served_environment(api: str, home: Path | None) -> dict[str, str]:
     """Return the environment of the processes of `worldpose serve`, without secrets.
 
-    Args:
-        api: address of Prefect's API.
-        home: database folder of our own Prefect server; None = an external server.
+    `home` is the database folder of our own Prefect server; None = an external server.
     """
     port = urlsplit(api).port or 80
     own = {} if home is None else {"PREFECT_HOME": str(home), "PREFECT_SERVER_API_PORT": str(port)}
@@ -139,10 +135,7 @@ def one_authority(folder: Path) -> dict[str, str]:
     """Return the environment of processes that use Prefect over plain HTTP only: no CA checks.
 
     Prefect reads every certificate authority twice for each task, which takes 34 ms of CPU time;
-    from a file with one of them it reads one.
-
-    Args:
-        folder: folder of the file; workers must see it too.
+    from a file with one of them it reads one. Workers must see the folder too.
     """
     end = b"-----END CERTIFICATE-----\n"
     first = Path(certifi.where()).read_bytes().partition(end)
@@ -191,11 +184,8 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
     """Set up environment and server for Prefect; yield a function that waits for its API.
 
     Prefect, which takes seconds to import, can then be imported while its server starts. The
-    function raises WorldposeError if our own server does not answer.
-
-    Args:
-        project: folder or URL of the store; a local one also holds Prefect's database.
-        is_local: whether all its clients see this machine's files.
+    function raises WorldposeError if our own server does not answer. A local project also holds
+    Prefect's database; `is_local` says that all its clients see this machine's files.
 
     Raises:
         InputError: a given server does not answer.
@@ -298,11 +288,7 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
 
 
 def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path) -> None:
-    """Return when the embedded server answers.
-
-    Raises:
-        WorldposeError: the server ended, or does not answer in time.
-    """
+    """Return when the embedded server answers."""
     deadline = time.monotonic() + START_SECONDS
     while server.poll() is None and time.monotonic() < deadline:
         if not problem_at(f"{address}/health"):

@@ -9,7 +9,6 @@ PREFECT_SERVER_API_AUTH_STRING is set. This one does not start without it.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import gc
 import os
 import resource
@@ -21,32 +20,22 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from starlette.datastructures import Headers
-
 from flows.orchestration.prefect_environment import SERVER_LOGIN
-from flows.web.host_guard import SAFE_METHODS, HostGuard
+from flows.web.host_guard import HostGuard
 from flows.web.http_server import serve_http
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+    from starlette.types import ASGIApp
 
 MAX_CONNECTIONS: Final = 1000
 """Maximum open connections: every run and every one of its workers has several."""
-BUSY: Final = 503
-REPETITIONS: Final = 8
-"""Repetitions of a request that the busy database refused; with the pauses below they last 4 s
-without their own time."""
-PAUSE_SECONDS: Final = 0.5
-"""Pause before each repetition [s]."""
 
 
 def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     """Create Prefect's API, and its dashboard unless embedded, for requests that name this server.
 
-    Args:
-        names: names of the server, in addition to those of loopback.
-        is_embedded: whether it lasts as long as one run.
+    An embedded one lasts as long as one run. Loopback's names need not be given.
 
     Raises:
         UsageError: the environment has no login for it.
@@ -68,7 +57,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     app = create_app(ephemeral=is_embedded, final=True)
     gc.freeze()
     gc.enable()
-    return HostGuard(RepeatBusy(app), names)
+    return HostGuard(app, names)
 
 
 def _let_dashboard_be_written() -> None:
@@ -85,13 +74,7 @@ def _let_dashboard_be_written() -> None:
 
 
 def serve(host: str, port: int, names: Iterable[str]) -> None:
-    """Serve API and dashboard until this process receives a signal to end.
-
-    Args:
-        host: address to listen at.
-        port: port to listen at.
-        names: names of this machine for remote clients.
-    """
+    """Serve API and dashboard until this process receives a signal to end."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each client has several connections
     serve_http(
@@ -103,63 +86,6 @@ def serve(host: str, port: int, names: Iterable[str]) -> None:
         server_header=False,
         timeout_graceful_shutdown=2,
     )
-
-
-class RepeatBusy:
-    """ASGI middleware that repeats changes of browsers that Prefect refuses.
-
-    SQLite has one writer. A transaction that reads and then writes fails at once if another one
-    wrote in between, and Prefect then answers 503. Prefect's clients retry; its dashboard reports
-    an error, and the run or schedule that a person submitted does not exist.
-
-    Args:
-        app: Prefect's server, which has undone all that a refused request had written.
-        pause_s: pause before each repetition [s].
-    """
-
-    def __init__(self, app: ASGIApp, pause_s: float = PAUSE_SECONDS) -> None:
-        self.app, self.pause_s = app, pause_s
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request; only browsers send `Sec-Fetch-Mode`."""
-        is_change = scope["type"] == "http" and scope["method"] not in SAFE_METHODS
-        if not is_change or "sec-fetch-mode" not in Headers(scope=scope):
-            await self.app(scope, receive, send)
-            return
-        body: list[Message] = []
-        while not body or body[-1].get("more_body", False):
-            message = await receive()
-            if message["type"] == "http.disconnect":
-                return
-            body.append(message)
-        for left in range(REPETITIONS, -1, -1):
-            if not await self._is_refused(scope, body, receive, send, may_repeat=left > 0):
-                return
-            await asyncio.sleep(self.pause_s)
-
-    async def _is_refused(
-        self, scope: Scope, body: list[Message], receive: Receive, send: Send, *, may_repeat: bool
-    ) -> bool:
-        """Ask Prefect once; withhold an answer after which to repeat, and return True then."""
-        unread = iter(body)
-        is_refused = False
-
-        async def read() -> Message:
-            return next(unread, None) or await receive()
-
-        async def answer(message: Message) -> None:
-            nonlocal is_refused
-            if message["type"] == "http.response.start":
-                is_refused = may_repeat and message["status"] == BUSY
-            if not is_refused:
-                await send(message)
-
-        try:
-            await self.app(dict(scope), read, answer)
-        except Exception:  # of the database, raised once more after it was answered
-            if not is_refused:
-                raise
-        return is_refused
 
 
 def main() -> None:

@@ -44,12 +44,8 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
     """Suspend this flow run, or record the verdict that it was resumed with.
 
     Prefect identifies the question by a key derived from the waiting results: after a resume the
-    same key returns the answer, and other results form another question.
-
-    Args:
-        store: the store for the verdict.
-        match_id: the match.
-        waiting: undecided units, already in the journal.
+    same key returns the answer, and other results form another question. The waiting units are in
+    the journal already.
 
     Raises:
         WorldposeError: resumed with `recorded` though nothing was decided.
@@ -93,10 +89,6 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
 
 def resume_suspended(project: str, match_id: str) -> list[str]:
     """Resume the suspended runs of a match after its reviews are decided; return their names.
-
-    Args:
-        project: folder or URL of the store.
-        match_id: the match.
 
     Raises:
         WorldposeError: Prefect does not answer, or refuses.

@@ -20,7 +20,7 @@ from flows.results.best_results import (
 )
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
-from worldpose.broadcast_calibration.calibration import camera_before
+from worldpose.broadcast_calibration.report import camera_before
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
 from worldpose.formats.files import whole_file

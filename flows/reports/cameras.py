@@ -148,7 +148,7 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
         pitch,
         clicks=[
             Click(point, place, inlier[point])
-            for point, place in _clicked_places(store, run, name).items()
+            for point, place in _clicked_places(run, name).items()
         ],
         still=background_image(store, match, name),
         error_map=ErrorMap(
@@ -196,13 +196,11 @@ def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
     return tuple(str(name) for name in result["point"].values[wrong])
 
 
-def _clicked_places(store: Store, run: Run, camera_id: str) -> dict[str, NDArray[np.float64]]:
+def _clicked_places(run: Run, camera_id: str) -> dict[str, NDArray[np.float64]]:
     """Return the clicks that the run used: those of the folder may have changed since.
 
     A camera without clicks was proposed from its image.
     """
-    record = run.record
-    key = record.results[f"static_calibration/{camera_id}"]
-    recipe = store.manifest(record.match_id, "static_calibration", camera_id, key).recipe
+    recipe = run.manifest(f"static_calibration/{camera_id}").recipe
     files = cast("dict[str, Any]", recipe.sources["clicked"]).values()
     return {name: np.array(place) for file in files for name, place in file["points"].items()}

@@ -22,7 +22,6 @@ from data_contracts.review import (
     ReviewRequest,
     Withdrawal,
 )
-from data_contracts.run import RunRecord
 from flows.reports.cameras import camera_pictures, camera_table, paint_pictures
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures, disagreement_pictures
@@ -100,7 +99,7 @@ def write_report(
     page = report_page(
         match.match_id,
         run.record,
-        seconds=_seconds(store, run.record),
+        seconds={name: run.manifest(name).seconds for name in run.record.results},
         scores=scores,
         sections=[first, shown, *others],
         tiles=tiles_of(run, match, scores),
@@ -225,15 +224,6 @@ def _broadcast_blocks(run: Run, match: Match) -> list[CaptionedImage | Table]:
     from flows.reports.broadcast import broadcast_pictures, broadcast_tables
 
     return [*broadcast_pictures(run, match), *broadcast_tables(run, match)]
-
-
-def _seconds(store: Store, record: RunRecord) -> dict[str, float]:
-    """Return the computation time of each unit [s]."""
-    seconds = {}
-    for name, key in record.results.items():
-        stage, _, unit = name.partition("/")
-        seconds[name] = store.manifest(record.match_id, stage, unit, key).seconds
-    return seconds
 
 
 def _own_reference(match: Match) -> str | None:

@@ -85,7 +85,7 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         InputError: there is nobody to show.
     """
     pitch = read_match(Path(origin.registration.folder)).pitch
-    page = _viewer_page()
+    page, footage = _viewer_page(), origin.footage
     written: dict[Path, tuple[str, ...]] = {
         out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips
     }
@@ -93,37 +93,34 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         written = {out: origin.clips}
     for path, names in written.items():
         with TemporaryDirectory(prefix="worldpose-viewer-") as draft:
-            videos = {} if origin.footage is None else _draw_videos(origin, names, Path(draft))
+            videos = {name: _draw_video(origin, name, Path(draft)) for name in names if footage}
             clips = [
-                viewer_clip(origin, name, pitch, _video_of(origin, name, videos)) for name in names
+                viewer_clip(
+                    origin,
+                    name,
+                    pitch,
+                    describe_video(origin.run, footage.match, name) if footage else None,
+                )
+                for name in names
             ]
             write_viewer(path, page, clips, videos)
     return list(written)
 
 
-def _video_of(origin: Origin, clip: str, videos: Mapping[str, Path]) -> dict[str, Any] | None:
-    footage = origin.footage
-    if footage is None or clip not in videos:
-        return None
-    return describe_video(origin.run, footage.match, clip)
-
-
-def _draw_videos(origin: Origin, clips: tuple[str, ...], folder: Path) -> dict[str, Path]:
-    """Draw the overlay video of every clip; return the files by clip."""
+def _draw_video(origin: Origin, clip: str, folder: Path) -> Path:
+    """Draw the overlay video of a clip; return the file."""
     footage = origin.footage
     assert footage is not None  # the caller asks
-    videos = {}
-    for clip in clips:
-        if clip_view(origin.run, footage.match, clip) is None:
-            raise UsageError(
-                "--video",
-                expected=f"a camera with a video that films clip {clip}",
-                found="no video of any camera",
-                todo="Export without --video, or add the videos to the match's folder videos/.",
-            )
-        videos[clip] = folder / f"{clip}.mp4"
-        write_clip_video(footage.store, origin.run, footage.match, clip, videos[clip])
-    return videos
+    if clip_view(origin.run, footage.match, clip) is None:
+        raise UsageError(
+            "--video",
+            expected=f"a camera with a video that films clip {clip}",
+            found="no video of any camera",
+            todo="Export without --video, or add the videos to the match's folder videos/.",
+        )
+    file = folder / f"{clip}.mp4"
+    write_clip_video(footage.store, origin.run, footage.match, clip, file)
+    return file
 
 
 def describe_video(run: Run, match: Match, clip: str) -> dict[str, Any] | None:

@@ -12,8 +12,8 @@ from worldpose.body.body_file import find_body
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.bundle_adjustment.adjustment import adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.report import marking_errors
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import InputError
@@ -25,7 +25,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.tracking.settings import TrackingSettings
@@ -88,10 +88,6 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     the whole lens and drops the camera priors, as is common practice; the rows `unguarded` show its
     result without held-out validation. Every row is triangulated from the same tracks; the last one
     fits bodies to our triangulation after adjustment.
-
-    Args:
-        seed: random seed of the trial.
-        clicks: simulated click noise.
 
     Note:
         Paper, table of the Vicon trial.

@@ -185,10 +185,8 @@ _KEPT: Final = {"camera": _LOCAL, "own": _ALONE}
 def select_defined_scores(evaluation: Evaluation, world: str) -> Evaluation:
     """Return the scores that are defined in a method's world.
 
-    Args:
-        evaluation: all scores.
-        world: `shared`, `own` or `camera`; people relative to a moving camera have no paths, people
-            in separate worlds have no common alignment.
+    People relative to a moving camera (`camera`) have no paths, people in separate worlds (`own`)
+    have no common alignment; `shared` keeps all.
     """
     if world not in _KEPT:
         return evaluation

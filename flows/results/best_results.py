@@ -425,10 +425,7 @@ def placed_joints(run: Run, clip: str) -> xr.Dataset:
 def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[str, Camera]:
     """Return the static cameras of a run by id; if it has joints, all that it did not leave out.
 
-    Args:
-        run: the run.
-        spec: the match.
-        stage: the cameras with which this stage computed joints; None = the best available.
+    They are those with which `stage` computed joints, or the best available.
     """
     if ADJUSTED in run and stage != "triangulation":
         adjusted = run[ADJUSTED]
@@ -456,12 +453,8 @@ def estimated_pitch(
 ) -> PitchSpec | None:
     """Return the pitch with the surface that a run estimated, for drawing; None without a pitch.
 
-    Args:
-        run: the run.
-        pitch: pitch of the match folder.
-        spec: the match.
-        clip: the pitch is that of this clip's broadcast camera, if it estimated one; otherwise
-            crown and end fall are those that the static cameras show together.
+    The pitch is that of the clip's broadcast camera, if it estimated one; otherwise crown and end
+    fall are those that the static cameras show together.
     """
     if pitch is None:
         return None

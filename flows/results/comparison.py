@@ -66,11 +66,7 @@ class Change:
 class SubjectChange:
     """Metrics of one camera, clip, player or the match in two runs.
 
-    Attributes:
-        kind: kind of the subject.
-        name: its id; for a player `clip: person 3`.
-        mark: summary over its metrics.
-        figures: metrics that both runs have.
+    The name of a player is like `clip: person 3`; `figures` are the metrics that both runs have.
     """
 
     kind: Kind
@@ -232,9 +228,7 @@ def bodies_of_both(a: Run, b: Run) -> Iterator[BodiesOfBoth]:
 def pair_people(before: Floats, after: Floats) -> dict[int, int]:
     """Map indices of `after` to those of `before`, for mutual nearest neighbours.
 
-    Args:
-        before: (frames, persons, joints, 3) [m].
-        after: (frames, others, joints, 3) [m], in the same frames.
+    Both are (frames, persons, joints, 3) [m], in the same frames.
     """
     if not before.shape[1] or not after.shape[1]:
         return {}
@@ -259,12 +253,8 @@ MIN_JOINTS: Final = 9
 class PoseChange:
     """Largest pose change in one camera's image.
 
-    Attributes:
-        clip: its id.
-        camera: its id.
-        frame: match frame.
-        person: id in the first run.
-        moved_px: mean distance between the person's joints in the two runs [px].
+    `person` is the id in the first run, `moved_px` the mean distance between its joints in the two
+    runs [px].
     """
 
     clip: str
@@ -280,12 +270,6 @@ def largest_pose_changes(
     """Return the images with the largest pose changes, one per camera and clip, largest first.
 
     Each run's bodies are projected with its own cameras.
-
-    Args:
-        store: store with both runs.
-        a: the first run.
-        b: the second run, of the same match.
-        most: maximum number of images.
     """
     spec = find_registration(store, a.match_id).spec
     ours, theirs = Run(store, a), Run(store, b)

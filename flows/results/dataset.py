@@ -49,11 +49,9 @@ def check(
 ) -> CheckReport:
     """Check a data set and return faults and measurements; one clip is in memory at a time.
 
-    Args:
-        folder: written by `worldpose export`, or another folder of the same layout.
-        fps: frames per second; None = as the data set states, or 50.
-        body: body model of pose files that name none; None = the open body.
-        pitch: whether the ground is z = 0; a manifest can state otherwise.
+    The folder is one of `worldpose export`, or of the same layout. Without `fps` the rate is the
+    one that the data set states, or 50 per second; `body` is the model of pose files that name
+    none. `pitch` says whether the ground is z = 0; a manifest can state otherwise.
 
     Raises:
         InputError: a file cannot be read.
@@ -90,11 +88,8 @@ def check(
 def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatistics:
     """Count the content of one data set, which can span several folders.
 
-    One clip is in memory at a time.
-
-    Args:
-        folders: written by `worldpose export`, or others of the same layouts.
-        fps: frames per second; None = as the data sets state, or 50.
+    One clip is in memory at a time. Without `fps` the rate is the one that the data sets state, or
+    50 per second.
 
     Raises:
         InputError: a file cannot be read.

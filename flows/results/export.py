@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -161,11 +162,6 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iter
     yield path
 
 
-def export_challenge_2025(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write the files of `export_challenge` in the 2025 layout."""
-    return export_challenge(origin, out, 2025)
-
-
 def export_tracks(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `tracks/<clip>.txt`, our boxes in the broadcast image, and the paper's settings."""
     yield _write_baseline_settings(out)
@@ -245,13 +241,8 @@ def export_minimap(origin: Origin, out: Path) -> Iterator[Path]:
 
 
 def export_viewer(origin: Origin, out: Path) -> list[Path]:
-    """Write `viewer/<clip>.html`, or one file with all clips where `out` ends with .html.
-
-    Raises:
-        UsageError: a video is asked for, and no camera of a clip has one.
-    """
-    # Imported here: it loads matplotlib, which takes 0.5 s.
-    from flows.reports.viewer import write_viewers
+    """Write `viewer/<clip>.html`, or one file with all clips where `out` ends with .html."""
+    from flows.reports.viewer import write_viewers  # late: it loads matplotlib, which takes 0.5 s
 
     return write_viewers(origin, out)
 
@@ -265,7 +256,7 @@ EXPORTS: dict[str, Callable[[Origin, Path], Iterable[Path]]] = {
     **TOOL_EXPORTS,
     "viewer": export_viewer,
     "challenge": export_challenge,
-    "challenge-2025": export_challenge_2025,
+    "challenge-2025": partial(export_challenge, edition=2025),
     "tracks": export_tracks,
     "slahmr-cameras": export_slahmr_cameras,
     "rerun": export_recording,
@@ -285,13 +276,9 @@ def export(origin: Origin, forms: list[str], out: Path, *, overwrite: bool = Fal
     """Write a run in several formats into one folder; return the files.
 
     Formats that `check` and `statistics` read also get frame_rates.json, and filled joints get
-    origins/<clip>.npz, which flags them. Earlier files of the same match are replaced.
-
-    Args:
-        origin: the run.
-        forms: names of the formats.
-        out: the folder, or a file of the viewer.
-        overwrite: also replace files of another match or of unknown origin.
+    origins/<clip>.npz, which flags them. Earlier files of the same match are replaced. `out` is a
+    folder, or a file of the viewer. `overwrite` also replaces files of another match or of unknown
+    origin.
 
     Raises:
         UsageError: an unknown format, two with the same file names, or a file in place of a folder.

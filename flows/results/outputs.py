@@ -43,11 +43,8 @@ def require_own(
 ) -> None:
     """Refuse to replace files of another owner or of unknown origin.
 
-    Args:
-        folder: folder of the files.
-        drafts: name of each file in it to its new content; None if that does not exist yet.
-        owners: owners whose files may be replaced.
-        overwrite: replace any files but those of a release.
+    `drafts` maps the name of each file to its new content, None if that does not exist yet. With
+    `overwrite`, only files of a release are refused.
 
     Raises:
         InputError: a file with other content has another owner.
@@ -111,13 +108,9 @@ def write_whole(
 ) -> list[Path]:
     """Write files to a temporary place next to `out`, then move all of them; return them there.
 
-    An error while they are written leaves `out` as it was.
-
-    Args:
-        out: a folder, or a file of the viewer.
-        write: writes into a folder, or a file, and returns the files.
-        claim: refuses to replace files of a folder, given their drafts by name.
-        shared: names of files that have no owner, and to which this call adds.
+    An error while they are written leaves `out` as it was. `claim` refuses to replace files of a
+    folder, given their drafts by name. Files with a `shared` name have no owner, and this call adds
+    to them.
 
     Raises:
         InputError: `out` cannot be written, or one of its files is a folder.

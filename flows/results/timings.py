@@ -8,7 +8,7 @@ from typing import Self
 
 from data_contracts.run import ResultManifest
 from flows.method import METHOD
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,7 @@ class StageTime:
 class Cost:
     """Processor time and storage of a run's results.
 
-    Attributes:
-        core_hours: sum of the computing times of all units, each on one core [h].
-        bytes: size of their files [byte].
+    Each unit computes on one core.
     """
 
     core_hours: float
@@ -90,18 +88,11 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
     """Return the timing of a run from the manifests of its computed results.
 
     A unit's time starts when its task opens its inputs. The start of Prefect precedes a run's
-    start.
-
-    Args:
-        store: the project.
-        match_id: the match.
-        run_id: a number or name, or `latest`.
+    start. The run is a number, a name or `latest`.
     """
     record = store.run(match_id, run_id)
-    manifests = {}
-    for name, key in record.results.items():
-        stage, _, unit = name.partition("/")
-        manifests[name] = store.manifest(match_id, stage, unit, key)
+    run = Run(store, record)
+    manifests = {name: run.manifest(name) for name in record.results}
     spans: dict[str, list[tuple[float, float]]] = {}
     for name in record.executed:
         stage, _, _ = name.partition("/")

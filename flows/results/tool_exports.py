@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -185,17 +186,7 @@ def _motions(origin: Origin, clip: str) -> Iterator[tuple[str, int, slice]]:
             yield f"person_{person_id:03d}_frame_{frames[part.start]:06d}", person, part
 
 
-def export_gltf(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `scenes/<clip>.glb`: bodies, cameras and the pitch."""
-    return _write_scenes(origin, out, "glb", write_gltf)
-
-
-def export_usd(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `scenes/<clip>.usdc` with the same content."""
-    return _write_scenes(origin, out, "usdc", write_usd)
-
-
-def _write_scenes(
+def export_scenes(
     origin: Origin, out: Path, suffix: str, write: Callable[..., None]
 ) -> Iterator[Path]:
     """Write `scenes/<clip>.<suffix>`: bodies, cameras and the pitch.
@@ -247,22 +238,13 @@ def _write_scenes(
         yield path
 
 
-def export_csv(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `tables/<clip>.<table>.csv` with its description, for joints, people and strides."""
-    return _write_tables(origin, out, "csv", write_csv)
-
-
-def export_parquet(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `tables/<clip>.<table>.parquet` for joints, people and strides."""
-    return _write_tables(origin, out, "parquet", write_parquet)
-
-
-def _write_tables(
+def export_tables(
     origin: Origin,
     out: Path,
     suffix: str,
     write: Callable[[Path, pd.DataFrame, Mapping[str, str]], list[Path]],
 ) -> Iterator[Path]:
+    """Write `tables/<clip>.<table>.<suffix>` for joints, people and strides."""
     fps = origin.spec.fps
     for clip in origin.clips:
         notes = {**describe_clip(origin, clip), "units": "in the name of each column"}
@@ -281,9 +263,9 @@ TOOL_EXPORTS: dict[str, Callable[[Origin, Path], Iterator[Path]]] = {
     "c3d": export_c3d,
     "bvh": export_motion,
     "mot": export_opensim,
-    "gltf": export_gltf,
-    "usd": export_usd,
-    "csv": export_csv,
-    "parquet": export_parquet,
+    "gltf": partial(export_scenes, suffix="glb", write=write_gltf),
+    "usd": partial(export_scenes, suffix="usdc", write=write_usd),
+    "csv": partial(export_tables, suffix="csv", write=write_csv),
+    "parquet": partial(export_tables, suffix="parquet", write=write_parquet),
 }
 """Part of `EXPORTS`."""

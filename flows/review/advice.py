@@ -7,6 +7,8 @@ from math import sqrt
 from statistics import median_low
 from typing import Final
 
+from pydantic import JsonValue
+
 from data_contracts.match import MatchSpec
 
 MIN_FREEDOM: Final = 10.0
@@ -17,13 +19,16 @@ MIN_STANDARD_ERRORS: Final = 4.0
 """Minimum difference from the stated noise in standard errors."""
 
 
-def click_advice(metrics: Mapping[str, Mapping[str, float]], stated: float) -> list[str]:
+def click_advice(
+    metrics: Mapping[str, Mapping[str, float]], settings: Mapping[str, Mapping[str, JsonValue]]
+) -> list[str]:
     """Return advice if the click noise is significantly larger than stated.
 
     The clicks of all cameras are pooled: a single camera with few clicks cannot determine its
-    noise. The metrics are those of a run, by unit and name; `stated` is its
-    `static_calibration.click_noise_px` [px].
+    noise. The metrics are those of a run, by unit and name, and the settings its own, by stage.
     """
+    given = settings.get("static_calibration", {}).get("click_noise_px")
+    stated = float(given) if isinstance(given, int | float) else 1.0
     told = [
         (each["click_noise_px"], each["click_freedom"])
         for name, each in metrics.items()

@@ -32,11 +32,7 @@ PICTURES: Final = "pictures"
 class Exported:
     """Content of an export.
 
-    Attributes:
-        annotations: file for the annotation tool.
-        pictures: number of images.
-        people: number of people in them.
-        unseen: images without a file, since the camera has no video of the frame.
+    `unseen` images have no file, since the camera has no video of the frame.
     """
 
     annotations: Path

@@ -22,6 +22,11 @@ from worldpose.review.journal import Journal, append, read_journal
 from worldpose.store.store import Store
 
 
+def owner_of(edit: Edit) -> str:
+    """Return the camera or clip of an edit, the unit of the results that it corrects."""
+    return str(getattr(edit, "camera", None) or getattr(edit, "clip", ""))
+
+
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:
     """Return the match with its corrections applied; no file of its folder changes."""
     journal = read_journal(store, registration.spec.match_id)
@@ -89,7 +94,9 @@ def new_corrections(
             edit=edit,
             who=who,
             made_at=datetime.now(UTC),
-            based_on={n: key for n, key in results.items() if n.partition("/")[2] == _unit(edit)},
+            based_on={
+                n: key for n, key in results.items() if n.partition("/")[2] == owner_of(edit)
+            },
             note=note or None,
         )
         replay = replay_corrections(folder, [correction])
@@ -167,8 +174,3 @@ def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit
         "who": last[0].who if last else None,
     }
     raise error
-
-
-def _unit(edit: Edit) -> str | None:
-    """Return the unit of the results that an edit refers to."""
-    return getattr(edit, "camera", None) or getattr(edit, "clip", None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from datetime import datetime
 from typing import Any, Final
 
@@ -49,6 +50,11 @@ def in_words(correction: Correction) -> str:
         )
         return f"{edit.joint} of {place}: {was} -> {xy}"
     return f"{edit.kind} {edit.model_dump_json(exclude={'kind'})}"
+
+
+def describe_corrections(corrections: Iterable[Correction]) -> list[str]:
+    """Return a line for each correction that was made, with its id."""
+    return [f"corrected: {in_words(each)} ({each.id})" for each in corrections]
 
 
 def when(moment: datetime) -> str:

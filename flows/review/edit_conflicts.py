@@ -19,11 +19,7 @@ E = TypeVar("E", bound=Record)
 
 
 class StaleEditError(InputError):
-    """The edited value changed after the reviewer looked at it.
-
-    Attributes:
-        difference: value that the editor saw, current value, and who changed it.
-    """
+    """The edited value changed after the reviewer looked at it."""
 
     difference: Mapping[str, Any] = {}
 
@@ -69,10 +65,8 @@ def edits_since(
 class StoredResult(NamedTuple):
     """A result of the latest run, without corrections if that version is stored.
 
-    Attributes:
-        result: the result.
-        plain: key of the result without corrections.
-        edits: the corrections that `result` contains, as its recipe lists them.
+    `plain` is the key of the result without corrections, `edits` are those that it contains, as its
+    recipe lists them.
     """
 
     result: xr.Dataset

@@ -14,7 +14,7 @@ from worldpose.ingest.clicks import RepeatedClick
 from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import read_pitch
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 
 NAMED_WITHIN_M: Final = 1.0
 """Maximum distance to a point of the pitch at which a place has the point's name [m]."""

@@ -32,7 +32,7 @@ from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.review.journal import Journal, last_decision, requests_by_id, say
 from worldpose.store.recipes import recipe_key
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 State = Literal["waits", "corrected", "approve", "reject", "superseded"]
 
@@ -41,11 +41,9 @@ State = Literal["waits", "corrected", "approve", "reject", "superseded"]
 class Review:
     """A review request and its verdict.
 
-    Attributes:
-        request: the review request.
-        decision: the last verdict on exactly these bytes.
-        is_current: whether it refers to the latest run's result.
-        is_corrected: whether corrections since then make the next run compute that result again.
+    `decision` is the last verdict on exactly these bytes. `is_current` says whether the latest run
+    has the result, `is_corrected` whether corrections since then make the next run compute it
+    again.
     """
 
     request: ReviewRequest
@@ -69,8 +67,8 @@ class Review:
     @property
     def question(self) -> str:
         """The decision for the reviewer."""
-        gates = {gate.stage: gate.question for gate in GATES}
-        return gates.get(self.request.gate, "Is it good enough to be built upon?")
+        gate = GATES.get(self.request.gate)
+        return "Is it good enough to be built upon?" if gate is None else gate.question
 
 
 def reviews_of(store: Store, match: Match, latest: RunRecord | None) -> list[Review]:
@@ -284,9 +282,9 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
     """Return each result's origin by `stage/unit`: automatic, corrected or rejected."""
     made_from: dict[str, tuple[str, ...]] = {}
     rejected = set()
-    for name, key in record.results.items():
-        stage, _, unit = name.partition("/")
-        manifest = store.manifest(match.match_id, stage, unit, key)
+    run = Run(store, record)
+    for name in record.results:
+        manifest = run.manifest(name)
         made_from[name] = tuple(manifest.recipe.inputs)
         decision = last_decision(match.journal.questions, name, manifest.content)
         if decision is not None and decision.verdict == "reject":
@@ -350,8 +348,6 @@ def resume(store: Store, match: Match) -> list[str]:
             found=f"none on {', '.join(review.request.id for review in waiting)}",
             todo="Approve or reject each of them first.",
         )
-    from flows.orchestration.suspension import (
-        resume_suspended,  # imported here: Prefect takes seconds to import
-    )
+    from flows.orchestration.suspension import resume_suspended  # late: it imports Prefect
 
     return resume_suspended(store.url, match_id)

@@ -32,12 +32,7 @@ LOG = logging.getLogger("worldpose.operations")
 class Alert:
     """An alert for an operator.
 
-    Attributes:
-        key: identifies the cause; each cause is sent once.
-        alert: kind of the alert.
-        text: message.
-        link: page with details; empty if there is none.
-        match_id: the match that it concerns; empty if none.
+    The key identifies the cause, of which one alert is sent. Link and match are empty without one.
     """
 
     key: str
@@ -112,11 +107,8 @@ class AlertDispatcher:
     """Sends each alert once while its cause lasts, and retries failed deliveries.
 
     `hold` sets the alerts to send and never blocks; `deliver` passes them to one channel. Each
-    channel has its own pace, so that a slow one delays no other.
-
-    Attributes:
-        state: keeps which alerts were sent, so that a restart repeats none.
-        channels: the channels; without any, alerts go to the log alone.
+    channel has its own pace, so that a slow one delays no other. The state keeps which alerts were
+    sent, so that a restart repeats none. Without channels, alerts go to the log alone.
     """
 
     def __init__(self, state: StateFolder, channels: Sequence[Channel]) -> None:
@@ -140,9 +132,7 @@ class AlertDispatcher:
     def deliver(self, channel: Channel, pause: float = 0.0) -> float:
         """Send a channel's outstanding alerts until it fails.
 
-        Args:
-            channel: the channel.
-            pause: the pause before this call, after a failure [s].
+        `pause` is the one before this call, after a failure [s].
 
         Returns:
             The pause before the next call [s]; 0 = nothing failed.

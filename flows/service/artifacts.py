@@ -1,34 +1,29 @@
-"""Artifacts of a deployment's run in Prefect's dashboard: progress and table of units."""
+"""Artifacts of a deployment's run in Prefect's dashboard: its progress and links."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
+from urllib.parse import quote
 from uuid import UUID
 
 from prefect.artifacts import (
+    create_link_artifact,
     create_progress_artifact,
-    create_table_artifact,
     update_progress_artifact,
 )
 
 from flows.progress import Reporter, format_duration, reporting_to
-from flows.review.metric_words import in_short
 from flows.service.match_runs import artifact_key
-from flows.service.overview import Overview
-from worldpose.store.store import Store
 
 LOG = logging.getLogger("worldpose.operations")
 
 
 class ArtifactReporter(Reporter):
-    """Progress as an artifact, in addition to the log lines.
-
-    Attributes:
-        artifact: the progress artifact; None if there is none.
-    """
+    """Progress as an artifact, in addition to the log lines."""
 
     def __init__(self, artifact: UUID | None) -> None:
         self.artifact = artifact
@@ -58,39 +53,28 @@ class ArtifactReporter(Reporter):
 
 
 @contextmanager
-def show_at_prefect(store: Store, match_id: str) -> Iterator[None]:
-    """Show progress of the enclosed run, and its outcome afterwards.
-
-    Failures to show it are logged and stop nothing.
-
-    Args:
-        store: the project.
-        match_id: the match.
-    """
-    key = artifact_key(match_id)
-    artifact = _show_artifact(lambda: create_progress_artifact(0.0, key=f"progress-{key}"))
+def show_at_prefect(match_id: str) -> Iterator[None]:
+    """Show progress of the enclosed run; failures to show it are logged and stop nothing."""
+    key = f"progress-{artifact_key(match_id)}"
+    artifact = _show_artifact(lambda: create_progress_artifact(0.0, key=key))
     reporter = ArtifactReporter(artifact)
     with reporting_to(reporter):
         yield
     if artifact is not None:
         _show_artifact(lambda: update_progress_artifact(artifact, 100.0, description="recorded"))
-    _show_artifact(lambda: create_table_artifact(table_of(store, match_id), key=f"units-{key}"))
 
 
-def table_of(store: Store, match_id: str) -> list[dict[str, Any]]:
-    """Return a row for each unit of the match's latest run."""
-    (match,) = [each for each in Overview(store).look() if each.match_id == match_id]
-    return [
-        {
-            "stage": stage,
-            "camera or clip": unit.unit,
-            "state": unit.state,
-            "seconds": None if unit.seconds is None else round(unit.seconds, 2),
-            "why": unit.why,
-            "metrics": in_short(unit.figures),
-        }
-        for stage, unit in match.units
-    ]
+def link_pages(pages: str, match_id: str) -> None:
+    """Link this flow run to the pages of its match, which have an address."""
+    links = {
+        f"review-{artifact_key(match_id)}": (
+            f"Review {match_id}",
+            f"{pages}/#/match/{quote(match_id, safe='')}",
+        ),
+        "status": ("Status of all matches", f"{pages}/status"),
+    }
+    for key, (text, address) in links.items():
+        _show_artifact(partial(create_link_artifact, address, text, key=key))
 
 
 def _show_artifact(show: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever Prefect gives

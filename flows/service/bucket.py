@@ -28,10 +28,8 @@ LOG = logging.getLogger("worldpose.operations")
 class BucketInbox:
     """Matches below one address, each in its own folder as in an inbox folder.
 
-    Attributes:
-        url: `s3://bucket/prefix`; credentials and endpoint come from the environment, as for a
-            project.
-        inbox: destination folder.
+    The address is `s3://bucket/prefix`; credentials and endpoint come from the environment, as for
+    a project.
     """
 
     def __init__(self, url: str, inbox: Path, state: StateFolder) -> None:
@@ -52,9 +50,7 @@ class BucketInbox:
     def fetch(self, now: float, quiet: float) -> list[str]:
         """Copy each match without recent changes; return their names.
 
-        Args:
-            now: time on the monotonic clock [s].
-            quiet: required time without changes [s].
+        `now` is on the monotonic clock, `quiet` the required time without changes [s].
         """
         fetched = []
         for name, objects in self._list_objects().items():

@@ -33,9 +33,7 @@ class DeliveryError(Exception):
 class Channel:
     """One channel; its address can contain a secret, and is never printed.
 
-    Attributes:
-        name: name in logs and in the state folder.
-        address: http(s) address of a webhook, or an Apprise URL.
+    The address is that of a webhook, or an Apprise URL.
     """
 
     name: str
@@ -186,11 +184,7 @@ def channels_of(environment: Mapping[str, str], file: Path | None = None) -> tup
 
 
 def _kind(address: str) -> str:
-    """Return `webhook`, or the service of an Apprise URL.
-
-    Raises:
-        UsageError: it is neither.
-    """
+    """Return `webhook`, or the service of an Apprise URL."""
     try:
         parts = urlsplit(address)
         is_web = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0

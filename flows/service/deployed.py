@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from prefect import flow
-from prefect.artifacts import create_markdown_artifact, create_table_artifact
 from prefect.context import FlowRunContext
 from prefect.runtime import flow_run
 from prefect.task_runners import TaskRunner
@@ -31,7 +30,7 @@ from flows.reprocess import reprocess_matches
 from flows.run_plan import plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
 from flows.running import RunRequest, keep_settings, kept_iterations
-from flows.service.artifacts import show_at_prefect
+from flows.service.artifacts import link_pages, show_at_prefect
 from flows.service.inbox import take_in
 from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name, title_of
 from flows.service.plan import ServePlan
@@ -95,9 +94,9 @@ def match(
         iteration=1,
         time_limits=time_limits or {},
     )
-    context, runs = FlowRunContext.get(), match_runs_of(store.url)
-    if runs is not None and context is not None and context.flow_run is not None:
-        runs.link_pages(str(context.flow_run.id), match_id)  # a run of Prefect's form has none
+    runs = match_runs_of(store.url)
+    if runs is not None:
+        link_pages(runs.pages, match_id)
     with alone_with(store, match_id):
         latest = latest_run(store, match_id)
         request = keep_settings(store, match_id, latest, request)
@@ -113,7 +112,7 @@ def _iterate_until_decided(
     """Iterate a match now and after each verdict."""
     request = _on_own_workers(request)
     while True:
-        with show_at_prefect(store, match_id):
+        with show_at_prefect(match_id):
             record = iterate_match(store, open_match(store, match_id), request, iterations).record
         open_questions = waiting_for_verdicts(record.waiting)
         if record.failed or not open_questions:
@@ -136,7 +135,7 @@ def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunR
                 continue
             if latest.state == "complete":
                 return latest
-        with show_at_prefect(store, match_id):
+        with show_at_prefect(match_id):
             reporter().run_planned(expected_work(store, opened, plan.missing, latest))
             log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
             record = run_stages(log, request.time_limits)
@@ -178,20 +177,6 @@ def ingest(plan: dict[str, Any]) -> list[str]:
     )
     for arrival in decided:
         LOG.info("%s: %s %s", arrival.name, arrival.state, arrival.reason)
-    if decided:
-        create_table_artifact(
-            key="arrivals",
-            table=[
-                {
-                    "arrival": each.name,
-                    "state": each.state,
-                    "match": each.match_id or "",
-                    "why": each.reason,
-                }
-                for each in decided
-            ],
-            description=f"What arrived in {served.inbox}",
-        )
     return [arrival.match_id for arrival in decided if arrival.match_id]
 
 
@@ -291,11 +276,6 @@ def release(
     write_release(store, origin, list(formats), folder, name, licence)
     report = folder.with_name(f"{folder.name}-report.html")
     write_report(store, opened, report, run_id=run.record.run_id, videos=False)
-    create_markdown_artifact(
-        f"Run {run.record.run_id} of {match_id}\n\n- files: `{folder}`\n- report: `{report}`",
-        key="release",
-        description=f"Release {name} of {match_id}",
-    )
     return str(folder)
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from prefect import Flow
 from prefect.utilities.callables import parameter_schema
 
 from flows.orchestration.prefect_api import PrefectApi
-from flows.service.forms import form_schema, offer, offered_matches
 from flows.service.layout import PRIORITIES
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan, deployment_name
@@ -21,10 +20,6 @@ from worldpose.errors import InputError
 
 MODULE: Final = "flows.service.deployed"
 """Module of the deployed flows; it starts Prefect's task runner when it is imported."""
-
-
-def _of_project(plan: ServePlan) -> dict[str, Any]:
-    return {"project": plan.project}
 
 
 @dataclass(frozen=True)
@@ -36,17 +31,17 @@ class Deployed:
         about: description.
         queue: default queue of its runs; None = that of the pool of arrivals.
         parameters: parameters from the plan.
-        interval: option of the plan that is the interval of its runs [min]; None = no schedule.
         fixed: parameters of the plan that a run must not change: the project that it processes, and
             the code that its workers run.
+        is_polled: whether it runs at the interval of the plan's `poll_minutes`.
     """
 
     flow: str
     about: str
     queue: str | None
-    parameters: Callable[[ServePlan], dict[str, Any]] = field(default=_of_project)
-    interval: str | None = None
+    parameters: Callable[[ServePlan], dict[str, Any]] = lambda plan: {"project": plan.project}
     fixed: tuple[str, ...] = ("project",)
+    is_polled: bool = False
 
 
 DEPLOYED: Final = (
@@ -61,14 +56,10 @@ DEPLOYED: Final = (
         "Take in the matches that have arrived in the inbox.",
         None,
         lambda plan: {"plan": plan.model_dump(mode="json")},
-        interval="poll_minutes",
         fixed=("plan",),
+        is_polled=True,
     ),
-    Deployed(
-        "reprocess",
-        "Start a run of every match with results that an edit made stale.",
-        None,
-    ),
+    Deployed("reprocess", "Start a run of every match with results that an edit made stale.", None),
     Deployed("release", "Freeze a match's complete run under a name, with a report.", None),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
 )
@@ -76,7 +67,7 @@ DEPLOYED: Final = (
 DEFAULT_QUEUE: Final = "default"
 """Queue that each of Prefect's pools has."""
 POLL: Final = "poll-interval"
-"""Slug of the schedule of `Deployed.interval`; all others are the operator's."""
+"""Slug of our schedule; all others are the operator's."""
 
 
 def pools(plan: ServePlan) -> tuple[str, str]:
@@ -113,7 +104,6 @@ def _deploy(prefect: PrefectApi, plan: ServePlan, deployed: Deployed) -> tuple[s
     flow: Flow[..., Any] = getattr(importlib.import_module(MODULE), deployed.flow)
     matches, arrivals = pools(plan)
     parameters = json.loads(json.dumps(deployed.parameters(plan)))
-    form = form_schema(parameter_schema(flow).model_dump(), deployed.fixed)
     wanted: dict[str, Any] = {
         "description": deployed.about,
         "entrypoint": f"{MODULE}.{deployed.flow}",
@@ -121,7 +111,7 @@ def _deploy(prefect: PrefectApi, plan: ServePlan, deployed: Deployed) -> tuple[s
         "pull_steps": [],
         "job_variables": {},
         "parameters": parameters,
-        "parameter_openapi_schema": offer(form, ()),
+        "parameter_openapi_schema": json.loads(parameter_schema(flow).model_dump_json()),
         "work_pool_name": arrivals if deployed.queue is None else matches,
         "work_queue_name": deployed.queue or DEFAULT_QUEUE,
         "enforce_parameter_schema": False,  # the worker checks, with the flow that it runs
@@ -130,25 +120,17 @@ def _deploy(prefect: PrefectApi, plan: ServePlan, deployed: Deployed) -> tuple[s
     there = prefect.deployment(name)
     if there is None:
         of_flow = prefect.ask("/flows/", {"name": flow.name})["id"]
-        polling = [{"schedule": _every(plan, deployed.interval), "slug": POLL}]
-        there = prefect.ask(
-            "/deployments/",
-            {
-                "name": name.partition("/")[2],
-                "flow_id": of_flow,
-                "schedules": polling if deployed.interval else [],
-                **wanted,
-            },
-        )
+        polling = [{"schedule": _polling(plan), "slug": POLL}] if deployed.is_polled else []
+        new = {"name": name.partition("/")[2], "flow_id": of_flow, "schedules": polling}
+        there = prefect.ask("/deployments/", {**new, **wanted})
     else:
         _update(prefect, plan, deployed, there, wanted)
     fixed = {name: parameters[name] for name in deployed.fixed}
     return there["id"], Installed(flow, fixed)
 
 
-def _every(plan: ServePlan, option: str | None) -> dict[str, float] | None:
-    """Return Prefect's schedule whose interval is an option of the plan."""
-    return None if option is None else {"interval": 60.0 * getattr(plan, option)}
+def _polling(plan: ServePlan) -> dict[str, float]:
+    return {"interval": 60.0 * plan.poll_minutes}
 
 
 def _update(
@@ -164,20 +146,15 @@ def _update(
     """
     place = f"/deployments/{there['id']}"
     before = there["parameters"].get("plan") or {}
-    option = deployed.interval
-    if option is not None and before.get(option) != getattr(plan, option):
+    if deployed.is_polled and before.get("poll_minutes") != plan.poll_minutes:
         # Otherwise the schedule stays, also if the operator has changed it or removed it.
         for schedule in there["schedules"]:
             if schedule["slug"] == POLL:
-                changed = {"schedule": _every(plan, option)}
+                changed = {"schedule": _polling(plan)}
                 prefect.ask(f"{place}/schedules/{schedule['id']}", changed, method="PATCH")
-    form = wanted["parameter_openapi_schema"]
-    known = {name: it for name, it in there["parameters"].items() if name in form["properties"]}
-    wanted = {
-        **wanted,
-        "parameters": {**known, **wanted["parameters"]},
-        "parameter_openapi_schema": offer(form, offered_matches(there["parameter_openapi_schema"])),
-    }
+    fields = wanted["parameter_openapi_schema"]["properties"]
+    known = {name: it for name, it in there["parameters"].items() if name in fields}
+    wanted = {**wanted, "parameters": {**known, **wanted["parameters"]}}
     if any(there[name] != value for name, value in wanted.items()):
         prefect.ask(place, wanted, method="PATCH")
 

@@ -25,14 +25,7 @@ AGAIN: Final = "End worldpose serve and begin it again: it installs what is miss
 
 @dataclass(frozen=True)
 class Finding:
-    """Check result of one part of the service.
-
-    Attributes:
-        part: its name.
-        is_well: whether it works as expected.
-        state: its state, as text.
-        remedy: how to fix it if it does not work.
-    """
+    """Check result of one part of the service."""
 
     part: str
     is_well: bool
@@ -88,12 +81,7 @@ def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
 
 
 def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
-    """Check that deployments exist, that a worker takes their runs, and that no run hangs.
-
-    Args:
-        serving: the served project.
-        login: login of clients at its server; None = it needs none.
-    """
+    """Check that deployments exist, that a worker takes their runs, and that no run hangs."""
     prefect = PrefectApi(serving.prefect, login, tries=1)
     try:
         names = {flow: deployment_name(serving.name, flow) for flow in FLOWS}

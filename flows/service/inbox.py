@@ -37,10 +37,7 @@ LONGEST_SUMS: Final = 1 << 28
 class Entry:
     """One entry of the inbox.
 
-    Attributes:
-        path: its path.
-        name: path below the inbox for display and storage.
-        priority: priority that the containing folder states.
+    The name is the path below the inbox; the containing folder states the priority.
     """
 
     path: Path
@@ -180,10 +177,7 @@ Begin = Callable[[Match, Arrival], str]
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
     """Scan the inbox, save its state, and return the names of complete arrivals.
 
-    Args:
-        state: holds the known state of the inbox.
-        inbox: the folder.
-        quiet: time without changes after which an arrival is complete [s].
+    An arrival is complete after `quiet` seconds without changes.
     """
     with state.only_one("arrivals", wait=False) as is_held:
         ready = _scan(state, inbox, quiet) if is_held else []
@@ -197,14 +191,7 @@ def take_in(
 
     A call after a kill registers nothing twice and starts no second run. An arrival whose intake
     ended the process (out of memory, a crash) is processed last at the next attempt, and is refused
-    after `MAX_DEATHS`.
-
-    Args:
-        store: the project.
-        state: holds the known state of the inbox.
-        inbox: the folder.
-        quiet: time without changes after which an arrival is complete [s].
-        begin: starts a match's run.
+    after `MAX_DEATHS`. `begin` starts a match's run.
     """
     decided = []
     with state.only_one("arrivals", wait=True):

@@ -25,11 +25,7 @@ PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")
 
 @dataclass(frozen=True)
 class StateFolder:
-    """State folder of a served project: it holds no results, and secrets only in `secrets/`.
-
-    Attributes:
-        folder: `<project>/operations`, or as given.
-    """
+    """State folder of a served project: it holds no results, and secrets only in `secrets/`."""
 
     folder: Path
 

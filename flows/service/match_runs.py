@@ -23,7 +23,6 @@ from pydantic import JsonValue
 from data_contracts.operations import Priority
 from flows.orchestration.prefect_api import (
     PrefectApi,
-    UnreachablePrefectError,
     of_types,
     parse_time,
 )
@@ -48,14 +47,8 @@ ENDED: Final = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
 class MatchRun:
     """A run of the deployment that processes matches.
 
-    Attributes:
-        id: Prefect's id.
-        match_id: its match.
-        state: type of its state, as `RUNNING`.
-        message: message of its state.
-        link: its page in Prefect's dashboard.
-        is_due: whether its time has come; a run of a schedule is created long before it.
-        ended_at: when it ended; None = not yet.
+    `state` is the type of its state, as `RUNNING`, and `link` its page in Prefect's dashboard. A
+    run of a schedule is created long before it is due. `ended_at` is None until it ends.
     """
 
     id: str
@@ -76,9 +69,7 @@ class MatchRun:
 class MatchRuns(PrefectApi):
     """Runs of matches of one served project.
 
-    Attributes:
-        name: name of the project's deployments.
-        pages: address of the review pages, to which runs link; empty if unknown.
+    `pages` is the address of the review pages, to which runs link; empty if unknown.
     """
 
     name: str = "worldpose"
@@ -112,11 +103,8 @@ class MatchRuns(PrefectApi):
     ) -> MatchRun:
         """Create a run of a match; the worker starts it in its turn.
 
-        Args:
-            match_id: a registered match.
-            priority: queue of the run.
-            key: a second call with the same key returns the run of the first; None = always new.
-            **parameters: parameters of the flow other than the match; None leaves the default.
+        A second call with the same key returns the run of the first. A parameter that is None has
+        the default of the flow.
 
         Raises:
             UnreachablePrefectError: no run was created.
@@ -131,29 +119,7 @@ class MatchRuns(PrefectApi):
             # A request that is repeated after a lost answer creates no second run.
             idempotency_key=key or f"once-{uuid.uuid4()}",
         )
-        run = self._run(created)
-        self.link_pages(run.id, match_id)
-        return run
-
-    def link_pages(self, run_id: str, match_id: str) -> None:
-        """Link a run to the pages of its match, once; a failure is logged and stops nothing."""
-        if not self.pages:
-            return
-        links = {
-            f"review-{artifact_key(match_id)}": (
-                f"Review {match_id}",
-                f"{self.pages}/#/match/{quote(match_id, safe='')}",
-            ),
-            "status": ("Status of all matches", f"{self.pages}/status"),
-        }
-        try:
-            there = self.list_all("artifacts", artifacts={"flow_run_id": {"any_": [run_id]}})
-            for key in links.keys() - {artifact["key"] for artifact in there}:
-                text, address = links[key]
-                artifact = {"key": key, "type": "markdown", "data": f"[{text}]({address})"}
-                self.ask("/artifacts/", {**artifact, "flow_run_id": run_id})
-        except UnreachablePrefectError as error:
-            LOG.warning("the run of %s is not linked to its pages: %s", match_id, error)
+        return self._run(created)
 
     def active(self) -> list[MatchRun]:
         """Return all runs that have not ended, first to last, without those of a later time."""
@@ -210,11 +176,7 @@ def artifact_key(match_id: str) -> str:
 
 
 def match_runs_of(url: str) -> MatchRuns | None:
-    """Return the runs of a project that a service on this machine serves now; None without one.
-
-    Args:
-        url: folder or URL of the store.
-    """
+    """Return the runs of a project that a service on this machine serves now; None without one."""
     state = served_state(url)
     serving = state.read_serving()
     if serving is None or "serve" not in serving.services:

@@ -39,12 +39,7 @@ ARRIVAL_STATES: Final = ("arriving", "incomplete", "refused", "taken")
 
 
 class ProjectMetrics(Collector):
-    """Prometheus collector for a project.
-
-    Attributes:
-        store: the project.
-        state: state of its arrivals and alerts.
-    """
+    """Prometheus collector for a project."""
 
     def __init__(self, store: Store, state: StateFolder) -> None:
         self.store, self.state = store, state
@@ -103,10 +98,7 @@ def exposition(metrics: ProjectMetrics) -> bytes:
 def metrics_app(plan: ServePlan, metrics: ProjectMetrics, token: str) -> ASGIApp:
     """Create the application with `/metrics` and `/health`, for requests that name its server.
 
-    Args:
-        plan: address and names of the server.
-        metrics: collector behind `/metrics`.
-        token: required by `/metrics`, as `Authorization: Bearer TOKEN`.
+    `/metrics` requires the token, as `Authorization: Bearer TOKEN`.
     """
     expected = f"Bearer {token}".encode()
 
@@ -156,7 +148,7 @@ def _unit_metrics(matches: list[MatchStatus]) -> Iterator[Metric]:
 def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
     """Yield the metrics that gates judge: the worst of a match's units, and the limit."""
     worst, limits = {}, {}
-    for gate in GATES:
+    for gate in GATES.values():
         for name, limit in gate.limits:
             limits[gate.stage, name] = limit
             for match in matches:

@@ -115,9 +115,8 @@ class Overview:
     def look(self, budget: float = math.inf) -> list[MatchStatus]:
         """Return the status of every match; an unreadable match does not affect others.
 
-        Args:
-            budget: time after which no further match is read [s]; at least `ALWAYS_READ` are, those
-                first that were not read for longest. The others have their last status.
+        After the budget [s] no further match is read; at least `ALWAYS_READ` are, those first that
+        were not read for longest. The others have their last status.
         """
         names = self.store.matches()
         begun = time.monotonic()
@@ -192,7 +191,7 @@ class Overview:
         manifest = self._manifest(run.match_id, stage, unit, run.results[name])
         decision = last_decision(records, name, manifest.content)
         is_approved = decision is not None and decision.verdict == "approve"
-        gate = {each.stage: each for each in GATES}.get(stage)
+        gate = GATES.get(stage)
         objections = () if gate is None or is_approved else gate.objections(manifest.figures)
         waits = next((each for each in run.waiting if each.unit == name), None)
         done = UnitSummary(

@@ -14,8 +14,8 @@ from typing import Any, Final
 from flows.orchestration.cluster_errors import LostWorkersError
 from flows.orchestration.prefect_api import PrefectApi, of_types, parse_time
 from flows.service.layout import is_alive
-from flows.service.match_runs import MatchRuns, run_name, title_of
-from flows.service.plan import TITLES, ServePlan, deployment_name, deployment_names
+from flows.service.match_runs import MatchRuns
+from flows.service.plan import ServePlan, deployment_names
 
 SILENT: Final = timedelta(seconds=90)
 """Without a heartbeat for so long, a run is checked; heartbeats come every 30 s."""
@@ -42,11 +42,9 @@ def restart_lost_runs(
 ) -> list[str]:
     """Reschedule runs that were killed or lost their machines; return their names.
 
-    Args:
-        plan: the served project.
-        at_start: no run is active yet, so with a Prefect server of our own even an apparently
-            active run was killed with the previous service.
-        since: runs that ended earlier were seen by a previous call; None = none were.
+    At the start no run is active yet: with a Prefect server of our own, even an apparently active
+    run was killed with the previous service. Runs that ended before `since` were seen by a previous
+    call.
     """
     prefect, deployments = MatchRuns.of_plan(plan), deployment_names(plan.name)
     if at_start and plan.owns_prefect:
@@ -70,20 +68,6 @@ def restart_lost_runs(
         LOG.warning("%s: %s; it restarts", run["name"], why)
         prefect.set_state(run["id"], "SCHEDULED", why, "AwaitingRetry")
     return [run["name"] for run in lost]
-
-
-def name_scheduled_runs(plan: ServePlan) -> None:
-    """Name the runs that Prefect has created for a schedule, which get random words from it."""
-    prefect = MatchRuns.of_plan(plan)
-    wanted = {"state": of_types("SCHEDULED"), "tags": {"all_": ["auto-scheduled"]}}
-    for flow in ("match", *TITLES):
-        deployment = deployment_name(plan.name, flow).partition("/")[2]
-        for run in prefect.runs([deployment], **wanted):
-            due = run["next_scheduled_start_time"]
-            if run["auto_scheduled"] and due is not None:
-                name = run_name(title_of(flow, run["parameters"]), parse_time(due))
-                if run["name"] != name:
-                    prefect.ask(f"/flow_runs/{run['id']}", {"name": name}, method="PATCH")
 
 
 def may_restart(run: PrefectRun) -> bool:

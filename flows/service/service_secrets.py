@@ -33,10 +33,7 @@ METRICS_TOKEN: Final = "WORLDPOSE_METRICS_TOKEN"
 class Secrets:
     """Secrets of a served project's parts, passed as environment variables.
 
-    Attributes:
-        pages: login token of the review pages.
-        metrics: token for Prometheus.
-        prefect: login of Prefect's server; None = an external server without login.
+    `prefect` is the login of its server; None = an external server without login.
     """
 
     pages: str
@@ -67,10 +64,6 @@ class Secrets:
 def secrets_of(plan: ServePlan, pages: str) -> Secrets:
     """Return the secrets of a project before it is served; stored secrets are created once.
 
-    Args:
-        plan: the served project.
-        pages: login token of the review pages.
-
     Raises:
         UsageError: the token for metrics is short.
     """
@@ -95,11 +88,7 @@ def secrets_of(plan: ServePlan, pages: str) -> Secrets:
 def kept_secret(file: Path, make: Callable[[], str]) -> str:
     """Return a secret from a file that only this user can read; create it if missing.
 
-    A secret that other users can read or write is replaced.
-
-    Args:
-        file: file in a folder that only this user can read.
-        make: returns a new secret, one line.
+    A secret that other users can read or write is replaced. Only this user can read its folder.
     """
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     file.parent.chmod(0o700)

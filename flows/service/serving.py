@@ -52,15 +52,8 @@ Tell = Callable[[str], None]
 class _Part:
     """A supervised process.
 
-    Attributes:
-        name: name of the part.
-        address: address for people.
-        log: file of its output.
-        process: None until its restart.
-        said: size of its log before the start [byte].
-        began: start time on the monotonic clock [s].
-        pause: pause before the last start [s].
-        due: time of the next start [s].
+    It has no process until its restart. `said` is the size of its log before the start [byte];
+    `began` and `due` are on the monotonic clock [s].
     """
 
     name: str
@@ -73,11 +66,7 @@ class _Part:
     due: float = 0.0
 
     def wait_until(self, is_well: Callable[[], bool], told: threading.Event) -> None:
-        """Wait until it is well, or the service is told to end.
-
-        Raises:
-            WorldposeError: it ended, or took too long.
-        """
+        """Wait until it is well, or the service is told to end."""
         deadline = time.monotonic() + BEGIN_SECONDS
         while not told.wait(0.2):
             has_ended = self.process is None or self.process.poll() is not None
@@ -90,13 +79,7 @@ class _Part:
 
 @dataclass
 class _Supervisor:
-    """Keeps the parts running.
-
-    Attributes:
-        plan: the served project.
-        secrets: secrets of its parts.
-        tell: receives lines for the operator.
-    """
+    """Keeps the parts running."""
 
     plan: ServePlan
     secrets: Secrets
@@ -180,11 +163,7 @@ class _Supervisor:
 def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Tell) -> None:
     """Serve a project until SIGINT or SIGTERM.
 
-    Args:
-        plan: the served project and its options.
-        secrets: secrets of its parts.
-        ready: called when all parts answer.
-        tell: receives lines for the operator.
+    `ready` is called when all parts answer; `tell` receives lines for the operator.
 
     Raises:
         InputError: a port is taken.

@@ -78,10 +78,8 @@ def routes(context: PageContext) -> APIRouter:
 class StatusRow:
     """A match on the page.
 
-    Attributes:
-        match: its status.
-        at_work: state of its run as the other pages have it; None if none is at work.
-        prefect: page of its latest run at Prefect; empty if unknown.
+    `at_work` is the state of its run as the other pages have it, `prefect` the page of its latest
+    run there; empty if unknown.
     """
 
     match: MatchStatus
@@ -104,12 +102,7 @@ def status_html(
 ) -> str:
     """Render the page; every name and message is escaped.
 
-    Args:
-        rows: all matches.
-        arrivals: state of the inbox.
-        dashboard: address of Prefect's dashboard; empty if unknown.
-        inbox: path of the inbox; empty if unknown.
-        opened: id of the match whose cameras are shown, if there are more than `MAX_DETAILS`.
+    Of more matches than `MAX_DETAILS`, only the `opened` one shows its cameras.
     """
     seen = {stage for row in rows for stage in row.match.stages}
     shown = [row.match for row in rows]

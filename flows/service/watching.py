@@ -15,19 +15,12 @@ from typing import Final
 from flows.orchestration.prefect_api import of_types, parse_time
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
 from flows.service.channels import Channel, channels_of
-from flows.service.forms import offer_matches
 from flows.service.inbox import watch_once
 from flows.service.match_runs import MatchRuns, run_name
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan, deployment_names
-from flows.service.recovery import (
-    ENDED_BADLY,
-    PrefectRun,
-    may_restart,
-    name_scheduled_runs,
-    restart_lost_runs,
-)
+from flows.service.recovery import ENDED_BADLY, PrefectRun, may_restart, restart_lost_runs
 from flows.service.service_secrets import METRICS_TOKEN
 from flows.web.http_server import serve_http
 from worldpose.store.store import Store
@@ -67,7 +60,6 @@ def watch(plan: ServePlan) -> None:
         settle = plan.settle_seconds
         fetch = lambda: bucket.fetch(time.monotonic(), settle)  # noqa: E731
         _start("looking at the bucket", BUCKET_SECONDS, fetch)
-    _start("naming runs and matches", ALERT_SECONDS, lambda: _name_all(plan, store))
     _start("looking for lost runs", ALERT_SECONDS, _restart_lost_runs(plan))
     _start("looking for alerts", ALERT_SECONDS, _hold_alerts(plan, store, dispatcher))
     for channel in dispatcher.channels:
@@ -84,11 +76,7 @@ def watch(plan: ServePlan) -> None:
 
 
 class Trouble:
-    """Failure log of a repeated operation: a lasting failure is logged once, then hourly.
-
-    Attributes:
-        what: name of the operation.
-    """
+    """Failure log of a repeated operation: a lasting failure is logged once, then hourly."""
 
     def __init__(self, what: str) -> None:
         self.what = what
@@ -138,11 +126,6 @@ def _look_at_inbox(plan: ServePlan) -> None:
     time.sleep(9.0 * (time.monotonic() - began))  # a tenth of the time, however long a scan takes
 
 
-def _name_all(plan: ServePlan, store: Store) -> None:
-    name_scheduled_runs(plan)
-    offer_matches(plan, store.matches())
-
-
 def _restart_lost_runs(plan: ServePlan) -> Callable[[], None]:
     looked: datetime | None = None  # the first look takes all runs that ever failed
 
@@ -180,9 +163,7 @@ def _deliver(dispatcher: AlertDispatcher, channel: Channel) -> None:
 def failed_runs(plan: ServePlan, began: datetime) -> list[FailedRun]:
     """Return failed runs of this project's deployments that do not restart, or have not in time.
 
-    Args:
-        plan: the served project.
-        began: start of the restarts; runs that ended before had to wait for it.
+    Runs that ended before the restarts `began` had to wait for them.
     """
     now = datetime.now(UTC)
     since = {"after_": (now - timedelta(days=FAILED_DAYS)).isoformat()}

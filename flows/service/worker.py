@@ -42,9 +42,7 @@ JOB_TEMPLATE: Final[dict[str, Any]] = {
 class Installed:
     """A flow that the worker can run.
 
-    Attributes:
-        flow: the flow.
-        fixed: parameters that a run must not change.
+    A run must not change the fixed parameters.
     """
 
     flow: Flow[..., Any]
@@ -57,10 +55,6 @@ class RefusedRunError(Exception):
 
 def require_installed(run: FlowRun, installed: Mapping[str, Installed]) -> Installed:
     """Return the installed flow of a run.
-
-    Args:
-        run: run from the server.
-        installed: flows by deployment id.
 
     Raises:
         RefusedRunError: the run belongs to another deployment, sets variables of its job, or has
@@ -97,8 +91,7 @@ class _OwnJob(BaseJobConfiguration):
 class ServedWorker(BaseWorker[_OwnJob, BaseVariables, BaseWorkerResult]):
     """Worker that runs installed flows in processes with this process's environment.
 
-    Attributes:
-        installed: flows by deployment id.
+    It knows the installed flows by deployment id.
     """
 
     type = "worldpose"
@@ -171,9 +164,7 @@ async def _end(process: anyio.abc.Process) -> None:
 async def work(pools: tuple[str, ...], installed: Mapping[str, Installed]) -> None:
     """Run due flow runs of work pools until this process ends.
 
-    Args:
-        pools: names of the pools.
-        installed: flows that can run; a run of any other flow fails.
+    A run of a flow that is not installed fails.
     """
     async with anyio.create_task_group() as group:
         for pool in pools:

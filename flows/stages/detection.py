@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from data_contracts.detection import detection_unit
-from data_contracts.redetection import redetection_name
+from data_contracts.detection import detection_unit, redetection_name
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import ingest
 from worldpose.detection.models import weights_of

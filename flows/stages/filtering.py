@@ -71,11 +71,7 @@ def redetection_sources(match: Match, unit: str) -> dict[str, JsonValue]:
 def seen_in(run: Container[str], match: Match, camera_id: str, clip_id: str) -> str:
     """Return the result with all of a static camera's people in a clip that a run used.
 
-    Args:
-        run: names of the run's results, as `stage/unit`.
-        match: the match.
-        camera_id: the static camera.
-        clip_id: the clip.
+    `run` has the names of its results, as `stage/unit`.
     """
     again = (name for name in detection.again(match, camera_id, clip_id) if name in run)
     return next(again, detection.seen_by(match, camera_id, clip_id))

@@ -39,12 +39,8 @@ from worldpose.store.store import Store
 class PageContext:
     """Shared context of all pages.
 
-    Attributes:
-        store: the project.
-        access: access control.
-        previews: clicks of the last preview of each camera, by match and camera, and the expected
-            errors of the camera that they give [m].
-        continuing: runs started or resumed from a page.
+    `previews` has the clicks of the last preview of each camera, by match and camera, and the
+    expected errors of the camera that they give [m].
     """
 
     store: Store
@@ -106,9 +102,6 @@ class Continuing:
 
     Without a service there is no worker: the pages run one match after another, each by `worldpose
     run` in its own process, which survives the end of the pages.
-
-    Attributes:
-        store: the project.
     """
 
     store: Store
@@ -190,11 +183,7 @@ class Continuing:
         return {match_id: run.link for match_id, run in latest.items()}
 
     def _look(self) -> _Seen | None:
-        """Return the runs of the service, of the last seconds; None without a service.
-
-        Raises:
-            UnreachablePrefectError: Prefect does not answer, or did not a moment ago.
-        """
+        """Return the runs of the service, of the last seconds; None without a service."""
         served = match_runs_of(self.store.url)
         if served is None:
             return None
@@ -247,11 +236,7 @@ class _Seen:
 
 @dataclass
 class LocalRuns:
-    """Runs of pages without a service, one after another.
-
-    Attributes:
-        store: the project.
-    """
+    """Runs of pages without a service, one after another."""
 
     store: Store
     _waiting: list[tuple[str, str | None]] = field(default_factory=list)

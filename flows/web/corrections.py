@@ -13,7 +13,7 @@ from pydantic import Field
 from data_contracts.records import Count, Name, Record
 from data_contracts.review import Correction, Edit
 from data_contracts.run import GatePolicy
-from flows.review.corrections import keep_edits
+from flows.review.corrections import keep_edits, owner_of
 from flows.review.descriptions import in_words, is_first_click
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
@@ -88,12 +88,8 @@ class WithdrawingGroup(Record):
 class Group:
     """Corrections of one person at one camera or clip in one session.
 
-    Attributes:
-        owner: the camera or clip.
-        who: the person.
-        is_first: whether all are first clicks: made before a run calibrated the camera, so that
-            they correct nothing.
-        corrections: each with the reason why it no longer applies; None if it applies.
+    First clicks were made before a run calibrated the camera, so that they correct nothing. Each
+    correction has the reason why it no longer applies, None if it applies.
     """
 
     owner: str
@@ -119,7 +115,7 @@ def group_corrections(match: Match) -> list[Group]:
     groups: list[Group] = []
     open_groups: dict[tuple[str, str, bool], Group] = {}
     for each in match.journal.standing.values():
-        key = (_owner(each), each.who, is_first_click(each))
+        key = (owner_of(each.edit), each.who, is_first_click(each))
         group = open_groups.get(key)
         if group is None or each.made_at - group.corrections[-1][0].made_at > SESSION_GAP:
             group = open_groups[key] = Group(key[0], key[1], key[2])
@@ -212,8 +208,3 @@ def _find(match: Match, group_id: str) -> Group:
         if group.id == group_id:
             return group
     raise HTTPException(409, "the group is not there any more: look again")
-
-
-def _owner(correction: Correction) -> str:
-    edit = correction.edit
-    return str(getattr(edit, "camera", None) or getattr(edit, "clip", ""))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
-from threading import Lock
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -166,8 +167,10 @@ class Group:
 
 def _add_views(router: APIRouter, context: PageContext) -> None:
     """Add the route of the other cameras' views."""
-    known: dict[tuple[Any, ...], Group] = {}
-    lock = Lock()
+
+    @lru_cache(CACHED_PEOPLE)
+    def find_group(match_id: str, state: Hashable, owner: str, frame: int, detection: int) -> Group:
+        return _group(context, context.match(match_id), owner, frame, detection)
 
     @router.get("/views")
     def views(
@@ -182,14 +185,8 @@ def _add_views(router: APIRouter, context: PageContext) -> None:
         match = context.match(match_id)
         if owner not in {camera.id for camera in match.folder.spec.static_cameras}:
             return {"person": None, "views": [], "here": None}
-        runs = context.store.runs(match_id)
-        said = len(match.journal.entries)
-        place = (match_id, runs[-1:], said, owner, frame, detection)
-        with lock:
-            while len(known) >= CACHED_PEOPLE:
-                known.pop(next(iter(known)))
-            group = known.get(place) or _group(context, match, owner, frame, detection)
-            known[place] = group
+        state = (*context.store.runs(match_id)[-1:], len(match.journal.entries))
+        group = find_group(match_id, state, owner, frame, detection)
         at = None if x is None or y is None or joint is None else (x, y)
         if owner not in group.names or (joint is not None and not 0 <= joint < len(COCO17)):
             return {"person": None, "views": [], "here": None}
@@ -197,11 +194,7 @@ def _add_views(router: APIRouter, context: PageContext) -> None:
 
 
 def _group(context: PageContext, match: Match, owner: str, frame: int, detection: int) -> Group:
-    """Return a detection's person by tracks and corrections, with its detections in all cameras.
-
-    Raises:
-        InputError: there is no such detection in the latest run.
-    """
+    """Return a detection's person by tracks and corrections, with its detections in all cameras."""
     clip = next(iter(match.folder.spec.clips_with(frame)), None)
     cameras = static_cameras(open_run(context.store.url, match.match_id), match.folder.spec)
     names = list(cameras)

@@ -46,8 +46,8 @@ from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.validation import validate_record
 from worldpose.store.store import Store
 from worldpose.video.files import VideoReader, index_frames
-from worldpose.video.folder import HEADER_BYTES, declared_size
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
+from worldpose.video.folder import declared_size
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 
@@ -104,10 +104,7 @@ class Draft(Record):
 class Drafts:
     """The drafts of an inbox.
 
-    Attributes:
-        inbox: folder of arriving matches.
-        folders: folders whose videos people can pick.
-        store: the project, whose ids are taken.
+    People can pick videos from the folders; ids of the store's matches are taken.
     """
 
     inbox: Path
@@ -491,12 +488,8 @@ def _choose_name(title: str, taken: set[str]) -> str:
 
 
 def _still_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of a still.
-
-    Raises:
-        InputError: no image.
-    """
-    size = declared_size(np.fromfile(path, dtype=np.uint8, count=HEADER_BYTES)) or (0, 0)
+    """Return width and height [px] of a still."""
+    size = declared_size(np.fromfile(path, dtype=np.uint8)) or (0, 0)
     read_still(path, size)
     return size
 

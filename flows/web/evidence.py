@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from threading import Lock
 from typing import Any, Final
 
@@ -56,17 +57,15 @@ class Evidence:
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the evidence for one review request."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
-    drawn: dict[tuple[str, str], Evidence] = {}
     lock, videos = Lock(), DrawnFiles()
 
+    @lru_cache(CACHED_REVIEWS)
+    def draw(match_id: str, request: str) -> Evidence:
+        return draw_evidence(context.store, *context.review(match_id, request))
+
     def evidence_of(match_id: str, request: str) -> Evidence:
-        match, asked = context.review(match_id, request)
         with lock:  # one at a time: drawing needs memory for all images
-            if (match_id, request) not in drawn:
-                while len(drawn) >= CACHED_REVIEWS:
-                    drawn.pop(next(iter(drawn)))
-                drawn[match_id, request] = draw_evidence(context.store, match, asked)
-            return drawn[match_id, request]
+            return draw(match_id, request)
 
     @router.get("/evidence")
     def evidence(match_id: str, request: str) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from threading import Lock
 from typing import Any, Final
 
 import h11
@@ -41,10 +40,8 @@ LOG = logging.getLogger("worldpose.pages")
 class _Connection:
     """An open connection.
 
-    Attributes:
-        socket: its socket.
-        deadline: time on the monotonic clock at which it is closed unless the client acts [s]; None
-            while the server computes a response.
+    It is closed at the deadline of the monotonic clock unless its client acts [s]; None while the
+    server computes a response.
     """
 
     socket: socket.socket
@@ -55,13 +52,11 @@ class _Connection:
 class Connections:
     """Open connections of a server; connections whose clients are too slow are closed.
 
-    Attributes:
-        limit: maximum number of open connections.
+    Only the event loop of the server calls it.
     """
 
     limit: int = MAX_CONNECTIONS
     _open: dict[Any, _Connection] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
     _closed: int = 0
     _told: float = float("-inf")
 
@@ -72,37 +67,34 @@ class Connections:
 
     def admit(self, connection: socket.socket, address: object) -> None:
         """Register a connection; beyond the limit, close the oldest that waits for its client."""
-        with self._lock:
-            self._open[address] = _Connection(connection, time.monotonic() + REQUEST_SECONDS)
-            if len(self._open) <= self.limit:
-                return
-            self._forget_closed()
-            waiting = (at for at, each in self._open.items() if each.deadline is not None)
-            if len(self._open) > self.limit:
-                self._close(next(waiting, address))
+        self._open[address] = _Connection(connection, time.monotonic() + REQUEST_SECONDS)
+        if len(self._open) <= self.limit:
+            return
+        self._forget_closed()
+        waiting = (at for at, each in self._open.items() if each.deadline is not None)
+        if len(self._open) > self.limit:
+            self._close(next(waiting, address))
 
     def expect(self, address: object, seconds: float | None) -> None:
         """Start a deadline for the client of a connection [s]; None while the server computes."""
-        with self._lock:
-            if address in self._open:
-                deadline = None if seconds is None else time.monotonic() + seconds
-                self._open[address].deadline = deadline
+        if address in self._open:
+            deadline = None if seconds is None else time.monotonic() + seconds
+            self._open[address].deadline = deadline
 
     def sweep(self) -> None:
         """Close the connections whose deadline has passed; called every second."""
-        with self._lock:
-            self._forget_closed()
-            now = time.monotonic()
-            for address, each in list(self._open.items()):
-                if each.deadline is not None and each.deadline < now:
-                    self._close(address)
-            if self._closed and now - self._told > LOG_SECONDS:
-                LOG.warning(
-                    "%s connections were closed: no whole request came within %g s, or more than "
-                    "%s were open",
-                    *(self._closed, REQUEST_SECONDS, self.limit),
-                )
-                self._closed, self._told = 0, now
+        self._forget_closed()
+        now = time.monotonic()
+        for address, each in list(self._open.items()):
+            if each.deadline is not None and each.deadline < now:
+                self._close(address)
+        if self._closed and now - self._told > LOG_SECONDS:
+            LOG.warning(
+                "%s connections were closed: no whole request came within %g s, or more than "
+                "%s were open",
+                *(self._closed, REQUEST_SECONDS, self.limit),
+            )
+            self._closed, self._told = 0, now
 
     def _close(self, address: object) -> None:
         """Shut a connection down in both directions; its reader then closes the file."""
@@ -295,9 +287,6 @@ def _port_error(option: str, host: str, port: int, error: OSError) -> InputError
 
 
 def _is_free(host: str, port: int) -> bool:
-    with ExitStack() as opened:
-        try:
-            _listen(opened, host, port)
-        except OSError:
-            return False
-    return True
+    with ExitStack() as opened, suppress(OSError):
+        return bool(_listen(opened, host, port))
+    return False

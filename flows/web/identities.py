@@ -103,9 +103,7 @@ def _person(found: Identities, ways: NDArray[np.float64], person: int, step: int
 def _ways(found: Identities, tracked: xr.Dataset) -> NDArray[np.float64]:
     """Return the ground positions (frames, persons, 2) [m]: mid-hips or feet, NaN if unknown.
 
-    Args:
-        found: identities with all corrections.
-        tracked: the tracks of the latest run, which have the places of feet.
+    The tracks of the latest run have the places of feet.
     """
     hips = found.joints[:, :, HIPS, :2].astype(np.float64)
     known = np.asarray(np.isfinite(hips).all(axis=3))
@@ -125,11 +123,7 @@ def _ways(found: Identities, tracked: xr.Dataset) -> NDArray[np.float64]:
 
 
 def _crop(store: Store, match: Match, found: Identities, person: int, frame: int) -> Image:
-    """Return one person from the view with the largest image of the person.
-
-    Raises:
-        HTTPException: 404, no camera with a video shows the person.
-    """
+    """Return one person from the view with the largest image of the person."""
     import cv2  # imported here: few pages decode an image
 
     k, f = found.person.tolist().index(person), int(np.searchsorted(found.frame, frame))

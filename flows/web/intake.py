@@ -36,9 +36,7 @@ FRAME_PX: Final = 960
 class Intake:
     """Where pages put new matches, and where they find videos.
 
-    Attributes:
-        inbox: folder of arriving matches.
-        folders: folders whose videos people can pick, read-only.
+    The folders are read-only.
     """
 
     inbox: Path

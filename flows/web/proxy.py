@@ -30,10 +30,8 @@ HeaderName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]+$")]
 class Visitor:
     """Person whom a trusted proxy has logged in.
 
-    Attributes:
-        who: the person's name.
-        role: the highest role of the person's groups; None if no group has one.
-        secure: whether the person's browser speaks TLS with the proxy.
+    The role is the highest of the person's groups, None if no group has one; `secure` says whether
+    the browser speaks TLS with the proxy.
     """
 
     who: str

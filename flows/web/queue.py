@@ -254,7 +254,8 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
 
 
 def _excess(request: ReviewRequest) -> float:
-    return next((g.excess(request.figures) for g in GATES if g.stage == request.gate), 0.0)
+    gate = GATES.get(request.gate)
+    return 0.0 if gate is None else gate.excess(request.figures)
 
 
 def _clicks(match: Match, camera: str) -> int:

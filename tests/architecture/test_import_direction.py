@@ -5,7 +5,7 @@ import functools
 import re
 import subprocess
 import sys
-from graphlib import CycleError, TopologicalSorter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -83,14 +83,6 @@ def test_imports_point_one_way(package):
     assert backward_imports(package, FORBIDDEN[package]) == []
 
 
-def test_a_backward_import_is_seen(tmp_path):
-    (tmp_path / "worldpose").mkdir()
-    (tmp_path / "worldpose" / "late.py").write_text("def f():\n    from flows.match import x\n")
-    assert backward_imports("worldpose", FORBIDDEN["worldpose"], tmp_path) == [
-        "worldpose/late.py imports flows.match"
-    ]
-
-
 def test_every_package_of_worldpose_has_a_place_in_the_order():
     files = (ROOT / "worldpose").rglob("*.py")
     found = {path.relative_to(ROOT / "worldpose").parts[0].removesuffix(".py") for path in files}
@@ -111,15 +103,6 @@ def later_imports(order, root=ROOT):
 
 def test_packages_of_worldpose_import_earlier_ones_only():
     assert later_imports(ORDER_IN_WORLDPOSE) == []
-
-
-def test_an_import_of_a_later_package_is_seen(tmp_path):
-    package = tmp_path / "worldpose" / "geometry"
-    package.mkdir(parents=True)
-    (package / "lens.py").write_text("from worldpose.simulation.settings import x\n")
-    assert later_imports(ORDER_IN_WORLDPOSE, tmp_path) == [
-        "worldpose/geometry/lens.py imports worldpose.simulation.settings"
-    ]
 
 
 def test_only_the_object_store_module_reaches_for_the_network_library():
@@ -211,24 +194,6 @@ def module_imports(root, packages):
 
 def test_no_modules_import_each_other_in_a_circle():
     TopologicalSorter(module_imports(ROOT, FORBIDDEN)).prepare()
-
-
-def test_a_circle_through_a_package_and_a_late_import_is_found(tmp_path):
-    sources = {
-        "__init__": "from one.c import value",
-        "a": "from one import value",
-        "b": "def late():\n    from one import a",
-        "c": "import one.b\nvalue = 1",
-    }
-    (tmp_path / "one").mkdir()
-    for name, source in sources.items():
-        (tmp_path / "one" / f"{name}.py").write_text(source)
-    imports = module_imports(tmp_path, ["one"])
-    assert imports["one.a"] == {"one.c"}
-    with pytest.raises(CycleError):
-        TopologicalSorter(imports).prepare()
-    del imports["one.b"]
-    TopologicalSorter(imports).prepare()
 
 
 HEAVY = ("numba", "scipy", "cv2", "av", "zarr", "xarray", "torch", "pandas", "matplotlib")

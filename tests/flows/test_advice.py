@@ -56,7 +56,7 @@ def run(noise, cameras, freedom=8.0):
 
 
 def test_noisy_clicks_of_several_cameras_are_told_with_the_setting():
-    (text,) = click_advice(run(3.0, 10), 1.0)
+    (text,) = click_advice(run(3.0, 10), {})
     # 80 degrees of freedom: 3 / sqrt(160).
     assert "10 cameras are 3.0 px off (standard error 0.2 px), stated are 1 px" in text
     assert text.endswith("--set static_calibration.click_noise_px=3")
@@ -67,4 +67,5 @@ def test_noisy_clicks_of_several_cameras_are_told_with_the_setting():
     [(1.0, 10, 1.0), (1.2, 40, 1.0), (3.0, 1, 1.0), (3.0, 10, 3.0), (0.4, 10, 1.0), (1.5, 2, 1.0)],
 )
 def test_honest_or_few_clicks_are_not(noise, cameras, stated):
-    assert click_advice(run(noise, cameras), stated) == []
+    settings = {"static_calibration": {"click_noise_px": stated}}
+    assert click_advice(run(noise, cameras), settings) == []

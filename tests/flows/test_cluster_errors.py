@@ -2,7 +2,6 @@
 
 import time
 from contextlib import closing
-from types import SimpleNamespace
 
 import dask
 import httpx
@@ -69,25 +68,3 @@ def test_workers_that_cannot_import_their_modules_are_told(monkeypatch):
         pytest.raises(WorldposeError, match="No worker process started within 5 s"),
     ):
         local_cluster.wait_for_worker(cluster)
-
-
-@pytest.mark.parametrize(
-    ("units", "workers"),
-    [
-        (17 * [("ingest", {"frame_count": 3000})] + 16 * [("static_calibration", {})], 1),
-        (16 * [("static_calibration", {"still": "stills/cam00.png"})], 1),
-        (30 * [("static_calibration", {"still": "stills/cam00.png"})], 3),
-        (2 * [("ingest", {"frame_count": 3000, "video": {"path": "videos/cam00.mp4"}})], 2),
-        (16 * [("ingest", {"frame_count": 270_000})], 3),
-        ([("tracking", {})], 1),
-        ([], 1),
-    ],
-)
-def test_a_second_worker_is_for_work_that_takes_longer_than_its_start(monkeypatch, units, workers):
-    monkeypatch.setattr(local_cluster.os, "cpu_count", lambda: 3)
-    missing = [
-        SimpleNamespace(recipe=SimpleNamespace(stage=stage, sources=sources))
-        for stage, sources in units
-    ]
-    assert local_cluster.workers_for(None, missing) == workers
-    assert local_cluster.workers_for(2, missing) == 2

@@ -105,7 +105,7 @@ def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_app
 def test_always_asks_behind_every_gate_in_turn(store):
     asked = []
     units_of = {stage.name: stage.units(open_match(store, TINY)) for stage in METHOD}
-    gates = [gate.stage for gate in GATES if units_of[gate.stage]]
+    gates = [gate.stage for gate in GATES.values() if units_of[gate.stage]]
     for _ in gates:
         record = run(store, "always")
         assert record.state == "waiting"

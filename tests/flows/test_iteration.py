@@ -140,7 +140,8 @@ def looped(monkeypatch):
             return record(request.iteration, errors[request.iteration - 1], state)
 
         monkeypatch.setattr(iterate, "run_match", run)
-        monkeypatch.setattr(iterate, "_plan", lambda *_: SimpleNamespace(missing=[]))
+        monkeypatch.setattr(iterate, "Gatekeeper", lambda *_: None)
+        monkeypatch.setattr(iterate, "plan_ahead", lambda *_: SimpleNamespace(missing=[]))
         monkeypatch.setattr(iterate, "_recorded_run", lambda *_: None)
         monkeypatch.setattr(iterate, "keep_settings", lambda *given: given[-1])
         monkeypatch.setattr(
@@ -206,6 +207,7 @@ def test_a_part_of_the_method_has_no_iterations():
         iterate_match(None, None, RunRequest({}, until_stage="tracking"), 2)
 
 
+@pytest.mark.slow  # with a server and workers of its own
 def test_the_command_runs_two_iterations_on_the_workers_of_one_run(tmp_path):
     short = tmp_path / "match"
     succeed("simulate", "--scenario", "tiny", "--duration", 0.3, "--no-stills", "--out", short)

@@ -106,6 +106,7 @@ def test_a_proposal_is_drawn_accepted_and_kept(folder, tiny, tmp_path):
     assert np.linalg.norm(np.array(camera["center"]) - true.center) < 3.0
 
 
+@pytest.mark.slow
 def test_an_unclear_proposal_waits_with_its_image_and_the_reason(folder, tmp_path):
     write_image(folder, "cam01", middle_of_the_pitch(), side="far")
     project = tmp_path / "project"

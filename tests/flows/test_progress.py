@@ -1,6 +1,5 @@
 """Progress reports of a running run."""
 
-import functools
 import io
 import os
 import pty
@@ -15,23 +14,13 @@ import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 from rich.console import Console
 
-from data_contracts.match import MatchSpec
 from flows import progress
 from flows.cli import console
 from flows.progress import MOST_TOLD, Reporter
 from flows.registering import open_match
 from flows.run_plan import plan_run
-from flows.run_record import (
-    DETECTION_SECONDS,
-    PAINT_SECONDS,
-    UNIT_SECONDS,
-    expected_work,
-    first_seconds,
-    latest_run,
-    require_no_other_run,
-)
+from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
 from flows.web.app_context import read_progress
-from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.documents import seal
 from worldpose.store.store import Store
 
@@ -123,25 +112,6 @@ def test_expected_work_comes_from_the_latest_run(project_copy):
     first = UNIT_SECONDS["tracking"] * 1.2 / 20.0 * 6.0 / 16.0  # 1.2 s in six cameras
     expected = {"tracking": pytest.approx(3.0 * first)}
     assert expected_work(store, match, units * 3, None) == expected
-
-
-def test_a_first_run_is_expected_to_take_as_long_as_its_footage_asks(tmp_path):
-    clip = {"id": "clip", "frame_count": 150, "broadcast": "tv"}
-    cameras = [{"id": name, "width": 3840, "height": 2160} for name in ("left", "right")]
-    cameras.append({"id": "tv", "kind": "broadcast", "width": 1920, "height": 1080})
-    spec = MatchSpec(match_id="match", fps=50.0, cameras=cameras, clips=[clip])
-    folder = MatchFolder(tmp_path, spec, {}, {}, None, {"left": tmp_path / "left.mp4"}, {}, {}, {})
-    left, right, broadcast = spec.cameras
-    (clip,) = spec.clips
-    seconds = functools.partial(first_seconds, folder)
-    assert seconds("detection", left, clip) == pytest.approx(150 * 4 * DETECTION_SECONDS)
-    assert seconds("detection", broadcast, clip) == pytest.approx(150 * DETECTION_SECONDS)
-    assert seconds("static_calibration", left, None) == PAINT_SECONDS
-    assert seconds("proposal", left, None) == PAINT_SECONDS
-    assert seconds("static_calibration", right, None) == UNIT_SECONDS["static_calibration"]
-    assert seconds("tracking", None, clip) == pytest.approx(2.8 * 3.0 / 20.0 * 2.0 / 16.0)
-    assert seconds("broadcast_calibration", None, clip) == pytest.approx(40.0 * 3.0 / 20.0)
-    assert seconds("ingest", None, clip) == UNIT_SECONDS["ingest"]
 
 
 def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):

@@ -5,7 +5,7 @@ import pytest
 
 from data_contracts.run import RunRecord
 from flows.results import comparison
-from flows.results.comparison import BodiesOfBoth, compare_runs, count_marks, pair_people
+from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
@@ -65,32 +65,6 @@ def test_better_and_worse_together_are_mixed(compared):
     assert (person.kind, person.name, person.mark) == ("player", "clip: person 1", "mixed")
     # Less jerk may be too much smoothing: it is not judged.
     assert len(person.figures) == 2
-
-
-def test_bodies_are_those_that_were_fitted_last(compared):
-    first, again = {"residual_m.person1": 0.020}, {"residual_m.person1": 0.010}
-    found = compared(
-        {"body_fitting/clip": first}, {"body_fitting/clip": first, "refitting/clip": again}
-    )
-    assert found["player clip: person 1"].mark == "better"
-
-
-def test_figures_of_a_clip_tell_of_its_cameras_and_the_match(compared):
-    before = {
-        "filtering/clip": {"held_out_error": 0.04, "rejected_share.cam01": 0.02},
-        "bundle_adjustment/cameras": {"held_out_error_after_px": 2.0},
-    }
-    after = {
-        "filtering/clip": {"held_out_error": 0.03, "rejected_share.cam01": 0.05},
-        "bundle_adjustment/cameras": {"held_out_error_after_px": 2.01},
-    }
-    found = compared(before, after)
-    assert {name: change.mark for name, change in found.items()} == {
-        "match cameras": "unchanged",
-        "clip clip": "better",
-        "camera cam01": "worse",
-    }
-    assert count_marks(list(found.values()), "camera") == {"worse": 1}
 
 
 def test_people_are_compared_by_who_they_are(compared):

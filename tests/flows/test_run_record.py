@@ -7,7 +7,7 @@ from command_line import TINY
 
 from data_contracts.review import MergedTracks
 from flows import iterate, run_record
-from flows.gates import IDENTITIES, IdentityLimits
+from flows.gates import GATES, IdentityLimits
 from flows.iterate import Iteration, iterate_match
 from flows.method import METHOD
 from flows.registering import open_match
@@ -97,8 +97,8 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
 
 def test_a_run_that_asks_no_person_warns_of_a_result_that_is_probably_wrong(store, monkeypatch):
     assert not [text for text in recorded(store, METHOD).warnings if "may be wrong" in text]
-    strict = replace(IDENTITIES, limits=IdentityLimits(mean_ray_distance_m=0.0))
-    monkeypatch.setattr(run_record, "GATES", (strict,))
+    strict = replace(GATES["tracking"], limits=IdentityLimits(mean_ray_distance_m=0.0))
+    monkeypatch.setattr(run_record, "GATES", {"tracking": strict})
     (text,) = (text for text in recorded(store, METHOD).warnings if "may be wrong" in text)
     assert text.startswith("tracking/clip may be wrong: mean ray distance: 0.")
     assert "--gates auto" in text

@@ -24,7 +24,12 @@ class Told:
         results = dict.fromkeys(self.units, "key")
         executed = tuple(self.units)
         return SimpleNamespace(
-            run_id=run, seconds=22.0, started_at=BEGUN, executed=executed, results=results
+            match_id=match,
+            run_id=run,
+            seconds=22.0,
+            started_at=BEGUN,
+            executed=executed,
+            results=results,
         )
 
     def manifest(self, match, stage, unit, key):

@@ -15,17 +15,17 @@ from fuzz.kinds import KINDS
 from worldpose.errors import InputError, InternalError
 
 ROOT = Path(__file__).parents[2]
-SAMPLE = {"cases": 48, "seed": 1}
 
 
-def test_a_sample_of_cases_ends_without_a_defect(tmp_path):
+@pytest.mark.parametrize("cases", [16, pytest.param(48, marks=pytest.mark.slow)])
+def test_a_sample_of_cases_ends_without_a_defect(tmp_path, cases):
     """Longer: python -m tests.fuzz --cases 5000 --seed S --out DIR."""
-    command = [sys.executable, "-m", "tests.fuzz", "--out", str(tmp_path)]
-    command += [text for name, value in SAMPLE.items() for text in (f"--{name}", str(value))]
+    command = [sys.executable, "-m", "tests.fuzz", "--seed", "1", "--cases", str(cases)]
+    command += ["--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ)
     assert done.returncode == 0, done.stdout + done.stderr
     outcomes = [json.loads(line) for line in (tmp_path / "cases.jsonl").read_text().splitlines()]
-    assert len(outcomes) == SAMPLE["cases"]
+    assert len(outcomes) == cases
     assert {"right", "refused"} <= {outcome["class"] for outcome in outcomes}
     assert "harmless right" in done.stdout
 

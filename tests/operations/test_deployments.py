@@ -17,18 +17,15 @@ from prefect.client.schemas.objects import FlowRun
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 from service import wait_until
 
-from data_contracts.release import EXPORT_FORMATS
-from flows.method import METHOD
-from flows.orchestration import suspension
+from flows.orchestration import prefect_api, suspension
 from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError
 from flows.service import recovery, watching
 from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, install
-from flows.service.forms import offer_matches
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import FLOWS, ServePlan, deployment_name
-from flows.service.recovery import name_scheduled_runs, restart_lost_runs
+from flows.service.recovery import restart_lost_runs
 from flows.service.watching import failed_runs
 from flows.service.worker import RefusedRunError, ServedWorker, require_installed
 from flows.web import app_context
@@ -125,7 +122,6 @@ def test_a_restart_keeps_what_an_operator_set(plan, prefect):
     (inbox,) = found["ingest"]["schedules"]
     update("ingest", f"/schedules/{inbox['id']}", active=False)
     update("release", "/pause_deployment", "POST")
-    offer_matches(plan, ("lab",))
     update("reprocess", "/schedule", "POST", min_runs=3)
     before, planned = look()
     assert len(planned) >= 3
@@ -149,39 +145,33 @@ def planned_runs(prefect, deployment):
     return prefect.list_all("flow_runs", flow_runs=wanted)
 
 
-def test_forms_ask_for_typed_values_and_offer_choices(plan, prefect):
-    def forms():
-        found = deployments(prefect)
-        return {flow: it["parameter_openapi_schema"]["properties"] for flow, it in found.items()}
-
-    offer_matches(plan, ("lab", "away"))
-    install(plan)
-    found = forms()
-    assert found["match"]["match_id"]["enum"] == ["away", "lab"]
-    assert found["match"]["until_stage"]["enum"] == [stage.name for stage in METHOD]
-    assert set(found["match"]["gates"]["enum"]) == {"never", "auto", "always"}
-    assert found["release"]["formats"]["items"]["enum"] == list(EXPORT_FORMATS)
-    assert found["reprocess"]["matches"]["items"]["enum"] == ["away", "lab"]
-    for form in found.values():
-        assert not {"project", "plan"} & set(form)  # a run must not change them
-        for field in form.values():
-            assert field.get("type") not in (None, "null") and "anyOf" not in field, field
-    offer_matches(plan, ())
-    assert "enum" not in forms()["match"]["match_id"]
-
-
 def test_runs_have_readable_names_of_their_own(plan, prefect):
     run = prefect.start("lab", priority="urgent", key="twice", gates="never")
     assert prefect.start("lab", key="twice").id == run.id
     assert [each.id for each in prefect.active() if each.match_id == "lab"] == [run.id]
-    ingest = deployments(prefect)["ingest"]["id"]
-    prefect.ask(f"/deployments/{ingest}/schedule", {"min_runs": 3})
-    name_scheduled_runs(plan)
-    named = {each["name"] for each in planned_runs(prefect, ingest)}
-    pattern = r", \d\d \w{3} \d\d:\d\d:\d\d"
-    assert len(named) >= 3
-    assert all(re.fullmatch(f"inbox{pattern}", name) for name in named)
-    assert re.fullmatch(f"lab{pattern}", prefect.ask(f"/flow_runs/{run.id}")["name"])
+    name = prefect.ask(f"/flow_runs/{run.id}")["name"]
+    assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", name)
+
+
+def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
+    plan, prefect, monkeypatch
+):
+    monkeypatch.setattr(app_context, "match_runs_of", lambda url: prefect)
+    continuing = Continuing(Store.create(plan.project))
+    first = continuing.go_on("clicked", gates="never")
+    assert (first["state"], first["how"]) == ("running", "the deployment")
+    assert "waits for its turn" in continuing.go_on("clicked")["how"]
+    state = continuing.state("clicked")
+    assert (state["state"], state["prefect"]) == ("running", first["prefect"])
+    continuing.go_on("clicked too")
+    assert "before it" in continuing.state("clicked too")["lines"][0]
+    (run,) = (run for run in prefect.active() if run.match_id == "clicked")
+    prefect.set_state(run.id, "RUNNING", "")
+    assert "once more" in continuing.go_on("clicked")["how"]
+    runs = [run for run in prefect.active() if run.match_id.startswith("clicked")]
+    assert [run.match_id for run in runs].count("clicked") == 2
+    for each in runs:  # no other test finds them
+        prefect.set_state(each.id, "CANCELLED", "")
 
 
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
@@ -260,6 +250,7 @@ def test_killed_runs_begin_again_and_no_others(plan, prefect, monkeypatch):
     given = {
         "crashed": ("CRASHED", None),
         "dead": ("RUNNING", dead),
+        "starting": ("PENDING", dead),
         "alive": ("RUNNING", alive),
         "waits": ("PAUSED", dead),
         "done": ("COMPLETED", dead),
@@ -273,8 +264,10 @@ def test_killed_runs_begin_again_and_no_others(plan, prefect, monkeypatch):
     # A run that has given a sign of life a moment ago is not looked after yet; later it is.
     monkeypatch.setattr(recovery, "SILENT", recovery.SILENT * 0)
     assert restart_lost_runs(plan) == ["dead"]
-    expected = {"crashed": "AwaitingRetry", "dead": "AwaitingRetry", "alive": "Running"}
-    assert states() == {**expected, "waits": "Suspended", "done": "Completed"}
+    monkeypatch.setattr(recovery, "STARTING", recovery.STARTING * 0)
+    assert restart_lost_runs(plan) == ["starting"]
+    again = dict.fromkeys(("crashed", "dead", "starting"), "AwaitingRetry")
+    assert states() == {**again, "alive": "Running", "waits": "Suspended", "done": "Completed"}
     # When the service starts, none of its runs is at work; on a server of others they may be.
     others = plan.model_copy(update={"owns_prefect": False})
     assert restart_lost_runs(others, at_start=True) == ["alive"]  # silent there
@@ -295,6 +288,7 @@ def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, prefect):
     assert (failed["poison"].state, failed["poison"].message) == ("crashed", "killed")
 
 
+@pytest.mark.slow  # a worker, and the processes of two runs
 def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, monkeypatch):
     own = {"project": str(tmp_path), "state": tmp_path / "operations", "name": "worked"}
     plan = plan.model_copy(update=own)
@@ -322,52 +316,42 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
     assert "absent" in prefect.ask(f"/flow_runs/{absent.id}")["state"]["message"]
 
 
-HUNDREDS = (
-    ("old-match", 1, "FAILED"),
-    ("crashed-match", 40, "CRASHED"),
-    *[("failed-match", 70, "FAILED")] * 3,
-    *[("paused-match", 70, "PAUSED")] * 3,
-)
+PAGES = {
+    "old-match": (1, "FAILED"),
+    "crashed-match": (6, "CRASHED"),
+    "failed-match": (11, "FAILED"),
+    "paused-match": (11, "PAUSED"),
+}
+"""Number and state of the runs that are made of a match."""
 
 
-@pytest.fixture(scope="module")
-def hundreds(plan):
-    """Give the server 210 failed runs of a match, 40 crashed and 210 suspended ones of others.
-
-    Prefect lists them by random ids, so that a page of 200 lacks some of each.
-    """
-    prefect = MatchRuns.of_plan(plan)
-    deployment = prefect.deployment(plan.match_deployment)["id"]
-    for part, (match, count, state) in enumerate(HUNDREDS):
+@pytest.fixture
+def pages_of_runs(plan, prefect, monkeypatch):
+    """Give the server more runs than an answer of Prefect holds, which lists them by random ids."""
+    monkeypatch.setattr(prefect_api, "PAGE", 5)
+    for match, (count, state) in PAGES.items():
         run = {
             "state": {"type": state, "message": "made"},
             "parameters": {"project": plan.project, "match_id": match},
         }
-        # A request whose answer came too late is sent again; by its key a run is made once.
-        missing = [
-            {**run, "name": f"{match}, {number}", "idempotency_key": f"{part}, {number}"}
-            for number in range(count)
-        ]
-        while missing:  # SQLite's one writer was busy
-            made = prefect.ask(f"/deployments/{deployment}/create_flow_run/bulk", missing)
-            done = [each["status"] == "CREATED" for each in made["results"]]
-            missing = [each for each, is_there in zip(missing, done, strict=True) if not is_there]
+        for name in (f"{match}, {number}" for number in range(count)):
+            prefect.create_run("match", name=name, idempotency_key=name, **run)
 
 
-def test_runs_are_found_among_hundreds(plan, prefect, hundreds, monkeypatch):
+def test_runs_are_found_on_all_pages(plan, prefect, pages_of_runs, monkeypatch):
     def failed_by_match():
         failed = failed_runs(plan, datetime.now(UTC))
         return Counter(each.match_id for each in failed), failed
 
     counts, _ = failed_by_match()
-    assert (counts["failed-match"], counts["crashed-match"]) == (210, 0)
+    assert (counts["failed-match"], counts["crashed-match"]) == (11, 0)
     monkeypatch.setattr(watching, "RESTART_PATIENCE", timedelta(0))
     counts, failed = failed_by_match()
-    assert (counts["failed-match"], counts["crashed-match"]) == (210, 40)
+    assert (counts["failed-match"], counts["crashed-match"]) == (11, 6)
     (message,) = {each.message for each in failed if each.match_id == "crashed-match"}
     assert message == "made; it was not restarted"
     again = restart_lost_runs(plan)
-    assert sorted(again) == sorted(f"crashed-match, {number}" for number in range(40))
+    assert sorted(again) == sorted(f"crashed-match, {number}" for number in range(6))
     ask, resumed = PrefectApi.ask, set()
 
     def note_resumed(api, path, *body, **method):
@@ -379,14 +363,14 @@ def test_runs_are_found_among_hundreds(plan, prefect, hundreds, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(PrefectApi, "ask", note_resumed)
         suspension.resume_suspended(plan.project, "paused-match")
-    assert len(resumed) == 210
+    assert len(resumed) == 11
     # The pages show the last run of every match; their second look asks for later runs alone.
     monkeypatch.setattr(app_context, "match_runs_of", lambda url: prefect)
     monkeypatch.setattr(app_context, "FRESH_SECONDS", 0.0)
     continuing = Continuing(Store.create(plan.project))
     for _ in range(2):
         assert continuing.state("old-match")["lines"] == ["made"]
-        assert continuing.links().keys() >= {match for match, _, _ in HUNDREDS}
+        assert continuing.links().keys() >= PAGES.keys()
 
 
 def test_a_server_that_refuses_or_is_gone_is_named(plan):

@@ -178,19 +178,6 @@ def test_serve_is_given_options_that_it_has(setup):
     assert "--inbox=/inbox" in arguments
 
 
-def test_prometheus_scrapes_services_that_are_there():
-    scraped = yaml.safe_load((INFRA / "prometheus" / "prometheus.yml").read_text())
-    for job in scraped["scrape_configs"]:
-        for target in job["static_configs"][0]["targets"]:
-            host, _, port = target.partition(":")
-            text = str(SERVICES[host])
-            assert port in text, target
-    (rules,) = yaml.safe_load((INFRA / "prometheus" / "alerts.yml").read_text())["groups"]
-    assert all({"alert", "expr", "annotations"} <= set(rule) for rule in rules["rules"])
-    # The metrics server answers to the name under which it is scraped.
-    assert "--host-name=serve" in SERVICES["serve"]["command"]
-
-
 def manifests():
     files = yaml.safe_load(KUSTOMIZATION.read_text())["resources"]
     return [
@@ -301,13 +288,3 @@ def test_the_batch_script_is_a_shell_script_that_asks_for_its_arguments():
         "--preload tasks",
     ):
         assert text.index("COMM__REQUIRE_ENCRYPTION=true") < text.index(started)
-
-
-def test_the_image_is_made_of_what_is_there():
-    text = (INFRA / "container" / "Containerfile").read_text()
-    for sources in re.findall(r"^COPY (.+) \S+$", text, re.MULTILINE):
-        for source in sources.split():
-            assert (INFRA.parent / source).exists(), source
-    ignored = (INFRA / "container" / "Containerfile.ignore").read_text()
-    for source in re.findall(r"^COPY (\w+) \w+$", text, re.MULTILINE):
-        assert f"!{source}\n" in ignored

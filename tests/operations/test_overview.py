@@ -1,4 +1,4 @@
-"""Overview of a project: what waits for review, and which runs are active."""
+"""Overview of a project: what waits for review."""
 
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -25,19 +25,18 @@ FIGURES = {
 }
 
 
-def record(run_id="0002", waits=True):
+def record():
     """A run of one camera whose clicks need a review."""
-    waiting = WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,))
     return RunRecord.model_validate(
         {
-            "run_id": run_id,
+            "run_id": "0002",
             "match_id": "m",
             "parent": None,
-            "state": "waiting" if waits else "complete",
+            "state": "waiting",
             **{name: {} for name in ("settings", "overrides", "versions", "figures")},
             **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
             "results": {UNIT: "0" * 32},
-            "waiting": (waiting,) if waits else (),
+            "waiting": (WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,)),),
             "started_at": ASKED,
             "finished_at": ENDED,
             "seconds": 300.0,
@@ -64,10 +63,10 @@ def verdict(word):
 
 
 class Told:
-    """A fake store of one match: its latest run, its journal, and its unfinished runs."""
+    """A fake store of one match: its latest run and its journal."""
 
-    def __init__(self, latest, journal=(), begun=()):
-        self.latest, self.journal, self.begun = latest, journal, begun
+    def __init__(self, latest, journal=()):
+        self.latest, self.journal = latest, journal
 
     def matches(self):
         return ("m",)
@@ -79,7 +78,7 @@ class Told:
         return SimpleNamespace(content=CONTENT, seconds=2.0, figures=FIGURES, files=())
 
     def unfinished_runs(self, match):
-        return tuple(SimpleNamespace(run_id=run, started_at=at) for run, at in self.begun)
+        return ()
 
 
 @pytest.fixture
@@ -89,8 +88,8 @@ def glance(monkeypatch):
     journal = lambda store, match: SimpleNamespace(last=0, questions=store.journal)  # noqa: E731
     monkeypatch.setattr(overview, "read_journal", journal)
 
-    def look(*told, **more):
-        (match,) = Overview(Told(*told, **more)).look()
+    def look(*told):
+        (match,) = Overview(Told(*told)).look()
         return match
 
     return look
@@ -113,30 +112,3 @@ def test_a_result_waits_until_it_is_approved_itself(glance, journal, state, obje
     assert (stage, unit.unit, unit.state) == ("static_calibration", "cam03", state)
     assert (unit.objections, unit.waiting_since) == (objections, since)
     assert unit.why == (IN_WORDS if state == "waiting" else "")
-
-
-def test_where_nobody_is_asked_a_figure_beyond_its_limit_is_said_all_the_same(glance):
-    match = glance(record(waits=False))
-    ((_, unit),) = match.units
-    assert (match.state, unit.state, unit.objections) == ("complete", "done", (WRONG,))
-    assert (unit.seconds, unit.waiting_since) == (2.0, None)
-
-
-LATER, LATEST = ENDED + timedelta(hours=1), ENDED + timedelta(hours=2)
-
-
-@pytest.mark.parametrize(
-    ("begun", "state", "since"),
-    [
-        ([], "complete", None),
-        # Killed: a later run has ended since.
-        ([("0001", ASKED)], "complete", None),
-        ([("0001", ASKED), ("0003", LATER)], "at work", LATER),
-        ([("0003", LATER), ("0004", LATEST)], "at work", LATEST),
-    ],
-)
-def test_a_match_is_at_work_while_a_run_after_the_latest_has_begun(glance, begun, state, since):
-    match = glance(record(waits=False), begun=begun)
-    assert (match.state, match.at_work_since) == (state, since)
-    first = glance(None, begun=begun)
-    assert first.state == ("at work" if begun else "not run")

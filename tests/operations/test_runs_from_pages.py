@@ -19,8 +19,6 @@ from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
-LINKED_SECONDS = 1.0
-"""A run links back to its pages no later after its start."""
 
 
 @pytest.fixture
@@ -81,14 +79,13 @@ def require_one_after_another(served, store, names, runs):
         (link,) = [found[key] for key in found if key.startswith("review-")]
         match_id = run["parameters"]["match_id"]
         assert f":{served.ports['pages']}/#/match/{match_id})" in link["data"]
-        late = (moment(link["created"]) - moment(run["start_time"])).total_seconds()
-        assert late <= LINKED_SECONDS
     for name in names:
         (record,) = [store.run(name, run_id) for run_id in store.runs(name)]
         assert record.state == "complete"
         assert store.unfinished_runs(name) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_matches_started_on_pages_run_one_after_another(served, matches):
     store, names = matches(2)

@@ -3,21 +3,14 @@
 import base64
 import http.client
 import json
-import os
 import shutil
 import signal
-import subprocess
 import time
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
-from threading import Thread
 
 import psutil
 import pytest
-from chromium import CHROMIUM
 from listeners import listening, says_nothing
-from service import TOKEN, Served, fetch, wait_until
+from service import TOKEN, Served, wait_until
 from websockets.sync.client import connect
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -328,126 +321,3 @@ def test_secrets_that_are_kept_are_for_this_user_alone(served):
         command = " ".join(arguments_of(process))
         for secret in (TOKEN, served.secret("prefect"), served.secret("metrics")):
             assert secret not in command
-
-
-PAGE = Path(__file__).with_name("evil_page.html").read_text()
-
-
-@contextmanager
-def evil_server(given):
-    """Another site's web server, and what its page could do."""
-    seen = {}
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):
-            page = PAGE.replace("GIVEN", json.dumps(given)).encode()
-            self.send_response(200)
-            self.send_header("content-type", "text/html")
-            self.end_headers()
-            self.wfile.write(page)
-
-        def do_POST(self):
-            seen.update(json.loads(self.rfile.read(int(self.headers["content-length"]))))
-            self.send_response(204)
-            self.end_headers()
-
-        def log_message(self, *arguments):
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield server.server_port, seen
-    server.shutdown()
-    server.server_close()
-
-
-@contextmanager
-def browsing(folder, *arguments):
-    """The file of what a browser prints; it has a profile of its own, and leaves no process."""
-    folder.mkdir()
-    said = folder / "said"
-    command = [
-        *(CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run"),
-        # The site's name leads to this machine, as after rebinding.
-        "--host-resolver-rules=MAP evil.example 127.0.0.1",
-        *(f"--user-data-dir={folder / 'profile'}", *arguments),
-    ]
-    with (
-        said.open("wb") as out,
-        subprocess.Popen(
-            command, stdout=out, stderr=subprocess.DEVNULL, start_new_session=True
-        ) as running,
-    ):
-        try:
-            yield said
-        finally:
-            os.killpg(running.pid, signal.SIGKILL)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_a_page_of_another_site_reads_and_does_nothing_in_a_browser(served, pwned, tmp_path):
-    file, command = pwned
-    deployment = deployment_of(served)["id"]
-    before = runs_by_request(served)
-    at = {name: f"http://127.0.0.1:{port}" for name, port in served.ports.items()}
-    create = f"/api/deployments/{deployment}/create_flow_run"
-    given = {
-        "read": {
-            "deployments": f"{at['prefect']}/api/deployments/name/ingest/worldpose-ingest",
-            "health": f"{at['prefect']}/api/health",
-            "ui": f"{at['prefect']}/ui-settings",
-            "settings": f"{at['prefect']}/api/admin/settings",
-            "pages": f"{at['pages']}/api/matches",
-            "login": f"{at['pages']}/login",
-            "figures": f"{at['metrics']}/metrics",
-        },
-        "post": {
-            "run": at["prefect"] + create,
-            "run by another name": at["prefect"].replace("127.0.0.1", "localhost") + create,
-            "match": f"{at['pages']}/api/matches/small/runs",
-        },
-        "body": scheduled(command),
-        "sockets": {
-            "events": f"ws://127.0.0.1:{served.ports['prefect']}/api/events/in",
-            "pages": f"ws://127.0.0.1:{served.ports['pages']}/",
-        },
-    }
-    with evil_server(given) as (port, seen):
-        for name in ("evil.example", "localhost"):
-            seen.clear()
-            # With a debugging port the browser stays until it is ended.
-            with browsing(tmp_path / name, "--remote-debugging-port=0", f"http://{name}:{port}/"):
-                wait_until(lambda: seen)
-            blind = {"opaque"}  # sent without an answer that can be read
-            assert set(seen.values()) <= {"refused", *blind}, seen
-            assert len(seen) >= 20
-    assert runs_by_request(served) == before
-    for number, place in enumerate(("/", "/api/deployments/filter", "/ui-settings")):
-        rebound = f"http://evil.example:{served.ports['prefect']}{place}"
-        with browsing(tmp_path / f"rebound-{number}", "--dump-dom", rebound) as said:
-            # Some builds of Chromium print the page and do not end.
-            wait_until(lambda said=said: "</html>" in said.read_text())
-            assert "this server has another name" in said.read_text()
-    time.sleep(5.0)
-    assert not file.exists(), file.read_text()
-
-
-def test_a_service_begun_again_puts_the_pools_right_and_keeps_its_login(served):
-    login = served.secret("prefect")
-    served.end()
-    served.begin()
-    assert served.secret("prefect") == login
-
-    def is_right():
-        """Soon: a worker that was heard of before the restart counts as one that is there."""
-        pools = [served.ask(f"/work_pools/{name}") for name in ("worldpose", "worldpose-arrivals")]
-        chosen = [set(pool["base_job_template"]["variables"]["properties"]) for pool in pools]
-        deployment = deployment_of(served)
-        code = (deployment["entrypoint"], deployment["pull_steps"])
-        installed = ("flows.service.deployed.ingest", [])
-        return chosen == [set()] * 2 and code == installed
-
-    wait_until(is_right, served.explain)
-    assert served.check().json["healthy"], served.explain()
-    with pytest.raises(Exception, match="401"):
-        fetch(f"http://127.0.0.1:{served.ports['prefect']}/api/deployments/filter", {})

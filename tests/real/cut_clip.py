@@ -15,7 +15,7 @@ import static_pair
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.video.files import write_video
 from worldpose.video.folder import open_video
 

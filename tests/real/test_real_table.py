@@ -11,10 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
 from worldpose.detection.interfaces import People
-from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.video.files import write_video
 
@@ -42,26 +41,11 @@ def table(monkeypatch, capsys):
     return run
 
 
-def look_at(center, target, focal):
-    forward = np.asarray(target, float) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(
-        focal=np.full(2, focal),
-        principal_point=np.array([319.5, 179.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(rotation, -rotation @ center),
-        image_size=np.array(SIZE),
-    )
-
-
 def write_moving_clip(folder):
     """A clip of 6 frames that pans over painted lines, clicked in two frames, drawn in one."""
     folder.mkdir()
     pitch = PitchTemplate.standard()
-    cameras = [look_at(CENTER, [0.4 * t, -2.0, 0.0], 800.0) for t in range(6)]
+    cameras = [look_at_camera(CENTER, (0.4 * t, -2.0, 0.0), 800.0, SIZE) for t in range(6)]
     images, markings = [], []
     for camera in cameras:
         image = np.full((SIZE[1], SIZE[0], 3), (60, 140, 60), np.uint8)
@@ -106,7 +90,8 @@ def write_mvor(folder):
     joints = np.array([0.3, 0.2, 1.2]) + rng.uniform(-0.3, 0.3, (17, 3))
     from_room, intrinsics, detections = [], [], []
     for n, angle in enumerate((0.0, 2.1, 4.2)):
-        camera = look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 2.0]), [0, 0, 1.0], 540.0)
+        place = (3 * np.cos(angle), 3 * np.sin(angle), 2.0)
+        camera = look_at_camera(place, (0.0, 0.0, 1.0), 540.0, SIZE)
         matrix = np.eye(4)
         matrix[:3, :3] = camera.cam_from_world.rotation
         matrix[:3, 3] = 1000.0 * camera.cam_from_world.translation

@@ -17,7 +17,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
 

@@ -1,10 +1,9 @@
 """A clip's detections as input of an iteration, corrected by the previous iteration's results."""
 
 import numpy as np
-import pytest
 import xarray as xr
 
-from tasks.clip_inputs import PAGE, StoredFeedback, open_detections, read_rows, select_frames
+from tasks.clip_inputs import PAGE, StoredFeedback, open_detections
 
 DIMS = {
     "keypoints": ("detection", "joint", "axis"),
@@ -79,20 +78,3 @@ def test_who_was_looked_for_again_is_taken_as_he_was_found_this_time():
     detected = read(StoredFeedback([one], redetected=False))
     np.testing.assert_array_equal(detected[:, 0, 0], 100.0)
     assert np.isnan(detected[:, 0, 1]).all()
-
-
-def test_rows_of_a_store_are_those_of_the_list():
-    array = xr.DataArray(np.arange(40.0).reshape(10, 4))
-    for rows in ([0, 1, 2, 7, 9], [4], [0, 2, 4], range(10), []):
-        chosen = np.array(rows, dtype=np.int64)
-        np.testing.assert_array_equal(read_rows(array, chosen), array.values[chosen])
-
-
-def test_chosen_frames_are_those_of_their_numbers():
-    stored = xr.Dataset({"x": ("frame", np.arange(10))}, coords={"frame": np.arange(50, 60)})
-    for frames in ([50, 51, 52], [51, 54, 57], [50, 53, 54], [59], []):
-        found = select_frames(stored, np.array(frames, dtype=np.int64))
-        assert found["frame"].values.tolist() == frames
-        assert found["x"].values.tolist() == [frame - 50 for frame in frames]
-    with pytest.raises(KeyError):
-        select_frames(stored, np.array([59, 60]))

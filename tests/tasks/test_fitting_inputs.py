@@ -5,28 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from camera_builders import look_at_camera
 
 from tasks import refitting
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
-from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
-from worldpose.simulation.scene import look_at
 
 
 def beside(frames):
     """A camera 70 m beside the pitch (frames,), which looks at the origin."""
-    pose = look_at(np.array([0.0, -70.0, 15.0]), np.array([0.0, 0.0, 1.0]), 0.0)
-    return Camera(
-        focal=np.full((frames, 2), 4000.0),
-        principal_point=np.tile([959.5, 539.5], (frames, 1)),
-        distortion=np.zeros((frames, 5)),
-        cam_from_world=Rigid(
-            np.tile(pose.rotation, (frames, 1, 1)), np.tile(pose.translation, (frames, 1))
-        ),
-        image_size=np.tile([1920, 1080], (frames, 1)),
-    )
+    return Camera.stack([look_at_camera((0.0, -70.0, 15.0), (0.0, 0.0, 1.0), 4000.0)] * frames)
 
 
 def runner(frame):
@@ -70,24 +60,6 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_of
     assert pictures.late == late
     assert pictures.number.tolist() == [104, 105, 106]
     assert np.isfinite(pictures.camera.focal).all(axis=-1).tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize("late", [1.0, -2.0, 0.5])
-def test_lines_of_pictures_that_are_late_are_those_of_the_frames(late):
-    frame, camera = np.arange(12), beside(12)
-    keypoints = camera.project(runner(frame + late)[:, 0])[:, None]
-    seen, joints = xr.DataArray(keypoints), xr.DataArray(runner(frame))
-    views = refitting._BroadcastViews(frame, camera, late, seen, joints, None)
-    view, without = views(slice(0, 12))
-    assert without is None
-    there = view.seen[:, 0]
-    assert there.sum() >= 10
-    # He runs straight on, so that the middle of two of his places is one.
-    np.testing.assert_allclose(view.points[there], runner(frame)[there], atol=1e-6)
-    # 7 mrad a frame along the image, and what bends of it in between.
-    own = camera.project(runner(frame)[:, 0])[:, None]
-    here = constrain_to_rays(camera, own, runner(frame)).across
-    np.testing.assert_allclose(view.across[there], here[there], atol=1e-4)
 
 
 @pytest.mark.parametrize("late", [1.0, -2.0])

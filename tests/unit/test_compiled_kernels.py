@@ -5,13 +5,12 @@ import os
 import shutil
 import subprocess
 import sys
-from itertools import islice
 from pathlib import Path
 
 import pytest
 
 import worldpose.compiled
-from worldpose.cache_folder import find_cache_folder, own_temporary_folder
+from worldpose.cache_folder import own_temporary_folder
 from worldpose.sources import code_version
 
 ROOT = Path(worldpose.compiled.__file__).parents[1]
@@ -85,77 +84,6 @@ def test_the_modules_whose_change_compiles_a_kernel_again_include_all_that_it_us
                 if str(origin).startswith(("worldpose.", "data_contracts.")):
                     assert origin in reached, f"{name} uses {used} of {origin}"
     assert kernels > 100
-
-
-LIST_SCENARIOS = """
-import sys
-from pathlib import Path
-
-import worldpose.cache_folder
-
-worldpose.cache_folder._PACKAGE = Path("/dev/null")  # no folder can be created in it, even by root
-from flows.cli import main
-from worldpose.compiled import load_compiler
-
-load_compiler()
-sys.argv = ["worldpose", "simulate", "--scenario", "list", "--out", "unused"]
-main()
-"""
-
-
-def test_kernels_of_a_user_without_a_home_are_kept_in_a_temporary_folder(tmp_path):
-    around = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
-    told = subprocess.run(
-        [sys.executable, "-c", LIST_SCENARIOS],
-        env={**around, "HOME": "/dev/null"},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stderr
-    folder = tmp_path / f"worldpose-{os.getuid()}"
-    assert told.count("warning: ") == 1
-    assert f"compiled code is kept in {folder}. Set NUMBA_CACHE_DIR" in told
-    assert folder.stat().st_mode & 0o777 == 0o700
-    assert list(folder.rglob("*.nbc"))
-
-
-def test_items_read_ahead_come_in_order_and_no_further_than_asked():
-    taken = []
-
-    def source():
-        for number in range(20):
-            taken.append(number)
-            yield number
-
-    items = worldpose.compiled.read_ahead(source(), 3)
-    assert next(items) == 0
-    assert list(islice(items, 4)) == [1, 2, 3, 4]
-    items.close()
-    # One more may be asked for when an item is handed out.
-    assert 5 <= len(taken) <= 9
-    assert list(worldpose.compiled.read_ahead(iter([]), 3)) == []
-    assert list(worldpose.compiled.read_ahead(range(2), 3)) == [0, 1]
-
-
-def test_an_error_ahead_is_raised_in_its_turn():
-    def source():
-        yield from (1, 2)
-        raise ValueError("the third")
-
-    found = []
-    with pytest.raises(ValueError, match="the third"):
-        for item in worldpose.compiled.read_ahead(source(), 8):
-            found.append(item)
-    assert found == [1, 2]
-
-
-def test_without_a_writable_package_compiled_code_is_kept_at_home(tmp_path, monkeypatch):
-    monkeypatch.setattr("worldpose.cache_folder._PACKAGE", Path("/dev/null"))
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    expected = tmp_path / ".cache" / "worldpose" / "__pycache__"
-    assert find_cache_folder.__wrapped__() == (expected, True)
-    assert expected.is_dir()
 
 
 @pytest.mark.parametrize("planted", ["link", "of another user", "writable by others"])

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.broadcast_calibration.normal_equations import Points
 from worldpose.geometry.rows import Index, join_rows, take_rows
 
 ENDS = 2
@@ -16,6 +16,22 @@ ENDS = 2
 itself."""
 CLICK, MARKING, PLAYER = 0, 1, 2
 """Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
+
+
+class PointArrays(NamedTuple):
+    """`PointEvidence` as compiled kernels take it."""
+
+    frame: Integers
+    world: Floats
+    image: Floats
+    whitening: Floats
+    loss: Floats
+    ends: Integers
+    """(n, 2) rows of the paint errors that define a point; -1 = none."""
+    shares: Floats
+    by_size: Floats
+    size_row: int
+    """First of two rows of the paint errors that hold the pitch's size; -1 = the size is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +44,6 @@ class PointEvidence:
         image: (n, 2) [px].
         whitening: (n, 2, 2) [1/px] converts a pixel error to standard deviations; a place along a
             line has one row, the other is zero.
-        weight: (n,) factor on the loss [1].
         loss: (n,) scale of the Geman-McClure loss [standard deviations]; infinite = squares.
         kind: (n,) CLICK, MARKING or PLAYER.
         source: (n,) index of the marking or person, -1 for clicks.
@@ -43,7 +58,6 @@ class PointEvidence:
     world: Floats
     image: Floats
     whitening: Floats
-    weight: Floats
     loss: Floats
     kind: Integers
     source: Integers
@@ -60,7 +74,6 @@ class PointEvidence:
             np.empty((0, 3)),
             np.empty((0, 2)),
             np.empty((0, 2, 2)),
-            empty,
             empty,
             index,
             index,
@@ -79,7 +92,6 @@ class PointEvidence:
         whitening: Floats,
         *,
         source: Integers | None = None,
-        weight: float,
         loss: float,
     ) -> PointEvidence:
         """Return evidence of places without survey error and with a known size of the pitch.
@@ -91,7 +103,6 @@ class PointEvidence:
             image: (n, 2) [px].
             whitening: (n, 2, 2) [1/px], see `whiten_across` and `whiten_points`.
             source: (n,) index of the marking or person; None = clicks.
-            weight: factor on the loss [1].
             loss: scale of the loss [standard deviations].
         """
         count = len(frame)
@@ -100,7 +111,6 @@ class PointEvidence:
             world=world,
             image=image,
             whitening=whitening,
-            weight=weight * np.ones(count),
             loss=loss * np.ones(count),
             kind=np.full(count, kind),
             source=np.full(count, -1) if source is None else source,
@@ -109,17 +119,17 @@ class PointEvidence:
             by_size=np.zeros((count, 2, 3)),
         )
 
-    def arrays(self, ends: Integers, size_row: int = -1) -> Points:
+    def arrays(self, ends: Integers, size_row: int = -1) -> PointArrays:
         """Return the arrays for compiled kernels.
 
         Points are defined by rows (n, 2) of the paint errors, -1 = none, and from `size_row` on by
         the size of the pitch, -1 = known.
         """
-        return Points(
+        return PointArrays(
+            self.frame,
             self.world,
             self.image,
             self.whitening,
-            self.weight,
             self.loss,
             ends,
             self.shares,

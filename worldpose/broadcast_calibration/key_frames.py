@@ -13,6 +13,7 @@ from data_contracts.broadcast_calibration import KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
 from data_contracts.static_calibration import DrawnMarking
+from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
     FlowEvidence,
@@ -26,14 +27,15 @@ from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cam
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.broadcast_calibration.solver import Problem, solve
+from worldpose.broadcast_calibration.solver import solve
 from worldpose.errors import DegenerateError, InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import propose_camera
-from worldpose.static_calibration.parameters import CameraEstimate, nearest_on_markings
+from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.residuals import nearest_on_markings
 from worldpose.static_calibration.sides import (
     INDEPENDENT_S,
     MIN_EVIDENCE,
@@ -233,10 +235,11 @@ def calibrate_keys(
                 seen, _ = find_lines(single, samples, pictures[frame], None, settings)
                 lines.append(seen.in_frame(index))
         clicks = join_evidence(parts)
-        problem = Problem(
+        problem = ClipProblem(
             points=join_evidence([clicks, *lines]),
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
+            weights=TermWeights(field=settings.field_weight),
         )
         solution = solve(camera, problem, settings.max_iterations)
         camera = solution.camera
@@ -347,7 +350,6 @@ def _click_evidence(
         pitch.positions([point.name for point in points]),
         np.array([point.xy for point in points]).reshape(-1, 2),
         whiten_points(np.full(len(points), settings.click_noise_px)),
-        weight=settings.field_weight,
         loss=settings.loss_scale,
     )
     at_points = errors.apply(at_points, own, np.ones(own.shape))
@@ -392,7 +394,6 @@ def _drawn_evidence(
         place,
         pixels,
         whiten_across(normal, np.full(len(pixels), settings.key_frame.drawn_noise_px)),
-        weight=settings.field_weight,
         loss=settings.loss_scale,
     )
     return errors.apply(seen, ends, shares)

@@ -11,14 +11,19 @@ from data_contracts.arrays import Flags, Floats, Image
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     PointEvidence,
-    bounds,
     join_evidence,
     whiten_across,
 )
-from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
-from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
+from worldpose.broadcast_calibration.moving_camera import (
+    CLIP_SIZE,
+    FRAME_SIZE,
+    MovingCamera,
+    join_cameras,
+)
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
+from worldpose.broadcast_calibration.residuals import field_residuals
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.geometry.optimize.arrow import ArrowSystem
 from worldpose.pitch.template import PitchTemplate, surface_shape
 from worldpose.static_calibration.line_detection import (
     CANDIDATES,
@@ -85,7 +90,7 @@ def find_lines(
     first = _measure_lines(camera, samples, picture, people, settings, settings.line_search_px)
     if len(first) < 15:
         return PointEvidence.none(), camera
-    corrected = _correct_camera(camera, first)
+    corrected = _correct_camera(camera, first, settings.field_weight)
     return samples.lower(
         _measure_lines(corrected, samples, picture, people, settings, 3.0)
     ), corrected
@@ -131,7 +136,6 @@ def _measure_lines(
         (sections.places + offsets[:, None] * sections.normals)[found],
         whiten_across(sections.normals[found], deviation),
         source=chosen.marking,
-        weight=settings.field_weight,
         loss=settings.loss_scale,
     )
     return samples.errors.apply(seen_bars, chosen.ends, chosen.shares)
@@ -174,19 +178,18 @@ def _find_hidden(places: Floats, people: Floats, reach: float) -> Flags:
         return np.asarray((across & (y > y0 - reach) & (y < y1 + reach)).any(axis=1))
 
 
-def _correct_camera(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
+def _correct_camera(camera: MovingCamera, lines: PointEvidence, weight: float) -> MovingCamera:
     """Return a single frame with rotation and focal length fitted to its lines."""
     std = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])  # prior of the step [rad, 1]
-    begin, edges = camera, bounds(lines.frame, 1)
-    step = np.zeros(4)
+    begin, step = camera, np.zeros(4)
     across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
     for scale in (12.0, 6.0, 3.0, 1.5, 1.0):
-        equations = empty_equations(1, 5)
+        system = ArrowSystem.zeros(1, FRAME_SIZE, CLIP_SIZE)
         scaled = replace(lines, whitening=across / scale, loss=np.ones(len(lines)))
         points = scaled.arrays(np.full_like(lines.ends, -1))
-        add_points(camera.arrays, edges, points, np.zeros((0, 3)), equations)
-        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / std**2)
-        step = step - np.linalg.solve(normal, equations.right[0, :4] + step / std**2)
+        field_residuals(camera, np.zeros((0, 3)), points, weight, system)
+        normal = system.blocks[0, 0, :4, :4] + np.diag(1.0 / std**2)
+        step = step - np.linalg.solve(normal, system.right[0, :4] + step / std**2)
         camera = begin.take_step(np.append(step, np.zeros(3))[None], np.zeros(5))
     return camera
 

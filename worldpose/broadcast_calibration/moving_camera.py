@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.broadcast_calibration.normal_equations import Cameras, Lens
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
+from worldpose.static_calibration.parameters import by_step
 
 FRAME_SIZE = 7
 """Parameters of a frame's step: rotation [rad] in the camera's axes, log focal, k1, k2, k3."""
@@ -72,15 +72,20 @@ class MovingCamera:
         )
 
     @property
-    def arrays(self) -> Cameras:
-        """Arrays for compiled kernels."""
-        return Cameras(
-            self.center, self.principal_point, self.focal, self.rotation, self.distortion
-        )
+    def rows(self) -> Floats:
+        """Rows (frames, WIDTH) as the kernels of `worldpose.geometry.camera_model` take them."""
+        return self.camera.numbers
 
-    def lens(self, frame: int) -> Lens:
-        """Return the lens of a frame for compiled kernels."""
-        return Lens(self.principal_point, self.focal[frame], self.distortion[frame])
+    def project_with_jacobian(self, frame: int, places: ArrayLike) -> tuple[Floats, Floats]:
+        """Return pixels (n, 2) of places (n, 3) [m], world, in a frame, and derivatives (n, 2, 12).
+
+        Derivatives are by the frame's step, then by the clip's; NaN where there is no image.
+        """
+        camera = self.frames(slice(frame, frame + 1)).camera[0]
+        seen = camera.project_with_jacobians(places)
+        step = by_step(camera, seen)
+        parts = step[..., :3], step[..., [6, 9, 10, 11]], -seen.d_points, step[..., 7:9]
+        return seen.points_image, np.concatenate(parts, axis=-1)
 
     def frames(self, index: Integers | slice) -> MovingCamera:
         """Return some of the frames."""

@@ -14,6 +14,7 @@ from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
+from worldpose.geometry.optimize.losses import geman_mcclure_loss
 
 BONES: Final = np.array(
     [
@@ -156,8 +157,8 @@ def player_evidence(
 ) -> tuple[PointEvidence, PlayerNoise]:
     """Return matched keypoints as evidence, and the estimated keypoint noise.
 
-    A keypoint's deviation is a share of the person's height in the image, and its weight falls with
-    the correlation time of the errors; the clip's residuals give both.
+    A keypoint's deviation is a share of the person's height in the image; the clip's residuals give
+    it, and the correlation time of the errors.
     """
     world = people.joints[matches.frame, matches.person]
     image = people.keypoints[matches.frame, matches.detection]
@@ -179,7 +180,6 @@ def player_evidence(
         image[known],
         whiten_points(np.maximum(deviation, 0.5)),
         source=np.repeat(matches.person[:, None], image.shape[1], axis=1)[known],
-        weight=settings.player_weight / noise.frames,
         loss=settings.loss_scale,
     )
     return evidence, noise
@@ -299,4 +299,4 @@ def _mean_loss(
     squared = squared[np.isfinite(squared)]
     if not len(squared):
         return np.nan, 0
-    return float(np.mean(9.0 * squared / (9.0 + squared))), len(pairs.frame)
+    return float(np.mean(geman_mcclure_loss(squared, 3.0))), len(pairs.frame)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Flags, Floats, Image, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
@@ -16,14 +18,15 @@ from worldpose.broadcast_calibration.evidence import (
     PointEvidence,
 )
 from worldpose.broadcast_calibration.key_frames import Keys
+from worldpose.broadcast_calibration.learned_noise import Weights
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
-from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.pitch_errors import PitchFit
+from worldpose.broadcast_calibration.pitch_errors import SIZES, PitchFit
 from worldpose.broadcast_calibration.players import FeedOffset, Matches
-from worldpose.broadcast_calibration.priors import Weights
+from worldpose.broadcast_calibration.residuals import pixel_residuals
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.tracking import Chain
-from worldpose.broadcast_calibration.uncertainty import Uncertainty
+from worldpose.broadcast_calibration.uncertainty import Uncertainty, moving_arrays
+from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
 from worldpose.pitch.template import PitchTemplate
 
 
@@ -223,20 +226,17 @@ def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: Pitch
     x, y = np.meshgrid(*(np.arange(-h, h + 1e-9, 4.0) for h in half))
     places = np.stack([x.ravel(), y.ravel(), pitch.height(x.ravel(), y.ravel())], axis=-1)
     expected = np.full(len(camera), np.nan)
-    pixel, rows = np.empty(2), np.empty((2, 12))
     width, height = camera.image_size
     seen = camera.camera.project(places)
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((seen >= 0.0) & (seen <= [width - 1.0, height - 1.0])).all(axis=-1))
     for frame in np.flatnonzero(inside.any(axis=1)):
-        total, count, lens = 0.0, 0, camera.lens(int(frame))
         # A dozen places suffice for a frame's mean.
         chosen = np.flatnonzero(inside[frame])
-        for place in places[chosen[:: max(1, len(chosen) // 12)]]:
-            if point_row(camera.rotation[frame], camera.center, lens, place, pixel, rows):
-                total += float(np.trace(rows @ uncertainty.frame[frame] @ rows.T))
-                count += 1
-        expected[frame] = np.sqrt(total / max(count, 1))
+        some = places[chosen[:: max(1, len(chosen) // 12)]]
+        _, rows = camera.project_with_jacobian(int(frame), some)
+        variance = np.einsum("nkp,pq,nkq->n", rows, uncertainty.frame[frame], rows)
+        expected[frame] = np.sqrt(variance.mean())
     return expected
 
 
@@ -288,16 +288,6 @@ def _select_picks(expected: Floats) -> tuple[int, ...]:
     return tuple(picks)
 
 
-def pixel_residuals(camera: MovingCamera, points: PointEvidence) -> Floats:
-    """Return projected minus observed pixels (n, 2); infinite where there is no projection."""
-    off = np.full((len(points), 2), np.inf)
-    for frame in np.unique(points.frame):
-        mine = np.flatnonzero(points.frame == frame)
-        single = camera.frames(slice(int(frame), int(frame) + 1)).camera[0]
-        off[mine] = single.project(points.world[mine]) - points.image[mine]
-    return np.where(np.isfinite(off), off, np.inf)
-
-
 def median_residuals(camera: MovingCamera, points: PointEvidence) -> tuple[float, float]:
     """Return the median residuals of markings and of people [px]; NaN without any.
 
@@ -322,3 +312,97 @@ def median_residuals(camera: MovingCamera, points: PointEvidence) -> tuple[float
         float(np.median(across)) if len(across) else float("nan"),
         float(np.median(distances)) if len(distances) else float("nan"),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class BroadcastCalibration:
+    """A moving camera, its covariance and its report.
+
+    Attributes:
+        camera: all frames.
+        uncertainty: its covariance.
+        report: residuals, drift, frames to click next.
+        tracked: camera from key frames and followed points alone, before any refinement.
+        before: `tracked` with rotation and focal length of each frame corrected on its painted
+            lines, before players and the joint fit.
+    """
+
+    camera: MovingCamera
+    uncertainty: Uncertainty
+    report: BroadcastReport
+    tracked: MovingCamera
+    before: MovingCamera
+
+
+def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:
+    """Return the stored arrays of a calibrated clip, by name, without the frame numbers."""
+    report, before = calibration.report, camera_arrays(calibration.before.camera)
+    del before["image_size"]
+    return {
+        **moving_arrays(calibration.camera, calibration.uncertainty),
+        **{f"{name}_before": array for name, array in before.items()},
+        "status": report.status,
+        "reprojection_error": report.reprojection_error,
+        "marking_rms": report.marking_rms,
+        "player_rms": report.player_rms,
+        "marking_count": report.marking_count.astype(np.int32),
+        "player_count": report.player_count.astype(np.int32),
+        "flow_count": report.flow_count.astype(np.int32),
+    }
+
+
+def camera_before(arrays: Mapping[Any, ArrayLike]) -> Camera:
+    """Return the stored camera (frames,) before players and the joint fit."""
+    ends = "_before"
+    stored = {name.removesuffix(ends): arrays[name] for name in arrays if name.endswith(ends)}
+    return camera_from_arrays({**stored, "image_size": arrays["image_size"]})
+
+
+def broadcast_attributes(
+    clip_id: str, calibration: BroadcastCalibration, first: int = 0
+) -> dict[str, Any]:
+    """Return the stored attributes of a calibrated clip, with frame numbers of its video.
+
+    Args:
+        clip_id: the clip.
+        calibration: its camera.
+        first: number of its first frame in its video.
+    """
+    report, offset = calibration.report, calibration.report.feed_offset
+    spec = report.pitch.spec
+    return {
+        "clip_id": clip_id,
+        "status_names": list(FRAME_STATUS),
+        "key_frames": [first + int(frame) for frame in report.key_frames],
+        "refused_key_frames": {str(first + frame): why for frame, why in report.refused.items()},
+        "weights": report.weights.model_dump(),
+        "feed_offset": None
+        if offset is None
+        else {
+            "frames": offset.frames if offset.determined else None,
+            "standard_error": offset.standard_error if offset.determined else None,
+            "pairs": offset.pairs,
+        },
+        "drift": [float(drift) for drift in report.drift],
+        "pick_next": [first + frame for frame in report.pick_next],
+        "markings_off": _finite_or_none(report.markings_off),
+        "players_off": _finite_or_none(report.players_off),
+        "pitch": None
+        if spec is None
+        else {
+            **spec.model_dump(mode="json", include={*SIZES, "points"}),
+            "std_m": report.pitch.size_std.tolist(),
+        },
+        "noise": {
+            "paint_m": report.pitch.paint_m,
+            "lines": report.pitch.line_noise,
+            "clicks": report.pitch.click_noise,
+        },
+        "decisions": list(report.decisions),
+        "reasons": list(report.reasons),
+    }
+
+
+def _finite_or_none(values: tuple[float, float]) -> list[float | None]:
+    """Return values for a record, which cannot hold NaN."""
+    return [value if np.isfinite(value) else None for value in values]

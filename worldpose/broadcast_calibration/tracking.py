@@ -11,14 +11,17 @@ import cv2
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image, Singles
-from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
-from worldpose.broadcast_calibration.normal_equations import (
-    Flow,
-    add_flow,
-    empty_equations,
-    flow_row,
+from worldpose.broadcast_calibration.evidence import FlowEvidence
+from worldpose.broadcast_calibration.moving_camera import (
+    CLIP_SIZE,
+    FRAME_SIZE,
+    MovingCamera,
+    join_cameras,
 )
+from worldpose.broadcast_calibration.residuals import flow_residuals, flow_row
 from worldpose.compiled import compile_kernel
+from worldpose.geometry.lens_models import load_camera
+from worldpose.geometry.optimize.arrow import ArrowSystem
 from worldpose.geometry.rigid import Rigid
 
 
@@ -138,35 +141,26 @@ def turn(camera: MovingCamera, followed: Followed) -> Turned:
     )
     if len(followed.start) < 8:
         return Turned(both, np.full((len(followed.start), 2), np.nan), False)
-    bounds = np.array([0, len(followed.start), len(followed.start)])
-    ones = np.ones(len(followed.start))
+    ones, first = np.ones(len(followed.start)), np.zeros(len(followed.start), dtype=np.int64)
     # The median motion is a robust start.
     x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
     both = _move_second(both, np.array([-y, x, 0.0, 0.0]))
     for scale in (20.0, 5.0, 1.5, 0.6, 0.6):
-        equations = empty_equations(2, 5)
-        flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
-        add_flow(both.arrays, bounds, flow, equations)
-        normal = equations.blocks[0, 1, :4, :4]
+        system = ArrowSystem.zeros(2, FRAME_SIZE, CLIP_SIZE)
+        flow = FlowEvidence(first, followed.start, followed.end, scale * ones)
+        flow_residuals(both, flow, 1.0, 1.0, system)
+        normal = system.blocks[0, 1, :4, :4]
         normal = normal + 1e-9 * np.diag(np.diag(normal))
         if not np.linalg.cond(normal) < 1e12:
-            return Turned(both, flow_residuals(both, followed), False)
-        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :4])))
-    return Turned(both, flow_residuals(both, followed), True)
+            return Turned(both, flow_errors(both, followed), False)
+        both = _move_second(both, np.asarray(-np.linalg.solve(normal, system.right[1, :4])))
+    return Turned(both, flow_errors(both, followed), True)
 
 
-def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
+def flow_errors(both: MovingCamera, followed: Followed) -> Floats:
     """Return predicted minus observed pixels of followed points (n, 2)."""
     residual = np.full((len(followed.start), 2), np.nan)
-    _residuals(
-        both.principal_point,
-        both.focal,
-        both.rotation,
-        both.distortion,
-        followed.start,
-        followed.end,
-        residual,
-    )
+    _residuals(both.rows, followed.start, followed.end, residual)
     return residual
 
 
@@ -195,19 +189,12 @@ def _move_second(both: MovingCamera, step: Floats) -> MovingCamera:
 
 
 @compile_kernel
-def _residuals(
-    principal: Floats,
-    focal: Floats,
-    rotation: Floats,
-    distortion: Floats,
-    start: Floats,
-    end: Floats,
-    residual: Floats,
-) -> None:
+def _residuals(cameras: Floats, start: Floats, end: Floats, residual: Floats) -> None:
     """Write residuals (n, 2) of followed points; rows without a prediction stay unchanged."""
     pixel, rows = np.empty(2), np.empty((2, 16))
+    before, after = load_camera(cameras, 0), load_camera(cameras, 1)
     for i in range(len(start)):
-        if flow_row(principal, focal, rotation, distortion, start[i], pixel, rows):
+        if flow_row(before, after, start[i, 0], start[i, 1], pixel, rows):
             residual[i, 0] = pixel[0] - end[i, 0]
             residual[i, 1] = pixel[1] - end[i, 1]
 

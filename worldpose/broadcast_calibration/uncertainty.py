@@ -11,19 +11,22 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.broadcast_calibration.evidence import CLICK, MARKING, PLAYER, PointEvidence
-from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.normal_equations import (
-    Cameras,
-    Lens,
-    Points,
-    displace_point,
-    displacement,
-    point_row,
+from worldpose.broadcast_calibration.clip_problem import ClipProblem
+from worldpose.broadcast_calibration.evidence import (
+    CLICK,
+    MARKING,
+    PLAYER,
+    PointArrays,
+    PointEvidence,
 )
-from worldpose.broadcast_calibration.solver import Problem, Solution, factorize
+from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.residuals import displace_point, displacement, point_row
+from worldpose.broadcast_calibration.solver import ClipSolution, factorize
 from worldpose.compiled import compile_kernel
+from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
+from worldpose.geometry.lens_models import load_camera
+from worldpose.geometry.optimize.losses import geman_mcclure_weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +87,8 @@ def moving_from_arrays(arrays: Mapping[Any, ArrayLike]) -> tuple[MovingCamera, U
 
 
 def compute_uncertainty(
-    solution: Solution,
-    problem: Problem,
+    solution: ClipSolution,
+    problem: ClipProblem,
     line_shift: float = 0.0,
     player_shift: float = 0.0,
     smooth_frames: float = 1.0,
@@ -113,25 +116,21 @@ def compute_uncertainty(
     Raises:
         DegenerateError: the system is singular.
     """
-    system = solution.equations.system
-    factor = factorize(system.blocks)
-    by_shared = factor.solve(system.border)
-    count = system.border.shape[2]
-    flat = system.border.reshape(-1, count)
-    reduced = system.corner - flat.T @ by_shared.reshape(-1, count)
-    shared = np.linalg.inv(0.5 * (reduced + reduced.T))
-    whole = np.empty((len(by_shared), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
-    whole[:, :FRAME_SIZE, :FRAME_SIZE] = factor.inverse_blocks()
-    whole[:, :FRAME_SIZE, :FRAME_SIZE] += by_shared @ shared @ np.swapaxes(by_shared, -1, -2)
+    factor = factorize(solution.equations.system)
+    frames, _, count = factor.border.shape
+    shared = factor.shared_covariance()
+    whole = np.empty((frames, FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
+    whole[:, :FRAME_SIZE, :FRAME_SIZE] = factor.frame_covariance(shared)
     gradients, rest = _lasting_gradients(solution, problem, count, line_shift, player_shift)
-    bent = _lens_gradients(problem, len(by_shared), smooth_frames)
-    rest = np.concatenate([rest, np.zeros((count, bent.shape[2]))], axis=1)
-    own = factor.solve(np.concatenate([gradients, bent], axis=2))
-    rest = shared @ (rest - flat.T @ own.reshape(len(flat), -1))
+    bent = _lens_gradients(problem, frames, smooth_frames)
+    own, rest = factor.solve(
+        np.concatenate([gradients, bent], axis=2),
+        np.concatenate([rest, np.zeros((count, bent.shape[2]))], axis=1),
+    )
     moved = np.concatenate(
-        [own - by_shared @ rest, np.broadcast_to(rest, (len(own), *rest.shape))], axis=1
-    )[:, : FRAME_SIZE + CLIP_SIZE]
-    across = -(by_shared @ shared)[..., :CLIP_SIZE]
+        [own, np.broadcast_to(rest[:CLIP_SIZE], (frames, CLIP_SIZE, rest.shape[1]))], axis=1
+    )
+    across = -(factor.answer @ shared)[..., :CLIP_SIZE]
     whole[:, :FRAME_SIZE, FRAME_SIZE:] = across
     whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
     whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared[:CLIP_SIZE, :CLIP_SIZE]
@@ -154,7 +153,7 @@ def lasting_samples(points: PointEvidence, off: Floats) -> float:
         return 1.0
     some = points[lines]
     white = np.einsum("nj,nj->n", some.whitening[:, 0], off[lines])
-    weight = 1.0 / (1.0 + (white / some.loss) ** 2) ** 2
+    weight = geman_mcclure_weight((white / some.loss) ** 2, 1.0)
     _, cluster = np.unique(_cells(some), axis=0, return_inverse=True)
     sums, counts = (np.bincount(cluster.ravel(), each) for each in (weight * white, weight))
     return float(np.mean(sums**2 / np.maximum(counts, 1.0)))
@@ -168,22 +167,22 @@ def _cells(points: PointEvidence) -> Integers:
     return np.column_stack([points.kind, points.source, cell])
 
 
-def paint_variance(solution: Solution) -> Floats:
+def paint_variance(solution: ClipSolution) -> Floats:
     """Return the posterior variance (painted, 3) of a solution's paint errors [std^2].
 
     Raises:
         DegenerateError: the system is singular.
     """
-    system = solution.equations.system
-    factor = factorize(system.blocks)
-    flat = system.border.reshape(-1, system.border.shape[2])
-    solved = factor.solve(system.border).reshape(flat.shape)
-    covariance = np.linalg.inv(system.corner - flat.T @ solved)
+    covariance = factorize(solution.equations.system).shared_covariance()
     return np.asarray(covariance.diagonal()[CLIP_SIZE:].reshape(-1, 3))
 
 
 def _lasting_gradients(
-    solution: Solution, problem: Problem, shared: int, line_shift: float, player_shift: float
+    solution: ClipSolution,
+    problem: ClipProblem,
+    shared: int,
+    line_shift: float,
+    player_shift: float,
 ) -> tuple[Floats, Floats]:
     """Return the gradients (frames, 7, n) and (shared, n) of each lasting error at the solution.
 
@@ -199,14 +198,15 @@ def _lasting_gradients(
     people = points.kind[chosen] == PLAYER
     deviation = 1.0 / np.maximum(np.linalg.norm(points.whitening[chosen, 0], axis=-1), 1e-12)
     shift = np.where(people, player_shift * deviation, line_shift)
+    weights = problem.weights
     clusters = _Clusters(
-        points.frame[chosen],
+        np.where(people, weights.player, weights.field),
         cluster.astype(np.int64).ravel(),
         shift,
         len(sources) + 2 * people.astype(np.int64),
     )
     evidence = points[chosen].arrays(problem.ends[chosen], problem.size_row)
-    _add_gradients(camera.arrays, evidence, solution.paint_offsets, clusters, by_frame, by_shared)
+    _add_gradients(camera.rows, evidence, solution.paint_offsets, clusters, by_frame, by_shared)
     of_people = np.flatnonzero(sources[:, 0] == PLAYER)
     by_frame, by_shared = (
         np.concatenate([each, each[..., of_people].sum(axis=-1, keepdims=True)], axis=-1)
@@ -217,7 +217,7 @@ def _lasting_gradients(
     return by_frame, by_shared
 
 
-def _lens_gradients(problem: Problem, frames: int, lasting: float) -> Floats:
+def _lens_gradients(problem: ClipProblem, frames: int, lasting: float) -> Floats:
     """Return the gradients (frames, 7, n) of common errors of second differences.
 
     One column per lens parameter and interval of about `lasting` frames, for an error of one
@@ -245,8 +245,8 @@ def _lens_gradients(problem: Problem, frames: int, lasting: float) -> Floats:
 class _Clusters(NamedTuple):
     """Assignment of points to lasting errors."""
 
-    frame: Integers
-    """(n,) frame of each point."""
+    weight: Floats
+    """(n,) weight of the term of each point [1]."""
     column: Integers
     """(n,) column of the point's own error."""
     shift: Floats
@@ -257,27 +257,26 @@ class _Clusters(NamedTuple):
 
 @compile_kernel
 def _add_gradients(
-    cameras: Cameras,
-    points: Points,
+    cameras: Floats,
+    points: PointArrays,
     paint_offsets: Floats,
     clusters: _Clusters,
     by_frame: Floats,
     by_shared: Floats,
 ) -> None:
     """Add every point's gradient to the columns of its lasting errors; see `add_points`."""
-    image, whitening, weight, loss = points.image, points.whitening, points.weight, points.loss
-    frame, shift = clusters.frame, clusters.shift
+    image, whitening, shift = points.image, points.whitening, clusters.shift
     pixel, rows, place = np.empty(2), np.empty((2, 12)), np.empty(3)
-    for i in range(len(frame)):
-        t = frame[i]
+    by_step, by_point = np.empty((2, STEP)), np.empty((2, 3))
+    for i in range(len(shift)):
+        t = points.frame[i]
         displace_point(points, i, paint_offsets, place)
-        lens = Lens(cameras.principal_point, cameras.focal[t], cameras.distortion[t])
-        if not point_row(cameras.rotation[t], cameras.center, lens, place, pixel, rows):
+        if not point_row(load_camera(cameras, t), place, pixel, rows, by_step, by_point):
             continue
         u, v = pixel[0] - image[i, 0], pixel[1] - image[i, 1]
         one = whitening[i, 0, 0] * u + whitening[i, 0, 1] * v
         two = whitening[i, 1, 0] * u + whitening[i, 1, 1] * v
-        factor = weight[i] / (1.0 + (one * one + two * two) / loss[i] ** 2) ** 2
+        factor = clusters.weight[i] * geman_mcclure_weight(one * one + two * two, points.loss[i])
         for source in range(3):
             # The residual, or a shift along x, or along y, in standard deviations.
             if source == 0:

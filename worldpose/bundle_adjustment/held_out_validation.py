@@ -10,14 +10,21 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
-from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
+from worldpose.bundle_adjustment.residuals import (
+    MEDIAN_SQUARED,
+    AdjustmentProblem,
+    AdjustmentSolution,
+    camera_knowledge,
+    known_covariance,
+)
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.bundle_adjustment.solver import Problem, Solution, solve
+from worldpose.bundle_adjustment.solver import solve
 from worldpose.bundle_adjustment.uncertainty import align_points
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
+from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
-from worldpose.static_calibration.parameters import SIZE
+from worldpose.geometry.optimize.losses import cauchy_loss
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
@@ -66,7 +73,7 @@ def held_out_errors(
         )
         length = np.linalg.norm(predicted[:, 0] - image[:, c], axis=-1)
         squared = (length / noise[:, 0]) ** 2
-        return length, robust_scale**2 * np.log1p(squared / robust_scale**2)
+        return length, cauchy_loss(squared, robust_scale)
 
     for c, measured in enumerate(map_in_threads(measure, range(len(cameras.focal)))):
         error[:, c, judges], loss[:, c, judges] = measured
@@ -155,7 +162,7 @@ def _significance(fall: Floats) -> float:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PooledEvidence:
     """Result of all held-out people together for a change of all cameras.
 
     Attributes:
@@ -169,7 +176,7 @@ class Evidence:
     shift: float
 
 
-def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -> Evidence:
+def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -> PooledEvidence:
     """Return the result of all held-out people together, in the images of some cameras."""
     fall = (before.loss - after.loss)[:, cameras]
     told = np.isfinite(fall)
@@ -180,9 +187,9 @@ def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -
     moved = align_points(before.joints[both], after.joints[both])
     shift = 0.0
     if both.any():
-        center = before.joints[both].mean(axis=0)
-        shift = float(np.linalg.norm(moved.move_points(center) - center))
-    return Evidence(gain, _significance(fall), shift)
+        center = before.joints[both].mean(axis=0, keepdims=True)
+        shift = float(np.linalg.norm(moved.apply(center) - center))
+    return PooledEvidence(gain, _significance(fall), shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +209,7 @@ class Contradictions:
     @classmethod
     def none(cls, count: int) -> Contradictions:
         """Return the result for cameras without contradictions."""
-        return cls(np.ones(count), np.zeros((count, SIZE)), np.zeros(count, dtype=np.bool_))
+        return cls(np.ones(count), np.zeros((count, STEP)), np.zeros(count, dtype=np.bool_))
 
 
 def find_contradictions(
@@ -241,7 +248,7 @@ def find_contradictions(
         if number < fewest:
             found.other_people[c] = True
             continue
-        problem = Problem(
+        problem = AdjustmentProblem(
             cameras=clip.cameras[c : c + 1],
             free=free[c : c + 1],
             camera_information=information[c : c + 1] / 16.0,
@@ -270,7 +277,9 @@ def find_contradictions(
     return found
 
 
-def _place_camera(problem: Problem, settings: BundleAdjustmentSettings) -> Solution | None:
+def _place_camera(
+    problem: AdjustmentProblem, settings: BundleAdjustmentSettings
+) -> AdjustmentSolution | None:
     """Return the camera fitted to these points; None if it cannot image all of them."""
     offset = None
     # The first scale allows a far step.

@@ -22,20 +22,21 @@ from worldpose.bundle_adjustment.people_views import (
     LOSS_SCALE,
     Start,
     Views,
-    adjust,
+    adjust_poses,
     find_walkers,
     refusal,
 )
-from worldpose.bundle_adjustment.problems import (
+from worldpose.bundle_adjustment.residuals import (
+    AdjustmentSolution,
     KeypointNoise,
     estimate_noise,
     keypoint_information,
-    residuals,
+    player_residuals,
 )
-from worldpose.bundle_adjustment.solver import Solution
-from worldpose.bundle_adjustment.uncertainty import Similarity, relative_covariance
+from worldpose.bundle_adjustment.uncertainty import move_cameras, relative_covariance
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Similarity
 from worldpose.static_calibration.boards import image_coverage
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
 
@@ -133,9 +134,9 @@ def locate_cameras(
     world = people.orient(scale)
     shown = [observed.image[observed.camera_of == c] for c in range(len(names))]
     std = relative * [scale, 1.0, 1.0]
-    off = np.linalg.norm(residuals(adjusted.cameras, observed.points, observed), axis=1)
+    off = np.linalg.norm(player_residuals(adjusted.cameras, observed.points, observed), axis=1)
     return CamerasFromPeople(
-        cameras=world.similarity.move_cameras(adjusted.cameras),
+        cameras=move_cameras(world.similarity, adjusted.cameras),
         std=std,
         scale_std=scale_std,
         # A rig that is bent tilts the vertical, too.
@@ -167,7 +168,7 @@ def _search(lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> St
             errors.append(error)
             continue
         for start in starts:
-            rough = adjust(start.cameras, start.observed, tried, KeypointNoise())
+            rough = adjust_poses(start.cameras, start.observed, tried, KeypointNoise())
             count = len(start.observed.image)
             adjusted = start.observed._replace(points=rough.points)
             found.append((rough.cost / count, count, Start(rough.cameras, adjusted)))
@@ -180,22 +181,22 @@ def _search(lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> St
 
 def _adjust_with_noise(
     start: Start, lenses: Sequence[LensCalibration]
-) -> tuple[Solution, Observations, KeypointNoise]:
+) -> tuple[AdjustmentSolution, Observations, KeypointNoise]:
     """Return the adjustment with the noise that the keypoints have."""
     cameras, observed, noise = start.cameras, start.observed, KeypointNoise()
     for _ in range(3):
-        adjusted = adjust(cameras, observed, lenses, noise)
+        adjusted = adjust_poses(cameras, observed, lenses, noise)
         observed = observed._replace(points=adjusted.points)
         noise = estimate_noise(adjusted.cameras, adjusted.points, observed, LOSS_SCALE)
     try:
-        adjusted = adjust(cameras, observed, lenses, noise, covariance=True)
+        adjusted = adjust_poses(cameras, observed, lenses, noise, covariance=True)
     except InputError as error:
         names = [lens.id for lens in lenses]
         raise refusal(names, "people who determine the cameras", error.found) from error
     return adjusted, observed, noise
 
 
-def _relative_std(adjusted: Solution, observed: Observations) -> Floats:
+def _relative_std(adjusted: AdjustmentSolution, observed: Observations) -> Floats:
     """Return the deviations (cameras, 3) of position, orientation and focal length.
 
     Relative to all cameras and people together: no keypoint tells their common place and size.
@@ -215,7 +216,7 @@ def _by_camera(off: Floats, camera_of: Integers, count: int) -> Floats:
 
 
 def _held_out(
-    adjusted: Solution,
+    adjusted: AdjustmentSolution,
     observed: Observations,
     lenses: Sequence[LensCalibration],
     noise: KeypointNoise,
@@ -234,11 +235,11 @@ def _held_out(
     for held in range(intervals):
         try:
             other, judged = observed.select(group != held), observed.select(group == held)
-            cameras = adjust(adjusted.cameras, other, lenses, noise).cameras
-            joints = adjust(cameras, judged, lenses, noise, fixed=True)
+            cameras = adjust_poses(adjusted.cameras, other, lenses, noise).cameras
+            joints = adjust_poses(cameras, judged, lenses, noise, fixed=True)
         except InputError:
             return np.full(count, np.nan)
-        off.append(np.linalg.norm(residuals(joints.cameras, joints.points, judged), axis=1))
+        off.append(np.linalg.norm(player_residuals(joints.cameras, joints.points, judged), axis=1))
         camera_of.append(judged.camera_of)
     return _by_camera(np.concatenate(off), np.concatenate(camera_of), count)
 
@@ -346,7 +347,7 @@ class _People(NamedTuple):
         x = x / np.linalg.norm(x)
         rotation = np.stack([x, np.cross(up, x), up])
         return _World(
-            Similarity(scale, rotation, -rotation @ origin),
+            Similarity(np.array(scale), rotation, -rotation @ origin),
             float(1.0 / np.sqrt(values.min())),
             bool(values.min() > 2.0 / lean_std**2),
         )

@@ -18,9 +18,13 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Observations
-from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.bundle_adjustment.residuals import (
+    AdjustmentProblem,
+    AdjustmentSolution,
+    KeypointNoise,
+)
 from worldpose.bundle_adjustment.settings import SolverSettings
-from worldpose.bundle_adjustment.solver import Problem, Solution, solve
+from worldpose.bundle_adjustment.solver import solve
 from worldpose.detection.box_tracking import BoxTracker
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
@@ -313,7 +317,7 @@ class Views:
         cameras = self._place(order, poses)
         lenses = [self.records[c] for c in order]
         observed = self._observe(order, cameras, shown, poses)
-        adjusted = adjust(cameras, observed, lenses, KeypointNoise()).cameras.cam_from_world
+        adjusted = adjust_poses(cameras, observed, lenses, KeypointNoise()).cameras.cam_from_world
         return {c: adjusted[k] for k, c in enumerate(order)}
 
     def _joints(self, person: dict[int, int], poses: dict[int, Rigid]) -> Floats:
@@ -418,7 +422,7 @@ class Views:
         )
 
 
-def adjust(
+def adjust_poses(
     cameras: Camera,
     observed: Observations,
     lenses: Sequence[LensCalibration],
@@ -426,7 +430,7 @@ def adjust(
     *,
     fixed: bool = False,
     covariance: bool = False,
-) -> Solution:
+) -> AdjustmentSolution:
     """Return cameras and joints adjusted to the keypoints, or the joints alone.
 
     The first camera stays where it is, and the second one at its distance: no keypoint tells the
@@ -456,7 +460,7 @@ def adjust(
     if fixed:
         information += fixed_information * fixed_information * np.eye(12)
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
-    problem = Problem(
+    problem = AdjustmentProblem(
         cameras=cameras,
         free=free,
         camera_information=information,

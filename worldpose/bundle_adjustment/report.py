@@ -1,4 +1,4 @@
-"""Arrays and attributes of an adjustment, as in `data_contracts.bundle_adjustment`."""
+"""An adjustment, its decisions in words, and its stored arrays and attributes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
-from worldpose.bundle_adjustment.adjustment import BundleAdjustment
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_by_person, project_joints
-from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.bundle_adjustment.held_out_validation import CHANCE, PooledEvidence, Verdict
+from worldpose.bundle_adjustment.residuals import KeypointNoise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.uncertainty import weak_direction
 from worldpose.compiled import map_in_threads
@@ -224,4 +224,101 @@ def review_clicks(
         residual=np.concatenate(residual)[order],
         surprise=np.concatenate(surprise)[order],
         problem=tuple(problem[index] for index in order),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class BundleAdjustment:
+    """Cameras of a clip after adjustment.
+
+    Attributes:
+        clip: the input, with the noise of its detector in its confidences.
+        cameras: (cameras,) batch; unchanged where the change was refused.
+        covariance: (cameras, 12, 12) covariance of a step; as calibrated where the change was
+            refused.
+        accepted: (cameras,) bool.
+        reasons: why each camera was accepted or refused.
+        proposed: match frames best suited to adjustment.
+        used: match frames that supplied people.
+        judged: match frames for held-out validation.
+        noise: noise of keypoints, as measured.
+        verdict: held-out errors with calibrated and with changed cameras, also where refused.
+        evidence: result of all held-out people together for the proposed change.
+        motion: (cameras, 3) motion of the accepted cameras: of the center [m], of the axes [rad],
+            of the focal length [1]; 0 where refused.
+        refused: (cameras,) batch as it would be without held-out validation.
+    """
+
+    clip: Clip
+    cameras: Camera
+    covariance: Floats
+    accepted: Flags
+    reasons: tuple[str, ...]
+    proposed: Integers
+    used: Integers
+    judged: Integers
+    noise: KeypointNoise
+    verdict: Verdict
+    evidence: PooledEvidence
+    motion: Floats
+    refused: Camera
+
+
+def explain_decision(
+    comparison: Verdict,
+    c: int,
+    accepted: bool,
+    settings: BundleAdjustmentSettings,
+    objection: str,
+    stands_alone: bool,
+) -> str:
+    """Return why a camera's change was accepted or refused, with the deciding numbers."""
+    judges = int(comparison.judges[c])
+    if judges < settings.min_judges:
+        return f"refused: {judges} held-out keypoints, at least {settings.min_judges} are required"
+    before, after = comparison.loss[c]
+    change = f"the loss of {judges} held-out keypoints goes from {before:.3f} to {after:.3f}"
+    if accepted:
+        return f"accepted: {change}"
+    if after > before:
+        return f"refused: {change}"
+    if stands_alone and comparison.significance[c] < CHANCE:
+        return (
+            f"refused: {change}; person by person it falls by {comparison.significance[c]:.1f} "
+            f"standard errors, at least {CHANCE:g} are required"
+        )
+    if objection and not stands_alone:
+        return f"refused: {change}, but {objection}"
+    return f"refused: {change}, but no more after other cameras were refused"
+
+
+def describe_motion(motion: Floats) -> str:
+    """Return the description of a camera's motion."""
+    center, rotation, focal = motion.tolist()
+    return (
+        f"; the camera moves {100.0 * center:.1f} cm and {np.degrees(rotation):.3f} degrees, "
+        f"the focal length changes {100.0 * focal:+.2f} %"
+    )
+
+
+def refuse_all(
+    clip: Clip, reason: str, proposed: Integers, used: Integers, judged: Integers
+) -> BundleAdjustment:
+    """Return the clip's cameras unchanged, with one reason for all of them."""
+    count = len(clip.clicks)
+    nan = np.full((count, 2), np.nan)
+    return BundleAdjustment(
+        clip=clip,
+        cameras=clip.cameras,
+        covariance=clip.covariance,
+        accepted=np.zeros(count, dtype=np.bool_),
+        reasons=(f"refused: {reason}",) * count,
+        proposed=clip.detections.frame[proposed],
+        used=clip.detections.frame[used],
+        judged=clip.detections.frame[judged],
+        noise=KeypointNoise(),
+        verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan, np.zeros(count)),
+        evidence=PooledEvidence(0.0, 0.0, 0.0),
+        motion=np.zeros((count, 3)),
+        refused=clip.cameras,
     )

@@ -9,15 +9,20 @@ import numpy as np
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import Floats
+from worldpose.bundle_adjustment.residuals import (
+    AdjustmentProblem,
+    AdjustmentSolution,
+    prior_cost,
+)
 from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.errors import InputError, InternalError
+from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
+from worldpose.geometry.optimize.levenberg_marquardt import Damping, minimize
 from worldpose.geometry.optimize.schur_complement import (
-    STEPS,
     CameraEquations,
-    Evidence,
+    PointObservations,
     cost,
     eliminate,
     substitute,
@@ -28,67 +33,12 @@ BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Bundle adjustment problem: initial cameras and points, pixels and priors.
-
-    Attributes:
-        cameras: (cameras,) batch with square pixels.
-        free: (cameras, 12) bool, parameters that may move, in the order of `PARAMETERS`.
-        camera_information: (cameras, 12, 12) information of a step from `cameras`: the prior,
-            without the observations here.
-        points: (points, 3) [m], world.
-        point_information: (points,) [1/m^2] per axis; 0 = free, infinite = fixed where it is.
-        point_of: (n,) point of every observation, ascending.
-        camera_of: (n,) its camera.
-        image: (n, 2) [px].
-        weight: (n,) [1/px^2], one over the variance per image axis.
-        scale: (n,) standard deviations beyond which an observation counts less (Cauchy's loss);
-            infinite = plain squares.
-        names: names of the cameras, for messages; empty = not known.
-    """
-
-    cameras: Camera
-    free: Flags
-    camera_information: Floats
-    points: Floats
-    point_information: Floats
-    point_of: Integers
-    camera_of: Integers
-    image: Floats
-    weight: Floats
-    scale: Floats
-    names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Solution of a bundle adjustment problem.
-
-    Attributes:
-        cameras: (cameras,) batch.
-        offset: (cameras, 12) steps from the problem's cameras to these.
-        points: (points, 3) [m], world.
-        cost: robust sum of squares with priors.
-        converged: whether the last step gained less than `min_cost_change`.
-        camera_covariance: (12 cameras, 12 cameras) covariance of steps from the solution, the
-            points being free; zero for fixed parameters, empty if not requested.
-    """
-
-    cameras: Camera
-    offset: Floats
-    points: Floats
-    cost: float
-    converged: bool
-    camera_covariance: Floats
-
-
 def solve(
-    problem: Problem,
+    problem: AdjustmentProblem,
     settings: SolverSettings | None = None,
     offset: Floats | None = None,
     covariance: bool = True,
-) -> Solution:
+) -> AdjustmentSolution:
     """Return the cameras and points that fit all observations and priors best.
 
     Args:
@@ -118,18 +68,19 @@ def solve(
             found="points behind a camera, or beyond its lens model",
             todo="Give cameras and points that project near their observations.",
         )
-    schedule = Schedule(
-        damping=settings.damping,
-        decrease=5.0,
-        min_damping=1e-9,
-        iterations=settings.max_iterations,
+    found = minimize(
+        start,
+        system.step,
+        Damping(start=settings.damping, decrease=5.0, lowest=1e-9),
+        settings.max_iterations,
         # A gain below rounding error means convergence, too.
-        converged=lambda before, after: abs(before - after) <= settings.min_cost_change * before,
+        converged=lambda before, after: (
+            abs(before.cost - after.cost) <= settings.min_cost_change * before.cost
+        ),
     )
-    found = minimize(start, system.step, schedule)
     last = found.state
     spread = system.covariance(last.cameras, last.points) if covariance else np.empty((0, 0))
-    return Solution(
+    return AdjustmentSolution(
         cameras=last.cameras,
         offset=last.offset,
         points=last.points,
@@ -149,7 +100,7 @@ class _State:
     cost: float
 
 
-def _require_two_views(problem: Problem) -> None:
+def _require_two_views(problem: AdjustmentProblem) -> None:
     first = np.searchsorted(problem.point_of, problem.point_of)
     several = np.zeros(len(problem.points), dtype=np.bool_)
     several[problem.point_of[problem.camera_of != problem.camera_of[first]]] = True
@@ -166,11 +117,11 @@ def _require_two_views(problem: Problem) -> None:
 class _System:
     """Normal equations of a problem, with points eliminated, and scratch arrays."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: AdjustmentProblem) -> None:
         self.names = problem.names
         first_of = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
         self.prior = problem.camera_information
-        self.evidence = Evidence(
+        self.observed = PointObservations(
             problem.points,
             problem.point_information,
             first_of,
@@ -186,8 +137,7 @@ class _System:
 
     def cost(self, cameras: Camera, points: Floats, offset: Floats) -> float:
         """Return the robust sum of squares with all priors."""
-        known = float(np.einsum("ci,cij,cj->", offset, self.prior, offset))
-        return cost(cameras.numbers, points, self.evidence) + known
+        return cost(cameras.numbers, points, self.observed) + prior_cost(offset, self.prior)
 
     def step(self, state: _State, damping: float) -> _State:
         """Return the state after a damped step."""
@@ -205,7 +155,7 @@ class _System:
         step = np.zeros(offset.shape)
         step.ravel()[self.free] = -self._solve(matrix, slope)
         trial = np.empty_like(points)
-        substitute(cameras.numbers, points, self.evidence, damping, step, trial)
+        substitute(cameras.numbers, points, self.observed, damping, step, trial)
         return step, trial
 
     def covariance(self, cameras: Camera, points: Floats) -> Floats:
@@ -254,14 +204,14 @@ class _System:
         """Return reduced matrix, diagonal before the reduction and slope of free parameters."""
         numbers = cameras.numbers
         width = self.free.size
-        blocks = np.zeros((len(numbers), STEPS, STEPS))
-        gradient = np.zeros((len(numbers), STEPS))
+        blocks = np.zeros((len(numbers), STEP, STEP))
+        gradient = np.zeros((len(numbers), STEP))
         loss = np.zeros((width + 1, width + 1), order="F")
         for first in range(0, len(points), BLOCK):
             last = min(first + BLOCK, len(points))
             rows = self.rows[: 3 * (last - first)]
             target = CameraEquations(self.columns, rows, blocks, gradient)
-            eliminate(numbers, points, self.evidence, damping, first, last, target)
+            eliminate(numbers, points, self.observed, damping, first, last, target)
             loss = dsyrk(1.0, rows.T, beta=1.0, c=loss, overwrite_c=True)
         lost = loss[:width, :width]
         blocks = np.tril(blocks) + np.tril(blocks, -1).swapaxes(1, 2) + self.prior

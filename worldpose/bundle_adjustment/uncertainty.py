@@ -18,7 +18,9 @@ import numpy as np
 from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.clip import Clip
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.optimize.covariance import invert_free
+from worldpose.geometry.optimize.losses import cauchy_weight
+from worldpose.geometry.rigid import Rigid, Similarity, align
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
     project_lines,
@@ -32,30 +34,12 @@ SIMILARITY: Final = 7
 """Degrees of freedom: translation, rotation, scale."""
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """The transform x' = scale * rotation @ x + translation.
-
-    Attributes:
-        scale: factor [1].
-        rotation: (3, 3).
-        translation: (3,) [m].
-    """
-
-    scale: float
-    rotation: Floats
-    translation: Floats
-
-    def move_points(self, points: Floats) -> Floats:
-        """Return points (..., 3) after the transform."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def move_cameras(self, cameras: Camera) -> Camera:
-        """Return the cameras (cameras,) that see transformed points in the same pixels."""
-        pose = cameras.cam_from_world
-        rotation = pose.rotation @ self.rotation.T
-        translation = self.scale * pose.translation - rotation @ self.translation
-        return replace(cameras, cam_from_world=Rigid(rotation, translation))
+def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
+    """Return the cameras (cameras,) that see transformed points in the same pixels."""
+    pose = cameras.cam_from_world
+    rotation = pose.rotation @ motion.rotation.T
+    translation = motion.scale * pose.translation - rotation @ motion.translation
+    return replace(cameras, cam_from_world=Rigid(rotation, translation))
 
 
 def align_points(points: Floats, targets: Floats) -> Similarity:
@@ -63,26 +47,20 @@ def align_points(points: Floats, targets: Floats) -> Similarity:
 
     The weight of a pair depends on its distance over the median distance (Cauchy's weight), so that
     a person or a joint that really moved has little influence. The result is the identity for fewer
-    than three pairs, or for pairs on one line (Umeyama, PAMI 1991).
+    than three pairs, or for pairs on one line.
     """
-    identity = Similarity(1.0, np.eye(3), np.zeros(3))
+    found = Similarity(np.array(1.0), np.eye(3), np.zeros(3))
     if len(points) < 3:
-        return identity
-    weight, found = np.ones(len(points)), identity
+        return found
+    off = [np.linalg.svd(each - each.mean(axis=0), compute_uv=False) for each in (points, targets)]
+    if any(values[1] <= 1e-4 * values[0] for values in off):
+        return found
+    weight = np.ones(len(points))
     # The last ones change less than a micrometre.
     for _ in range(10):
-        share = weight / weight.sum()
-        center, target = share @ points, share @ targets
-        away, off = points - center, targets - target
-        left, values, right = np.linalg.svd((off * share[:, None]).T @ away)
-        if values[1] <= 1e-9 * values[0]:
-            return identity
-        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-        rotation = (left * sign) @ right
-        scale = float((values * sign).sum() / (share @ (away**2).sum(axis=1)))
-        found = Similarity(scale, rotation, target - scale * rotation @ center)
-        distance = np.linalg.norm(found.move_points(points) - targets, axis=1)
-        weight = 1.0 / (1.0 + (distance / max(float(np.median(distance)), 1e-9)) ** 2)
+        found = align(points, targets, with_scale=True, weights=weight)
+        distance = np.linalg.norm(found.apply(points) - targets, axis=1)
+        weight = cauchy_weight(distance**2, max(float(np.median(distance)), 1e-9))
     return found
 
 
@@ -127,9 +105,10 @@ def relative_covariance(
     steps = similarity_steps(cameras, origin)
     weighted = information @ steps
     normal = np.einsum("cij,cik->jk", steps, weighted)
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    inverse = np.linalg.inv(normal * scale * scale[:, None]) * scale * scale[:, None]
-    common_of = inverse @ weighted.reshape(count * size, SIMILARITY).T
+    common_of = (
+        invert_free(normal, np.ones(len(normal), np.bool_))
+        @ weighted.reshape(count * size, SIMILARITY).T
+    )
     flat = steps.reshape(count * size, SIMILARITY)
     keep = np.eye(count * size) - flat @ common_of
     relative = (keep @ covariance @ keep.T).reshape(count, size, count, size)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
 from data_contracts.records import CONTRACT_VERSION
-from data_contracts.release import ReleasedFile, ReleaseManifest
+from data_contracts.release import ReleaseManifest
+from data_contracts.run import StoredFile
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
@@ -40,14 +41,14 @@ def _write(path: Path, content: object) -> Path:
     return path
 
 
-def released_files(folder: Path, paths: Iterable[Path]) -> tuple[ReleasedFile, ...]:
+def released_files(folder: Path, paths: Iterable[Path]) -> tuple[StoredFile, ...]:
     """Return sizes and checksums of files in `folder`, by name."""
     files = []
     for path in sorted(paths):
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         name = path.relative_to(folder).as_posix()
-        files.append(ReleasedFile(path=name, size=path.stat().st_size, sha256=sha256))
+        files.append(StoredFile(path=name, size=path.stat().st_size, sha256=sha256))
     return tuple(files)
 
 

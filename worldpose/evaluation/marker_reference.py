@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import yaml
@@ -27,6 +27,15 @@ from worldpose.geometry.rigid import Similarity, align
 
 METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit in such files [m]."""
+UNIT_NAMES: Final = {
+    "meter": "m",
+    "meters": "m",
+    "metres": "m",
+    "centimeters": "cm",
+    "millimeters": "mm",
+    "millimetres": "mm",
+}
+"""Units as words."""
 SUFFIXES: Final = (".c3d", ".trc")
 """Suffixes of marker files."""
 _MAX_OFFSET_S: Final = 2.0
@@ -137,8 +146,9 @@ def _read_c3d(path: Path) -> Markers:
     try:
         with path.open("rb") as file:
             reader = c3d.Reader(file)
-            unit = reader.get("POINT:UNITS").string_value.strip().lower()
-            names = tuple(label.strip() for label in reader.point_labels)
+            given = reader.get("POINT:UNITS")
+            unit = "" if given is None else given.string_value.strip().lower()
+            names = c3d_labels(reader)
             # Copies: the reader reuses its array. Residual -1 means missing.
             rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
             rate = float(reader.point_rate)
@@ -148,12 +158,27 @@ def _read_c3d(path: Path) -> Markers:
         raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
+    if not unit:
+        raise _wrong(f"{path}: POINT:UNITS", f"the unit of length: {', '.join(METRES)}", "none")
     return _check_markers(path, rate, names[: points.shape[1]], points, unit)
+
+
+def c3d_labels(reader: Any) -> tuple[str, ...]:  # noqa: ANN401
+    """Return the markers' names: LABELS, and LABELS2 and so on of files with more than 255."""
+    names: list[str] = []
+    number = 1
+    while True:
+        part = reader.get("POINT:LABELS" + (str(number) if number > 1 else ""))
+        if part is None:
+            return tuple(names)
+        names += [str(label).strip() for label in part.string_array]
+        number += 1
 
 
 def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], str]:
     """Return rate [1/s], names, points (samples, markers, 3) in the file's unit, and that unit."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    # The first line has the path, in the bytes of the writer's system; only numbers matter.
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
     names = tuple(name for name in lines[3].split("\t")[2:] if name)
     width = 2 + 3 * len(names)
@@ -172,6 +197,7 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], 
 def _check_markers(
     path: Path, rate: float, names: tuple[str, ...], points: NDArray[np.float64], unit: str
 ) -> Markers:
+    unit = UNIT_NAMES.get(unit, unit)
     if unit not in METRES or not rate > 0.0 or len(names) != points.shape[1]:
         raise _wrong(
             path,

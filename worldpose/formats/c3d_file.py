@@ -17,8 +17,10 @@ from worldpose.formats.joints_file import JointTracks
 
 BLOCK: Final = 512
 """Size of the blocks that a C3D file consists of [byte]."""
-MAX_FRAMES: Final = 65535
-"""The header counts frames in 16 bits."""
+HEADER_FRAMES: Final = 65535
+"""The header counts frames in 16 bits; POINT:LONG_FRAMES and TRIAL:ACTUAL_END_FIELD count more."""
+MAX_FRAMES: Final = 1 << 24
+"""LONG_FRAMES is a number of single precision: 46 hours at 100 frames per second."""
 MAX_TEXT_BYTES: Final = 32000
 """Maximum length of a text parameter, whose size has 15 bits, with its padding [byte]."""
 MAX_RESIDUAL_MM: Final = 255
@@ -100,7 +102,7 @@ def _points(tracks: JointTracks, person: int, count: int) -> NDArray[np.float32]
 
 def _header(points: int, count: int, fps: float, start: int) -> bytes:
     """Return the first block: sizes, rate, and that event labels have four characters."""
-    sizes = struct.pack("<BB5H", 2, 0x50, points, 0, 1, count, 0)
+    sizes = struct.pack("<BB5H", 2, 0x50, points, 0, 1, min(count, HEADER_FRAMES), 0)
     # A negative scale announces floats; its absolute value is the unit of residuals.
     rates = struct.pack("<fHHf", -1.0, start, 0, fps)
     return sizes + rates
@@ -115,7 +117,8 @@ def _parameters(
     return {
         "POINT": {
             "USED": np.int16(len(points)),
-            "FRAMES": np.uint16(count).astype(np.int16),
+            "FRAMES": np.uint16(min(count, HEADER_FRAMES)).astype(np.int16),
+            **({"LONG_FRAMES": np.float32(count)} if count > HEADER_FRAMES else {}),
             "DATA_START": zero,
             "SCALE": np.float32(-1.0),
             "RATE": np.float32(fps),
@@ -134,7 +137,7 @@ def _parameters(
         "TRIAL": {
             # Pairs of the low and the high 16 bits.
             "ACTUAL_START_FIELD": np.array([1, 0], np.int16),
-            "ACTUAL_END_FIELD": np.array([count, 0], np.uint16).astype(np.int16),
+            "ACTUAL_END_FIELD": np.array([count & 0xFFFF, count >> 16], np.uint16).astype(np.int16),
             "CAMERA_RATE": np.float32(fps),
         },
         "SUBJECTS": {"USED": np.int16(1), "IS_STATIC": zero, "NAMES": [subject]},

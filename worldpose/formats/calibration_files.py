@@ -16,7 +16,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,10 @@ FREEMOCAP: Final = (
     "path_to_recorded_videos",
 )
 """Keys of `metadata` that FreeMoCap alone writes."""
+
+
+LeftOut: TypeAlias = dict[str, str]
+"""Reasons why cameras are left out, by camera."""
 
 
 def build_camera(
@@ -199,6 +203,14 @@ def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -
     rotations = np.array([camera.rotation for camera in cameras])
     centers = -np.einsum("cij,ci->cj", rotations, [camera.translation for camera in cameras])
     distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
+    if distance == 0.0:
+        raise InputError(
+            f"{path}: translation",
+            expected="cameras at different places",
+            found="all at one place: a calibration before the poses were found",
+            todo="Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
+            "cameras by clicks or by worldpose locate-cameras.",
+        )
     in_millimetres = unit_m == MILLIMETRE
     if distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M):
         return
@@ -223,8 +235,14 @@ def _shorten(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
+def read_calibration_toml(
+    path: Path, left_out: LeftOut | None = None
+) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
+
+    Args:
+        path: the file.
+        left_out: receives cameras without a pose; None = all must have one.
 
     Raises:
         InputError: the file is unreadable or has a missing, misshapen or infinite entry, no
@@ -234,8 +252,15 @@ def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
     """
     content = read_toml(path)
     unit_m = MILLIMETRE if _is_freemocap(path, content) else 1.0
+    tables = list(camera_tables(path, content))
+    posed = [each for each in tables if not _lacks_pose(each[2])]
+    if left_out is not None and posed:
+        left_out.update(
+            {camera_id(name): "it has no pose" for _, name, table in tables if _lacks_pose(table)}
+        )
+        tables = posed
     cameras = []
-    for where, name, table in camera_tables(path, content):
+    for where, name, table in tables:
         if "matrix" in table and not {"rotation", "translation"} & table.keys():
             raise InputError(
                 f"{where}.rotation",
@@ -246,6 +271,12 @@ def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
             )
         cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
     return index_by_name(path, cameras, unit_m)
+
+
+def _lacks_pose(table: Mapping[str, Any]) -> bool:
+    """Return whether a camera has a lens but neither rotation nor translation, or empty ones."""
+    empty: tuple[object, ...] = (None, "null", "None", "", [])
+    return "matrix" in table and all(table.get(key) in empty for key in ("rotation", "translation"))
 
 
 def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:

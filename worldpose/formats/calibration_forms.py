@@ -7,9 +7,11 @@ and one of poses; a folder then stands for all of them.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,9 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     Keys,
+    LeftOut,
     calibration_error,
+    camera_id,
     index_by_name,
     read_calibration_toml,
     read_camera_table,
@@ -51,6 +55,10 @@ LYING: Final = np.diag([1.0, -1.0, -1.0])
 """(3, 3) from a board on the ground, whose z points into it."""
 
 
+Sizes: TypeAlias = Mapping[str, tuple[int, int]]
+"""Width and height [px] by camera."""
+
+
 class Form(NamedTuple):
     """A form of calibrations."""
 
@@ -60,8 +68,8 @@ class Form(NamedTuple):
     """How the names of its files end; the first one tells the form without doubt."""
     unit: str
     """Unit of positions, and the axis that points up."""
-    read: Callable[[tuple[Path, ...]], dict[str, CameraCalibration]]
-    """Reads its files."""
+    read: Callable[[tuple[Path, ...], Sizes, LeftOut | None], dict[str, CameraCalibration]]
+    """Reads its files, with image sizes that they may lack, and receives cameras without a pose."""
 
 
 def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
@@ -75,22 +83,29 @@ def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     """
     from worldpose.geometry.cameras import Camera  # late: most commands only check calibrations
 
-    given = read_calibration(Path(path))
+    left_out: LeftOut = {}
+    given = read_calibration(Path(path), left_out=left_out)
+    for name, why in left_out.items():
+        warnings.warn(f"{path}: camera {name} is left out: {why}", stacklevel=2)
     return {name: Camera.from_calibration(calibration) for name, calibration in given.items()}
 
 
-def read_calibration(path: Path) -> dict[str, CameraCalibration]:
+def read_calibration(
+    path: Path, sizes: Sizes = MappingProxyType({}), left_out: LeftOut | None = None
+) -> dict[str, CameraCalibration]:
     """Return the cameras of a calibration by name, in file order.
 
     Args:
         path: a file of one of `FORMS`, or a folder that has one calibration.
+        sizes: image sizes that the file may lack, such as those of the videos.
+        left_out: receives cameras without a pose, with the reason; None = all must have one.
 
     Raises:
         InputError: an unknown form, a folder with no calibration or several, or an invalid entry,
             with file and key.
     """
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
-    return form.read(files)
+    return form.read(files, sizes, left_out)
 
 
 def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
@@ -282,7 +297,9 @@ def _downward(file: Path, table: Mapping[str, Any]) -> NDArray[np.float64]:
     return np.asarray(rotation[1], np.float64)
 
 
-def _read_easymocap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
+def _read_easymocap(
+    files: tuple[Path, ...], sizes: Sizes, left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
     """Return the cameras of EasyMocap's intri.yml and extri.yml, files of OpenCV's FileStorage.
 
     For each of `names`: K, dist (k1 k2 p1 p2 k3), H and W [px] in intri.yml, and R (Rodrigues
@@ -304,9 +321,16 @@ def _read_easymocap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     names = lenses.get("names")
     if not isinstance(names, list) or not names:
         raise calibration_error(f"{lens_file}: names", "a list of cameras", "none")
+    posed = [name for name in names if f"T_{name}" in poses]
+    if left_out is not None and posed:
+        left_out.update({camera_id(name): "it has no pose" for name in names if name not in posed})
+        names = posed
     cameras = []
     for name in names:
         where = f"{lens_file}: {name}"
+        known = sizes.get(camera_id(name))
+        if known is not None and f"W_{name}" not in lenses:
+            lenses |= {f"W_{name}": float(known[0]), f"H_{name}": float(known[1])}
         if f"W_{name}" not in lenses or f"H_{name}" not in lenses:
             raise InputError(
                 f"{lens_file}: W_{name}",
@@ -375,20 +399,20 @@ TOML: Final = Form(
     "Anipose, Pose2Sim, caliscope, FreeMoCap",
     (".toml",),
     "m (FreeMoCap: mm), z up",
-    lambda files: read_calibration_toml(files[0]),
+    lambda files, _, left_out: read_calibration_toml(files[0], left_out),
 )
 QUALISYS: Final = Form(
     "Qualisys",
     (".qca.txt", ".txt", ".xml"),
     "mm, z up",
-    lambda files: read_calibration_xml(files[0]),
+    lambda files, _, left_out: read_calibration_xml(files[0], left_out),
 )
-VICON: Final = Form("Vicon", (".xcp",), "mm, z up", lambda files: read_calibration_xml(files[0]))
-OPTITRACK: Final = Form(
-    "OptiTrack", (".mcal",), "m, y up", lambda files: read_calibration_xml(files[0])
+VICON: Final = Form("Vicon", (".xcp",), "mm, z up", QUALISYS.read)
+OPTITRACK: Final = Form("OptiTrack", (".mcal",), "m, y up", QUALISYS.read)
+OPENCAP: Final = Form(
+    "OpenCap", (".pickle",), "mm, those of the board", lambda files, *_: _read_opencap(files)
 )
-OPENCAP: Final = Form("OpenCap", (".pickle",), "mm, those of the board", _read_opencap)
 EASYMOCAP: Final = Form("EasyMocap", ("intri.yml", "extri.yml"), "m, z up", _read_easymocap)
-BIOCV: Final = Form("bioCV", (".calib",), "mm, z up", _read_biocv)
+BIOCV: Final = Form("bioCV", (".calib",), "mm, z up", lambda files, *_: _read_biocv(files))
 FORMS: Final = (TOML, QUALISYS, VICON, OPTITRACK, OPENCAP, EASYMOCAP, BIOCV)
 """All forms; docs/reference/formats.md describes them."""

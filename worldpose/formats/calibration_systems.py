@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,12 +16,14 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     NUMBER_LIMIT,
+    LeftOut,
     build_camera,
     calibration_error,
     index_by_name,
 )
 from worldpose.formats.files import SETTINGS_BYTES, parse_xml, require_file
 
+_COMMA: Final = re.compile(r"(?<=\d),(?=\d+$)")
 LENS_ERROR_PX: Final = 0.1
 """Maximum error of OpenCV's coefficients fitted to Vicon's lens, within the image [px]: a tenth of
 the error with which a detector finds a joint."""
@@ -32,10 +35,16 @@ BACKWARD: Final = np.diag([1.0, -1.0, -1.0])
 """(3, 3) from camera axes x right, y up, z backward to OpenCV's."""
 
 
-def read_calibration_xml(path: Path) -> dict[str, CameraCalibration]:
+def read_calibration_xml(
+    path: Path, left_out: LeftOut | None = None
+) -> dict[str, CameraCalibration]:
     """Return the cameras of a calibration of Qualisys, Vicon or OptiTrack, in file order.
 
     The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`.
+
+    Args:
+        path: the file.
+        left_out: receives cameras that are not calibrated; None = all must be.
 
     Raises:
         InputError: the file is unreadable, of another program, or has a missing attribute, no
@@ -62,7 +71,7 @@ def read_calibration_xml(path: Path) -> dict[str, CameraCalibration]:
             found=f"<{root.tag:.40}>",
             todo="Export the calibration of the system again.",
         )
-    return readers[root.tag](path, root)
+    return readers[root.tag](path, root, left_out)
 
 
 def _child(where: str, element: ET.Element, tag: str) -> ET.Element:
@@ -85,7 +94,8 @@ def _parse(where: str, text: str | None, count: int) -> NDArray[np.float64]:
     if text is None:
         raise calibration_error(where, "a number" if count == 1 else f"{count} numbers", "nothing")
     try:
-        values = np.array([float(each) for each in text.split()])
+        # Some systems write decimal commas.
+        values = np.array([float(_COMMA.sub(".", each)) for each in text.split()])
     except ValueError as error:
         raise calibration_error(where, "numbers", f"{text!r:.60}") from error
     if len(values) != count:
@@ -95,14 +105,38 @@ def _parse(where: str, text: str | None, count: int) -> NDArray[np.float64]:
     return values
 
 
-def _read_qualisys(path: Path, root: ET.Element) -> dict[str, CameraCalibration]:
-    """Return the active cameras by serial."""
-    cameras = []
-    for index, element in enumerate(root.iterfind("cameras/camera")):
-        where = f"{path}: camera[{index}]"
-        if element.get("active", "1") != "0":
-            cameras.append((where, _read_qualisys_camera(where, element)))
+def _read_qualisys(
+    path: Path, root: ET.Element, left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
+    """Return the active cameras by serial; the video cameras alone if some are called so."""
+    active = [
+        (f"{path}: camera[{index}]", element)
+        for index, element in enumerate(root.iterfind("cameras/camera"))
+        if element.get("active", "1") != "0"
+    ]
+    has_video = any("video" in element.get("model", "").lower() for _, element in active)
+    lacks = [_qualisys_lack(element, has_video) for _, element in active]
+    if left_out is not None and not all(lacks):
+        for (where, element), why in zip(active, lacks, strict=True):
+            if why:
+                left_out[element.get("serial", where)] = why
+        active = [each for each, why in zip(active, lacks, strict=True) if not why]
+    cameras = [(where, _read_qualisys_camera(where, element)) for where, element in active]
     return index_by_name(path, cameras, MILLIMETRE)
+
+
+def _qualisys_lack(element: ET.Element, has_video: bool) -> str:
+    """Return why a camera makes no calibrated video; empty if it does."""
+    model = element.get("model", "")
+    if has_video and "video" not in model.lower():
+        return f"it records markers ({model})"
+    if element.find("fov_video") is None:
+        return "it makes no video (no fov_video)"
+    place = element.find("transform")
+    axes = [] if place is None else [place.get(f"r{i}{j}", "") for i in "123" for j in "123"]
+    if all(re.fullmatch(r"-?0*[.,]?0*", text) for text in axes):
+        return "it is not calibrated (its rotation is zero)"
+    return ""
 
 
 def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
@@ -144,24 +178,34 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
     )
 
 
-def _read_vicon(path: Path, root: ET.Element) -> dict[str, CameraCalibration]:
+def _read_vicon(
+    path: Path, root: ET.Element, left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
     """Return the video cameras of an XCP file by device id; those for markers make no video."""
-    cameras, others = [], set()
+    elements: list[tuple[str, ET.Element]] = []
+    others = set()
     for index, element in enumerate(root.iterfind("Camera")):
         where = f"{path}: Camera[{index}]"
         kind = f"{element.get('DISPLAY_TYPE', '')} {element.get('TYPE', '')}".lower()
         is_digital = element.get("SYSTEM") == "DV" or element.get("ISDV", "0") not in ("", "0")
         if is_digital or "video" in kind or "vue" in kind:
-            cameras.append((where, _read_vicon_camera(where, element)))
+            elements.append((where, element))
         else:
             others.add(element.get("DISPLAY_TYPE", "?"))
-    if others and not cameras:
+    posed = [each for each in elements if each[1].find("KeyFrames/KeyFrame") is not None]
+    if left_out is not None and posed:
+        names = {element.get("DEVICEID", where) for where, element in elements}
+        names -= {element.get("DEVICEID", where) for where, element in posed}
+        left_out.update(dict.fromkeys(sorted(names), "it is not calibrated (no KeyFrame)"))
+        elements = posed
+    if others and not elements:
         raise InputError(
             str(path),
             expected="a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)",
             found=f"cameras for markers alone: {', '.join(sorted(others)):.80}",
             todo="Calibrate the video cameras with the others, and export again.",
         )
+    cameras = [(where, _read_vicon_camera(where, element)) for where, element in elements]
     return index_by_name(path, cameras, MILLIMETRE)
 
 
@@ -285,7 +329,9 @@ def _vicon_lens(
     return np.asarray(lens)
 
 
-def _read_optitrack(path: Path, root: ET.Element) -> dict[str, CameraCalibration]:
+def _read_optitrack(
+    path: Path, root: ET.Element, left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
     """Return the cameras of a Motive calibration that film, by serial; all if none does.
 
     Colour cameras (serial C...) and those in grayscale or MJPEG mode film (VideoType 1 or 6); the

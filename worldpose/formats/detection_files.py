@@ -6,42 +6,29 @@ OpenPose and Pose2Sim write one file per frame, trackers such as ByteTrack one l
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17, FEET
-from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
-from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
 from worldpose.formats.files import read_json, require_file
-from worldpose.formats.keypoint_files import COORDINATE_LIMIT, PEOPLE_LIMIT
+from worldpose.formats.keypoint_sets import (
+    COORDINATE_LIMIT,
+    KNOWN_SETS,
+    MAX_CONFIDENCE,
+    PEOPLE_LIMIT,
+    SIZES,
+    PeopleFile,
+    clean_points,
+    order_by_points,
+    people_by_frame,
+)
 
-KEYPOINTS_KEY: Final = "pose_keypoints_2d"
-
-
-class PointOrder(NamedTuple):
-    """A set of keypoints of an estimator."""
-
-    name: str
-    joints: tuple[int, ...]
-    """(17,) places of COCO-17's joints in it."""
-    feet: tuple[int, ...] = ()
-    """(6,) places of `FEET`; none if it has no feet."""
-
-
-PLACES: Final = {
-    17: PointOrder("COCO-17", tuple(range(17))),
-    25: PointOrder("BODY_25", *(tuple(map(BODY25.index, names)) for names in (COCO17, FEET))),
-    26: PointOrder("HALPE-26", tuple(range(17)), (20, 22, 24, 21, 23, 25)),
-    133: PointOrder("COCO-WholeBody", tuple(range(17)), tuple(range(17, 23))),
-    136: PointOrder("HALPE-136", tuple(range(17)), (20, 22, 24, 21, 23, 25)),
-}
-"""Sets of keypoints by their size."""
+KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints")
+"""Of version 1 and later, and of version 0."""
 BOX_BYTES: Final = 1 << 28
 """Maximum size of a file of boxes [byte]: that of 22 people in an hour has 200 MB."""
 BOX_COLUMNS: Final = range(6, 11)
@@ -51,34 +38,22 @@ PEDESTRIAN: Final = 1
 _NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
 
 
-class OpenPoseFolder(NamedTuple):
-    """Content of a folder of frames."""
+def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
+    """Return the people of one camera; `worldpose.formats.keypoint_sets` tells their points.
 
-    people: KeypointDetections
-    """The keypoints of COCO-17, and `FEET` if the set has them; others are left out."""
-    kind: str | None
-    """Name of the set of keypoints in the files; None without people."""
+    The last number in a file's name is its frame. An empty file is a frame without people.
 
-
-def read_openpose_folder(folder: Path) -> OpenPoseFolder:
-    """Return the people of one camera.
-
-    The last number in a file's name is its frame. A keypoint with confidence 0 is missing; a
-    confidence above 1, which some estimators give, counts as 1. Boxes surround the keypoints, and
-    a person's score is the mean confidence.
+    Args:
+        folder: holds a JSON file for each frame.
+        model: Pose2Sim's name of the pose model, if it is known.
 
     Raises:
         InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
             unknown or a changing number of keypoints; the error names file and key.
     """
     files = _frame_files(folder)
-    frames = sorted(files)
-    people = [_read_frame(files[frame]) for frame in frames]
-    sizes = {
-        len(person): files[frame]
-        for frame, found in zip(frames, people, strict=True)
-        for person in found
-    }
+    read = {frame: _read_frame(files[frame]) for frame in sorted(files)}
+    sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
         (one, file), (two, other) = list(sizes.items())[:2]
         raise InputError(
@@ -87,32 +62,16 @@ def read_openpose_folder(folder: Path) -> OpenPoseFolder:
             found=f"{one} in {file.name}, {two} in {other.name}",
             todo="Use the files of one estimator, and remove older ones.",
         )
-    order = PLACES[next(iter(sizes))] if sizes else None
-    places = [*order.joints, *order.feet] if order else list(range(17))
-    most = max(map(len, people), default=0)
-    values = np.full((len(frames), most, len(places), 3), np.nan, np.float32)
-    for row, each in enumerate(people):
-        for column, person in enumerate(each):
-            values[row, column] = person[places]
-    keypoints, confidence = values[..., :2], np.minimum(values[..., 2], 1.0)
-    found = np.asarray(confidence > 0.0)
-    # An entry without any keypoint of COCO-17 is no person.
-    there = np.asarray(found[..., :17].any(axis=-1))
-    missing = ~(found & there[..., None])
-    keypoints = np.where(missing[..., None], np.nan, keypoints)
-    confidence = np.where(missing, np.nan, confidence).astype(np.float32)
-    keypoints, feet = np.split(keypoints, [17], axis=-2)
-    confidence, sure = np.split(confidence, [17], axis=-1)
-    boxes = np.full((*there.shape, 4), np.nan, np.float32)
-    score = np.full(there.shape, np.nan, np.float32)
-    boxes[there] = np.concatenate(
-        [np.nanmin(keypoints[there], axis=-2), np.nanmax(keypoints[there], axis=-2)], axis=-1
-    )
-    score[there] = np.nanmean(confidence[there], axis=-1)
-    detected = KeypointDetections(keypoints, confidence, boxes, score, np.array(frames, np.int64))
-    if order is not None and order.feet:
-        detected = replace(detected, points=FEET, extra_keypoints=feet, extra_confidence=sure)
-    return OpenPoseFolder(detected, None if order is None else order.name)
+    empty = sum(people is None for people in read.values())
+    found = [one for people in read.values() for one in people or ()]
+    frames = np.repeat(list(read), [len(people or ()) for people in read.values()])
+    points = np.array(found, np.float32) if found else np.empty((0, 17, 3), np.float32)
+    order = order_by_points(str(folder), points, model)
+    points, changed = clean_points(points[:, order.places])
+    people, nobody = people_by_frame(folder, frames.astype(np.int64), points)
+    people = people.reindex(np.array(list(read), np.int64))
+    kind = order.name if found else None
+    return PeopleFile(people, kind, changed._replace(nobody=nobody, empty=empty))
 
 
 def _frame_files(folder: Path) -> dict[int, Path]:
@@ -144,40 +103,46 @@ def _frame_files(folder: Path) -> dict[int, Path]:
     return files
 
 
-def _read_frame(file: Path) -> list[NDArray[np.float64]]:
-    """Return the keypoints (n, 3) x, y, confidence of each person of a frame."""
+def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
+    """Return the keypoints (n, 3) x, y, confidence of each person of a frame; None if empty."""
+    if not file.stat().st_size:
+        return None
     content = read_json(file)
-    people = content.get("people") if isinstance(content, dict) else None
-    if not isinstance(people, list) or len(people) > PEOPLE_LIMIT:
+    people = content.get("people") if isinstance(content, dict) else content
+    if people == [] and content == []:
+        return None
+    if not isinstance(people, list) or not isinstance(content, dict) or len(people) > PEOPLE_LIMIT:
         raise InputError(
             f"{file}: people",
             expected=f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it",
             found=f"{len(people)}" if isinstance(people, list) else type(content).__name__,
             todo="Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose').",
         )
-    return [_read_person(f"{file}: people[{n}].{KEYPOINTS_KEY}", p) for n, p in enumerate(people)]
+    return [_read_person(f"{file}: people[{n}]", person) for n, person in enumerate(people)]
 
 
 def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
-    numbers = person.get(KEYPOINTS_KEY) if isinstance(person, dict) else None
-    known = ", ".join(f"{3 * size} ({order.name})" for size, order in PLACES.items())
+    entries = person if isinstance(person, dict) else {}
+    key = next((key for key in KEYPOINTS_KEYS if key in entries), KEYPOINTS_KEYS[0])
+    numbers = entries.get(key)
     if (
         not isinstance(numbers, list)
-        or len(numbers) not in {3 * size for size in PLACES}
+        or len(numbers) not in {3 * size for size in SIZES}
         or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers)
     ):
         raise InputError(
-            where,
-            expected=f"x, y and confidence of each keypoint: {known} numbers",
+            f"{where}.{key}",
+            expected=f"x, y, confidence of each point, of {KNOWN_SETS} points",
             found=f"{len(numbers)} entries" if isinstance(numbers, list) else f"{numbers!r:.40}",
             todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
         )
     values = np.array(numbers, dtype=np.float64).reshape(-1, 3)
-    if not (np.abs(values) <= COORDINATE_LIMIT).all():  # also NaN
+    off = (np.abs(values) > COORDINATE_LIMIT).any(axis=1) | (values[:, 2] > MAX_CONFIDENCE)
+    if off.any():
         raise InputError(
-            where,
-            expected=f"finite numbers up to {COORDINATE_LIMIT:g}",
-            found=f"{values[~(np.abs(values) <= COORDINATE_LIMIT)][0]}",
+            f"{where}.{key}",
+            expected=f"pixels up to {COORDINATE_LIMIT:g}, and confidences from 0 to 1",
+            found=", ".join(f"{number:g}" for number in values[off][0]),
             todo="Estimate the poses of this frame again.",
         )
     return values

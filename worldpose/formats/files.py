@@ -13,7 +13,7 @@ import json
 import os
 import tempfile
 import tomllib
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
@@ -258,15 +258,17 @@ class JsonItems:
         is_mapping: whether the file is a mapping; set when iteration begins.
         other: value in place of the list, None if there is no value or the list.
         has_list: whether the file has the list; set when iteration ends.
+        kept: values of the other keys to keep; filled while iterating.
     """
 
-    def __init__(self, path: Path, key: str, limit: int) -> None:
+    def __init__(self, path: Path, key: str, limit: int, keep: Collection[str] = ()) -> None:
         """Prepare reading.
 
         Args:
             path: the file.
             key: key of the list if the file is a mapping.
             limit: maximum size of the file [byte].
+            keep: further keys of the mapping whose values are kept.
 
         Raises:
             InputError: no such file, or too large.
@@ -276,6 +278,8 @@ class JsonItems:
         self.is_mapping = False
         self.has_list = False
         self.other: Any = None
+        self.keep = frozenset(keep)
+        self.kept: dict[str, Any] = {}
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the entries.
@@ -318,7 +322,10 @@ class JsonItems:
             if name is None:
                 raise text.error("Expecting property name enclosed in double quotes")
             text.take(":")
-            if name != self.key:
+            if name in self.keep:
+                is_list = text.ahead() == "["
+                self.kept[name] = list(_read_list(text)) if is_list else text.value()
+            elif name != self.key:
                 _skip(text)
             elif self.has_list or self.other is not None:
                 raise text.error(f"{self.key!r} is given twice")

@@ -25,7 +25,7 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
-from worldpose.formats.files import SETTINGS_BYTES, require_file
+from worldpose.formats.files import SETTINGS_BYTES, read_yaml, require_file
 from worldpose.parsing import read_npy
 
 FOCAL_STD: Final = 0.01
@@ -36,10 +36,13 @@ PRINCIPAL_POINT_STD: Final = 0.005
 DISTORTION_STD: Final = 0.005
 """The same of the image corner's displacement, relative to its distance from the centre [1]: boards
 seldom reach the corners."""
-MATRIX_NAMES: Final = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx", "K", "matrix")
+MATRIX_NAMES: Final = (
+    *("camera_matrix", "cameraMatrix", "Camera_Matrix", "camMatrix", "mtx", "K", "matrix"),
+)
 DISTORTION_NAMES: Final = (
     *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs"),
-    *("dist_coefs", "dist", "distortions", "distortion", "D"),
+    *("dist_coefs", "dist_coeff", "distCoef", "distCoeff", "dist", "distortions", "distortion"),
+    *("distortion_coeffs", "D"),
 )
 ARRAY_BYTES: Final = 1 << 26
 """Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
@@ -81,11 +84,17 @@ def read_lenses(
     where = ", ".join(map(str, files))
     matrix = _pick(where, given, MATRIX_NAMES, "a 3 x 3 camera matrix")
     distortion = np.ravel(_pick(where, given, DISTORTION_NAMES, "distortion coefficients"))
+    try:
+        matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise calibration_error(where, "matrices of numbers", str(error)) from error
     size = _image_size(given, sizes[camera])
+    is_fisheye = "fisheye_model" in given and np.any(np.asarray(given["fisheye_model"]) != 0)
     table = {
         "size": list(size),
-        "matrix": np.asarray(matrix, dtype=np.float64).tolist(),
+        "matrix": matrix.tolist(),
         "distortions": distortion.tolist(),
+        **({"fisheye": True} if is_fisheye else {}),
     }
     return {camera: _lens(where, camera, table, sizes[camera])}
 
@@ -148,7 +157,11 @@ def _read_file(file: Path) -> dict[str, Any]:
         raise calibration_error(str(file), "arrays of numbers", str(error)) from error
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
-    if suffix in (".xml", ".yml", ".yaml", ".json"):
+    if suffix in (".yml", ".yaml"):
+        with file.open("rb") as stream:
+            is_storage = b"%YAML:" in stream.read(64) or b"!!opencv-matrix" in stream.read()
+        return read_file_storage(file) if is_storage else _read_yaml(file)
+    if suffix in (".xml", ".json"):
         return read_file_storage(file)
     raise InputError(
         str(file),
@@ -156,6 +169,37 @@ def _read_file(file: Path) -> dict[str, Any]:
         found=repr(file.suffix),
         todo="Save the camera matrix and the distortion coefficients in one of these forms.",
     )
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    """Return numbers, arrays and texts of plain YAML, as ROS's camera_calibration writes it.
+
+    A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
+
+    Raises:
+        InputError: the file is no mapping, a matrix has other sizes than it says, or the lens model
+            is neither `plumb_bob` nor one of zeros beyond k3.
+    """
+    content = read_yaml(file)
+    if not isinstance(content, dict):
+        raise calibration_error(str(file), "a mapping", type(content).__name__)
+    found: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, dict) and {"rows", "cols", "data"} <= value.keys():
+            try:
+                found[str(name)] = np.reshape(value["data"], (value["rows"], value["cols"]))
+            except (ValueError, TypeError) as error:
+                raise calibration_error(
+                    f"{file}: {name}", "rows x cols numbers", str(error)
+                ) from error
+        elif isinstance(value, list | int | float):
+            found[str(name)] = value
+    model = content.get("distortion_model", "plumb_bob")
+    if model in ("equidistant", "fisheye"):
+        found["fisheye_model"] = 1
+    elif model not in ("plumb_bob", "rational_polynomial"):
+        raise calibration_error(f"{file}: distortion_model", "plumb_bob", repr(model))
+    return found
 
 
 def read_file_storage(file: Path) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from data_contracts.arrays import Floats, Image, Integers
 from data_contracts.cameras import CameraCalibration, LensCalibration, Vector3
 from worldpose.errors import InputError
-from worldpose.geometry import projection
-from worldpose.geometry.projection import fold_radius
+from worldpose.geometry import camera_model
+from worldpose.geometry.lens_models import WIDTH, LensModel, lens_rows
 from worldpose.geometry.rays import Rays
 from worldpose.geometry.rigid import (
     Index,
@@ -24,7 +24,7 @@ from worldpose.geometry.rigid import (
     nearest_rotation,
 )
 
-_PARTS = {"focal": 2, "principal_point": 2, "distortion": 5, "image_size": 2}
+_PARTS = ("focal", "principal_point", "distortion", "image_size")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +51,10 @@ class Projection:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One pinhole camera with OpenCV's five distortion coefficients, or a batch of them.
+    """One pinhole camera with a distorting lens, or a batch of them.
 
     Batch dimensions of the fields broadcast against each other. A camera with a NaN is missing: its
-    pixels and rays are NaN.
+    pixels and rays are NaN. Files and records hold cameras of Brown's model alone.
 
     Raises:
         InputError: a field has the wrong shape, or the batches do not broadcast.
@@ -68,17 +68,21 @@ class Camera:
     principal_point: Floats
     """(..., 2) cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
     distortion: Floats
-    """(..., 5) k1 k2 p1 p2 k3."""
+    """(..., 5) k1 k2 p1 p2 k3 of Brown's model; (..., 8) of others, then k4 k5 k6. A coefficient
+    that a model does not have is 0."""
     cam_from_world: Rigid
     """(...) pose."""
     image_size: Integers
     """(..., 2) width, height [px]."""
+    lens_model: LensModel = LensModel.BROWN
+    """Model of all cameras of the batch."""
 
     def __post_init__(self) -> None:
         pose = self.cam_from_world
+        lens = 5 if self.lens_model == LensModel.BROWN else 8
         parts = {
             name: check_shape(f"Camera.{name}", getattr(self, name), (length,))
-            for name, length in _PARTS.items()
+            for name, length in zip(_PARTS, (2, 2, lens, 2), strict=True)
         }
         batch = common_batch(
             "Camera", pose.batch_shape, *(part.shape[:-1] for part in parts.values())
@@ -95,14 +99,16 @@ class Camera:
         """Return one batch of cameras, stacked along a new first dimension.
 
         Raises:
-            InputError: there are no cameras, or their batch shapes differ.
+            InputError: there are no cameras, or their batch shapes or lens models differ.
         """
-        if len({camera.batch_shape for camera in cameras}) != 1:
+        shapes = [camera.batch_shape for camera in cameras]
+        models = [camera.lens_model.name for camera in cameras]
+        if len(set(shapes)) != 1 or len(set(models)) != 1:
             raise InputError(
                 "Camera.stack",
-                expected="one or more cameras of one batch shape",
-                found=f"batch shapes {[camera.batch_shape for camera in cameras]}",
-                todo="Stack single cameras.",
+                expected="one or more cameras of one batch shape and lens model",
+                found=f"batch shapes {shapes}, lens models {models}",
+                todo="Stack single cameras of one lens model.",
             )
         poses = [camera.cam_from_world for camera in cameras]
         return cls(
@@ -111,6 +117,7 @@ class Camera:
                 np.stack([pose.rotation for pose in poses]),
                 np.stack([pose.translation for pose in poses]),
             ),
+            lens_model=cameras[0].lens_model,
         )
 
     @classmethod
@@ -195,18 +202,32 @@ class Camera:
             image_size=np.array(lens.image_size if image_size is None else image_size),
         )
 
+    @classmethod
+    def from_numbers(cls, row: Floats, image_size: ArrayLike) -> Camera:
+        """Return the camera of a row (WIDTH,), its rotation replaced by the nearest exact one."""
+        u, _, v = np.linalg.svd(row[9:18].reshape(3, 3))
+        model = LensModel(int(row[25]))
+        return cls(
+            focal=row[:2],
+            principal_point=row[2:4],
+            distortion=row[4:9] if model == LensModel.BROWN else row[[4, 5, 6, 7, 8, 22, 23, 24]],
+            cam_from_world=Rigid(u @ v, row[18:21]),
+            image_size=np.asarray(image_size),
+            lens_model=model,
+        )
+
     def to_calibration(self, camera_id: str) -> CameraCalibration:
         """Return the record of a single camera.
 
         Raises:
-            InputError: this is a batch.
+            InputError: this is a batch, or its lens model is not Brown's.
         """
-        if self.batch_shape:
+        if self.batch_shape or self.lens_model != LensModel.BROWN:
             raise InputError(
                 "Camera.to_calibration",
-                expected="a single camera",
-                found=f"a batch of shape {self.batch_shape}",
-                todo="Index the batch first.",
+                expected="a single camera of Brown's lens model",
+                found=f"a batch of shape {self.batch_shape} of model {self.lens_model.name}",
+                todo="Index the batch first; fit Brown's model to another lens.",
             )
         width, height = (int(n) for n in self.image_size)
         fx, fy = self.focal.tolist()
@@ -235,23 +256,19 @@ class Camera:
 
     @property
     def numbers(self) -> Floats:
-        """Rows (..., 22) as the compiled kernels of `worldpose.geometry.projection` take them."""
-        return np.concatenate(
-            [
-                self.focal,
-                self.principal_point,
-                self.distortion,
-                self.cam_from_world.rotation.reshape(*self.batch_shape, 9),
-                self.cam_from_world.translation,
-                fold_radius(self.distortion)[..., None],
-            ],
-            axis=-1,
-        )
+        """Rows (..., WIDTH) as the kernels of `worldpose.geometry.camera_model` take them."""
+        rows = lens_rows(self.distortion, self.lens_model)
+        rows[..., :2] = self.focal
+        rows[..., 2:4] = self.principal_point
+        rows[..., 9:18] = self.cam_from_world.rotation.reshape(*self.batch_shape, 9)
+        rows[..., 18:21] = self.cam_from_world.translation
+        return rows
 
     def __getitem__(self, index: Index) -> Camera:
         return Camera(
             **{name: getattr(self, name)[index_leading(index, 1)] for name in _PARTS},
             cam_from_world=self.cam_from_world[index],
+            lens_model=self.lens_model,
         )
 
     def project(self, points_world: ArrayLike) -> Floats:
@@ -270,7 +287,7 @@ class Camera:
         """
         batch, cameras, points = self._flat("Camera.project: points_world", points_world, 3)
         image = np.empty((*points.shape[:-1], 2))
-        projection.project(cameras, points, image)
+        camera_model.project(cameras, points, image)
         return image.reshape((*batch, *image.shape[1:]))
 
     def project_with_jacobians(self, points_world: ArrayLike) -> Projection:
@@ -289,7 +306,7 @@ class Camera:
         image = np.empty((*shape, 2))
         jacobian = np.empty((*shape, 2, 18))
         status = np.empty(shape, dtype=np.uint8)
-        projection.project_with_jacobians(cameras, points, image, jacobian, status)
+        camera_model.project_with_jacobians(cameras, points, image, jacobian, status)
         jacobian = jacobian.reshape((*batch, *jacobian.shape[1:]))
         return Projection(
             points_image=image.reshape((*batch, *image.shape[1:])),
@@ -312,7 +329,7 @@ class Camera:
         batch, cameras, points = self._flat("Camera.unproject: points_image", points_image, 2)
         plane, status = _normalize(cameras, points)
         directions = np.empty((*points.shape[:-1], 3))
-        projection.point_rays(cameras, plane, directions)
+        camera_model.point_rays(cameras, plane, directions)
         return Rays(
             origins=self.center[..., None, :],
             directions=directions.reshape((*batch, *directions.shape[1:])),
@@ -334,11 +351,11 @@ class Camera:
     def _flat(
         self, where: str, points: ArrayLike, width: int
     ) -> tuple[tuple[int, ...], Floats, Floats]:
-        """Return the common batch shape, cameras (batch, 22) and points (batch, n, width)."""
+        """Return the common batch shape, cameras (batch, WIDTH) and points (batch, n, width)."""
         values = check_shape(where, points, (-1, width))
         batch = common_batch(where, self.batch_shape, values.shape[:-2])
         size = int(np.prod(batch))
-        cameras = np.broadcast_to(self.numbers, (*batch, 22)).reshape(size, 22)
+        cameras = np.broadcast_to(self.numbers, (*batch, WIDTH)).reshape(size, WIDTH)
         shape = values.shape[-2:]
         return batch, cameras, np.broadcast_to(values, (*batch, *shape)).reshape((size, *shape))
 
@@ -347,7 +364,7 @@ def _normalize(cameras: Floats, points: Floats) -> tuple[Floats, Image]:
     """Return undistorted coordinates (batch, n, 2) and their status (batch, n)."""
     plane = np.empty(points.shape)
     status = np.empty(points.shape[:-1], dtype=np.uint8)
-    projection.normalize(cameras, points, plane, status)
+    camera_model.normalize(cameras, points, plane, status)
     return plane, status
 
 

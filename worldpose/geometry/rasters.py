@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from worldpose.compiled import compile_kernel
+from worldpose.geometry.camera_model import project_point
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.projection import project_point
+from worldpose.geometry.lens_models import load_camera
 from worldpose.geometry.rays import RayStatus
 
 Box = tuple[int, int, int, int]
@@ -256,23 +257,23 @@ class Outlines:
 def outline_surfaces(camera: Camera, vertices: Singles) -> Outlines:
     """Return outlines in a single camera's image of (surfaces, vertices, 3) [m], world."""
     pixels, boxes = np.empty_like(vertices), np.empty((len(vertices), 4))
-    _project(camera.numbers, vertices, pixels, boxes)
+    _project(camera.numbers[None], vertices, pixels, boxes)
     return Outlines(pixels, boxes)
 
 
 @compile_kernel
-def _project(camera: Floats, vertices: Singles, pixels: Singles, boxes: Floats) -> None:
+def _project(cameras: Floats, vertices: Singles, pixels: Singles, boxes: Floats) -> None:
     """Write pixels and depth (surfaces, vertices, 3), and the box (4,) around each surface."""
+    camera = load_camera(cameras, 0)
     for p in range(vertices.shape[0]):
         left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
         for v in range(vertices.shape[1]):
             at = vertices[p, v]
-            seen = project_point(camera, float(at[0]), float(at[1]), float(at[2]))
-            if seen[0] != _OK:
+            status, x, y, depth = project_point(camera, float(at[0]), float(at[1]), float(at[2]))
+            if status != _OK:
                 pixels[p, v] = np.nan
                 continue
-            x, y = camera[0] * seen[1] + camera[2], camera[1] * seen[2] + camera[3]
-            pixels[p, v, 0], pixels[p, v, 1], pixels[p, v, 2] = x, y, seen[5]
+            pixels[p, v, 0], pixels[p, v, 1], pixels[p, v, 2] = x, y, depth
             left, right = min(left, x), max(right, x)
             top, bottom = min(top, y), max(bottom, y)
         boxes[p, 0], boxes[p, 1], boxes[p, 2], boxes[p, 3] = left, top, right, bottom

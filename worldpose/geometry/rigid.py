@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import Flags, Floats
 from worldpose.errors import InputError
 
 Index: TypeAlias = (
@@ -256,8 +256,10 @@ class Similarity:
         return moved
 
 
-def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similarity:
-    """Return the motion of `source` with the least sum of squared distances to `target`.
+def align(
+    source: ArrayLike, target: ArrayLike, *, with_scale: bool, weights: ArrayLike = 1.0
+) -> Similarity:
+    """Return the motion of `source` with the least weighted sum of squared distances to `target`.
 
     The function ignores points that are missing on either side. The rotation is always proper: a
     mirrored set stays mirrored. If the motion is not unique, the result is one of the minima:
@@ -268,6 +270,7 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
         source: (..., n, 3) [m]; NaN where missing.
         target: (..., n, 3) [m]; NaN where missing.
         with_scale: a similarity (Procrustes analysis) if true, a rigid motion if not.
+        weights: (..., n) weight of each pair.
 
     Raises:
         InputError: the last dimensions are not (n, 3).
@@ -279,27 +282,31 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
         check_shape("align: source", source, (-1, 3)), check_shape("align: target", target, (-1, 3))
     )
     common = np.isfinite(a).all(-1) & np.isfinite(b).all(-1)
-    count = common.sum(-1)
-    a_mean, a_offset = _center(a, common, count)
-    b_mean, b_offset = _center(b, common, count)
-    u, s, v = np.linalg.svd(np.swapaxes(b_offset, -1, -2) @ a_offset)
+    weight = np.where(common, weights, 0.0)
+    a_mean, a_offset = _center(a, weight)
+    b_mean, b_offset = _center(b, weight)
+    u, s, v = np.linalg.svd(np.swapaxes(weight[..., None] * b_offset, -1, -2) @ a_offset)
     handed = np.ones_like(s)
     handed[..., 2] = np.where(np.linalg.det(u) * np.linalg.det(v) < 0.0, -1.0, 1.0)
     rotation = (u * handed[..., None, :]) @ v
-    spread = np.square(a_offset).sum((-1, -2))
+    spread = (weight * np.square(a_offset).sum(-1)).sum(-1)
     # Offsets of coinciding points are only rounding errors of their mean.
-    single = spread <= count * np.square(8.0 * np.finfo(float).eps * np.abs(a_mean).max(-1))
+    single = spread <= weight.sum(-1) * np.square(
+        8.0 * np.finfo(float).eps * np.abs(a_mean).max(-1)
+    )
     rotation = np.where(single[..., None, None], np.eye(3), rotation)
     scale = np.ones(spread.shape)
     if with_scale:
         np.divide((handed * s).sum(-1), spread, out=scale, where=~single)
-    scale = np.where(count > 0, scale, np.nan)
+    scale = np.where(common.any(-1), scale, np.nan)
     moved = scale[..., None] * (rotation @ a_mean[..., None])[..., 0]
     return Similarity(scale=scale, rotation=rotation, translation=b_mean - moved)
 
 
-def _center(points: Floats, common: Flags, count: Integers) -> tuple[Floats, Floats]:
-    """Return the mean of the common points and their offsets from it; 0 for other points."""
-    known = np.where(common[..., None], points, 0.0)
-    mean = known.sum(-2) / np.maximum(count, 1)[..., None]
-    return mean, np.where(common[..., None], known - mean[..., None, :], 0.0)
+def _center(points: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Return the weighted mean of points and their offsets from it; 0 without weight."""
+    known = weight[..., None] > 0.0
+    total = weight.sum(-1)
+    weighted = np.where(known, weight[..., None] * points, 0.0).sum(-2)
+    mean = weighted / np.where(total > 0.0, total, 1.0)[..., None]
+    return mean, np.where(known, points - mean[..., None, :], 0.0)

@@ -19,7 +19,11 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.formats.annotations.marked_images import MarkedImage, read_marked_images
+from worldpose.formats.annotations.marked_images import (
+    SOCCERNET_MARKINGS,
+    MarkedImage,
+    read_marked_images,
+)
 from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
@@ -76,14 +80,15 @@ class ImportedClicks:
 def import_clicks(file: Path, folder: Path, owner: str | None = None) -> ImportedClicks:
     """Write the labelled points of an annotation file into a match folder.
 
-    Labels are names of the pitch template, or places in metres: from a corner along the touch line
+    Labels are names of the pitch template or SoccerNet's of lines, without regard to case and
+    spaces, or places in metres: from a corner along the touch line
     and the goal line, or, if some are negative, from the centre spot. On which side y is positive
     follows from the clicks: no camera above a pitch sees it mirrored. Places that neither the Laws
     nor pitch.json name become points of pitch.json. A label that is clicked twice in one image
     gives two points at one place, from which calibration tells the wrong one.
 
     Args:
-        file: CVAT for images XML, Label Studio JSON or COCO keypoints JSON.
+        file: CVAT for images XML, Label Studio JSON, COCO keypoints JSON or SoccerNet's lines.
         folder: the match folder, with match.yaml.
         owner: the static camera, or the clip of the broadcast camera whose key frames are numbered
             by the images' names; None: the images are named after cameras.
@@ -106,13 +111,14 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
     report = ImportedClicks()
     labels = _Labels(file, images, pitch, report)
     records: dict[str, Record] = {}
-    for name, (camera, own) in by_owner.items():
+    for name, (camera, given) in by_owner.items():
+        own = [image.of_size((camera.width, camera.height)) for image in given]
         for image in own:
             if image.size != (camera.width, camera.height):
                 raise InputError(
                     f"{file}: {image.name}",
                     expected=f"{camera.width} x {camera.height} px, as match.yaml has it",
-                    found=f"{image.size[0]} x {image.size[1]} px",
+                    found="{} x {} px".format(*(image.size or ())),
                     todo="Click in images of the camera's own size, or correct match.yaml.",
                 )
         records |= _records(file, name, camera, own, labels)
@@ -156,7 +162,9 @@ def _assign_images(
         )
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
-        name = owner or PurePosixPath(image.name.replace("\\", "/")).stem
+        stem = PurePosixPath(image.name.replace("\\", "/")).stem
+        # Label Studio puts eight digits before the name of an uploaded file.
+        name = owner or (stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem))
         if name not in static or name in found:
             raise InputError(
                 f"{file}: {image.name}",
@@ -242,8 +250,9 @@ class _Labels:
         return (x, y, z)
 
     def _name(self, image: MarkedImage, label: str) -> str:
-        if label in self._template.points:
-            return label
+        known = _find_name(label, self._template.points)
+        if known is not None:
+            return known
         found = COORDINATES.fullmatch(label.strip())
         if found is None or self._frame is None:
             raise self._unknown(image, label, self._template.points)
@@ -259,9 +268,11 @@ class _Labels:
         return name
 
     def _line(self, image: MarkedImage, label: str) -> str:
-        if label not in self._template.marking_names:
+        known = _find_name(label, self._template.marking_names)
+        theirs = _find_name(label, SOCCERNET_MARKINGS)
+        if known is None and theirs is None:
             raise self._unknown(image, label, self._template.marking_names)
-        return label
+        return SOCCERNET_MARKINGS[theirs] if known is None and theirs is not None else str(known)
 
     def _unknown(self, image: MarkedImage, label: str, known: Collection[str]) -> InputError:
         close = get_close_matches(label, known, n=3)
@@ -271,6 +282,15 @@ class _Labels:
             found=repr(label[:60]) + (f"; did you mean {' or '.join(close)}?" if close else ""),
             todo="Rename the label; docs/reference/match_folder.md lists the names.",
         )
+
+
+def _find_name(label: str, names: Collection[str]) -> str | None:
+    """Return the name that a label means, without regard to case and spaces; None if none does."""
+    if label in names:
+        return label
+    plain = re.sub(r"[\s_-]+", "_", label.strip()).lower()
+    found = [name for name in names if re.sub(r"[\s_-]+", "_", name).lower() == plain]
+    return found[0] if len(found) == 1 else None
 
 
 def _label_frame(file: Path, images: Sequence[MarkedImage], pitch: PitchSpec) -> Floats | None:

@@ -205,13 +205,13 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     """Return the image (height, width, 3), RGB.
 
     Args:
-        path: a PNG or JPEG file.
+        path: a PNG, JPEG, TIFF, BMP or WebP file.
         image_size: width and height of the camera [px].
 
     Raises:
         InputError: no such file, no image, or another image size.
     """
-    from worldpose.video.folder import declared_size, decode_image  # late: as above
+    from worldpose.video.folder import MAX_PIXELS, declared_size, decode_image  # late: as above
 
     path = Path(path)
     size = require_file(path)
@@ -221,14 +221,14 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
         raise InputError(
             str(path),
             expected=f"{image_size[0]} x {image_size[1]} px, the size in match.yaml",
-            found=f"{declared[0]} x {declared[1]}",
+            found=f"{declared[0]} x {declared[1]} as shown, with the turn of its EXIF tag",
             todo="Export the still at the size of the video, or correct match.yaml.",
         )
     image = decode_image(content)
     if image is None:
         raise InputError(
             str(path),
-            expected=f"a PNG or JPEG image of at most {STILL_BYTES} bytes",
+            expected=f"an image of at most {STILL_BYTES} bytes and {MAX_PIXELS} pixels",
             found=f"{size} bytes that are none",
             todo="Export the still again.",
         )

@@ -7,25 +7,33 @@ import shutil
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import camera_id
-from worldpose.formats.calibration_forms import (
-    read_calibration,
-)
+from worldpose.formats.calibration_files import LeftOut, camera_id
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.files import whole_file
-from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
+from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
+from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
-from worldpose.video.files import index_frames
+from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
+
+SAME_SHAPE: Final = 0.002
+"""Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
+MAX_BLACK: Final = 16.0
+"""Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
 
 def import_match(
@@ -35,7 +43,7 @@ def import_match(
     out: Path,
     match_id: str | None = None,
     pitch: Literal["none"] | None = "none",
-) -> MatchSpec:
+) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and their detections.
 
     The only clip, `clip`, spans the first to the last frame with a person; frames keep their
@@ -43,29 +51,86 @@ def import_match(
 
     Args:
         calibration: a file or folder that `read_calibration` reads.
-        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration.
+        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration, or
+            with a folder of OpenPose's files for each.
         fps: frame rate of all cameras [1/s].
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
         pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
 
     Returns:
-        Content of match.yaml.
+        Content of match.yaml, and sentences about what was found and what was changed.
 
     Raises:
         InputError: a file is invalid, names do not match, there are no people, or `out` is not
             empty; nothing is written then.
     """
-    cameras = read_calibration(calibration)
-    files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
-    people = {name: read_observations(file) for name, file in files.items()}
+    left_out: LeftOut = {}
+    cameras = read_calibration(calibration, left_out=left_out)
+    files = detections_by_camera(detections, list(cameras), calibration, left_out)
+    read = {name: read_people(file) for name, file in files.items()}
+    people = {name: found.people for name, found in read.items()}
     first, stop = find_people(detections, people)
     sizes = {name: camera.image_size for name, camera in cameras.items()}
     spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
     write_match(out, spec, calibrations=cameras, observations=people)
-    return spec
+    return spec, describe_left_out(left_out) + describe_people(read)
+
+
+def describe_left_out(left_out: LeftOut) -> list[str]:
+    """Return a sentence about each camera that is left out."""
+    return [f"camera {name} is left out: {why}" for name, why in left_out.items()]
+
+
+def camera_of(place: Path) -> str:
+    """Return the camera of a video, of a file of 2D poses, or of a folder `<camera>_json`."""
+    return camera_id(place.stem.removesuffix("_json"))
+
+
+_CHANGES: Final = {
+    "clamped": "confidences above 1 count as 1",
+    "nobody": "entries without a known joint count as nobody",
+    "empty": "empty files count as frames without people",
+}
+
+
+def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
+    """Return sentences about the points of cameras' 2D poses, and what was changed in them."""
+    notes = []
+    for kind in sorted({found.kind for found in read.values() if found.kind} - {"COCO-17"}):
+        which = [name for name, found in read.items() if found.kind == kind]
+        kept = "the 17 keypoints of COCO"
+        kept += " and heels and toes" if read[which[0]].people.points else ""
+        whose = "" if len(which) == len(read) else f" of {', '.join(which)}"
+        notes.append(f"2D poses{whose}: {kind}; kept are {kept}; the others are left out")
+    for key, what in _CHANGES.items():
+        counts = {name: getattr(found.changes, key) for name, found in read.items()}
+        if total := sum(counts.values()):
+            notes.append(f"{total} {what} ({', '.join(name for name in counts if counts[name])})")
+    return notes
+
+
+def detections_by_camera(
+    folder: Path, cameras: Sequence[str], calibration: Path, left_out: Collection[str] = ()
+) -> dict[str, Path]:
+    """Return each camera's file of 2D poses, or its folder `<camera>` or `<camera>_json`.
+
+    Args:
+        folder: holds them.
+        cameras: the cameras.
+        calibration: file of the cameras, for messages.
+        left_out: further cameras, whose files are ignored.
+
+    Raises:
+        InputError: a camera lacks its file, or a file its camera.
+    """
+    places = [each for each in sorted(folder.glob("[!.]*")) if each.is_dir()]
+    folders = {camera_of(each): each for each in places if camera_of(each) not in left_out}
+    if sorted(folders) == sorted(cameras):
+        return {name: folders[name] for name in cameras}
+    return files_by_camera(folder, cameras, calibration, (".json", ".npz"), left_out)
 
 
 def import_lenses(
@@ -107,15 +172,20 @@ def import_lenses(
 
 
 def files_by_camera(
-    folder: Path, cameras: Sequence[str], calibration: Path, suffixes: Collection[str]
+    folder: Path,
+    cameras: Sequence[str],
+    calibration: Path,
+    suffixes: Collection[str],
+    left_out: Collection[str] = (),
 ) -> dict[str, Path]:
-    """Return the file of each camera in a folder, by the camera's name.
+    """Return the file of each camera in a folder, by the camera's name; others are ignored.
 
     Raises:
         InputError: a camera lacks its file, or a file its camera.
     """
     there = sorted(folder.glob("[!.]*"))
     files = [file for file in there if file.suffix.lower() in suffixes]
+    files = [file for file in files if camera_id(file.stem) not in left_out]
     if sorted(camera_id(file.stem) for file in files) != sorted(cameras):
         raise InputError(
             str(folder),
@@ -197,10 +267,11 @@ def import_videos(
     fps: float | None = None,
     match_id: str | None = None,
     boxes: Path | None = None,
-) -> MatchSpec:
+) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
-    Without a calibration each video is a camera, to be located by clicks or by people.
+    Without a calibration each video is a camera, to be located by clicks or by people. A camera
+    that was calibrated in larger or smaller images of the same shape is scaled to its video.
 
     The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
     in match.yaml can shift them afterwards.
@@ -215,20 +286,27 @@ def import_videos(
             estimated, for some of the cameras or all; None = people are detected.
 
     Returns:
-        Content of match.yaml.
+        Content of match.yaml, and sentences about what was found and what was changed.
 
     Raises:
         InputError: a file is invalid, names or rates do not match, or `out` is not empty; nothing
             is written then.
     """
     cameras: dict[str, CameraCalibration] = {}
+    notes: list[str] = []
     if calibration is None:
         files = {camera_id(file.stem): file for file in list_videos(videos)}
         indices = {name: index_frames(file) for name, file in files.items()}
     else:
-        cameras = read_calibration(calibration)
-        files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES)
-        indices = {name: _index_video(file, cameras[name]) for name, file in files.items()}
+        filmed = [file for file in sorted(videos.glob("[!.]*")) if is_video(file)]
+        known = {camera_id(file.stem): index_frames(file) for file in filmed}
+        left_out: LeftOut = {}
+        cameras = read_calibration(calibration, {n: one.size for n, one in known.items()}, left_out)
+        notes += describe_left_out(left_out)
+        files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES, left_out)
+        indices = {name: known[name] for name in files}
+        for name, file in files.items():
+            cameras[name] = fit_to_video(file, cameras[name], indices[name], notes)
     rate = round(next(iter(indices.values())).fps, 3) if fps is None else fps
     counts = {name: len(index.on_clock(rate, str(files[name]))) for name, index in indices.items()}
     sizes = {name: index.size for name, index in indices.items()}
@@ -240,7 +318,7 @@ def import_videos(
             copy_boxes(boxes, indices, folder)
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
-    return spec
+    return spec, notes
 
 
 def list_videos(folder: Path) -> list[Path]:
@@ -261,12 +339,75 @@ def list_videos(folder: Path) -> list[Path]:
     return files
 
 
-def _index_video(file: Path, camera: CameraCalibration) -> FrameIndex:
-    """Return the frames of a camera's video, which has the size in the calibration."""
-    index = index_frames(file)
-    if index.size != camera.image_size:
-        raise video_size_error(file, camera, index)
-    return index
+def fit_to_video(
+    file: Path,
+    camera: CameraCalibration,
+    index: FrameIndex,
+    notes: list[str],
+    *,
+    is_part: bool = False,
+) -> CameraCalibration:
+    """Return a camera in the pixels of its video, which may be resized, or have black bars.
+
+    Args:
+        file: the video.
+        camera: the camera in the calibrated pixels.
+        index: the video's frames.
+        notes: sentences for the user, to which a change is added.
+        is_part: whether a smaller video is the middle part of the image, as Vicon's video modes
+            are of the sensor to which the calibration belongs.
+
+    Raises:
+        InputError: the video is neither what was calibrated nor the same picture resized.
+    """
+    if index.size == camera.image_size:
+        return camera
+    own, shown = np.array(camera.image_size), np.array(index.size)
+    if is_part and np.all(shown <= own):
+        corner = 0.5 * (own - shown)
+        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
+        middle = np.array(camera.principal_point_px) - corner
+        return camera.model_copy(
+            update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}
+        )
+    scale = float((shown / own).min())
+    bar = 0.5 * (shown - scale * own)
+    if (shown / own).max() > (1.0 + SAME_SHAPE) * scale:
+        with VideoReader(file, index) as video:
+            if not _has_black_bars(video.frame(0), bar):
+                raise video_size_error(file, camera, index)
+    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
+    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
+    notes.append(
+        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
+            *camera.image_size
+        )
+        + f"the calibration is scaled by {scale:.5f}"
+        + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
+    )
+    return camera.model_copy(
+        update={
+            "image_size": index.size,
+            "focal_px": tuple(scale * focal for focal in camera.focal_px),
+            "principal_point_px": tuple(middle.tolist()),
+        }
+    )
+
+
+def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
+    """Return whether a frame has black bars of a width on both sides of one axis, and no wider.
+
+    Args:
+        frame: (height, width, channels).
+        bar: their width along x and y [px], with a fraction.
+    """
+    axis = int(bar.argmax())
+    width = int(bar[axis])
+    lines = frame.mean(axis=(axis, 2)).astype(np.float64)
+    black = np.concatenate([lines[:width], lines[len(lines) - width :]])
+    # The line next to a bar with a fraction is a mixture.
+    next_lines = [lines[width + 2], lines[-width - 3]]
+    return width > 0 and bool(black.max() < MAX_BLACK and min(next_lines) > MAX_BLACK)
 
 
 def video_size_error(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:

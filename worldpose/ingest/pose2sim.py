@@ -7,110 +7,37 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import camera_id
+from worldpose.formats.calibration_files import LeftOut, camera_id
 from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
     find_calibration,
     read_calibration,
 )
-from worldpose.formats.detection_files import OpenPoseFolder, read_openpose_folder
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.files import read_toml
 from worldpose.formats.keypoint_files import on_frames
+from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.importing import (
     build_spec,
+    camera_of,
     copy_videos,
+    describe_left_out,
+    describe_people,
     find_people,
+    fit_to_video,
     list_videos,
-    video_size_error,
 )
 from worldpose.ingest.writing import write_match
-from worldpose.video.files import VideoReader, index_frames
+from worldpose.video.files import index_frames
 from worldpose.video.names import is_video
 from worldpose.video.pictures import FrameIndex
 
-SAME_SHAPE: Final = 0.002
-"""Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
-MAX_BLACK: Final = 16.0
-"""Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
-
-
-def _fit_to_video(
-    file: Path,
-    camera: CameraCalibration,
-    index: FrameIndex,
-    notes: list[str],
-    *,
-    is_part: bool = False,
-) -> CameraCalibration:
-    """Return a camera in the pixels of its video, which may be resized, or have black bars.
-
-    Args:
-        file: the video.
-        camera: the camera in the calibrated pixels.
-        index: the video's frames.
-        notes: sentences for the user, to which a change is added.
-        is_part: whether a smaller video is the middle part of the image, as Vicon's video modes
-            are of the sensor to which the calibration belongs.
-
-    Raises:
-        InputError: the video is neither what was calibrated nor the same picture resized.
-    """
-    if index.size == camera.image_size:
-        return camera
-    own, shown = np.array(camera.image_size), np.array(index.size)
-    if is_part and np.all(shown <= own):
-        corner = 0.5 * (own - shown)
-        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
-        middle = np.array(camera.principal_point_px) - corner
-        return camera.model_copy(
-            update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}
-        )
-    scale = float((shown / own).min())
-    bar = 0.5 * (shown - scale * own)
-    if (shown / own).max() > (1.0 + SAME_SHAPE) * scale:
-        with VideoReader(file, index) as video:
-            if not _has_black_bars(video.frame(0), bar):
-                raise video_size_error(file, camera, index)
-    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
-    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
-    notes.append(
-        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
-            *camera.image_size
-        )
-        + f"the calibration is scaled by {scale:.5f}"
-        + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
-    )
-    return camera.model_copy(
-        update={
-            "image_size": index.size,
-            "focal_px": tuple(scale * focal for focal in camera.focal_px),
-            "principal_point_px": tuple(middle.tolist()),
-        }
-    )
-
-
-def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
-    """Return whether a frame has black bars of a width on both sides of one axis, and no wider.
-
-    Args:
-        frame: (height, width, channels).
-        bar: their width along x and y [px], with a fraction.
-    """
-    axis = int(bar.argmax())
-    width = int(bar[axis])
-    lines = frame.mean(axis=(axis, 2)).astype(np.float64)
-    black = np.concatenate([lines[:width], lines[len(lines) - width :]])
-    # The line next to a bar with a fraction is a mixture.
-    next_lines = [lines[width + 2], lines[-width - 3]]
-    return width > 0 and bool(black.max() < MAX_BLACK and min(next_lines) > MAX_BLACK)
+_SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
+"""Entries of Config.toml that hold."""
 
 
 def import_pose2sim(
@@ -142,7 +69,6 @@ def import_pose2sim(
     """
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)
-    cameras = {} if calibration is None else read_calibration(calibration)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
     films = [file for file in sorted((project / "videos").glob("[!.]*")) if is_video(file)]
@@ -153,6 +79,9 @@ def import_pose2sim(
             found="neither",
             todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
         )
+    known = {file: index_frames(file) for file in films}
+    left_out: LeftOut = {}
+    cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
         notes = [
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
@@ -161,23 +90,26 @@ def import_pose2sim(
         names = [camera_id(file.stem) for file in list_videos(project / "videos")]
         source = project / "videos"
     else:
-        notes = [f"cameras: {calibration}"]
+        shown = {camera_of(file): index.size for file, index in known.items()}
+        cameras = read_calibration(calibration, shown, left_out)
+        notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
+        places = [each for each in places if camera_of(each) not in left_out]
+        films = [each for each in films if camera_of(each) not in left_out]
     is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
     poses = _assign(places, names, source, notes) if places else {}
     videos = _assign(films, names, source, notes) if films else {}
-    indices = {name: index_frames(file) for name, file in videos.items()}
+    indices = {name: known[file] for name, file in videos.items()}
     for name, file in videos.items():
         if name in cameras:
-            cameras[name] = _fit_to_video(
-                file, cameras[name], indices[name], notes, is_part=is_part
-            )
+            cameras[name] = fit_to_video(file, cameras[name], indices[name], notes, is_part=is_part)
     sizes = {name: index.size for name, index in indices.items()}
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
-    read = {name: read_openpose_folder(place) for name, place in poses.items()}
+    model = settings.get("pose_model")
+    read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
     first, stop = find_people(folder, people) if people else (0, min(counts, default=0))
     first, stop = settings.get("frame_range", (first, stop))
@@ -193,20 +125,15 @@ def import_pose2sim(
     return spec, notes + _describe_poses(folder, read)
 
 
-def _describe_poses(folder: Path, read: Mapping[str, OpenPoseFolder]) -> list[str]:
+def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:
     """Return sentences about the 2D poses of cameras and what of them is kept."""
     if not read:
         return [
             f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
             "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
         ]
-    kinds = {found.kind: found.people.points for found in read.values() if found.kind}
-    return [
-        f"2D poses: {folder}, {kind}; kept are the 17 keypoints of COCO"
-        + (" and heels and toes" if points else "")
-        + ("" if kind == "COCO-17" else "; those of hands, face and trunk are left out")
-        for kind, points in sorted(kinds.items())
-    ]
+    kinds = sorted({found.kind for found in read.values() if found.kind})
+    return [f"2D poses: {folder}, {' and '.join(kinds)}", *describe_people(read)]
 
 
 def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
@@ -222,7 +149,7 @@ def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
 
 
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
-    """Return `frame_rate` and `frame_range` where Config.toml sets them, and that file.
+    """Return `frame_rate`, `frame_range`, `pose_model` where Config.toml sets them, and that file.
 
     As in Pose2Sim, the file of the folder above gives what the trial's file lacks.
     """
@@ -236,13 +163,19 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
     files = [place / "Config.toml" for place in (project, project.resolve().parent)]
     given: dict[str, Any] = {}
     for file in reversed(files):
-        table = read_toml(file).get("project", {}) if file.is_file() else {}
-        if not isinstance(table, dict):
-            raise InputError(
-                f"{file}: project", expected="a table", found=f"{table!r:.40}", todo="Correct it."
-            )
-        given |= {key: (table[key], file) for key in ("frame_rate", "frame_range") if key in table}
-    settings: dict[str, Any] = {}
+        content = read_toml(file) if file.is_file() else {}
+        for name in ("project", "pose"):
+            table = content.get(name, {})
+            if not isinstance(table, dict):
+                raise InputError(
+                    f"{file}: {name}",
+                    expected="a table",
+                    found=f"{table!r:.40}",
+                    todo="Correct it.",
+                )
+            given |= {key: (table[key], file) for key in _SETTINGS if key in table}
+    model, _ = given.get("pose_model", (None, files[0]))
+    settings: dict[str, Any] = {"pose_model": model} if isinstance(model, str) else {}
     rate, place = given.get("frame_rate", ("auto", files[0]))
     if rate != "auto":
         if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:
@@ -315,7 +248,7 @@ def _assign(
             found=", ".join(place.name for place in places),
             todo="Add the missing ones, or take the camera out of the calibration.",
         )
-    named = {camera_id(place.stem.removesuffix("_json")): place for place in places}
+    named = {camera_of(place): place for place in places}
     if set(named) == set(cameras):
         return {camera: named[camera] for camera in cameras}
     pairs = dict(zip(cameras, places, strict=True))

@@ -23,7 +23,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rays import Rays, intersect_rays
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.detections import DetectionEdit
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import CalibrationReport
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 

@@ -57,6 +57,10 @@ class Board:
         board = self._charuco()
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if ids is None or len(ids) < 8:
+            # OpenCV before 4.6 began boards of an even number of rows with a white square.
+            board.setLegacyPattern(True)
+            corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if ids is None or len(ids) < 8:
             return None
         # The detector interpolates corners between markers.
         window = (5, 5)  # half the sides

@@ -10,22 +10,20 @@ from scipy.special import chdtri
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.errors import InputError
-from worldpose.static_calibration.adjustment import (
-    Fits,
-    Problem,
-    Residuals,
-    adjust,
-    camera_from_row,
-    camera_row,
-    compute_residuals,
-)
+from worldpose.geometry.camera_model import STEP
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.covariance import invert_free
+from worldpose.geometry.optimize.losses import cauchy_loss
 from worldpose.static_calibration.curvature_correction import add_curvature
-from worldpose.static_calibration.parameters import (
-    PRIORS,
-    SIZE,
-    CameraEstimate,
-    prior_residuals,
+from worldpose.static_calibration.fit import (
+    CameraProblem,
+    Fits,
+    Residuals,
+    compute_residuals,
+    fit_cameras,
 )
+from worldpose.static_calibration.parameters import CameraEstimate
+from worldpose.static_calibration.residuals import PRIORS, prior_residuals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 CLEAR_GAIN: Final = 6.0
@@ -38,7 +36,7 @@ class InlierFit:
     """A fit to the inliers among the clicks.
 
     Attributes:
-        row: (22,) camera.
+        row: (WIDTH,) camera.
         covariance: (12, 12) covariance of a step, to second order.
         tangent_covariance: (12, 12) covariance of a step, to first order.
         evidence_information: (12, 12) information of the inliers, at the estimated noise.
@@ -67,7 +65,7 @@ class InlierFit:
 
     def estimate(self, image_size: tuple[int, int]) -> CameraEstimate:
         """Return the fitted camera and its covariance."""
-        return CameraEstimate(camera_from_row(self.row, image_size), self.covariance)
+        return CameraEstimate(Camera.from_numbers(self.row, image_size), self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +79,7 @@ class Explanation:
         assumptions: further assumptions, in words.
     """
 
-    problem: Problem
+    problem: CameraProblem
     fit: InlierFit
     settings: StaticCalibrationSettings
     assumptions: tuple[str, ...] = ()
@@ -96,8 +94,10 @@ class Explanation:
         return self.settings.click_noise_px / stated.click_noise_px
 
 
-def fit_inliers(problem: Problem, start: Floats, settings: StaticCalibrationSettings) -> InlierFit:
-    """Return the fit to the inliers among clicks and markings, from a camera (22,) near the answer.
+def fit_inliers(
+    problem: CameraProblem, start: Floats, settings: StaticCalibrationSettings
+) -> InlierFit:
+    """Return the fit to the inliers among clicks and markings, from a camera (WIDTH,) near it.
 
     From the inliers of a robust fit, the search removes or restores one click at a time: the inlier
     with the largest leave-one-out residual above the limit, else an outlier that the inliers
@@ -112,7 +112,7 @@ def fit_inliers(problem: Problem, start: Floats, settings: StaticCalibrationSett
     """
     limit = settings.wrong_click
     count = len(problem.evidence.points)
-    robust = adjust(problem, start[None], click_loss=3.0)
+    robust = fit_cameras(problem, start[None], click_loss=3.0)
     row = robust.rows[0]
     problem = problem.with_survey_error(row, settings)
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1) / problem.click_noise
@@ -122,7 +122,7 @@ def fit_inliers(problem: Problem, start: Floats, settings: StaticCalibrationSett
     while True:
         seen.add(inliers.tobytes() + markings.tobytes())
         kept = problem.select(inliers, markings)
-        fit = adjust(kept, row[None])
+        fit = fit_cameras(kept, row[None])
         row = fit.rows[0]
         _, _, mahalanobis = _judge_clicks(problem, kept, fit, inliers)
         following = inliers.copy()
@@ -143,9 +143,9 @@ def fit_inliers(problem: Problem, start: Floats, settings: StaticCalibrationSett
 
 
 def fit_inliers_at_best_noise(
-    problem: Problem, start: Floats, settings: StaticCalibrationSettings
+    problem: CameraProblem, start: Floats, settings: StaticCalibrationSettings
 ) -> Explanation:
-    """Return the explanation of the clicks at their most probable noise, from a camera (22,).
+    """Return the explanation of the clicks at their most probable noise, from a camera (WIDTH,).
 
     A few clicks with large residuals are outliers at the stated noise, or inliers at a larger
     noise. The larger posterior probability decides: inliers are Gaussian, outliers are uniform in
@@ -175,8 +175,8 @@ def fit_inliers_at_best_noise(
 
 
 def scale_noise(
-    problem: Problem, factor: float, settings: StaticCalibrationSettings
-) -> tuple[Problem, StaticCalibrationSettings]:
+    problem: CameraProblem, factor: float, settings: StaticCalibrationSettings
+) -> tuple[CameraProblem, StaticCalibrationSettings]:
     """Return problem and settings with the noise of clicks and drawn pixels times a factor."""
     noisy = {
         name: factor * getattr(settings, name) for name in ("click_noise_px", "drawn_noise_px")
@@ -217,17 +217,19 @@ def negative_log_posterior(found: Explanation, *, factor: float, with_prior: boo
     if with_prior:
         posterior_volume += 4.0 * float(np.log(problem.prior[4]))  # of the principal point's prior
         known = np.empty(PRIORS)
-        prior_residuals(fit.row, problem.prior, known, np.empty((PRIORS, SIZE)))
+        prior_residuals(fit.row, problem.prior, known, np.empty((PRIORS, STEP)))
         squared += float((known**2).sum())
     # True noise is half to twice the stated noise.
     noise_deviation = float(np.log(scale * factor)) / 0.5
     return float(squared + volume + outliers + posterior_volume + noise_deviation**2)
 
 
-def fit_given_inliers(problem: Problem, row: Floats, inliers: Flags, markings: Flags) -> InlierFit:
-    """Return the fit to given clicks (n,) and markings (m,), from a camera (22,) near it."""
+def fit_given_inliers(
+    problem: CameraProblem, row: Floats, inliers: Flags, markings: Flags
+) -> InlierFit:
+    """Return the fit to given clicks (n,) and markings (m,), from a camera (WIDTH,) near it."""
     kept = problem.select(inliers, markings)
-    fit = adjust(kept, row[None])
+    fit = fit_cameras(kept, row[None])
     row = fit.rows[0]
     covariance, noise, mahalanobis = _judge_clicks(problem, kept, fit, inliers)
     scale = noise.scale
@@ -251,20 +253,20 @@ def fit_given_inliers(problem: Problem, row: Floats, inliers: Flags, markings: F
     )
 
 
-def noise_ratio(problem: Problem, row: Floats) -> float:
-    """Return the median click residual at a camera (22,), over its stated value."""
+def noise_ratio(problem: CameraProblem, row: Floats) -> float:
+    """Return the median click residual at a camera (WIDTH,), over its stated value."""
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1)
     return _median_spread(length / problem.click_noise)
 
 
-def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> Floats:
+def mahalanobis_distances(problem: CameraProblem, estimate: CameraEstimate) -> Floats:
     """Return each click's distance (n,) from its prediction by an independent camera."""
-    rows = compute_residuals(problem, camera_row(estimate.camera))
+    rows = compute_residuals(problem, estimate.camera.numbers)
     no_inliers = np.zeros(len(rows.click), dtype=np.bool_)
     return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, no_inliers)
 
 
-def held_out_error(problem: Problem, fit: InlierFit) -> float:
+def held_out_error(problem: CameraProblem, fit: InlierFit) -> float:
     """Return the root mean square leave-one-out error of clicks and markings [px].
 
     One click, or all pixels of one marking, are left out at a time; their residual follows from the
@@ -300,7 +302,7 @@ def held_out_error(problem: Problem, fit: InlierFit) -> float:
 
 
 def _select_markings(
-    problem: Problem, row: Floats, inliers: Flags, settings: StaticCalibrationSettings
+    problem: CameraProblem, row: Floats, inliers: Flags, settings: StaticCalibrationSettings
 ) -> Flags:
     """Return a mask of drawn markings (m,) near their projections; all where too few remain.
 
@@ -323,9 +325,9 @@ def _select_markings(
     return accepted if enough else np.ones(len(accepted), dtype=np.bool_)
 
 
-def _can_image(problem: Problem, row: Floats) -> Flags:
-    """Return a mask of the clicked points (n,) that a camera (22,) can image."""
-    camera = camera_from_row(row, problem.image_size)
+def _can_image(problem: CameraProblem, row: Floats) -> Flags:
+    """Return a mask of the clicked points (n,) that a camera (WIDTH,) can image."""
+    camera = Camera.from_numbers(row, problem.image_size)
     return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
 
 
@@ -368,7 +370,7 @@ class _Noise:
 
 
 def _judge_clicks(
-    problem: Problem, kept: Problem, fit: Fits, inliers: Flags
+    problem: CameraProblem, kept: CameraProblem, fit: Fits, inliers: Flags
 ) -> tuple[Floats, _Noise, Floats]:
     """Return the covariance (12, 12), the noise, and each click's Mahalanobis distance (n,).
 
@@ -395,7 +397,7 @@ def _judge_clicks(
     return covariance, noise, mahalanobis
 
 
-def _covariance(problem: Problem, fit: Fits) -> tuple[Floats, _Noise]:
+def _covariance(problem: CameraProblem, fit: Fits) -> tuple[Floats, _Noise]:
     """Return the covariance (12, 12), and the noise estimated from the residuals."""
     observed = fit.evidence_information[0]
     prior = fit.information[0] - observed
@@ -407,14 +409,10 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[Floats, _Noise]:
         raise _no_camera(problem, count)
     spent = float(np.trace(np.linalg.solve(fit.information[0][free], observed[free])))
     noise = _Noise.estimate(squared, max(count - spent, 0.0))
-    covariance = np.zeros_like(prior)
-    total = observed[free] / noise.scale**2 + prior[free]
-    size = np.sqrt(np.abs(np.diag(total)))
-    scaled = total / np.outer(size, size)
-    if not _is_invertible(total):
+    total = observed / noise.scale**2 + prior
+    if not _is_invertible(total[free]):
         raise _no_camera(problem, count)
-    covariance[free] = np.linalg.inv(scaled) / np.outer(size, size)
-    return covariance, noise
+    return invert_free(total, problem.free), noise
 
 
 def _is_invertible(information: Floats) -> bool:
@@ -429,7 +427,7 @@ def _is_invertible(information: Floats) -> bool:
     return bool(np.linalg.eigvalsh(information / np.outer(size, size))[0] > 1e-14)
 
 
-def _no_camera(problem: Problem, count: int) -> InputError:
+def _no_camera(problem: CameraProblem, count: int) -> InputError:
     return InputError(
         problem.where,
         expected="clicks that a camera next to or above the pitch can see",
@@ -438,13 +436,13 @@ def _no_camera(problem: Problem, count: int) -> InputError:
     )
 
 
-def _click_loss(problem: Problem, rows: Residuals) -> float:
+def _click_loss(problem: CameraProblem, rows: Residuals) -> float:
     return float(((rows.click / problem.click_noise[:, None]) ** 2).sum())
 
 
-def _drawn_loss(problem: Problem, rows: Residuals) -> float:
-    limit = problem.drawn_loss**2
-    return float(limit * np.log1p((rows.drawn / problem.drawn_noise) ** 2 / limit).sum())
+def _drawn_loss(problem: CameraProblem, rows: Residuals) -> float:
+    squared = (rows.drawn / problem.drawn_noise) ** 2
+    return float(cauchy_loss(squared, problem.drawn_loss).sum())
 
 
 def _leave_one_out_distances(

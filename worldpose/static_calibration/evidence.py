@@ -18,7 +18,7 @@ _FEWEST: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ClickEvidence:
     """Clicked points and drawn markings with their places on the template.
 
     Attributes:
@@ -49,7 +49,7 @@ class Evidence:
     surface: Floats
     straight: Flags
 
-    def select(self, points: Flags, markings: Flags) -> Evidence:
+    def select(self, points: Flags, markings: Flags) -> ClickEvidence:
         """Return the evidence restricted to some clicked points (n,) and drawn markings (m,)."""
         keep, on = points, markings[self.drawn_marking]
         return replace(
@@ -62,7 +62,7 @@ class Evidence:
             drawn_marking=self.drawn_marking[on],
         )
 
-    def on_surface(self, surface: Floats) -> Evidence:
+    def on_surface(self, surface: Floats) -> ClickEvidence:
         """Return the evidence at its places on another surface.
 
         Args:
@@ -86,7 +86,7 @@ def gather_evidence(
     image_size: tuple[int, int],
     spacing: float,
     where: str,
-) -> Evidence:
+) -> ClickEvidence:
     """Return the evidence of one image, with samples along markings at a spacing [m].
 
     Raises:
@@ -126,7 +126,7 @@ def gather_evidence(
     samples = [pitch.marking_points(name, spacing) for name in pixels]
     shapes = [pitch.marking_by_surface(name, spacing) for name in pixels]
     counts = [len(drawn) for drawn in pixels.values()]
-    return Evidence(
+    return ClickEvidence(
         points=tuple(names),
         points_world=pitch.positions(names),
         points_image=np.array([point.xy for point in clicked.points]).reshape(-1, 2),
@@ -144,7 +144,7 @@ def gather_evidence(
     )
 
 
-def count_neighbors(evidence: Evidence, reach: float) -> Floats:
+def count_neighbors(evidence: ClickEvidence, reach: float) -> Floats:
     """Return per drawn pixel (d,) the count of its marking's pixels within `reach` [px].
 
     Errors of hand drawing are correlated along a line: pixels within `reach` count as one.
@@ -186,7 +186,7 @@ def _unknown(where: str, name: str, known: tuple[str, ...]) -> InputError:
     )
 
 
-def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
+def check_amount(evidence: ClickEvidence, pitch: PitchTemplate, where: str) -> None:
     """Raise InputError when the clicks are too few, or on one line, for any camera."""
     points, found = len(evidence.points), describe_clicks(evidence)
     if not evidence.markings:
@@ -225,7 +225,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
         )
 
 
-def has_enough_points(evidence: Evidence) -> bool:
+def has_enough_points(evidence: ClickEvidence) -> bool:
     """Return whether the clicked points alone can determine the camera."""
     plan = evidence.points_world[:, :2]
     if len(plan) < _FEWEST:
@@ -235,7 +235,7 @@ def has_enough_points(evidence: Evidence) -> bool:
     return bool(spread >= np.sqrt(len(plan)))
 
 
-def describe_clicks(evidence: Evidence) -> str:
+def describe_clicks(evidence: ClickEvidence) -> str:
     """Return the number and the names of the clicked points and drawn markings."""
     parts = []
     if evidence.points:

@@ -14,9 +14,10 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import WIDTH
 from worldpose.geometry.rigid import Rigid
-from worldpose.static_calibration.adjustment import Problem, adjust, camera_row
-from worldpose.static_calibration.evidence import Evidence
+from worldpose.static_calibration.evidence import ClickEvidence
+from worldpose.static_calibration.fit import CameraProblem, fit_cameras
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 
 _PLANE_SCALE = 50.0
@@ -118,7 +119,7 @@ def camera_from_homography(
 
 
 def homographies(
-    evidence: Evidence, image_size: tuple[int, int], tolerance: float, *, leave_out: bool
+    evidence: ClickEvidence, image_size: tuple[int, int], tolerance: float, *, leave_out: bool
 ) -> list[Floats]:
     """Return candidate homographies (3, 3) from the plane to pixels, the best one first.
 
@@ -184,7 +185,7 @@ def _consensus(
     return np.asarray(errors[winner] < tolerance)
 
 
-def _surface_lines(evidence: Evidence) -> tuple[Floats, Floats, Integers]:
+def _surface_lines(evidence: ClickEvidence) -> tuple[Floats, Floats, Integers]:
     """Return pixels (d, 2) on straight surface markings, their lines (d, 3) and markings (d,)."""
     straight = evidence.straight[evidence.drawn_marking]
     lines = np.zeros((len(evidence.markings), 3))
@@ -206,8 +207,10 @@ _COMPARISON_LOSS: Final = 60.0
 of residuals of hundreds of pixels, but not of tens."""
 
 
-def cameras_from_homographies(problem: Problem, prior: CameraPrior, *, leave_out: bool) -> Floats:
-    """Return cameras (b, 22) of the homographies from points and straight markings.
+def cameras_from_homographies(
+    problem: CameraProblem, prior: CameraPrior, *, leave_out: bool
+) -> Floats:
+    """Return cameras (b, WIDTH) of the homographies from points and straight markings.
 
     Each straight marking may be left out in turn: one name may be wrong.
     """
@@ -223,12 +226,12 @@ def cameras_from_homographies(problem: Problem, prior: CameraPrior, *, leave_out
             evidence, problem.image_size, 0.012 * width, leave_out=leave_out
         )
     ]
-    rows = [camera_row(camera) for camera in found if camera is not None]
-    return np.array(rows).reshape(-1, 22)
+    rows = [camera.numbers for camera in found if camera is not None]
+    return np.array(rows).reshape(-1, WIDTH)
 
 
-def plausible_cameras(problem: Problem, prior: CameraPrior) -> Floats:
-    """Return level cameras (b, 22) all around the stadium, oriented towards the clicks.
+def plausible_cameras(problem: CameraProblem, prior: CameraPrior) -> Floats:
+    """Return level cameras (b, WIDTH) all around the stadium, oriented towards the clicks.
 
     The mean of the clicked pixels shows the mean of the clicked points, or each of the places along
     the drawn markings in turn.
@@ -250,7 +253,7 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> Floats:
         [grid[:, 1] * np.cos(grid[:, 0]), grid[:, 1] * np.sin(grid[:, 0]), grid[:, 2]], axis=1
     )
     aims = _aims(problem)[grid[:, 4].astype(np.int64)]
-    rows = np.zeros((len(grid), 22))
+    rows = np.zeros((len(grid), WIDTH))
     rows[:, :2] = grid[:, 3:4]
     rows[:, 2:4] = problem.prior[2:4]
     rotation = _rotations_towards(centers, aims, pixels.mean(axis=0) - rows[:, 2:4], grid[:, 3])
@@ -260,7 +263,7 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> Floats:
     return rows
 
 
-def _aims(problem: Problem) -> Floats:
+def _aims(problem: CameraProblem) -> Floats:
     """Return places (a, 3) [m], world, that the mean of the clicked pixels may show."""
     evidence = problem.evidence
     middles = [
@@ -291,8 +294,8 @@ def _rotations_towards(centers: Floats, aims: Floats, offsets: Floats, focal: Fl
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def find_start(problem: Problem, settings: StaticCalibrationSettings) -> Floats:
-    """Return the (22,) camera that the outlier search starts from."""
+def find_start(problem: CameraProblem, settings: StaticCalibrationSettings) -> Floats:
+    """Return the (WIDTH,) camera that the outlier search starts from."""
     count = 2 * len(problem.evidence.points) + len(problem.evidence.drawn_image)
     rows = cameras_from_homographies(problem, settings.prior, leave_out=False)
     if len(rows):
@@ -301,23 +304,25 @@ def find_start(problem: Problem, settings: StaticCalibrationSettings) -> Floats:
             return best
     coarse = replace(problem, drawn_loss=_COMPARISON_LOSS)
     everywhere = plausible_cameras(problem, settings.prior)
-    weighed = adjust(coarse, everywhere, click_loss=_COMPARISON_LOSS, iterations=0)
+    weighed = fit_cameras(coarse, everywhere, click_loss=_COMPARISON_LOSS, iterations=0)
     chosen = everywhere[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
     rows = cameras_from_homographies(problem, settings.prior, leave_out=True)
     return fit_from_starts(problem, np.concatenate([rows, chosen]), settings.wrong_click)[0]
 
 
-def fit_from_starts(problem: Problem, rows: Floats, click_loss: float) -> tuple[Floats, float]:
-    """Return the best camera (22,) reached from starts (b, 22), and its robust cost.
+def fit_from_starts(
+    problem: CameraProblem, rows: Floats, click_loss: float
+) -> tuple[Floats, float]:
+    """Return the best camera (WIDTH,) reached from starts (b, WIDTH), and its robust cost.
 
     A wide loss first moves every start into its basin; then a sharper loss decides, which a marking
     under a wrong name cannot dominate.
     """
     iterations = 12
     coarse = replace(problem, drawn_loss=_COMPARISON_LOSS)
-    near = adjust(coarse, rows, click_loss=_COMPARISON_LOSS, iterations=iterations)
-    sharp = adjust(problem, near.rows, click_loss=click_loss, iterations=iterations)
-    direct = adjust(problem, rows, click_loss=click_loss, iterations=iterations)
+    near = fit_cameras(coarse, rows, click_loss=_COMPARISON_LOSS, iterations=iterations)
+    sharp = fit_cameras(problem, near.rows, click_loss=click_loss, iterations=iterations)
+    direct = fit_cameras(problem, rows, click_loss=click_loss, iterations=iterations)
     cost = np.concatenate([sharp.cost, direct.cost])
     best = int(np.argmin(cost))
     return np.concatenate([sharp.rows, direct.rows])[best], float(cost[best])

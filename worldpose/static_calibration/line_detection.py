@@ -20,6 +20,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Image
 from worldpose.compiled import compile_kernel
 from worldpose.errors import InputError
+from worldpose.geometry.optimize.dense import solve_in_place
 
 CANDIDATES: Final = 4
 """Maximum bar candidates per place [1]."""
@@ -294,7 +295,7 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
                     normal[a, b] += row[a] * row[b]
         if fitting == 0:
             normal[3, 3] = 1.0
-        pivot = _solve(normal, right)
+        pivot = solve_in_place(normal, right, 1e-9)
         if not pivot > 0.0:
             return shift, 0.0, 0.0, np.inf
         level += right
@@ -304,30 +305,3 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
         if not abs(shift) < 3.0 or (fitting > 0 and abs(right[3]) < 0.01):
             break
     return shift, level[1] - level[0], level[1] - level[2], variance
-
-
-@compile_kernel
-def _solve(normal: Floats, right: Floats) -> float:
-    """Replace `right` by the solution; return the last unknown's information, 0 if singular.
-
-    Args:
-        normal: (n, n) positive definite; the function overwrites its lower half.
-        right: (n,).
-    """
-    size = len(right)
-    for a in range(size):
-        for b in range(a):
-            for c in range(b):
-                normal[a, b] -= normal[a, c] * normal[b, c] * normal[c, c]
-            normal[a, b] /= normal[b, b]
-        for c in range(a):
-            normal[a, a] -= normal[a, c] ** 2 * normal[c, c]
-        if not normal[a, a] > 1e-9:
-            return 0.0
-        for b in range(a):
-            right[a] -= normal[a, b] * right[b]
-    for a in range(size - 1, -1, -1):
-        right[a] /= normal[a, a]
-        for b in range(a + 1, size):
-            right[a] -= normal[b, a] * right[b]
-    return float(normal[size - 1, size - 1])

@@ -21,7 +21,6 @@ from scipy.special import chdtrc
 from data_contracts.arrays import Flags, Floats, Image, Integers
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate, Surface
-from worldpose.static_calibration.adjustment import Problem, camera_row
 from worldpose.static_calibration.click_outliers import (
     Explanation,
     InlierFit,
@@ -36,6 +35,7 @@ from worldpose.static_calibration.curvature_correction import (
     fit_with_curvature,
     linearize_at,
 )
+from worldpose.static_calibration.fit import CameraProblem
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_samples import (
     PaintNoise,
@@ -252,7 +252,7 @@ def refine_and_judge(
     """
     problem, fit, settings = found.problem, found.fit, found.settings
 
-    def refine(problem: Problem, fit: InlierFit) -> LineRefinement:
+    def refine(problem: CameraProblem, fit: InlierFit) -> LineRefinement:
         return _refine(_start_from_clicks(problem, fit, pitch), pitch, picture, settings)
 
     first = refine(problem, fit)
@@ -276,7 +276,9 @@ def refine_and_judge(
     return found, first
 
 
-def _start_from_clicks(problem: Problem, fit: InlierFit, pitch: PitchTemplate) -> CameraOnPitch:
+def _start_from_clicks(
+    problem: CameraProblem, fit: InlierFit, pitch: PitchTemplate
+) -> CameraOnPitch:
     """Return camera and surface of a fit to clicks, with their covariance to second order."""
     kept = problem.select(fit.inliers, fit.markings)
     start = linearize_at(kept, fit.row, fit.noise_scale, Surface.of(pitch))
@@ -285,7 +287,7 @@ def _start_from_clicks(problem: Problem, fit: InlierFit, pitch: PitchTemplate) -
     return replace(start, covariance=whole)
 
 
-def _leave_one_out_fits(problem: Problem, fit: InlierFit) -> Iterator[InlierFit]:
+def _leave_one_out_fits(problem: CameraProblem, fit: InlierFit) -> Iterator[InlierFit]:
     """Yield the leave-one-out fits of a fit to a problem."""
     for index in range(len(problem.evidence.points)):
         inliers = np.arange(len(problem.evidence.points)) != index
@@ -304,7 +306,7 @@ def _judge(
         return None
     settings, prior = found.settings, Surface.of(pitch)
     problem = _on_surface(found.problem, lines.estimate)
-    row = camera_row(lines.estimate.camera)
+    row = lines.estimate.camera.numbers
     ratio = noise_ratio(problem, row)
     # The median residual of a few clicks exceeds the stated noise by chance.
     factor = 1.0 if ratio <= 1.5 else min(ratio, _NOISE_FACTORS[-1])
@@ -334,7 +336,7 @@ def _judge(
     return found, replace(again, estimate=best, venue=gather_venue_evidence(evidence, best))
 
 
-def _on_surface(problem: Problem, found: CameraOnPitch) -> Problem:
+def _on_surface(problem: CameraProblem, found: CameraOnPitch) -> CameraProblem:
     return replace(problem, evidence=problem.evidence.on_surface(found.surface))
 
 

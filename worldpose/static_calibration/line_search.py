@@ -16,6 +16,7 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Image, Integers
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.losses import geman_mcclure_weight
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
 from worldpose.static_calibration.line_samples import (
@@ -126,7 +127,7 @@ class LineStep:
     paint: PaintUnknowns
 
 
-def adjust(
+def solve_line_step(
     offsets: Floats,
     variances: Floats,
     by_camera: Floats,
@@ -162,8 +163,7 @@ def adjust(
     residuals = shift
     for scale in scales:
         if scale < np.inf:
-            squared = residuals**2 / variances / scale**2
-            weights = np.where(known, 1.0 / (1.0 + squared) ** 2, 0.0)
+            weights = np.where(known, geman_mcclure_weight(residuals**2 / variances, scale), 0.0)
         normal[:] = 0.0
         right = np.zeros(size)
         _accumulate(shift, weights / variances, by_camera, by_paint, index, normal, right)
@@ -448,7 +448,7 @@ class LineSearch:
         seen = at.seen
         information, mean = self._prior(at)
         known = np.flatnonzero(seen.visible)
-        adjusted = adjust(
+        adjusted = solve_line_step(
             at.offsets[known],
             at.variances[known],
             np.ascontiguousarray(seen.by_camera[np.ix_(known, np.flatnonzero(self.free))]),

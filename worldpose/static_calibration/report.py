@@ -10,23 +10,20 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.cameras import LensCalibration
+from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rays import RayStatus
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.adjustment import Problem, camera_row, compute_residuals
 from worldpose.static_calibration.click_outliers import Explanation, InlierFit
+from worldpose.static_calibration.fit import CameraProblem, compute_residuals
 from worldpose.static_calibration.ground_error import (
     GroundErrorMap,
     ground_error_map,
     propose_clicks,
 )
 from worldpose.static_calibration.line_refinement import LineRefinement
-from worldpose.static_calibration.parameters import (
-    PARAMETERS,
-    SIZE,
-    CameraEstimate,
-    drawn_residuals,
-)
+from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
+from worldpose.static_calibration.residuals import drawn_residuals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
@@ -148,7 +145,7 @@ def build_report(
     problem, fit, settings = found.problem, found.fit, found.settings
     evidence = problem.evidence
     scale = fit.noise_scale * settings.click_noise_px / stated
-    residuals = compute_residuals(problem, camera_row(estimate.camera))
+    residuals = compute_residuals(problem, estimate.camera.numbers)
     points = _point_residuals(estimate.camera, found, residuals.click)
     drawn = []
     for index, name in enumerate(evidence.markings):
@@ -282,7 +279,7 @@ def _lens_deviations(
 def _true_name(
     index: int,
     estimate: CameraEstimate,
-    problem: Problem,
+    problem: CameraProblem,
     pitch: PitchTemplate,
     settings: StaticCalibrationSettings,
 ) -> str:
@@ -290,8 +287,8 @@ def _true_name(
     evidence = problem.evidence
     pixels = evidence.drawn_image[evidence.drawn_marking == index]
     every = np.zeros(len(pixels), dtype=np.int64)
-    off, by_step = np.empty(len(pixels)), np.empty((len(pixels), SIZE))
-    row = camera_row(estimate.camera)
+    off, by_step = np.empty(len(pixels)), np.empty((len(pixels), STEP))
+    row = estimate.camera.numbers
     worst = {}
     for name in pitch.marking_names:
         samples = pitch.marking_points(name, settings.sample_spacing_m)

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats, Integers
+from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.pitch.template import Surface
-from worldpose.static_calibration.adjustment import camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, weight_residuals
 from worldpose.static_calibration.line_samples import FIRST_KNOT
-from worldpose.static_calibration.parameters import SIZE, CameraOnPitch, step_camera
+from worldpose.static_calibration.parameters import CameraOnPitch, step_camera
 
 SURFACE: Final = (-2_000_000_000, -2_000_000_001)
 """Numbers of the unknown crown and end fall."""
@@ -31,7 +31,7 @@ ARRAYS: Final = ("number", "prior_mean", "prior", "mean", "information", "respon
 
 @dataclass(frozen=True, eq=False)
 class VenueEvidence:
-    """Evidence of one camera about the unknowns of a venue.
+    """ClickEvidence of one camera about the unknowns of a venue.
 
     Attributes:
         number: (k,) numbers of the unknowns, see `ProjectedLines`, then `SURFACE`.
@@ -72,7 +72,7 @@ def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> Venue
     there = evidence.problem.evidence.on_surface(best.surface)
     problem = replace(evidence.problem, evidence=there)
     clicks, by_clicks = weight_residuals(
-        problem, camera_row(best.camera), evidence.scale, evidence.surface
+        problem, best.camera.numbers, evidence.scale, evidence.surface
     )
     lines, by_lines = bars.whiten_raw(best.camera, best.surface)
     numbers, index = np.unique(bars.unknowns, return_inverse=True)
@@ -94,8 +94,8 @@ def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> Venue
     )
     common = np.concatenate(
         [
-            np.concatenate([np.zeros((click_rows, len(shared_std))), by_clicks[:, SIZE:]], axis=1),
-            np.concatenate([paint[:, shared] / shared_std, by_lines[:, SIZE:]], axis=1),
+            np.concatenate([np.zeros((click_rows, len(shared_std))), by_clicks[:, STEP:]], axis=1),
+            np.concatenate([paint[:, shared] / shared_std, by_lines[:, STEP:]], axis=1),
         ]
     )
     residuals = np.concatenate([clicks, lines])
@@ -111,7 +111,7 @@ def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> Venue
     start = np.concatenate([np.zeros(len(shared_std)), best.surface])
     right = prior @ (prior_mean - start)
     right -= common.T @ residuals - cross.T @ answer[:, -1]
-    response = np.zeros((SIZE, len(start)))
+    response = np.zeros((STEP, len(start)))
     response[free] = -answer[: len(free), :-1]
     return VenueEvidence(
         number=np.concatenate([numbers[shared], SURFACE]).astype(np.int64),
@@ -145,7 +145,7 @@ def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
         calibrations: arrays of each camera.
     """
     cameras = [camera_from_arrays(each) for each in calibrations]
-    unknown = np.full((SIZE, SIZE), np.nan)
+    unknown = np.full((STEP, STEP), np.nan)
     covariance = np.array([np.asarray(each.get("covariance", unknown)) for each in calibrations])
     evidence = [VenueEvidence.from_arrays(each) for each in calibrations]
     told = [each for each in evidence if each is not None]

@@ -18,8 +18,9 @@ from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import projection
+from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.losses import geman_mcclure_weight
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
@@ -223,7 +224,7 @@ class MovingJoints:
         n, row = len(self.at), self.rig.cameras[camera]
         image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, 18))
         given, status = np.ascontiguousarray(self.at[None]), np.empty((1, n), np.uint8)
-        projection.project_with_jacobians(row[None], given, image, jacobian, status)
+        camera_model.project_with_jacobians(row[None], given, image, jacobian, status)
         miss = self._pixels[:, camera][self._known] - image[0]
         depth = self.at @ self.rig.depths[camera, :3] + self.rig.depths[camera, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -231,7 +232,7 @@ class MovingJoints:
             variance = self._settings.pixel_noise_px**2 + (size * self._settings.joint_noise_m) ** 2
             weight = self._precision[:, camera][self._known] / variance
             squared = weight * (miss**2).sum(axis=-1)
-            weight = weight / (1.0 + squared / self._settings.max_deviation**2) ** 2
+            weight = weight * geman_mcclure_weight(squared, self._settings.max_deviation)
         usable = np.isfinite(weight * squared)
         return (
             np.where(usable[:, None, None], jacobian[0], 0.0),

@@ -21,8 +21,9 @@ from data_contracts.conventions import COCO17, COCO17_LIMBS
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import projection
-from worldpose.geometry.projection import project_point
+from worldpose.geometry import camera_model
+from worldpose.geometry.camera_model import project_point
+from worldpose.geometry.lens_models import load_camera
 from worldpose.triangulation.residuals import Observations
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solve import SolvedJoints, solve_joints
@@ -147,7 +148,8 @@ def _find_swaps(
     gain = np.empty(exchanged.shape[3])
     for t in range(frames):
         for c in range(count):
-            camera = cameras[c]
+            camera = load_camera(cameras, c)
+            area = camera.fx * camera.fy
             for n in range(persons):
                 detection = index[t, c, n]
                 if detection < 0:
@@ -166,10 +168,10 @@ def _find_swaps(
                     for side in range(2):
                         joint = pairs[k, side]
                         x, y, z = joints[t, n, joint]
-                        at = project_point(camera, x, y, z)
-                        image[side, 0] = camera[0] * at[1] + camera[2]
-                        image[side, 1] = camera[1] * at[2] + camera[3]
-                        size = camera[0] * camera[1] / at[5] ** 2 if at[0] == 0 else math.nan
+                        status, image[side, 0], image[side, 1], depth = project_point(
+                            camera, x, y, z
+                        )
+                        size = area / depth**2 if status == 0 else math.nan
                         base[side] = noise[0] ** 2 + size * noise[1] ** 2
                         trace = covariance[t, n, joint, 0, 0] + covariance[t, n, joint, 1, 1]
                         doubt[side] = size * (trace + covariance[t, n, joint, 2, 2]) / 3.0 + extra
@@ -416,7 +418,7 @@ def _misfit(observations: Observations, noise: tuple[float, float], points: Floa
     shift = observations.shift
     at = np.broadcast_to(points, (len(weights), *points.shape))
     image = np.empty((*at.shape[:-1], 2))
-    projection.project(cameras, np.ascontiguousarray(at), image)
+    camera_model.project(cameras, np.ascontiguousarray(at), image)
     depth = at @ depths[:, :3, None] + depths[:, 3, None, None]
     size = np.prod(cameras[:, :2], axis=1)[:, None] / depth[..., 0] ** 2
     moved = shift[0, :, 0] if len(shift) else np.zeros((len(weights), 3))

@@ -18,7 +18,7 @@ from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import projection
+from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.report import Histogram
@@ -191,7 +191,7 @@ def estimate_midhip_shift(
     joints = solve_joints(observed, settings).joints[:, :, 0]
     image = np.empty((len(rig.cameras), joints[..., 0].size, 2))
     points = np.ascontiguousarray(np.broadcast_to(joints.reshape(1, -1, 3), (*image.shape[:2], 3)))
-    projection.project(rig.cameras, points, image)
+    camera_model.project(rig.cameras, points, image)
     image = image.reshape(-1, *joints.shape[:2], 2).swapaxes(0, 1)
     place = np.maximum(index, 0).astype(np.int64)[..., None]
     pixels = np.take_along_axis(middle[..., 0, :], place, axis=2)

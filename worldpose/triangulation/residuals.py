@@ -40,9 +40,13 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Floats
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import projection
+from worldpose.geometry.camera_model import is_finite
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.projection import distort, fold_radius
+from worldpose.geometry.lens_models import LensModel, distort, distort_brown, load_camera, undistort
+from worldpose.geometry.rays import RayStatus
+
+_BROWN = int(LensModel.BROWN)
+_OK = int(RayStatus.OK)
 
 LANES: Final = 64
 """Joints per tile: 16 cameras x 64 joints fit the L2 cache of a processor core."""
@@ -94,6 +98,9 @@ STATE: Final = np.dtype(
 )
 """64 joints: their points, equations and statistics."""
 
+RAYS: Final = np.dtype([("direction", np.float64, (3, LANES))])
+"""Unit directions from one camera to 64 points."""
+
 Tiles = NDArray[np.void]
 """(cameras,) of `TILE`."""
 Tile = np.void
@@ -106,7 +113,7 @@ class Rig(NamedTuple):
     """Cameras in the memory layout of the kernels.
 
     Attributes:
-        cameras: (cameras, 22) parameters as in `worldpose.geometry.projection`.
+        cameras: (cameras, WIDTH) rows as in `worldpose.geometry.camera_model`.
         depths: (cameras, 4), depth of (x, y, z, 1) [m]; 1 where a camera is missing.
         centers: (cameras, 3) [m], world.
     """
@@ -119,18 +126,10 @@ class Rig(NamedTuple):
     def from_cameras(cls, cameras: Camera) -> Self:
         """Return the rig of a batch (cameras,)."""
         pose = cameras.cam_from_world
-        parts = (
-            cameras.focal,
-            cameras.principal_point,
-            cameras.distortion,
-            pose.rotation.reshape(-1, 9),
-            pose.translation,
-            fold_radius(cameras.distortion)[:, None],
-        )
-        rows = np.concatenate(parts, axis=-1)
+        rows = cameras.numbers
         depths = np.concatenate([pose.rotation[:, 2], pose.translation[:, 2:]], axis=-1)
         # 0 x NaN is NaN: a camera of weight 0 needs a finite depth nevertheless.
-        missing = ~np.isfinite(rows[:, :-1]).all(axis=-1)
+        missing = [not is_finite(rows, c) for c in range(len(rows))]
         depths[missing] = [0.0, 0.0, 0.0, 1.0]
         return cls(rows, depths, np.ascontiguousarray(cameras.center))
 
@@ -185,12 +184,14 @@ class Buffers(NamedTuple):
     Attributes:
         tiles: (cameras,) of `TILE`.
         state: (1,) of `STATE`.
+        rays: (cameras,) of `RAYS`.
         trial_tiles: (cameras,) of `TILE`, to try other views of one joint.
         trial_state: (1,) of `STATE`.
     """
 
     tiles: Tiles
     state: NDArray[np.void]
+    rays: NDArray[np.void]
     trial_tiles: Tiles
     trial_state: NDArray[np.void]
 
@@ -199,7 +200,7 @@ class Buffers(NamedTuple):
         """Return buffers for a number of cameras."""
         tiles = np.zeros((2, cameras), TILE)
         states = np.zeros((2, 1), STATE)
-        return cls(tiles[0], states[0], tiles[1], states[1])
+        return cls(tiles[0], states[0], np.zeros(cameras, RAYS), tiles[1], states[1])
 
 
 @compile_kernel
@@ -213,7 +214,7 @@ def read_tile(observations: Observations, first: int, tiles: Tiles) -> None:
     """
     for camera in range(len(tiles)):
         _gather(observations, first, camera, tiles[camera])
-        _linearize(tiles[camera], observations.rig.cameras[camera])
+        _linearize(tiles[camera], observations.rig.cameras, camera)
 
 
 @compile_kernel
@@ -256,16 +257,17 @@ def _gather(observations: Observations, first: int, camera: int, tile: Tile) -> 
 
 
 @compile_kernel
-def _linearize(tile: Tile, c: Floats) -> None:
-    """Turn one camera's pixels into equations.
+def _linearize(tile: Tile, cameras: Floats, camera: int) -> None:
+    """Turn the pixels of one of the cameras into equations.
 
     Observations are dropped where the lens model has no inverse, and for a missing camera.
     """
     a, b, scale, precision = tile["a"], tile["b"], tile["scale"], tile["precision"]
-    if not projection.is_finite(c):
+    if not is_finite(cameras, camera):
         a[:], b[:], scale[:], precision[:] = 0.0, 0.0, 0.0, 0.0
         tile["extra"][:] = 0.0
         return
+    c, is_brown = cameras[camera], cameras[camera, 25] == _BROWN
     # Undistorted x and y, the derivatives of the distortion, and whether they are exact.
     plane = np.empty((6, LANES))
     over_u, over_v = 1.0 / c[0], 1.0 / c[1]
@@ -274,14 +276,14 @@ def _linearize(tile: Tile, c: Floats) -> None:
         square = xd * xd + yd * yd
         over = 1.0 / (1.0 + square * (c[4] + square * c[5]))
         x, y = xd * over, yd * over
-        # Newton steps that invert most lens models to rounding; the others are inverted one by one.
+        # Newton steps that invert most of Brown's lenses to rounding; others are inverted below.
         for _ in range(2):
-            fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+            fx, fy, dxx, dxy, dyy = distort_brown(x, y, c[4], c[5], c[6], c[7], c[8])
             over = 1.0 / (dxx * dyy - dxy * dxy)
             fx, fy = fx - xd, fy - yd
             x -= (dyy * fx - dxy * fy) * over
             y -= (dxx * fy - dxy * fx) * over
-        fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        fx, fy, dxx, dxy, dyy = distort_brown(x, y, c[4], c[5], c[6], c[7], c[8])
         misfit = max(abs(fx - xd), abs(fy - yd))
         # Largest accepted misfit of an inverse on the plane z = 1.
         inside = misfit <= 1e-13 and x * x + y * y < c[21] * c[21]
@@ -289,15 +291,12 @@ def _linearize(tile: Tile, c: Floats) -> None:
         plane[2, j], plane[3, j], plane[4, j] = dxx, dxy, dyy
         plane[5, j] = 1.0 if inside else 0.0
     for j in range(LANES):
-        if plane[5, j] == 0.0:
-            pixel, found = np.empty((1, 1, 2)), np.empty((1, 1, 2))
-            pixel[0, 0, 0], pixel[0, 0, 1] = a[0, j], b[0, j]
-            projection.normalize(c.reshape(1, 22), pixel, found, np.empty((1, 1), np.uint8))
-            if not math.isfinite(found[0, 0, 0]):
-                found[:] = 0.0
-                precision[j] = 0.0
-            x, y = found[0, 0, 0], found[0, 0, 1]
-            _, _, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        if plane[5, j] == 0.0 or not is_brown:
+            numbers = load_camera(cameras, camera)
+            x, y, status = undistort(numbers, (a[0, j] - c[2]) / c[0], (b[0, j] - c[3]) / c[1])
+            if status != _OK:
+                x = y = precision[j] = 0.0
+            _, _, dxx, dxy, dyy = distort(numbers, x, y)
             plane[0, j], plane[1, j] = x, y
             plane[2, j], plane[3, j], plane[4, j] = dxx, dxy, dyy
     for j in range(LANES):

@@ -14,7 +14,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import projection
+from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.report import Changes, Histogram
@@ -136,7 +136,7 @@ def _whiten_errors(
     """Return errors (cameras, frames, 2) in standard deviations; NaN for outlier views."""
     image = np.empty(pixels.shape)
     at = np.ascontiguousarray(np.broadcast_to(points, (*image.shape[:2], 3)))
-    projection.project(rig.cameras, at, image)
+    camera_model.project(rig.cameras, at, image)
     depth = at @ rig.depths[:, :3, None] + rig.depths[:, 3, None, None]
     size = rig.cameras[:, 0, None, None] / depth
     variance = noise[0] ** 2 + (size * noise[1]) ** 2

@@ -80,19 +80,19 @@ def _solve_all(
     """Solve tile by tile and write the arrays of `solved`."""
     frames, count, persons = observations.detection_index.shape
     joint_count = observations.precision.shape[3]
-    tiles, state, rays = buffers.tiles, buffers.state[0], np.empty((count, 3, LANES))
+    tiles, state = buffers.tiles, buffers.state[0]
     found, place = np.zeros(LANES, np.bool_), np.empty((LANES, 3), np.int64)
     agrees = np.empty((2, LANES), np.bool_)
     total = frames * persons * joint_count
     for first in range(0, total, LANES):
         read_tile(observations, first, tiles)
         find_consensus(observations.rig, noise, limit, buffers)
-        _measure(tiles, observations.rig, state, rays)
+        _measure(tiles, observations.rig, buffers.rays, state)
         last = min(LANES, total - first)
         for j in range(last):
             person, place[j, 2] = (first + j) // joint_count, (first + j) % joint_count
             place[j, 0], place[j, 1] = person // persons, person % persons
-            found[j] = _write_joint(state, j, place[j], min_views, min_sine, solved)
+        _write_joints(state, place[:last], min_views, min_sine, solved, found)
         for camera in range(count):
             precision, used = tiles[camera]["precision"], tiles[camera]["used"]
             for j in range(LANES):
@@ -109,31 +109,42 @@ def _solve_all(
 
 
 @compile_kernel
-def _write_joint(
+def _write_joints(
     state: State,
-    j: int,
     place: NDArray[np.int64],
     min_views: int,
     min_sine: float,
     solved: SolvedJoints,
-) -> bool:
-    """Write a joint if its views determine it; return whether they do."""
-    t, n, joint = place
-    x, y, z = state["point"][0, j], state["point"][1, j], state["point"][2, j]
-    matrix = state["matrix"]
-    xx, xy, xz = matrix[0, j], matrix[1, j], matrix[2, j]
-    yy, yz, zz = matrix[3, j], matrix[4, j], matrix[5, j]
-    views, widest = state["views"][j], math.sqrt(state["spread"][j])
-    if not (math.isfinite(x + xx) and widest >= min_sine and views >= min_views):
-        return False
-    solved.joints[t, n, joint] = x, y, z
-    solved.covariance[t, n, joint, 0] = xx, xy, xz
-    solved.covariance[t, n, joint, 1] = xy, yy, yz
-    solved.covariance[t, n, joint, 2] = xz, yz, zz
-    solved.views[t, n, joint] = int(views)
-    solved.spread[t, n, joint] = math.asin(min(1.0, widest))
-    solved.reprojection_error[t, n, joint] = math.sqrt(state["pixels"][j] / views)
-    return True
+    found: NDArray[np.bool_],
+) -> None:
+    """Write the joints that their views determine, and in `found` (lanes,) which these are.
+
+    Args:
+        state: joints with their covariance and statistics.
+        place: (joints, 3), frame, person and joint of each lane.
+        min_views: minimum inlier views.
+        min_sine: minimum sine of the widest angle between their rays.
+        solved: written.
+        found: written.
+    """
+    point, matrix = state["point"], state["matrix"]
+    pixels, inliers, spread = state["pixels"], state["views"], state["spread"]
+    joints, covariance, error = solved.joints, solved.covariance, solved.reprojection_error
+    for j in range(len(place)):
+        t, n, joint = place[j]
+        x, y, z = point[0, j], point[1, j], point[2, j]
+        xx, xy, xz = matrix[0, j], matrix[1, j], matrix[2, j]
+        yy, yz, zz = matrix[3, j], matrix[4, j], matrix[5, j]
+        views, widest = inliers[j], math.sqrt(spread[j])
+        found[j] = math.isfinite(x + xx) and widest >= min_sine and views >= min_views
+        if found[j]:
+            joints[t, n, joint] = x, y, z
+            covariance[t, n, joint, 0] = xx, xy, xz
+            covariance[t, n, joint, 1] = xy, yy, yz
+            covariance[t, n, joint, 2] = xz, yz, zz
+            solved.views[t, n, joint] = int(views)
+            solved.spread[t, n, joint] = math.asin(min(1.0, widest))
+            error[t, n, joint] = math.sqrt(pixels[j] / views)
 
 
 @compile_kernel
@@ -360,13 +371,13 @@ def _largest(values: Floats) -> float:
 
 
 @compile_kernel
-def _measure(tiles: Tiles, rig: Rig, state: State, rays: Floats) -> None:
-    """Write `pixels`, `views` and `spread` of the used views, with room `rays` (cameras, 3, 64)."""
+def _measure(tiles: Tiles, rig: Rig, rays: NDArray[np.void], state: State) -> None:
+    """Write `pixels`, `views` and `spread` of the used views, and the rays to the points."""
     point, pixels, views, spread = state["point"], state["pixels"], state["views"], state["spread"]
     pixels[:], views[:], spread[:] = 0.0, 0.0, 1.0
     for camera in range(len(tiles)):
         a, b, inlier = tiles[camera]["a"], tiles[camera]["b"], tiles[camera]["used"]
-        ray, depth, center = rays[camera], rig.depths[camera], rig.centers[camera]
+        ray, depth, center = rays[camera]["direction"], rig.depths[camera], rig.centers[camera]
         p, q, r, s = depth[0], depth[1], depth[2], depth[3]
         cx, cy, cz = center[0], center[1], center[2]
         for j in range(LANES):
@@ -384,9 +395,9 @@ def _measure(tiles: Tiles, rig: Rig, state: State, rays: Floats) -> None:
             length = length if used > 0.0 else np.nan
             ray[0, j], ray[1, j], ray[2, j] = x * length, y * length, z * length
     for camera in range(len(tiles)):
-        one = rays[camera]
+        one = rays[camera]["direction"]
         for other in range(camera):
-            two = rays[other]
+            two = rays[other]["direction"]
             for j in range(LANES):
                 dot = one[0, j] * two[0, j]
                 dot += one[1, j] * two[1, j] + one[2, j] * two[2, j]

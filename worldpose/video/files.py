@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import dropwhile, islice, pairwise
 from pathlib import Path
+from typing import Final
 
 import av
 import numpy as np
@@ -19,6 +20,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Image
 from worldpose.errors import InputError
 from worldpose.video.pictures import FrameIndex, Pictures, convert_pixels
+
+MAX_STRETCH: Final = 0.01
+"""Largest deviation of a pixel's sides that rounding in a file explains [1]."""
 
 
 def index_frames(path: Path) -> FrameIndex:
@@ -43,6 +47,7 @@ def index_frames(path: Path) -> FrameIndex:
                 if packet.size and not packet.is_discard:
                     packets.append((packet.pts, packet.is_keyframe))
             size = (stream.width, stream.height) if size is None else size
+            _require_square(path, stream)
             base = stream.time_base
             reorders = stream.codec_context.has_b_frames
         given = [stamp for stamp, _ in packets if stamp is not None]
@@ -129,6 +134,19 @@ def _shown_size(packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
             return picture.height, picture.width
         return picture.width, picture.height
     return None
+
+
+def _require_square(path: Path, stream: VideoStream) -> None:
+    """Raise InputError for a video whose pixels are wider or narrower than high."""
+    ratio = stream.sample_aspect_ratio
+    if ratio and abs(float(ratio) - 1.0) > MAX_STRETCH:
+        raise InputError(
+            str(path),
+            expected="square pixels",
+            found=f"a sample aspect ratio of {ratio.numerator}:{ratio.denominator}",
+            todo="Make them square: ffmpeg -i IN -vf scale=trunc(iw*sar/2)*2:ih,setsar=1 OUT; a "
+            "calibration of the stretched pictures has to be made again.",
+        )
 
 
 def _no_video(path: Path, found: str) -> InputError:

@@ -1,13 +1,13 @@
 """Folders of numbered images, with the interface of videos, and selected frames of either.
 
-PNG and JPEG images are decoded in memory, after a check of the size in their header.
+Images are decoded in memory, after a check of the size in their header.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import re
-import struct
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -20,8 +20,6 @@ from worldpose.errors import InputError
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.pictures import FrameIndex, Pictures
 
-HEADER_BYTES: Final = 1 << 20
-"""First bytes of a file that must hold its image's size [byte]; camera metadata may precede it."""
 MAX_PIXELS: Final = 200_000_000
 """No camera takes larger images; a few hundred bytes can declare gigabytes."""
 
@@ -30,7 +28,7 @@ def decode_image(content: Image, *, grey: bool = False) -> Image | None:
     """Return an image (height, width, 3) RGB, or (height, width) grey.
 
     Args:
-        content: (bytes,) content of a PNG or JPEG file.
+        content: (bytes,) content of an image file of `FORMATS`.
         grey: without colour.
 
     Returns:
@@ -49,25 +47,26 @@ def decode_image(content: Image, *, grey: bool = False) -> Image | None:
 
 
 def declared_size(content: Image) -> tuple[int, int] | None:
-    """Return width and height [px] in the header of a PNG or JPEG file; None for other files."""
-    header = content[:HEADER_BYTES].tobytes()
-    if header[:8] == b"\x89PNG\r\n\x1a\n" and header[12:16] == b"IHDR" and len(header) >= 24:
-        width, height = struct.unpack(">II", header[16:24])
-        return width, height
-    place = 2 if header[:2] == b"\xff\xd8" else len(header)
-    while place + 9 <= len(header) and header[place] == 0xFF:
-        marker, length = struct.unpack(">BH", header[place + 1 : place + 4])
-        if marker == 0xFF:  # padding before a marker
-            place += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
-            height, width = struct.unpack(">HH", header[place + 5 : place + 9])
-            return width, height
-        else:
-            place += 2 + length
-    return None
+    """Return width and height [px], as displayed, in the header of an image; None for other files.
+
+    An image that its EXIF tag turns by a quarter is shown with its sides exchanged.
+    """
+    from PIL import Image as Pillow  # late: few commands open an image
+
+    try:
+        with Pillow.open(io.BytesIO(content.tobytes()), formats=FORMATS) as image:
+            width, height = image.size
+            turned = image.getexif().get(ORIENTATION) in (5, 6, 7, 8)
+    except Exception:  # Pillow documents no closed list for damaged files
+        return None
+    return (height, width) if turned else (width, height)
 
 
-SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+FORMATS: Final = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
+"""Pillow's names of the kinds of images that are read."""
+ORIENTATION: Final = 0x0112
+"""EXIF tag of the way in which an image is shown."""
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 class ImageFolder(Pictures):
@@ -104,7 +103,7 @@ class ImageFolder(Pictures):
         """Return the error of a file that is no image."""
         return InputError(
             str(self._files[number]),
-            expected="a PNG or JPEG picture",
+            expected="a picture",
             found="none",
             todo="Write it again.",
         )

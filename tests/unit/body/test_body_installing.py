@@ -44,13 +44,6 @@ def test_a_pickle_like_smpls_is_installed_and_found(official, arrays, tmp_path, 
     np.testing.assert_array_equal(found.joints(rest), open_body.joints(rest))
 
 
-def test_an_npz_is_installed_too(arrays, tmp_path):
-    np.savez(tmp_path / "SMPL_MALE.npz", **arrays, betas=np.zeros(3))
-    made = install_body(tmp_path / "SMPL_MALE.npz", tmp_path / "bodies")
-    assert made.name == "smpl-male"
-    np.testing.assert_array_equal(made.weights, arrays["weights"])
-
-
 class Attack:
     def __init__(self, command):
         self.command = command

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
@@ -12,25 +11,6 @@ from worldpose.geometry.rigid import Rigid
 SINGLE = 1e-6
 # Double precision at tens of metres.
 ROUNDING = 1e-12
-
-
-def test_a_body_at_rest_is_the_template(open_body):
-    rest = BodyParameters.rest()
-    np.testing.assert_allclose(open_body.vertices(rest), open_body.template, atol=SINGLE)
-    np.testing.assert_allclose(open_body.joints(rest), open_body.joint_template, atol=ROUNDING)
-
-
-def test_the_open_body_stands_as_smpl_does(open_body):
-    joints = dict(zip(JOINT_NAMES, open_body.joint_template, strict=True))
-    height = np.ptp(open_body.template[:, 1])
-    assert open_body.name == "open-neutral/2"
-    assert open_body.template.shape == (6890, 3)
-    # An adult: MakeHuman's mean over both sexes.
-    assert 1.70 < height < 1.90
-    assert joints["left_wrist"][0] > 0.6 > -0.6 > joints["right_wrist"][0]
-    assert joints["head"][1] > joints["pelvis"][1] > joints["left_ankle"][1]
-    # Toes are in front of the ankles: the body looks along +z.
-    assert joints["left_foot"][2] > joints["left_ankle"][2] + 0.1
 
 
 def test_orientation_turns_about_the_pelvis_and_translation_comes_after(open_body):
@@ -45,23 +25,6 @@ def test_orientation_turns_about_the_pelvis_and_translation_comes_after(open_bod
     np.testing.assert_allclose(joints, expected, atol=ROUNDING)
     expected = (open_body.template - pelvis) @ rotation.T + pelvis + turned.transl
     np.testing.assert_allclose(open_body.vertices(turned), expected, atol=SINGLE)
-
-
-def test_batches_broadcast_and_longer_ones_than_a_chunk_work(open_body):
-    frames = BodyParameters(
-        betas=np.zeros((1, 10)),
-        global_orient=np.zeros(3),
-        body_pose=np.zeros(69),
-        transl=np.arange(2.0 * 20 * 3).reshape(2, 20, 3),
-    )
-    vertices = open_body.vertices(frames)
-    assert vertices.shape == (2, 20, 6890, 3)
-    expected = open_body.template + frames.transl[:, :, None]
-    # Single precision of the weights' sums, at a metre from the origin.
-    np.testing.assert_allclose(vertices, expected, atol=SINGLE)
-    assert open_body.joints(frames).shape == (2, 20, 24, 3)
-    assert frames[1].batch_shape == (20,)
-    assert frames[..., 3].batch_shape == (2,)
 
 
 def test_a_person_with_missing_parameters_is_nan_and_the_others_are_not(open_body, people):
@@ -86,11 +49,6 @@ def test_parameters_of_a_wrong_shape_are_refused(name, array, expected):
     with pytest.raises(InputError, match=f"BodyParameters.{name}") as refused:
         replace(BodyParameters.rest(), **{name: array})
     assert refused.value.expected == expected
-
-
-def test_betas_of_another_model_are_refused(open_body):
-    with pytest.raises(InputError, match="10 betas of open-neutral/2"):
-        open_body.joints(BodyParameters.rest(shapes=16))
 
 
 @pytest.mark.parametrize(

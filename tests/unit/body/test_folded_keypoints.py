@@ -30,13 +30,6 @@ def keypoints_of_the_surface(model, parameters, points):
     )
 
 
-def test_folded_keypoints_are_those_of_the_surface(open_body, people):
-    name = "body25"
-    folded = fold_keypoints(open_body, SKELETONS[name])(people)
-    expected = keypoints_of_the_surface(open_body, people, SKELETONS[name])
-    np.testing.assert_allclose(folded, expected, atol=ROUNDING)
-
-
 def test_folded_keypoints_are_those_of_the_surface_with_pose_correctives(corrected_body, people):
     folded = fold_keypoints(corrected_body, SKELETONS["body25"])(people)
     expected = keypoints_of_the_surface(corrected_body, people, SKELETONS["body25"])
@@ -47,27 +40,12 @@ def test_folded_keypoints_are_those_of_the_surface_with_pose_correctives(correct
     assert moved.max() > 1e-3
 
 
-def test_a_regressor_over_a_thousand_vertices_is_folded_too(corrected_body, people):
-    rng = np.random.default_rng(2)
-    shares = np.zeros((4, 6890))
-    for row in shares:
-        row[rng.choice(6890, 1000, replace=False)] = rng.normal(0.001, 0.001, 1000)
-    shares /= shares.sum(1, keepdims=True)
-    folded = fold_regressor(corrected_body, np.zeros((4, 24)), shares)(people)
-    np.testing.assert_allclose(folded, shares @ corrected_body.vertices(people), atol=ROUNDING)
-
-
 def test_a_missing_person_is_nan_and_the_others_are_not(open_body, people):
     transl = people.transl.copy()
     transl[1] = np.nan
     keypoints = fold_keypoints(open_body, SKELETONS["coco17"])(replace(people, transl=transl))
     assert np.isnan(keypoints[1]).all()
     assert np.isfinite(np.delete(keypoints, 1, axis=0)).all()
-
-
-def test_an_unknown_point_is_refused(open_body):
-    with pytest.raises(InputError, match="keypoint 'tail'"):
-        fold_keypoints(open_body, ("nose", "tail"))
 
 
 def test_a_vertex_of_a_model_of_another_size_is_refused(open_body):

@@ -27,12 +27,6 @@ def differences(folded, people, name):
     return np.stack(columns, axis=-1)
 
 
-def test_keypoints_are_those_of_folding(folded, people):
-    found = ChainedKeypoints.of(folded).differentiate(people).keypoints
-    # Rounding of coordinates below 100 m.
-    np.testing.assert_allclose(found, folded(people), atol=2e-13)
-
-
 @pytest.mark.parametrize("name", NAMES[:3])
 def test_derivatives_are_those_of_differences(folded, people, name):
     jacobian = ChainedKeypoints.of(folded).differentiate(people)
@@ -40,20 +34,6 @@ def test_derivatives_are_those_of_differences(folded, people, name):
     np.testing.assert_allclose(
         getattr(jacobian, name), differences(folded, people, name), atol=5e-8
     )
-
-
-def test_derivatives_are_those_of_torch(folded, people):
-    torch = pytest.importorskip("torch")
-    from worldpose.body.differentiable import DifferentiableBody
-
-    body = DifferentiableBody(folded)
-    given = [torch.tensor(np.array(getattr(people, name)), requires_grad=True) for name in NAMES]
-    weights = np.random.default_rng(0).normal(size=(5, len(BODY25), 3))
-    (body.keypoints(*given) * torch.tensor(weights)).sum().backward()
-    jacobian = ChainedKeypoints.of(folded).differentiate(people)
-    for name, tensor in zip(NAMES[:3], given, strict=False):
-        pulled = np.einsum("nka,nkap->np", weights, getattr(jacobian, name))
-        np.testing.assert_allclose(pulled, tensor.grad.numpy(), atol=1e-11)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.1001, 3.0])

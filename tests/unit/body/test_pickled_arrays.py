@@ -76,12 +76,6 @@ def test_arrays_come_as_they_were(tmp_path, array, protocol):
     assert back.dtype == array.dtype
 
 
-@pytest.mark.parametrize("kind", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix])
-def test_sparse_matrices_become_dense(tmp_path, kind):
-    protocol = 2
-    np.testing.assert_array_equal(read(tmp_path, pickled({"a": kind(NUMBERS)}, protocol)), NUMBERS)
-
-
 @pytest.mark.parametrize("protocol", [0, 2])
 def test_chumpy_is_read_without_chumpy(tmp_path, protocol):
     assert "chumpy" not in sys.modules
@@ -153,11 +147,6 @@ def test_a_pickle_that_calls_something_is_refused_and_calls_nothing(tmp_path, na
         assert not canary.exists()
 
 
-def test_the_refused_name_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"the name (posix|nt)\.system, which is not allowed"):
-        read(tmp_path, pickled({"a": Payload(os.system, "true")}))
-
-
 @pytest.mark.parametrize(
     "stream",
     [
@@ -183,12 +172,6 @@ def test_the_refused_name_is_told(tmp_path):
 )
 def test_handmade_streams_are_refused(tmp_path, stream):
     with pytest.raises(InputError):
-        read(tmp_path, stream)
-
-
-def test_names_of_chumpy_run_nothing(tmp_path):
-    stream = b"\x80\x04\x8c\x06chumpy\x8c\x09os.system\x93\x8c\x04true\x85R."
-    with pytest.raises(InputError, match="a pickled nonetype"):
         read(tmp_path, stream)
 
 
@@ -238,18 +221,6 @@ def spoiled_contents():
 def test_an_array_whose_parts_contradict_each_other_is_refused(tmp_path, stream, told):
     with pytest.raises(InputError, match=told):
         read(tmp_path, stream)
-
-
-def test_every_truncation_is_refused(tmp_path):
-    stream = pickled({"a": Ch(NUMBERS)})
-    for length in range(len(stream)):
-        with pytest.raises(InputError):
-            read(tmp_path, stream[:length])
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_pickled_arrays(tmp_path / "none.pkl", ("a",))
 
 
 @settings(

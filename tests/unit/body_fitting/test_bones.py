@@ -2,25 +2,12 @@
 
 import numpy as np
 import pytest
-from walking_bodies import KEYPOINTS, MODEL
 
-from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.bones import (
-    BONES,
-    BoneLengths,
     Shape,
-    fit_shape,
     measure_bones,
     pool_shapes,
-    shorten_limbs,
 )
-
-
-def bones_of(betas):
-    """Exact lengths of a body's bones [m]."""
-    rest = BodyParameters(betas, np.zeros(3), np.zeros(69), np.zeros(3))
-    joints = KEYPOINTS(rest)
-    return np.array([np.linalg.norm(joints[b] - joints[a]) for a, b in BONES])
 
 
 def test_noise_lengthens_bones_and_the_lengths_here_are_without_it():
@@ -37,35 +24,6 @@ def test_noise_lengthens_bones_and_the_lengths_here_are_without_it():
     # 68 mm of a difference along the bone over 4000 frames: 1.1 mm; four of these.
     assert measured.length[0] == pytest.approx(0.28, abs=0.0045)
     assert np.sqrt(measured.variance[0]) == pytest.approx(0.0011, rel=0.3)
-
-
-def test_the_shortened_bone_of_a_negative_beta_is_short():
-    # The printed formula would add the length of the direction: longer for either sign.
-    for beta in (-2.0, 2.0):
-        betas = np.r_[beta, np.zeros(9)]
-        lengths = bones_of(betas)
-        shape = fit_shape(MODEL, BoneLengths(lengths, np.full(len(BONES), 1e-8)))
-        # The prior and 2 cm of definition hold back; height follows to a tenth of beta's 0.2 m.
-        assert shape.betas[0] == pytest.approx(beta, abs=0.5)
-        assert np.abs(bones_of(shape.betas) - lengths).max() < 0.01
-
-
-def test_limbs_that_noise_lengthened_are_shortened_joint_by_joint():
-    rng = np.random.default_rng(4)
-    joints = np.zeros((4000, 17, 3))
-    joints[:, 13], joints[:, 15] = [0.0, 0.0, -0.45], [0.0, 0.3, -0.85]
-    noise = 0.04
-    noisy = joints + noise * rng.standard_normal(joints.shape)
-    covariance = np.broadcast_to(noise**2 * np.eye(3), (*joints.shape, 3))
-    shortened = shorten_limbs(noisy, covariance)
-    for a, b, length in ((11, 13, 0.45), (13, 15, 0.5)):
-        before, after = (
-            np.linalg.norm(x[:, b] - x[:, a], axis=-1).mean() for x in (noisy, shortened)
-        )
-        # Two axes across x two joints x variance / (2 x length).
-        assert before - length == pytest.approx(2.0 * noise**2 / length, rel=0.35)
-        # The next order, and 57 mm along the bone over 4000 frames: 1 mm each.
-        assert after == pytest.approx(length, abs=0.003)
 
 
 def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counted_once():

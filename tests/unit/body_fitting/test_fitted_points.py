@@ -7,7 +7,7 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.conventions import FEET
-from worldpose.body.keypoints import LANDMARKS, fold_keypoints, point_segments
+from worldpose.body.keypoints import fold_keypoints
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.extra_points import perceived_points
 from worldpose.body_fitting.results import ClipEvidence
@@ -89,60 +89,3 @@ def test_offsets_of_shoes_are_learned_and_do_not_move_the_ankles():
     )
     feet, ankles = errors(fit, bodies)
     assert feet < 0.02 and ankles < 0.015
-
-
-def test_a_foot_without_points_stands_as_before(walk):
-    """On the ground a foot whose points are missing for long is level, the other is as seen."""
-    bodies, evidence = walk
-    joints = evidence.extra.joints.copy()
-    joints[:, :, 3:] = np.nan
-    extra = replace(evidence.extra, joints=joints)
-
-    def ground(x, y):
-        return np.zeros(np.shape(x)) - 0.25
-
-    both = [
-        fit_bodies(MODEL, replace(evidence, extra=each), SETTINGS, ground) for each in (extra, None)
-    ]
-    left, right = (slice(3 * (joint - 1), 3 * joint) for joint in (7, 8))
-    poses = [fit.parameters.body_pose for fit in both]
-    apart = [np.abs(poses[0][..., foot] - poses[1][..., foot]).mean() for foot in (left, right)]
-    assert apart[0] > 0.1 and apart[1] < 0.02
-    truth = bodies[0].body_pose[:, left]
-    assert np.abs(poses[0][:, 0, left] - truth).mean() < 0.12
-
-
-LANDMARK_POINTS = tuple(LANDMARKS)
-ON_BODY = fold_keypoints(MODEL, LANDMARK_POINTS)
-
-
-def landmarks(bodies, evidence, wobble_m, seed=7):
-    """Evidence with landmarks; those of one segment err alike, by a slow wobble [m]."""
-    rng = np.random.default_rng(seed)
-    segment = point_segments(MODEL, LANDMARK_POINTS)
-    frames = evidence.joints.shape[0]
-    time = np.arange(frames) / 50.0
-    each = []
-    for body in bodies:
-        phase, way = rng.uniform(0, 2 * np.pi, 24), rng.standard_normal((24, 3))
-        way /= np.linalg.norm(way, axis=1, keepdims=True)
-        sway = np.sin(2.0 * np.pi * 1.5 * time[:, None] + phase)[..., None] * way
-        places = ON_BODY(body) + wobble_m * sway[:, segment]
-        each.append(places + 0.003 * rng.standard_normal(places.shape))
-    places = np.stack(each, axis=1)
-    stated = np.broadcast_to((0.003**2 + BIAS**2) * np.eye(3), (*places.shape, 3)).copy()
-    views = np.full(places.shape[:3], 4, np.uint8)
-    bias = np.full(len(LANDMARK_POINTS), BIAS)
-    return replace(evidence, extra=ExtraJoints(LANDMARK_POINTS, places, stated, views, bias))
-
-
-def joint_error(fit, bodies):
-    truth = np.stack([KEYPOINTS(body) for body in bodies], axis=1)
-    return np.linalg.norm(fit.joints - truth, axis=-1).mean()
-
-
-def test_accurate_landmarks_make_bodies_better(walk):
-    bodies, evidence = walk
-    plain = joint_error(fit_bodies(MODEL, replace(evidence, extra=None), SETTINGS), bodies)
-    better = joint_error(fit_bodies(MODEL, landmarks(bodies, evidence, 0.0), SETTINGS), bodies)
-    assert better < 0.9 * plain

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 from walking_bodies import KEYPOINTS, MODEL, walker
 
 from data_contracts.conventions import JOINT_GROUPS
@@ -13,8 +14,6 @@ from worldpose.body_fitting.held_out import SeenClip, compare_held_out
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
-from worldpose.simulation.scene import look_at
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -24,24 +23,9 @@ GROUPS = list(JOINT_GROUPS)
 
 def ring(count):
     """Cameras around the origin, 40 m away."""
-    poses = [
-        look_at(
-            np.array([40.0 * np.cos(angle), 40.0 * np.sin(angle), 12.0]),
-            np.array([0.0, 0.0, 1.0]),
-            0.0,
-        )
-        for angle in np.linspace(0.0, 5.5, count)
-    ]
-    return Camera(
-        focal=np.full((count, 2), 3000.0),
-        principal_point=np.tile([959.5, 539.5], (count, 1)),
-        distortion=np.zeros((count, 5)),
-        cam_from_world=Rigid(
-            np.stack([pose.rotation for pose in poses]),
-            np.stack([pose.translation for pose in poses]),
-        ),
-        image_size=np.tile([1920, 1080], (count, 1)),
-    )
+    angles = np.linspace(0.0, 5.5, count)
+    places = [(40.0 * np.cos(angle), 40.0 * np.sin(angle), 12.0) for angle in angles]
+    return Camera.stack([look_at_camera(place, (0.0, 0.0, 1.0), 3000.0) for place in places])
 
 
 def filmed(cameras, noise_px, seed, people=3, frames=60):
@@ -95,13 +79,3 @@ def test_a_body_whose_shanks_are_wrong_is_named_at_knees_or_ankles(clip, fit):
     assert not named & {"head", "shoulder", "elbow", "wrist"}
     # Half of the 8 cm goes into the pose, at most, and image planes show two axes of three.
     assert 0.01 < wrong.certain_excess[GROUPS.index("ankle")] < 0.08
-
-
-def test_two_cameras_leave_none_to_hold_out(fit, clip):
-    two = KeypointDetections.from_keypoints(
-        clip.detections.keypoints[:, :2],
-        clip.detections.confidence[:, :2],
-        clip.detections.detection_index[:, :2],
-    )
-    pair = replace(clip, cameras=clip.cameras[:2], detections=two)
-    assert compare_held_out(MODEL, SETTINGS, None, pair, fit) is None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
@@ -11,11 +9,9 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.monocular import (
-    INDEPENDENT_SHARE,
     PRIOR_SPREAD,
     MonocularPoses,
     MonocularPrior,
-    carry_errors,
     learn_precision,
     parse_monocular,
     place_monocular_poses,
@@ -69,19 +65,6 @@ def test_turns_and_crops_are_the_same_whatever_the_method(tmp_path, layout):
     np.testing.assert_array_equal(found.center, CROP["box_center"])
     np.testing.assert_array_equal(found.frame, [4, 4, 7])
     assert found.cropped
-
-
-def test_a_place_before_the_whole_picture_is_projected(tmp_path):
-    arrays = {
-        "poses": VECTORS.reshape(3, 72),
-        "transl": np.array([[0.0, 0.0, 10.0], [1.0, 0.0, 10.0], [0.0, -2.0, 20.0]]),
-        "focal_length": np.array(1000.0),
-        "img_size": np.array([1921, 1081]),
-    }
-    found = read_monocular(written(tmp_path, arrays))
-    assert not found.cropped
-    np.testing.assert_allclose(found.center, [[960.0, 540.0], [1060.0, 540.0], [960.0, 440.0]])
-    np.testing.assert_array_equal(found.frame, [0, 1, 2])
 
 
 @pytest.mark.parametrize(
@@ -157,19 +140,6 @@ def test_exact_bodies_of_crops_come_back_in_the_world_at_their_persons():
     np.testing.assert_allclose(found.angles, bodies.body_pose @ GATHER.T, atol=1e-9)
 
 
-def test_people_whom_nobody_estimated_and_estimates_of_nobody_are_left_out():
-    bodies, camera = crowd(4), broadcast(4)
-    joints = KEYPOINTS(bodies)
-    found = place_monocular_poses(estimates(bodies, camera), camera, np.arange(4), joints[:, :1])
-    assert np.isfinite(found.angles).all()
-    later = place_monocular_poses(estimates(bodies, camera), camera, np.array([0, 1, 7, 8]), joints)
-    assert np.isfinite(later.angles[:2]).all() and np.isnan(later.angles[2:]).all()
-    nobody = place_monocular_poses(estimates(bodies, camera), camera, np.arange(4), joints[:, :0])
-    assert nobody.angles.shape == (4, 0, 30)
-    nowhere = place_monocular_poses(estimates(bodies, camera), camera, np.arange(4), joints + 50.0)
-    assert np.isnan(nowhere.angles).all() and np.isnan(nowhere.orient).all()
-
-
 RNG = np.random.default_rng(2)
 
 
@@ -243,57 +213,3 @@ def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():
         np.linalg.norm(x.joints - exact, axis=-1)[35:75].mean() for x in (alone, guided)
     )
     assert after < 0.8 * before
-
-
-def test_who_turned_unseen_is_found_from_pictures_that_miss_every_eighth_frame():
-    rng = np.random.default_rng(5)
-    truth = walker(100, rng)
-    about = np.zeros((100, 3))
-    about[:, 2] = np.radians(300.0) * np.clip((np.arange(100) - 30) / 40.0, 0.0, 1.0)
-    turned = Rigid(rotation(about) @ rotation(truth.global_orient), np.zeros(3)).rotvec
-    truth = replace(truth, global_orient=turned)
-    joints, covariance = seen(truth, 0.01, rng)
-    joints[30:70] = np.nan
-    glimpses = glimpsed(truth, 0.1, rng)
-    missed = (np.arange(100) % 8 == 0)[:, None, None]
-    glimpses = MonocularPoses(
-        np.where(missed[..., None], np.nan, glimpses.orient),
-        np.where(missed, np.nan, glimpses.angles),
-    )
-    fit = fit_bodies(
-        MODEL,
-        ClipEvidence(joints, covariance, 50.0, monocular_poses=glimpses),
-        BodyFittingSettings(),
-    )
-    away = rotation(fit.parameters.global_orient[30:70, 0]) @ rotation(turned[30:70]).swapaxes(1, 2)
-    # The shorter way round between the ends is the other way, 180 degrees off in the middle.
-    assert np.degrees(np.linalg.norm(Rigid(away, np.zeros(3)).rotvec, axis=-1)).max() < 20.0
-
-
-def test_what_pictures_get_wrong_before_and_after_is_taken_off_between():
-    spread, lasting = 0.1, 25.0
-    used = np.zeros(120, dtype=bool)
-    used[40:80] = True
-    keeps = np.exp(-1.0 / lasting)
-    squares, shares = [], []
-    for _ in range(100):
-        slow = RNG.standard_normal((120, 33))
-        for frame in range(1, 120):
-            slow[frame] = keeps * slow[frame - 1] + np.sqrt(1.0 - keeps**2) * slow[frame]
-        off = np.sqrt(1.0 - INDEPENDENT_SHARE) * slow + np.sqrt(
-            INDEPENDENT_SHARE
-        ) * RNG.standard_normal((120, 33))
-        off *= spread
-        estimated = rotation(-off[:, :3]), -off[:, 3:]
-        known = np.where(used[:, None], np.nan, off)
-        turn, angles, left = carry_errors(*estimated, known, used, lasting)
-        np.testing.assert_array_equal(turn[~used], estimated[0][~used])
-        wrong = np.concatenate([Rigid(turn, np.zeros(3)).rotvec, angles], axis=-1)
-        squares.append((wrong[used] ** 2).mean(axis=-1) / spread**2)
-        shares.append(left[used])
-    found, told = np.mean(squares, axis=0), np.mean(shares, axis=0)
-    # 3300 draws for each frame: 2.5 %, four of these. Turns that do not commute add less.
-    np.testing.assert_allclose(found, told, rtol=0.1)
-    assert told[0] < 0.75
-    assert told[-1] < 0.75
-    assert told[20] > told[0] + 0.1

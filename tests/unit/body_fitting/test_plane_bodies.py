@@ -11,7 +11,7 @@ from walking_bodies import KEYPOINTS, MODEL, walker
 
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.evidence import ankle_height
-from worldpose.body_fitting.monocular import MonocularEstimates, parse_monocular
+from worldpose.body_fitting.monocular import parse_monocular
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -107,12 +107,6 @@ class Clip:
         return np.linalg.norm(middle[frame] - center[:, None], axis=-1).argmin(axis=1) == person
 
 
-def some_rows(estimates, kept):
-    return MonocularEstimates(
-        estimates.frame[kept], estimates.rotations[kept], estimates.center[kept], estimates.cropped
-    )
-
-
 def centred(clip, joints):
     off = joints - clip.truth
     return np.linalg.norm(off - off.mean(axis=2, keepdims=True), axis=-1)
@@ -151,31 +145,6 @@ def test_regions_hold_the_truth_and_are_long_in_depth():
     assert np.median(ratios) > 4.0
 
 
-def test_a_wrong_size_a_lean_and_half_turns_hardly_matter():
-    rng = np.random.default_rng(0)
-    clip = Clip(8, errors=MonocularErrors(size=0.4))
-    rotations = clip.estimates.rotations.copy()
-    rotations[:, 0] = turn(np.radians(8.0), 0.0, 0.0) @ rotations[:, 0]
-    turned = rng.random(len(rotations)) < 0.05
-    rotations[turned, 0] = rotations[turned, 0] @ turn(0.0, np.pi, 0.0)
-    usual, leaning = clip.fit(), clip.fit(replace(clip.estimates, rotations=rotations))
-    assert leaning.missing == (None, None)
-    assert np.nanmean(centred(clip, leaning.placed)) > 0.15
-    assert np.mean(centred(clip, leaning.fit.joints)) < 0.08
-    assert np.mean(clip.errors(leaning.fit.joints)) < 1.5 * np.mean(clip.errors(usual.fit.joints))
-
-
-def test_a_person_without_estimates_has_no_body_and_changes_no_other():
-    clip = Clip(9)
-    bodies = clip.fit(some_rows(clip.estimates, clip.rows_of(0)))
-    assert bodies.missing == (None, "no monocular estimate lies at the person's keypoints")
-    assert np.isfinite(bodies.fit.joints[:, 0]).all()
-    for array in (bodies.fit.joints, bodies.fit.covariance, bodies.fit.parameters.transl):
-        assert np.isnan(array[:, 1]).all()
-    assert np.isnan(bodies.fit.betas[1]).all()
-    assert not bodies.views[:, 1].any()
-
-
 @pytest.mark.parametrize("case", ["upside down", "turned round"])
 def test_estimates_that_contradict_the_keypoints_are_refused_with_the_reason(case):
     clip = Clip(10)
@@ -191,29 +160,3 @@ def test_estimates_that_contradict_the_keypoints_are_refused_with_the_reason(cas
     assert np.isnan(bodies.fit.joints[:, 1]).all()
     assert np.isnan(bodies.fit.betas_covariance[1]).all()
     assert np.isfinite(bodies.fit.joints[:, 0]).all()
-
-
-def test_missing_values_leave_gaps_and_no_failure():
-    clip = Clip(12)
-    rotations = clip.estimates.rotations.copy()
-    rotations[::5] = np.nan
-    keypoints, place = clip.keypoints.copy(), clip.place.copy()
-    keypoints[5:8, 0] = np.nan
-    keypoints[:, 1, 9:11] = np.nan
-    place[:4, 1] = np.nan
-    focal = clip.camera.focal.copy()
-    focal[12] = np.nan
-    bodies = clip.fit(
-        replace(clip.estimates, rotations=rotations),
-        keypoints=keypoints,
-        place=place,
-        camera=replace(clip.camera, focal=focal),
-    )
-    assert bodies.missing == (None, None)
-    assert np.isnan(bodies.fit.joints[:4, 1]).all()
-    assert np.isfinite(bodies.fit.joints[:, 0]).all()
-    assert np.isfinite(bodies.fit.covariance[4:, 1]).all()
-    np.testing.assert_array_equal(np.flatnonzero(bodies.fit.filled[:, 0]), [5, 6, 7])
-    assert not bodies.views[5:8, 0].any()
-    assert not bodies.views[:, 1, 9:11].any()
-    assert np.nanmean(centred(clip, bodies.fit.joints)) < 0.08

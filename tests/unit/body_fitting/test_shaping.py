@@ -58,9 +58,3 @@ def test_what_other_clips_know_of_a_person_counts():
     known = fit(joints, {0: sure}).people[0]
     assert np.linalg.norm(known.betas - true) < 0.1 < np.linalg.norm(alone.betas - true)
     assert np.trace(known.covariance) < 1e-2 * np.trace(alone.covariance)
-
-
-def test_without_people_there_are_no_offsets():
-    shapes = fit({})
-    assert shapes.people == {}
-    np.testing.assert_array_equal(shapes.offsets, 0.0)

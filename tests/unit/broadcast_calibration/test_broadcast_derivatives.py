@@ -6,34 +6,20 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
-from worldpose.broadcast_calibration.normal_equations import flow_row, point_row, undistort_point
+from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
+from worldpose.broadcast_calibration.evidence import PLAYER
 from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.residuals import flow_row, linearize, point_row
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.solver import Problem, equations_at
+from worldpose.geometry.lens_models import CameraNumbers
 
 POINT = np.array([6.0, -9.0, 1.2])
 
 
 def pixel_and_rows(camera, point=POINT):
-    image, rows = np.empty(2), np.empty((2, 12))
-    assert point_row(camera.rotation[0], camera.center, camera.lens(0), point, image, rows)
+    image, rows, room = np.empty(2), np.empty((2, 12)), (np.empty((2, 12)), np.empty((2, 3)))
+    assert point_row(CameraNumbers(*camera.rows[0]), point, image, rows, *room)
     return image, rows
-
-
-def test_a_point_is_where_the_camera_projects_it():
-    camera = clip.moving(2)
-    # Both are double precision on numbers of a thousand.
-    np.testing.assert_allclose(
-        pixel_and_rows(camera)[0], camera.camera[0].project(POINT[None])[0], atol=1e-9
-    )
-
-
-def test_a_point_behind_the_camera_has_no_pixel():
-    camera = clip.moving(2)
-    image, rows = np.empty(2), np.empty((2, 12))
-    behind = camera.center - camera.rotation[0, 2]
-    assert not point_row(camera.rotation[0], camera.center, camera.lens(0), behind, image, rows)
 
 
 def test_a_pixel_moves_with_the_step_as_derived():
@@ -56,8 +42,8 @@ def test_a_followed_point_moves_with_both_frames_as_derived():
     def predicted(step):
         moved = camera.take_step(step[:14].reshape(2, 7), [0.0, 0.0, 0.0, *step[14:]])
         image, rows = np.empty(2), np.empty((2, 16))
-        lens = moved.principal_point, moved.focal, moved.rotation, moved.distortion
-        assert flow_row(*lens, start, image, rows)
+        before, after = (CameraNumbers(*row) for row in moved.rows)
+        assert flow_row(before, after, start[0], start[1], image, rows)
         return image, rows
 
     rows = predicted(np.zeros(16))[1]
@@ -65,15 +51,6 @@ def test_a_followed_point_moves_with_both_frames_as_derived():
         size = 1e-6 if number < 14 else 1e-4
         numeric = (predicted(size * unit)[0] - predicted(-size * unit)[0]) / (2.0 * size)
         np.testing.assert_allclose(rows[:, number], numeric, rtol=1e-6, atol=1e-4)
-
-
-def test_the_lens_is_inverted_exactly():
-    k = np.array([0.4, 1.5, -0.2])
-    for x, y in ((0.0, 0.0), (0.2, -0.1), (-0.05, 0.13)):
-        s = x * x + y * y
-        radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
-        # Newton ends at rounding.
-        assert undistort_point(x * radial, y * radial, k)[:2] == pytest.approx((x, y), abs=1e-14)
 
 
 def test_the_gradient_is_the_slope_of_the_cost():
@@ -87,22 +64,22 @@ def test_the_gradient_is_the_slope_of_the_cost():
     by_size[:, 1, :2] = 0.0  # the end fall moves places along z alone
     known = {"ends": ends, "shares": shares, "by_size": by_size}
     robust = replace(points, loss=np.full(len(points), 3.0), **known)
-    problem = Problem(
+    problem = ClipProblem(
         robust,
         flow,
         build_prior(BroadcastPrior(), true.focal, true.image_size),
+        TermWeights(field=1.3, player=0.4, flow=0.7),
         np.array([np.inf] * 3 + [1e-3, 1e-2, 1e-2, 1e-2]),
-        0.7,
         2.0,
     )
     camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
     beside = 0.3 * rng.standard_normal((problem.paint_count, 3))
-    here = equations_at(camera, beside, problem)
+    here = linearize(camera, beside, problem)
     step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
     paint = rng.standard_normal(beside.shape)
     size = 1e-8
     ahead, behind = (
-        equations_at(camera.take_step(by * step, by * shared), beside + by * paint, problem).cost
+        linearize(camera.take_step(by * step, by * shared), beside + by * paint, problem).cost
         for by in (size, -size)
     )
     slope = float(
@@ -112,11 +89,22 @@ def test_the_gradient_is_the_slope_of_the_cost():
     assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)
 
 
-def test_evidence_of_nothing_costs_nothing():
-    camera = clip.moving(3)
-    prior = build_prior(BroadcastPrior(), camera.focal, camera.image_size)
-    problem = Problem(PointEvidence.none(), FlowEvidence.none(), prior)
-    bare = equations_at(camera, np.zeros((0, 3)), problem)
-    # The remaining residuals are the prior's: 5 of the clip, 4 of each frame.
-    assert np.count_nonzero(bare.system.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
-    assert not bare.system.border.any()
+@pytest.mark.parametrize("term", ["field", "player", "flow"])
+def test_a_weight_multiplies_its_own_term_alone(term):
+    rng = np.random.default_rng(5)
+    true = clip.moving(6)
+    points = clip.ground_points(true, rng, each=8)
+    some = rng.random(len(points)) < 0.4
+    points = replace(points, kind=np.where(some, PLAYER, points.kind))
+    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
+    camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), np.zeros(5))
+
+    def cost(weight):
+        weights = TermWeights()._replace(**{term: weight})
+        problem = ClipProblem(
+            points, clip.followed_points(true, np.random.default_rng(6)), prior, weights
+        )
+        return linearize(camera, np.zeros((0, 3)), problem).cost
+
+    assert cost(1.0) > cost(0.0)
+    assert cost(3.0) - cost(0.0) == pytest.approx(3.0 * (cost(1.0) - cost(0.0)))

@@ -1,7 +1,6 @@
 """The stage's task in a store: numbers of frames, the clip's clock, people and the layout."""
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from flows.registering import register
 from flows.run_plan import plan_run
-from flows.stages.broadcast_calibration import POOLING
 from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry.cameras import Camera
@@ -202,11 +200,3 @@ def test_two_clips_of_one_camera_get_one_place_that_is_known_better(calibrated):
     # Sums of the same two places in either order.
     np.testing.assert_allclose(places[0], places[1], atol=1e-9)
     assert np.linalg.norm(before[0] - before[1]) > 1e-3
-
-
-def test_a_clip_alone_is_not_pooled(calibrated):
-    _, match, _ = calibrated
-    one = match.folder.spec.model_copy(update={"clips": match.folder.spec.clips[:1]})
-    alone = replace(match, folder=replace(match.folder, spec=one))
-    assert POOLING.units(alone) == ()
-    assert POOLING.units(match) == ("goal", "shot")

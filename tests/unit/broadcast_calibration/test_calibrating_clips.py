@@ -5,19 +5,11 @@ import pytest
 import turning_clip as clip
 
 from data_contracts.broadcast_calibration import (
-    BROADCAST_CALIBRATION,
     FRAME_STATUS,
     KeyFrame,
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.broadcast_calibration import calibration
-from worldpose.broadcast_calibration.calibration import (
-    BroadcastClip,
-    broadcast_arrays,
-    broadcast_attributes,
-    calibrate_broadcast,
-)
-from worldpose.broadcast_calibration.evidence import CLICK, MARKING
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
@@ -91,26 +83,6 @@ def test_two_key_frames_give_every_frame(calibrated, true):
     assert np.percentile(errors, 95.0) < 1.5
 
 
-def test_the_report_says_what_frames_rest_on(calibrated):
-    report = calibrated.report
-    names = [FRAME_STATUS[status] for status in report.status]
-    assert names[3] == names[12] == "key_frame"
-    assert set(names) == {"key_frame", "lines"}
-    assert len(report.drift) == 1 and report.drift[0] < 5.0
-    assert report.reasons == ()
-
-
-def test_the_stored_form_is_the_contract_s(calibrated):
-    arrays = broadcast_arrays(calibrated)
-    attributes = broadcast_attributes("clip", calibrated)
-    assert set(arrays) == {layout.name for layout in BROADCAST_CALIBRATION.arrays}
-    assert set(attributes) == set(BROADCAST_CALIBRATION.attributes)
-    for name, array in arrays.items():
-        layout = BROADCAST_CALIBRATION.layout(name)
-        assert array.dtype == layout.dtype, name
-        assert array.ndim == len(layout.dims), name
-
-
 def test_proposed_key_frames_start_the_fit_and_do_not_bias_it(true, pictures):
     keys = []
     for frame in (3, 12):
@@ -136,40 +108,6 @@ def test_proposed_key_frames_start_the_fit_and_do_not_bias_it(true, pictures):
     assert errors[True] < errors[False]
 
 
-def test_the_weight_of_the_field_applies_to_points_drawn_markings_and_painted_lines(
-    true, pictures, monkeypatch
-):
-    weights = {}
-
-    def note(camera, problem, *further, **options):
-        for kind in np.unique(problem.points.kind):
-            weights[int(kind)] = np.unique(problem.points.weight[problem.points.kind == kind])
-        return solve(camera, problem, *further, **options)
-
-    solve = calibration.solve
-    monkeypatch.setattr(calibration, "solve", note)
-    settings = SETTINGS.model_copy(update={"field_weight": 0.25})
-    whole = BroadcastClip([clicks(true, 3), clicks(true, 12)], lambda: iter(pictures), FPS)
-    calibrate_broadcast(clip.PITCH, whole, settings)
-    assert {kind: found.tolist() for kind, found in weights.items()} == {
-        CLICK: [0.25],
-        MARKING: [0.25],
-    }
-
-
-def test_frames_without_lines_are_carried_by_what_stands_still(true, pictures, bare):
-    mixed = [*pictures[:5], *bare[5:12], *pictures[12:]]
-    keys = [clicks(true, 3), clicks(true, 13)]
-    found = calibrate_broadcast(clip.PITCH, BroadcastClip(keys, lambda: iter(mixed), FPS), SETTINGS)
-    names = {FRAME_STATUS[status] for status in found.report.status[6:11]}
-    assert names == {"followed"}
-    assert np.percentile(place_errors(found.camera, true), 95.0) < 3.0
-    # They are known less well, and the report knows.
-    expected = found.report.reprojection_error
-    assert expected[8] > expected[3]
-    assert any(5 <= frame < 12 for frame in found.report.pick_next)
-
-
 def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):
     keys = [clicks(true, 3, renamed="penalty_mark_left"), clicks(true, 12)]
     found = calibrate_broadcast(
@@ -178,25 +116,6 @@ def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):
     assert "penalty_mark_left" in found.report.wrong[3]
     assert any("penalty_mark_left" in reason for reason in found.report.reasons)
     assert np.median(place_errors(found.camera, true)) < 0.5
-
-
-def test_a_key_frame_that_tells_nothing_is_refused_under_its_number_and_the_others_do(
-    true, pictures
-):
-    empty = KeyFrame(
-        frame=102,
-        markings=ClickedMarkings(points=(ClickedPoint(name="center_mark", xy=(400.0, 300.0)),)),
-    )
-    keys = [empty, clicks(true, 8).model_copy(update={"frame": 108})]
-    found = calibrate_broadcast(
-        clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS, first=100), SETTINGS
-    )
-    stored = broadcast_attributes("clip", found, 100)
-    assert list(stored["refused_key_frames"]) == ["102"]
-    assert stored["key_frames"] == [108]
-    assert all(100 <= frame < 100 + FRAMES for frame in stored["pick_next"])
-    assert any("key frame 102 is not used" in reason for reason in found.report.reasons)
-    assert np.median(place_errors(found.camera, true)) < 1.0
 
 
 def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true, pictures):

@@ -1,10 +1,8 @@
 """Followed points, what they say of the camera, and which are no part of the image."""
 
 import numpy as np
-import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.shots import find_cuts
 from worldpose.broadcast_calibration.tracking import (
     Followed,
     chain,
@@ -32,28 +30,6 @@ def test_a_shifted_picture_is_followed_by_its_shift():
     assert pair.inlier_share > 0.9
 
 
-def test_people_are_not_followed():
-    picture = textured(np.random.default_rng(2))
-    box = np.array([[[100.0, 60.0, 240.0, 200.0]]])
-    (pair,) = follow([picture, picture], np.repeat(box, 2, axis=0), 400)
-    x, y = pair.start.T
-    assert len(x) > 50
-    assert not ((x > 100) & (x < 240) & (y > 60) & (y < 200)).any()
-
-
-def test_another_picture_is_a_cut():
-    rng = np.random.default_rng(3)
-    one, two = textured(rng), textured(rng)
-    assert find_cuts(follow([one, one, two, two], None, 200), 0.25) == [2]
-
-
-def test_modified_z_scores_are_those_of_the_definition():
-    residual = np.zeros((5, 2))
-    residual[:, 0] = [-2.0, -1.0, 0.0, 1.0, 10.0]
-    # The median is 0 and that of the distances 1, so 10 scores 0.6745 times 10.
-    assert modified_z_scores(residual)[4] == pytest.approx(6.745)
-
-
 def pairs_of(camera, rng, noise=0.05, each=80):
     flow = clip.followed_points(camera, rng, each=each, noise=noise)
     return [
@@ -76,13 +52,6 @@ def test_a_turn_and_a_zoom_are_found_among_movers():
     # 55 points of 0.05 px: a hundredth of a pixel, of 2000 px.
     assert np.abs(one - two).max() < 2e-5
     assert (modified_z_scores(found.residual)[:25] > 3.5).mean() > 0.9
-
-
-def test_too_few_points_leave_the_camera_where_it_was():
-    camera = clip.moving(1)
-    found = turn(camera, Followed(np.zeros((3, 2)), np.zeros((3, 2)), np.nan))
-    assert not found.determined
-    np.testing.assert_array_equal(found.camera.rotation[1], camera.rotation[0])
 
 
 def test_a_chain_meets_its_key_frames_and_says_what_it_missed():

@@ -3,14 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
-from worldpose.broadcast_calibration.shots import find_shots, grass_and_people
+from worldpose.broadcast_calibration.shots import find_shots
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_broadcast
-from worldpose.simulation.scene import look_at
 from worldpose.video.files import VideoReader, cut_video, index_frames, write_video
 
 SIZE = np.array([320, 180])
@@ -19,18 +18,7 @@ FPS = 10.0
 
 def filmed(center, aims, focal):
     """Images of an empty pitch from a tripod."""
-    poses = [look_at(np.array(center), np.array([*aim, 0.0]), 0.0) for aim in aims]
-    count = len(poses)
-    cameras = Camera(
-        focal=np.full((count, 2), focal),
-        principal_point=np.broadcast_to((SIZE - 1.0) / 2.0, (count, 2)),
-        distortion=np.zeros((count, 5)),
-        cam_from_world=Rigid(
-            np.stack([pose.rotation for pose in poses]),
-            np.stack([pose.translation for pose in poses]),
-        ),
-        image_size=SIZE,
-    )
+    cameras = Camera.stack([look_at_camera(center, (*aim, 0.0), focal, SIZE) for aim in aims])
     return list(render_broadcast(cameras, PitchTemplate.standard(), None, 3))
 
 
@@ -96,24 +84,6 @@ def test_only_live_pans_of_the_main_camera_are_proposed(found):
     assert "too little grass" in said["low"]
     assert said["replay"] == ("between two wipes, as replays are",)
     assert "shorter than 4 s" in said["short"]
-
-
-def test_a_person_close_by_is_tall():
-    lawn = np.full((180, 320, 3), (70, 130, 50), np.uint8)
-    assert grass_and_people(lawn) == (1.0, 0.0)
-    near = lawn.copy()
-    near[30:180, 140:180] = (200, 30, 30)
-    # The image's border closes him off from below; the hull of the grass is the whole image.
-    share, tallest = grass_and_people(near)
-    assert tallest == pytest.approx(150.0 / 180.0, abs=0.02)
-    assert share == pytest.approx(1.0 - 40.0 * 150.0 / (180.0 * 320.0), abs=0.02)
-    assert grass_and_people(np.zeros_like(lawn)) == (0.0, 1.0)
-
-
-def test_a_damaged_picture_ends_a_shot(programme):
-    pictures = programme[1][:44]
-    broken = [(n, None if n == 20 else each) for n, each in enumerate(pictures)]
-    assert [(shot.first, shot.count) for shot in find_shots(broken, FPS)] == [(0, 20), (21, 23)]
 
 
 def test_a_stretch_is_cut_out_picture_for_picture(programme, tmp_path):

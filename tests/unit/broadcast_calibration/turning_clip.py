@@ -72,7 +72,6 @@ def ground_points(camera, rng, each=40, noise=0.3):
         image + noise * rng.standard_normal(image.shape),
         whiten_across(normals, np.full(len(frame), noise)),
         source=np.zeros(len(frame), dtype=np.int64),
-        weight=1.0,
         loss=np.inf,
     )
 

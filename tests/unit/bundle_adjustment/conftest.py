@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clicks, Clip
-from worldpose.bundle_adjustment.solver import Problem
+from worldpose.bundle_adjustment.residuals import AdjustmentProblem
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
-from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.parameters import PARAMETERS, step_camera
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
@@ -15,17 +14,19 @@ from worldpose.triangulation.settings import TriangulationSettings
 def rig(count, rng):
     """Cameras around the origin, 50 m away."""
     angles = 2.0 * np.pi * np.arange(count) / count + 0.3
-    centers = np.stack([50.0 * np.cos(angles), 50.0 * np.sin(angles), np.full(count, 15.0)], axis=1)
-    poses = [look_at(center, np.array([0.0, 0.0, 1.0]), 0.01) for center in centers]
-    return Camera(
-        focal=np.repeat(rng.uniform(1800.0, 2400.0, (count, 1)), 2, axis=1),
-        principal_point=np.array([959.5, 539.5]) + rng.normal(0.0, 5.0, (count, 2)),
-        distortion=np.array([[-0.08, 0.02, 0.0, 0.0, 0.0]] * count),
-        cam_from_world=Rigid(
-            np.stack([pose.rotation for pose in poses]),
-            np.stack([pose.translation for pose in poses]),
-        ),
-        image_size=np.tile([1920, 1080], (count, 1)),
+    focal = rng.uniform(1800.0, 2400.0, count)
+    middle = np.array([959.5, 539.5]) + rng.normal(0.0, 5.0, (count, 2))
+    lens = (-0.08, 0.02, 0.0, 0.0, 0.0)
+    return Camera.stack(
+        [
+            look_at_camera(
+                *((50.0 * np.cos(angle), 50.0 * np.sin(angle), 15.0), (0.0, 0.0, 1.0), focal[n]),
+                middle=middle[n],
+                lens=lens,
+                roll=0.01,
+            )
+            for n, angle in enumerate(angles)
+        ]
     )
 
 
@@ -48,7 +49,7 @@ def scene():
         image = true.project(points)[camera_of, point_of]
         free = np.ones((cameras, len(PARAMETERS)), dtype=bool)
         free[:, PARAMETERS.index("k3")] = False
-        problem = Problem(
+        problem = AdjustmentProblem(
             cameras=true,
             free=free,
             camera_information=np.zeros((cameras, len(PARAMETERS), len(PARAMETERS))),

@@ -8,11 +8,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
@@ -45,25 +45,17 @@ class Lab(NamedTuple):
 def ring(count, rng, radius=4.6):
     """Cameras around the origin that look inwards."""
     angles = 2.0 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
-    rotations, translations = [], []
+    centers = []
     for angle in angles:
         distance = radius * rng.uniform(0.9, 1.15)
-        center = np.array(
-            [distance * np.cos(angle), distance * np.sin(angle), rng.uniform(1.4, 2.6)]
-        )
-        forward = np.array([0.0, 0.0, 0.95]) - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        rotations.append(rotation)
-        translations.append(-rotation @ center)
-    return Camera(
-        focal=np.repeat(rng.uniform(900.0, 1150.0, (count, 1)), 2, axis=1),
-        principal_point=np.array(SIZE) / 2.0 + rng.normal(0.0, 6.0, (count, 2)),
-        distortion=np.zeros((count, 5)),
-        cam_from_world=Rigid(np.stack(rotations), np.stack(translations)),
-        image_size=np.tile(SIZE, (count, 1)),
+        centers.append((distance * np.cos(angle), distance * np.sin(angle), rng.uniform(1.4, 2.6)))
+    focal = rng.uniform(900.0, 1150.0, count)
+    middle = np.array(SIZE) / 2.0 + rng.normal(0.0, 6.0, (count, 2))
+    return Camera.stack(
+        [
+            look_at_camera(centers[n], (0.0, 0.0, 0.95), focal[n], SIZE, middle=middle[n])
+            for n in range(count)
+        ]
     )
 
 

@@ -105,22 +105,6 @@ def test_a_camera_that_nothing_holds_is_named(scene):
         solve(replace(lone, names=names))
 
 
-def test_a_point_of_two_parallel_rays_stays_at_its_depth(scene):
-    problem, true, points = scene(joints=6, seen=1.1)
-    # The second camera stands where the first one does: the last point has one ray, twice.
-    twin = true[[0, 0, 2, 3]]
-    kept = (problem.point_of < len(points) - 1) | (problem.camera_of < 2)
-    image = twin.project(points)[problem.camera_of, problem.point_of]
-    twins = keep(replace(problem, image=image), kept, cameras=twin)
-    adjust = solve(disturbed(twins))
-    assert np.isfinite(adjust.camera_covariance).all()
-    np.testing.assert_allclose(adjust.cameras.center, twin.center, atol=1e-4)
-    np.testing.assert_allclose(adjust.points[:-1], points[:-1], atol=1e-4)
-    np.testing.assert_allclose(
-        adjust.cameras[0].project(adjust.points[-1:]), twins.image[-1:], atol=1e-3
-    )
-
-
 def test_numbers_that_are_not_finite_are_no_fault_of_the_cameras(scene):
     problem, *_ = scene()
     information = problem.camera_information.copy()

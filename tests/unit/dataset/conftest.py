@@ -25,12 +25,12 @@ from worldpose.geometry.rigid import Rigid
 LENS = (0.05, 0.02, 0.004, -0.003, 0.03)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def model():
     return load_open_body()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def poses(model):
     """Running people with moving limbs; one is missing for a while."""
     rng = np.random.default_rng(3)
@@ -55,7 +55,7 @@ def poses(model):
     return BodyParameters(betas, orient, body_pose, transl)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cameras():
     return {
         "north": looking([5.0, 55.0, 14.0], [0.0, 0.0, 0.0], 2000.0, LENS),
@@ -64,7 +64,7 @@ def cameras():
     }
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def main_camera():
     """The broadcast camera, which pans and zooms from one place."""
     rows = [
@@ -74,7 +74,7 @@ def main_camera():
     return Camera.stack(rows)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def written(model, poses, cameras, main_camera, tmp_path_factory):
     """Sound data sets by kind: with 2D of static cameras, without 2D, the challenge's."""
     folder = tmp_path_factory.mktemp("sets")

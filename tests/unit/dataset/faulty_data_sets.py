@@ -1,10 +1,10 @@
 """Faults planted in a sound data set, which its check must find."""
 
 import numpy as np
+from camera_builders import look_at_camera
 
 from worldpose.dataset.check import CheckSettings, check_clip
 from worldpose.dataset.contents import list_clips, read_clip
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
 FRAMES, PERSONS, FPS = 40, 6, 50.0
@@ -13,19 +13,7 @@ Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def looking(center, target, focal, distortion=(0.0,) * 5):
-    """A camera at a place that looks at another with the horizon level."""
-    center, target = np.asarray(center, float), np.asarray(target, float)
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(
-        focal=np.full(2, float(focal)),
-        principal_point=np.array([960.0, 540.0]),
-        distortion=np.array(distortion),
-        cam_from_world=Rigid(rotation, -rotation @ center),
-        image_size=np.array([1920, 1080]),
-    )
+    return look_at_camera(center, target, focal, middle=(960.0, 540.0), lens=distortion)
 
 
 def findings(folder, model, pitch=True):

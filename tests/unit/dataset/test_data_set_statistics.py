@@ -14,14 +14,13 @@ from typer.testing import CliRunner
 from flows.cli.app import app
 from flows.results.dataset import check, count
 from worldpose.body.model import BodyParameters
-from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates, write_frame_rates
-from worldpose.dataset.statistics import clip_statistics, data_set_statistics
-from worldpose.errors import InputError, UsageError
-from worldpose.formats.challenge import write_moving_camera, write_submission
+from worldpose.dataset.manifest import write_frame_rates
+from worldpose.dataset.statistics import clip_statistics
+from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.reports.data_set import bin_edges, plot_statistics
+from worldpose.reports.data_set import plot_statistics
 
 
 def made(rng, frames, persons):
@@ -112,37 +111,6 @@ def test_a_gap_adds_no_way_and_heights_do_not_count():
     assert (found.persons, found.poses, found.frames, found.seconds) == (1, 4, 5, 0.1)
 
 
-def test_joints_and_submissions_count_like_poses(tmp_path):
-    places = made(np.random.default_rng(1), 40, 3).astype(np.float64)
-    joints = np.tile(places.swapaxes(0, 1)[:, :, None], (1, 1, 17, 1))
-    write_joints(tmp_path / "a" / "joints.npz", JointTracks(np.arange(40), np.arange(3), joints))
-    (tmp_path / "b").mkdir()
-    write_submission(tmp_path / "b" / "submission.zip", {"C": joints[:, :, :15].swapaxes(0, 1)})
-    one, other = (count([tmp_path / name]) for name in "ab")
-    assert one.poses == other.poses
-    assert one.distance_km == pytest.approx(other.distance_km, rel=1e-5)  # single precision
-    both = count([tmp_path / "a", tmp_path / "b"])
-    assert set(both.clips) == {"a/clip", "b/C"}
-    assert both.poses == 2 * one.poses
-    with pytest.raises(UsageError, match="twice"):
-        count([tmp_path / "a", tmp_path / "a"])
-
-
-def test_nothing_at_all_is_counted_as_nothing(tmp_path):
-    found = data_set_statistics({})
-    assert (found.frames, found.subjects_per_frame, found.speed_m_s) == (0, None, None)
-    plot_statistics(found)
-    with pytest.raises(InputError, match="no such folder"):
-        count([tmp_path / "nowhere"])
-
-
-@pytest.mark.parametrize(("top", "width"), [(199.0, 10.0), (0.7, 0.05)])
-def test_bins_are_round_and_reach_beyond_the_largest(top, width):
-    edges = bin_edges([0.0, top])
-    assert np.diff(edges) == pytest.approx(width)
-    assert edges[-2] <= top < edges[-1] + 1e-12
-
-
 @pytest.mark.parametrize("command", ["statistics", "check"])
 def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_path, command):
     places = made(np.random.default_rng(3), 50, 2).astype(np.float64)
@@ -155,13 +123,3 @@ def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_pa
     assert told not in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
     assert count([tmp_path]).clips["clip"].seconds == pytest.approx(2.0)
     assert count([tmp_path], fps=50.0).clips["clip"].seconds == pytest.approx(1.0)
-
-
-def test_clips_of_several_exports_keep_their_frame_rates(tmp_path):
-    write_frame_rates(tmp_path, {"A": 25.0})
-    write_frame_rates(tmp_path, {"B": 50.0})
-    rates = read_frame_rates(tmp_path)
-    assert [clip_frame_rate(rates, clip) for clip in ("A", "B", "clip")] == [25.0, 50.0, None]
-    (tmp_path / "frame_rates.json").write_text('{"A": "fast"}')
-    with pytest.raises(InputError, match=r"frame_rates\.json"):
-        read_frame_rates(tmp_path)

@@ -35,23 +35,6 @@ def test_two_people_who_cross_keep_their_tracks():
     assert np.unique(np.array(ids), axis=0).tolist() == [[0, 1]]
 
 
-def test_a_doubtful_box_continues_a_track_and_begins_none():
-    tracker = BoxTracker(high_score_threshold=0.4, track_buffer_frames=25)
-    lone = np.array([900.0, 200, 924, 260])
-    assert tracker.update(np.array([walker(0), lone]), np.array([0.9, 0.2])).tolist() == [0, -1]
-    assert tracker.update(np.array([walker(1), lone]), np.array([0.2, 0.2])).tolist() == [0, -1]
-
-
-def test_a_track_is_given_up_after_the_patience_and_not_before():
-    for missed, expected in ((5, 0), (6, 1)):
-        tracker = BoxTracker(high_score_threshold=0.4, track_buffer_frames=5)
-        tracker.update(np.array([walker(0, speed=0)]), np.array([0.9]))
-        for _ in range(missed):
-            tracker.update(np.empty((0, 4)), np.empty(0))
-        found = tracker.update(np.array([walker(0, speed=0)]), np.array([0.9]))
-        assert found.tolist() == [expected]
-
-
 def test_a_gap_is_filled_evenly_and_a_longer_one_is_not():
     for gap, filled in ((4, 4), (6, 0)):
         seen = [people() if 10 <= n < 10 + gap else people([*walker(n), 0.9]) for n in range(30)]
@@ -62,16 +45,6 @@ def test_a_gap_is_filled_evenly_and_a_longer_one_is_not():
         assert cleaner.bridged == filled
         if filled:
             np.testing.assert_allclose(frames[12][1].boxes, [walker(12)])
-
-
-def test_a_flicker_is_dropped_and_a_single_picture_is_not():
-    seen = [people([*walker(n), 0.9]) for n in range(20)]
-    seen[7] = people([*walker(7), 0.9], [900, 200, 924, 260, 0.8])
-    frames, cleaner = followed(seen)
-    assert [len(one.scores) for _, one in frames] == [1] * 20
-    assert cleaner.flickers == 1
-    frames, _ = followed([people([*walker(0), 0.9])])
-    assert len(frames[0][1].scores) == 1
 
 
 def test_looks_at_every_third_frame_give_boxes_in_all_of_them():

@@ -1,17 +1,14 @@
 """The detector finds small people and people close together in enlarged parts of a frame."""
 
 import numpy as np
+from camera_builders import look_at_camera
 
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.enlargement import (
-    choose_reduction,
     expect_parts,
-    find_groups,
     find_small,
 )
 from worldpose.detection.interfaces import People
-from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 
 SHAPE = (1080, 1920, 3)
@@ -19,18 +16,6 @@ SHAPE = (1080, 1920, 3)
 
 def people(*boxes, score=0.9):
     return People(np.array(boxes, dtype=float).reshape(-1, 4), np.full(len(boxes), score))
-
-
-def test_neighbours_make_a_group_and_others_none():
-    near, beside = (100.0, 100.0, 120.0, 150.0), (110.0, 102.0, 130.0, 152.0)
-    alone, tall = (400.0, 100.0, 420.0, 150.0), (700.0, 100.0, 800.0, 330.0)
-    found = find_groups(people(near, beside, alone, tall, tuple(x + 20 for x in tall)), SHAPE)
-    # Two people of 50 px, shown as of 100 and 150 px; those of 230 px are seen well enough.
-    assert [group.zoom for group in found] == [2.0, 3.0]
-    for group in found:
-        np.testing.assert_allclose(group.inner, [87.5, 87.5, 142.5, 164.5])
-    assert find_groups(people(near, beside, score=0.2), SHAPE) == []
-    assert find_groups(people(), SHAPE) == []
 
 
 def test_small_people_are_seen_in_enlarged_tiles_and_tall_ones_are_not():
@@ -56,28 +41,8 @@ def seen(part, *boxes):
     return people(*((np.array(boxes) - shift + 0.5) * part.zoom - 0.5))
 
 
-def test_an_enlarged_tile_replaces_small_people_and_keeps_tall_ones():
-    (tile,) = find_small(people((300.0, 300.0, 310.0, 320.0)), SHAPE, (36.0, 2.0))
-    small, moved = (300.0, 300.0, 310.0, 320.0), (301.0, 300.0, 311.0, 321.0)
-    tall, other = (295.0, 280.0, 320.0, 340.0), (900.0, 300.0, 910.0, 320.0)
-    merged = tile.merge(people(small, tall, other), seen(tile, moved, tall))
-    # The tile is no judge of tall people, nor of people outside of it.
-    np.testing.assert_allclose(merged.boxes, [tall, other, moved], atol=1e-9)
-
-
 def looking(focal):
-    center, target = np.array([0.0, -75.0, 22.0]), np.array([0.0, 5.0, 0.0])
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-    return Camera(
-        focal=np.full(2, focal),
-        principal_point=np.array([959.5, 539.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(rotation, -rotation @ center),
-        image_size=np.array([1920, 1080]),
-    )
+    return look_at_camera((0.0, -75.0, 22.0), (0.0, 5.0, 0.0), focal)
 
 
 def test_a_calibrated_camera_tells_where_people_are_small():
@@ -94,20 +59,6 @@ def test_a_calibrated_camera_tells_where_people_are_small():
         box = np.array([middle[0] - 4, head[1], middle[0] + 4, feet[1]])
         found = any(len(tile.to_frame(seen(tile, box)).scores) for tile in tiles)
         assert found == wanted
-
-
-def test_a_frame_of_large_people_is_seen_reduced():
-    for height, zoom in ((99.0, 1.0), (101.0, 0.5), (199.0, 0.5), (201.0, 0.25)):
-        boxes = [(x, 100.0, x + 30.0, 100.0 + height) for x in (100.0, 300.0, 500.0)]
-        assert choose_reduction(people(*boxes)) == zoom
-    # Two unsure boxes of fragments do not make the people small.
-    large = people((100.0, 100.0, 160.0, 310.0))
-    parts = people(*[(x, 100.0, x + 9.0, 130.0) for x in (120.0, 140.0)], score=0.1)
-    both = People(
-        np.concatenate([large.boxes, parts.boxes]), np.concatenate([large.scores, parts.scores])
-    )
-    assert choose_reduction(both) == 0.25
-    assert choose_reduction(people()) == 1.0
 
 
 class SizesSeen(BundledDetector):
@@ -133,29 +84,3 @@ def test_the_detector_looks_at_the_size_that_suits_the_people():
     detector = SizesSeen(150.0)
     detector.detect_parts([image], [])
     assert detector.shapes == [(1080, 1920)]
-
-
-class Scripted(BundledDetector):
-    """A detector whose net finds one person with a score that depends on the image's width."""
-
-    def __init__(self, scores):
-        self.scores, self.seen = scores, []
-
-    def _detect(self, image):
-        width = image.shape[1]
-        self.seen.append(width)
-        return people((0.25 * width, 0.0, 0.5 * width, 40.0), score=self.scores.get(width, 0.1))
-
-
-def test_a_close_up_is_seen_at_the_size_of_its_surest_person():
-    frame = np.zeros((1080, 1920, 3), dtype=np.uint8)
-    close = Scripted({960: 0.4, 480: 0.5, 240: 0.8, 170: 0.7})
-    (found,) = close.detect([frame])
-    np.testing.assert_allclose(found.boxes, [[483.5, 3.5, 963.5, 323.5]])
-    np.testing.assert_allclose(found.scores, [0.8])
-    # A gain within the noise of scores, or a sure person of usual size, leaves the frame as it is.
-    for scores in ({960: 0.4, 480: 0.44}, {960: 0.6, 240: 0.95}):
-        usual = Scripted(scores)
-        usual.detect([frame])
-        assert 1920 in usual.seen
-    assert 240 not in usual.seen

@@ -5,21 +5,14 @@ from safetensors.torch import save
 
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import (
-    CROP,
     FORMAT,
     KeypointNet,
     PeopleNet,
-    decode_boxes,
-    edges,
     load_weights,
-    peaks,
     save_weights,
 )
 from worldpose.detection.bundled_pose import (
     BundledPoseEstimator,
-    crops_around,
-    cut_crop,
-    frame_from_crop,
 )
 from worldpose.detection.models import (
     BUNDLED_WEIGHTS,
@@ -43,56 +36,6 @@ def shaken(net):
             module.running_mean.normal_(0.0, 0.1)
             module.running_var.uniform_(0.5, 1.5)
     return net.eval()
-
-
-def test_a_crop_shows_its_box_and_goes_back_to_the_picture():
-    picture = np.zeros((200, 300, 3), dtype=np.uint8)
-    picture[50:150, 100:140] = 255
-    box = np.array([[99.5, 49.5, 139.5, 149.5]])
-    for turn, mirrored in ((0.0, False), (0.3, True)):
-        mapping = frame_from_crop(crops_around(box)[0], CROP, turn, mirrored)
-        crop = cut_crop(picture, mapping, CROP, outside=0)
-        rows, columns = np.nonzero(crop[..., 0] > 127)
-        middle = np.array([columns.mean(), rows.mean()])
-        np.testing.assert_allclose(middle, (np.array(CROP) - 1) / 2, atol=0.05)
-        np.testing.assert_allclose(mapping[:, :2] @ middle + mapping[:, 2], [119.5, 99.5], atol=0.1)
-        # The box fills the crop but for its margin: its height is the tighter side.
-        area = np.abs(np.linalg.det(mapping[:, :2]))
-        # Its outline of 280 px is known to a quarter of a pixel.
-        assert len(rows) * area == pytest.approx(40 * 100, abs=140)
-        assert np.sqrt(area) == pytest.approx(1.25 * 100 / CROP[1])
-
-
-def test_the_peak_of_a_bump_is_found_within_a_cell():
-    y, x = np.mgrid[:64, :48]
-    said = np.array([20.3, 41.6])
-    bump = -0.5 * (((x - said[0]) / 0.8) ** 2 + ((y - said[1]) / 0.8) ** 2)
-    at, mass = peaks(torch.tensor(bump, dtype=torch.float32)[None, None])
-    # Cells are 2 px, the first one's middle is at 0.5; five cells lose a little of one tail.
-    np.testing.assert_allclose(at[0, 0], 2 * said + 0.5, atol=0.05)
-    assert float(mass) > 0.97
-
-
-def test_edges_are_read_along_their_own_axis():
-    rows, columns = 32, 24
-    maps = torch.full((1, 4, rows, columns), -40.0)
-    # The left edge in column 3 of some rows, the right one between columns 20 and 21 of one row.
-    maps[0, 0, 5:9, 3] = maps[0, 2, 30, 20] = maps[0, 2, 30, 21] = 0.0
-    maps[0, 1, 2, :] = maps[0, 3, 28, 7] = 0.0
-    boxes, spread = edges(maps)
-    # Cells of 4 px whose first middle is at 1.5.
-    torch.testing.assert_close(boxes, torch.tensor([[13.5, 9.5, 83.5, 113.5]]))
-    torch.testing.assert_close(spread, torch.tensor([[1e-3, 1e-3, 0.5, 1e-3]]), atol=1e-3, rtol=0)
-
-
-def test_boxes_stand_at_peaks_best_first():
-    logits, sides = torch.full((8, 10), -9.0), torch.full((4, 8, 10), 5.0)
-    logits[2, 3], logits[2, 4], logits[6, 8] = 1.0, 0.5, 2.0
-    boxes, scores = decode_boxes(logits, sides, 0.05, 300)
-    # Cells of 4 px whose first middle is at 1.5; the neighbour of a better cell is no peak.
-    np.testing.assert_allclose(boxes, [[28.5, 20.5, 38.5, 30.5], [8.5, 4.5, 18.5, 14.5]])
-    np.testing.assert_allclose(scores, torch.sigmoid(torch.tensor([2.0, 1.0])))
-    assert len(decode_boxes(logits, sides, 0.05, 1)[0]) == 1
 
 
 def test_people_and_poses_do_not_depend_on_the_batch():

@@ -1,18 +1,13 @@
 """Players are found and the crowd is not, by a detector that knows the truth."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.interfaces import People, ScoreMap
-from worldpose.detection.models import SHIPPED_SCORE_MAP
+from worldpose.detection.interfaces import People
 from worldpose.detection.pipeline import PeopleFinder, Place, on_pitch
 from worldpose.detection.settings import DetectionSettings
-from worldpose.detection.suppression import object_keypoint_similarity, suppress_poses
-from worldpose.formats.calibration_files import build_camera
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 
 SIZE = (1920, 1080)
@@ -22,23 +17,8 @@ PITCH = PitchTemplate.standard()
 @pytest.fixture(scope="module")
 def camera():
     """From a stand's roof at the half-way line, looking across the pitch."""
-    center, target = np.array([0.0, -75.0, 22.0]), np.array([0.0, 5.0, 0.0])
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera.from_calibration(
-        build_camera(
-            "camera",
-            name="cam",
-            size=np.array(SIZE, dtype=np.float64),
-            focal=np.array([1300.0, 1300.0]),
-            principal_point=np.array([959.5, 539.5]),
-            distortion=np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
-            rotation=rotation,
-            translation=-rotation @ center,
-        )
-    )
+    lens = (-0.05, 0.01, 0.0, 0.0, 0.0)
+    return look_at_camera((0.0, -75.0, 22.0), (0.0, 5.0, 0.0), 1300.0, SIZE, lens=lens)
 
 
 def boxes_of(camera, feet, height=1.8):
@@ -64,15 +44,6 @@ def test_players_stay_over_the_touch_line_too_and_the_crowd_goes(camera):
     assert visible.sum() > 150
     assert inside[:203][visible].all()
     assert inside[203:].mean() <= 0.01
-
-
-def test_whose_feet_the_border_cuts_off_is_told_by_the_head(camera):
-    boxes = boxes_of(camera, np.array([[0.0, -33.0, 0.0], [0.0, -36.0, 0.0]]))
-    height = int(boxes[0, 3]) - 1  # the image ends at the player's feet
-    assert boxes[1, 1] < height - 4 < height < boxes[1, 3]
-    boxes[:, 3] = height - 1
-    # By the border the second would stand at the first one's feet.
-    assert on_pitch(boxes, camera, (SIZE[0], height), PITCH, 1.0).tolist() == [True, False]
 
 
 class Knowing:
@@ -128,62 +99,6 @@ def test_a_video_becomes_arrays_in_the_form_of_given_poses(camera):
     assert np.array_equal(np.isnan(found["confidence"]), np.isnan(found["keypoints"]).any(axis=3))
     report = finder.report
     assert (report.crowd, report.unreadable, report.empty, report.flickers) == (69, [130], 0, 0)
-
-
-class LookingCloser(Knowing):
-    """The same, and boxes a tenth wider to each side, which fit by 0.4."""
-
-    def estimate(self, picture, boxes):
-        poses = super().estimate(picture, boxes)
-        wider = boxes + (boxes[:, 2:] - boxes[:, :2])[:, [0, 1, 0, 1]] * [-0.1, 0.0, 0.1, 0.0]
-        wider[1] = wider[1, [0, 1, 0, 1]]  # a box of no size is none
-        return replace(poses, boxes=wider, score=np.full(len(boxes), 0.4))
-
-
-def test_a_score_map_changes_logits_linearly():
-    score = np.array([0.2, 0.5, 0.9, np.nan])
-    found = ScoreMap(slope=2.0, offset=1.0).probability(score)
-    # Odds of 1/4, 1 and 9, squared and times e.
-    odds = np.e * np.array([1.0 / 16.0, 1.0, 81.0])
-    np.testing.assert_allclose(found[:3], odds / (1.0 + odds))
-    assert np.isnan(found[3])
-    edge = ScoreMap(slope=4.0, offset=-1.0).probability(np.array([0.0, 1e-9, 1.0]))
-    assert (edge > 0.0).all() and edge[2] == 1.0
-
-
-def test_a_score_map_changes_scores_alone_and_not_who_is_kept():
-    boxes = np.array(
-        [[10.0, 10.0, 30.0, 60.0], [100.0, 10.0, 120.0, 60.0], [50.0, 10.0, 70.0, 60.0]]
-    )
-    truth = LookingCloser([boxes] * 3, np.array([[0.9, 0.45, 0.3]] * 3))
-    blank = np.zeros((80, 160, 3), dtype=np.uint8)
-
-    def find(score_map):
-        finder = PeopleFinder([truth], truth, DetectionSettings(max_people=8), score_map)
-        return next(finder.find((n, blank) for n in range(3)))
-
-    plain, mapped = find(None), find(SHIPPED_SCORE_MAP)
-    assert np.isfinite(plain.score[1]).sum() == 2  # 0.3 begins no track
-    for name in ("keypoints", "confidence", "boxes"):
-        np.testing.assert_array_equal(getattr(mapped, name), getattr(plain, name))
-    wanted = SHIPPED_SCORE_MAP.probability(plain.score.astype(np.float64))
-    np.testing.assert_allclose(mapped.score, wanted, rtol=1e-4)
-    assert mapped.score[1, 0] > plain.score[1, 0] > 0.5 > mapped.score[1, 1]
-
-
-def test_of_two_boxes_with_one_pose_the_better_stays_and_who_is_close_to_one_comes_last():
-    person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
-    near, far = person + [6.0, 0.0], person + [200.0, 0.0]
-    keypoints = np.stack([person + 0.5, near, person, far])
-    box = np.array([0.0, 0.0, 30.0, 80.0])
-    boxes = box + np.array([0.5, 6.0, 0.0, 200.0])[:, None] * [1.0, 0.0, 1.0, 0.0]
-    score = np.array([0.6, 0.7, 0.8, 0.5])
-    people = KeypointDetections(keypoints, np.full((4, 17), 0.9), boxes, score)
-    kept = suppress_poses(people, 0.05, 0.85)
-    np.testing.assert_array_equal(kept.keypoints, keypoints[1:])
-    alike = object_keypoint_similarity(keypoints[1:3], np.full(2, 2400.0))[0, 1]
-    assert 0.3 < alike < 0.85
-    np.testing.assert_allclose(kept.score, [0.7 * (1.0 - 0.5 * alike**2), 0.8, 0.5])
 
 
 def test_a_clip_without_people_has_a_true_reason(camera):

@@ -17,7 +17,6 @@ from worldpose.detection.landmark_net import (
     POINTS,
     LandmarkEstimator,
     LandmarkNet,
-    locate,
 )
 from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks
 from worldpose.detection.net_inference import QuantizedNet
@@ -61,18 +60,6 @@ def people(*boxes):
     )
 
 
-def test_a_map_s_peak_gives_the_position_and_its_extent_the_uncertainty():
-    maps = torch.full((1, 2, ROWS, COLUMNS), -40.0)
-    maps[0, 0, 20, 12] = 0.0
-    # Two equal peaks, 20 cells apart: the position is at one of them.
-    maps[0, 1, 20, 12] = maps[0, 1, 40, 12] = 0.0
-    places, extent = locate(maps)
-    assert_allclose(places[0, 0], [CELL * 12 + 0.5, CELL * 20 + 0.5], atol=1e-4)
-    assert float(extent[0, 0]) < -2.0
-    # Half of the probability is 40 px away along one axis of two.
-    assert_allclose(torch.exp(extent[0, 1]), np.sqrt(0.5 * 0.5 * (20.0 * CELL) ** 2), rtol=1e-4)
-
-
 def test_points_are_in_frame_pixels_with_the_probability_of_being_correct():
     image = np.zeros((240, 320, 3), dtype=np.uint8)
     found = LandmarkEstimator(PeakedNet()).add_points(image, people(BOX))
@@ -91,20 +78,6 @@ def test_points_are_in_frame_pixels_with_the_probability_of_being_correct():
     assert np.flatnonzero(missing).tolist() == [HIDDEN]
     assert_array_equal(np.isnan(found.extra_keypoints[0]).all(axis=-1), missing)
     assert_array_equal(found.keypoints, people(BOX).keypoints)
-
-
-def test_a_frame_without_people_has_no_points_and_neighbours_are_told_to_the_net():
-    net = PeakedNet()
-    estimator = LandmarkEstimator(net)
-    image = np.zeros((240, 320, 3), dtype=np.uint8)
-    none = estimator.add_points(image, KeypointDetections.empty())
-    assert none.extra_keypoints.shape == (0, len(POINTS), 2) and not net.batches
-    behind = BOX + [20.0, -10.0, 20.0, -10.0]
-    estimator.add_points(image, people(BOX, behind, BOX + [1.0, 0.0, 1.0, 0.0]))
-    (maps,) = net.batches
-    # The second person stands behind; the third box is the first one again and is no neighbour.
-    assert not maps[0, 1].any() and maps[0, 2].any()
-    assert maps[1, 1].any()
 
 
 class Finder:

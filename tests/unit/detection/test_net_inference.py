@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.bundled_nets import CROP, KeypointNet, Seen, load_weights
-from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_pose
-from worldpose.detection.net_inference import CROPS, FloatNet, QuantizedNet
+from worldpose.detection.bundled_nets import CROP, Seen
+from worldpose.detection.models import BUNDLED_WEIGHTS
+from worldpose.detection.net_inference import CROPS, QuantizedNet
 from worldpose.detection.pipeline import detect_people
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
@@ -43,38 +43,11 @@ def test_integers_give_equal_bytes_in_every_batch(crops, count):
         np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[:count])
 
 
-@pytest.mark.parametrize("count", [3, 8])
-def test_a_person_has_the_same_pose_whoever_else_is_asked_for(still, count):
-    pose = load_bundled_pose()
-    x = 20.0 + 90.0 * np.arange(8)  # apart: neighbours may change a pose
-    boxes = np.stack([x, 0 * x + 100.0, x + 30.0, 0 * x + 180.0], axis=1)
-    together, alone = pose.estimate(still, boxes), pose.estimate(still, boxes[:count])
-    for name, values in alone.arrays().items():
-        np.testing.assert_array_equal(together.arrays()[name][:count], values)
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_one_clear_error(still):
     with pytest.raises(InputError, match=r"detection\.device") as caught:
         detect_people([still], DetectionSettings(device="cuda"))
     assert "detection.device=cpu" in str(caught.value)
-
-
-@on_gpu
-@pytest.mark.parametrize("half", [False, True])
-def test_a_graph_computes_what_its_kernels_compute_one_by_one(crops, half):
-    net = FloatNet(load_weights(BUNDLED_WEIGHTS[1], KeypointNet()), "cuda", half, batch=CROPS)
-    for count in (CROPS, 5, CROPS, 3, 7):
-        found = [each.clone() for each in net(crops[0][:count], crops[1][:count])]
-        alone = [torch.from_numpy(each[:CROPS].copy()).cuda() for each in crops]
-        for each in alone:
-            each[count:] = 0
-        with torch.inference_mode():
-            expected = net.compute(alone)
-        for one, other in zip(found, expected, strict=True):
-            # The weights of peaks are no row of an image.
-            rows = slice(count if len(one) == CROPS else None)
-            torch.testing.assert_close(one[rows], other.cpu()[rows], rtol=0.0, atol=0.0)
 
 
 @on_gpu

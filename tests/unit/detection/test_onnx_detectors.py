@@ -146,14 +146,6 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     assert _class_names({"names": "__import__('os')"}) == _class_names({}) == {}
 
 
-def test_a_pose_net_of_one_class_is_a_detector():
-    output = np.zeros((56, CELLS))
-    output[:4, 7], output[4, 7], output[5:, 7] = PERSON, 0.8, 90.0
-    people = _person_classes("net.onnx", FORMS["yolov8"], [output], {}, None)
-    found = FORMS["yolov8"].decode([output], SIZE, people)
-    assert found.scores.tolist() == [0.8]
-
-
 def test_nets_take_channels_and_grey_levels_as_in_their_training():
     image = np.array([[[[255, 51, 0]]]], np.uint8)  # RGB
     taken = {name: FORMS[name].prepare(image)[0, 0, 0] for name in FORMS}

@@ -7,10 +7,8 @@ from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.models import load_detectors, weights_of
 from worldpose.detection.onnx_nets import (
-    _read_keypoints,
     cut_crops,
     fit_crops,
-    from_heat_maps,
     points_in_frame,
 )
 from worldpose.detection.settings import DetectionSettings
@@ -40,31 +38,6 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
             continue  # the square reaches over the crop: its middle is another
         # A fifth of a crop's pixel: the square's hard edges are sampled twice.
         np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, frames[0, 2]))
-
-
-def test_the_forms_of_pose_nets_give_the_same_point():
-    size = (48, 64)
-    single = np.zeros((1, 1, 17, 3))
-    single[..., 0], single[..., 1], single[..., 2] = 20 / 64, 10 / 48, 0.8
-    points, confidence = _read_keypoints([single], size)
-    np.testing.assert_allclose(points[0, 0], [10.0, 20.0])
-    assert confidence[0, 0] == pytest.approx(0.8)
-    across, down = np.zeros((1, 17, 96)), np.zeros((1, 17, 128))
-    across[..., 20], down[..., 40] = 0.8, 0.9
-    points, confidence = _read_keypoints([across, down], size)
-    np.testing.assert_allclose(points[0, 0], [10.0, 20.0])
-    assert confidence[0, 0] == pytest.approx(0.8)
-
-
-def test_a_heat_map_s_peak_lies_between_cells():
-    size, true = (48, 64), np.array([17.3, 40.9])
-    y, x = np.mgrid[:16, :12]
-    cell = (true + 0.5) / 4.0 - 0.5
-    maps = np.exp(-((x - cell[0]) ** 2 + (y - cell[1]) ** 2) / (2 * 1.5**2))
-    points, height = from_heat_maps(np.broadcast_to(maps, (1, 17, 16, 12)), size)
-    # Of a Gaussian the parabola through three logarithms is exact.
-    np.testing.assert_allclose(points[0, 3], true, atol=1e-6)
-    assert 0.9 < height[0, 0] <= 1.0
 
 
 class Leaning:

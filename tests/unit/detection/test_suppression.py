@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import People
-from worldpose.detection.suppression import combine_boxes, fuse, suppress
+from worldpose.detection.suppression import suppress
 from worldpose.detection.views import TiledDetector
 
 
@@ -16,21 +15,6 @@ def people(*rows):
 def test_the_best_of_two_boxes_of_a_person_stays():
     found = suppress(people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6)
     assert found.scores.tolist() == [0.9, 0.2]
-
-
-def test_an_ensemble_agrees_on_the_mean_weighted_by_score():
-    one = people([0, 0, 10, 20, 0.9])
-    two = people([2, 0, 12, 20, 0.3], [50, 0, 60, 20, 0.6])
-    found = fuse([one, two], 0.6)
-    # (0.9 * 0 + 0.3 * 2) / 1.2 = 0.5; both members: (0.9 + 0.3) / 2; one of two: 0.6 / 2.
-    np.testing.assert_allclose(found.boxes, [[0.5, 0, 10.5, 20], [50, 0, 60, 20]])
-    np.testing.assert_allclose(found.scores, [0.6, 0.3])
-
-
-def test_a_member_never_joins_two_people_of_its_own():
-    # Two people in a duel overlap by half; each detector separates them.
-    duel = people([0, 0, 10, 20, 0.9], [3, 0, 13, 20, 0.8])
-    assert len(fuse([duel, duel], 0.6).scores) == 2
 
 
 class Blobs:
@@ -77,14 +61,3 @@ def test_a_person_in_a_scaled_view_lies_where_the_picture_has_them():
     found = TiledDetector(Blobs(), (zoom,), view_overlap=0.3, overlap=0.3).detect([picture])[0]
     # An edge pixel that is half white counts as white or not.
     np.testing.assert_allclose(found.boxes, [[60, 40, 69, 55]], atol=1.0)
-
-
-def test_a_closer_look_scores_by_detector_fit_and_the_surest_keypoints():
-    confidence = np.full((1, 17), 0.5)
-    confidence[0, :5] = np.nan, 0.1, 0.1, 0.1, 0.1  # a hidden head tells nothing
-    poses = KeypointDetections(
-        np.zeros((1, 17, 2)), confidence, np.array([[1.0, 1.0, 5.0, 9.0]]), np.array([0.8])
-    )
-    found = combine_boxes(People(np.array([[0.0, 0.0, 6.0, 9.0]]), np.array([0.54])), poses)
-    np.testing.assert_array_equal(found.boxes, poses.boxes)
-    np.testing.assert_allclose(found.score, [(0.54 * 0.8 * 0.5) ** (1 / 3)])

@@ -1,11 +1,9 @@
 """Checkpoints of transformers: saved folders are loaded offline, and boxes come back in pixels."""
 
-import hashlib
-
 import numpy as np
 import pytest
 
-from worldpose.detection.models import load_detectors, load_pose, weights_of
+from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 
@@ -141,13 +139,3 @@ def test_pickled_weights_and_foreign_folders_are_refused(tmp_path):
         load_detectors(DetectionSettings(detector=f"transformers:{folder}"))
     with pytest.raises(InputError, match=r"config\.json"):
         load_detectors(DetectionSettings(detector=f"transformers:{tmp_path}"))
-
-
-def test_weights_are_known_by_their_content(tmp_path):
-    file = tmp_path / "net.onnx"
-    file.write_bytes(b"one")
-    name = f"onnx:{file}"
-    known = weights_of(DetectionSettings(detector=("embedded", name), pose=name))
-    assert known[name] == hashlib.sha256(b"one").hexdigest()
-    assert known["embedded"] is None  # part of the code
-    assert known["onnxruntime"]

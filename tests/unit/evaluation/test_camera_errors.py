@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
@@ -164,19 +162,3 @@ def test_rays_over_the_horizon_and_missing_rays_meet_nothing():
         upright.unproject([[900.0, 100.0], [900.0, 539.5], [np.nan, 1.0]]), FLAT
     )
     assert np.isnan(points).all()
-
-
-@given(
-    x=st.floats(-52.0, 52.0),
-    y=st.floats(-33.0, 33.0),
-    center=st.tuples(st.floats(-60.0, 60.0), st.floats(-90.0, -50.0), st.floats(8.0, 30.0)),
-)
-def test_a_ray_to_a_point_of_the_crowned_surface_meets_it(x, y, center):
-    true = tilted(0.15, center)
-    point = np.array([[x, y, float(CROWNED.height(x, y))]])
-    pixels = true.project(point)
-    if np.isfinite(pixels).all():
-        # Pixels near 1e4 rounded, at 3000 px a radian, 150 m away and 4 degrees above the grass.
-        np.testing.assert_allclose(
-            surface_points(true.unproject(pixels), CROWNED), point, atol=1e-7
-        )

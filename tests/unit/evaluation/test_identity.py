@@ -63,13 +63,6 @@ def test_case_s_two_people_exchange_ids():
     assert exchanged.association_accuracy == pytest.approx(0.7 * 7 / 13 + 0.3 * 3 / 17, abs=1e-15)
 
 
-def test_a_person_keeps_the_prediction_of_the_frame_before_though_another_is_nearer():
-    distances = np.array([[[0.1, 0.5]], [[0.4, 0.2]], [[0.4, 0.2]]])
-    assert scores(distances).switches == 0
-    distances[1:, :, 0] = 1.1
-    assert scores(distances).switches == 1
-
-
 def test_nobody_anywhere_has_no_scores():
     empty = scores(np.empty((3, 0, 0)))
     assert (empty.idf1, empty.hota, empty.switches) == (None, None, None)

@@ -6,18 +6,17 @@ from people_samples import person
 from scipy.spatial.transform import Rotation
 
 from data_contracts.conventions import COCO17
-from worldpose.errors import DegenerateError, InputError
+from worldpose.errors import InputError
 from worldpose.evaluation.marker_reference import (
     align_reference,
+    c3d_labels,
     map_marker_names,
     marker_joints,
     read_marker_map,
     read_markers,
-    sample_joints,
 )
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
-from worldpose.formats.motion_capture import Y_UP, write_markers
 
 FPS, RATE, OFFSET = 50.0, 100.0, 0.7313
 TURN = Rotation.from_rotvec([0.0, 0.0, 2.1])
@@ -77,13 +76,19 @@ def test_c3d_gives_the_points_that_were_written(tmp_path, markers):
     np.testing.assert_allclose(joints, markers, atol=1e-5)
 
 
-def test_trc_that_we_write_is_read_back(tmp_path):
-    tracks = JointTracks(np.arange(3), np.array([1]), people_at(np.arange(3) / FPS)[:, :1])
-    write_markers(tmp_path / "a.trc", tracks, 0, FPS)
-    found = read_markers(tmp_path / "a.trc")
-    joints = marker_joints(found, map_marker_names(found.names))
-    # Micrometres, y up.
-    np.testing.assert_allclose(joints @ Y_UP, tracks.joints, atol=1e-6)
+def test_labels_beyond_255_and_a_missing_unit_are_told(tmp_path, markers):
+    write_c3d(tmp_path / "a.c3d", markers[:3])
+    content = (tmp_path / "a.c3d").read_bytes()
+    (tmp_path / "b.c3d").write_bytes(content.replace(b"UNITS", b"UNITZ"))
+    with pytest.raises(InputError, match=r"b.c3d: POINT:UNITS: expected the unit of length"):
+        read_markers(tmp_path / "b.c3d")
+
+    class Part:
+        def __init__(self, names):
+            self.string_array = names
+
+    parts = {"POINT:LABELS": Part(["a ", "b"]), "POINT:LABELS2": Part(["c"])}
+    assert c3d_labels(parts) == ("a", "b", "c")
 
 
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):
@@ -126,21 +131,6 @@ def test_known_error_stays(markers, prediction):
     scores, _ = evaluate_joints(wrong, reference)
     # A shift of all people by 1/17 of it takes the mean from the others: (48 + ...) / 17 of 50.
     assert scores.mpjpe_mm == pytest.approx((16 / 17 * 50 + 16 * 50 / 17) / 17, rel=0.1)
-
-
-def test_samples_are_straight_between_neighbours_and_missing_beyond():
-    joints = np.zeros((3, 1, 17, 3))
-    joints[1:, ..., 0] = 1.0
-    joints[2, ..., 0] = np.nan
-    found = sample_joints(joints, 10.0, np.array([-0.01, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3]))[
-        :, 0, 0, 0
-    ]
-    np.testing.assert_array_equal(found, [np.nan, 0.0, 0.5, 1.0, np.nan, np.nan, np.nan])
-
-
-def test_reference_without_people_is_refused(prediction):
-    with pytest.raises(DegenerateError, match="matches the prediction nowhere"):
-        align_reference(prediction, np.full((50, 1, 17, 3), np.nan), RATE, FPS)
 
 
 @pytest.mark.parametrize("name", ["a.c3d", "a.trc"])

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from joint_regions import group_errors, region_counts
+from joint_regions import region_counts
 
-from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 
@@ -56,12 +55,3 @@ def test_joints_without_covariance_are_refused():
     plain = JointTracks(prediction.frames, prediction.person_ids, prediction.joints)
     with pytest.raises(InputError, match="covariance"):
         region_counts(plain, truth)
-
-
-def test_errors_are_summed_by_group():
-    prediction, truth = people(frames=5, persons=2, spread=0.0)
-    prediction.joints[:, :, COCO17.index("left_wrist"), 1] += 0.03
-    found = group_errors(prediction, truth)
-    assert found["wrist"] == pytest.approx((30.0 * 5 * 2, 2 * 5 * 2))
-    assert found["elbow"] == (0.0, 2 * 5 * 2)
-    assert sum(count for _, count in found.values()) == 5 * 2 * 17

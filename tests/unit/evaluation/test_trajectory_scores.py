@@ -7,7 +7,7 @@ import pytest
 from people_samples import crowd, e4, person, score, tracks
 
 from worldpose.errors import InputError
-from worldpose.evaluation.metrics import evaluate_joints, path_lengths
+from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -235,16 +235,3 @@ def test_worlds_of_their_own_are_registered_despite_noise_and_split_tracks():
     # The mean length of three normal errors of 20 mm is 20 sqrt(8 / pi) = 31.9 mm, of the neck
     # 1 / sqrt(2) of it: 31.2 over the 14; 5000 joints leave less than one per cent of that.
     assert scores.g_mpjpe_mm == pytest.approx(31.2, rel=0.01)
-
-
-def test_a_path_goes_straight_across_frames_that_are_not_compared_or_have_no_hips():
-    joints = np.zeros((5, 2, 17, 3))
-    joints[:, 0, :, 0] = [[0.0], [3.0], [3.0], [3.0], [6.0]]
-    joints[1:4, 0, :, 1] = [[4.0], [90.0], [50.0]]
-    joints[2, 0, 11] = np.nan
-    compared = np.ones((5, 2), dtype=bool)
-    compared[3] = False
-    # 5 m, 5 m back, and the standing person.
-    np.testing.assert_allclose(path_lengths(joints, compared), [10.0, 0.0])
-    compared[1] = False
-    np.testing.assert_allclose(path_lengths(joints, compared), [6.0, 0.0])

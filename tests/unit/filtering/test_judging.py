@@ -48,18 +48,6 @@ def test_a_box_that_nobody_claims_is_given_to_the_body_that_it_fits(scene):
     assert not found.dropped[frame, camera, place]
 
 
-def test_two_boxes_under_each_other_s_names_fit_the_other_and_are_kept(scene):
-    index = scene.suspects.detections.detection_index.copy()
-    frame, camera = 5, 0
-    first, second = np.flatnonzero(index[frame, camera] >= 0)[:2]
-    places = index[frame, camera, [first, second]]
-    index[frame, camera, [first, second]] = places[::-1]
-    found = judged(scene, detection_index=index)
-    assert found.fits[frame, camera, places].tolist() == [first, second]
-    assert not found.dropped[frame, camera, places].any()
-    assert found.rejected[frame, camera, places].mean() < 0.3
-
-
 def test_a_box_that_fits_nobody_is_dropped_whole(scene):
     keypoints = scene.suspects.detections.keypoints.copy()
     frame, camera, person = 4, 2, 1
@@ -70,23 +58,6 @@ def test_a_box_that_fits_nobody_is_dropped_whole(scene):
     there = np.isfinite(scene.suspects.detections.confidence[frame, camera, place])
     np.testing.assert_array_equal(found.rejected[frame, camera, place], there)
     assert found.fits[frame, camera, place] == -1
-
-
-def test_a_dropped_box_that_nobody_claims_any_more_stays_dropped_until_it_fits(scene):
-    frame, camera, person = 4, 2, 1
-    place = scene.suspects.detections.detection_index[frame, camera, person]
-    before = np.zeros_like(scene.suspects.dropped)
-    before[frame, camera, place] = True
-    assert not judged(scene, dropped=before).dropped[frame, camera, place]
-    keypoints, index = (
-        scene.suspects.detections.keypoints.copy(),
-        scene.suspects.detections.detection_index.copy(),
-    )
-    keypoints[frame, camera, place, :, 0] += 400.0
-    index[frame, camera, person] = -1
-    unclaimed = {"keypoints": keypoints, "detection_index": index}
-    assert judged(scene, dropped=before, **unclaimed).dropped[frame, camera, place]
-    assert not judged(scene, **unclaimed).dropped[frame, camera, place]
 
 
 def test_sides_that_were_put_right_are_no_contradiction(scene):
@@ -107,17 +78,3 @@ def test_sides_that_were_put_right_are_no_contradiction(scene):
     np.testing.assert_allclose(
         found.mahalanobis_distance[frame, camera, place], honest[left_right], rtol=1e-3
     )
-
-
-def test_a_person_without_a_body_is_not_judged(scene):
-    gone = 2
-    views = replace(scene.views, image=scene.views.image.copy())
-    views.image[:, :, gone] = np.nan
-    spread = learn_keypoint_spread(scene.views, scene.suspects)
-    found = judge_detections(views, scene.suspects, spread, SETTINGS)
-    his = scene.person == gone
-    assert his.any()
-    assert not found.dropped[his].any()
-    assert (found.fits[his] != gone).all()
-    unjudged = his & (found.fits < 0)
-    assert not found.rejected[unjudged].any()

@@ -7,20 +7,16 @@ import pytest
 from planted_errors import plant
 
 from data_contracts.conventions import COCO17
-from worldpose.filtering.judging import Residuals, judge_detections, learn_keypoint_spread
+from worldpose.filtering.judging import Residuals
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.systematic_errors import (
     TERMS,
-    ClockEquations,
     SystematicErrors,
     ViewBias,
-    find_azimuths,
     learn_systematic_errors,
     learn_view_bias,
     watch_motion,
 )
-from worldpose.geometry.rigid import Rigid
-from worldpose.simulation.visibility import facing_axes
 
 ROWS = 3000
 
@@ -47,51 +43,6 @@ def test_a_bias_that_goes_with_the_side_is_found():
     found = learn_view_bias(misses, *seen)
     # 1 px at 55 px per metre over 3,000 rows: 0.5 mm; five of these.
     np.testing.assert_allclose(found.coefficient, bias.coefficient, atol=0.0025)
-
-
-def test_azimuths_are_those_that_detectors_see(scene):
-    joints = scene.joints[::10]
-    front, left = facing_axes(joints)
-    away = scene.cameras.center[:, None] - joints[..., (5, 6, 11, 12), :].mean(axis=-2)[:, None]
-    level = np.arctan2(
-        np.einsum("fcpa,fpa->fcp", away, left), np.einsum("fcpa,fpa->fcp", away, front)
-    )
-    off = np.angle(np.exp(1j * (find_azimuths(scene.cameras, joints) - level)))
-    # Of level axes and of those of a trunk that leans forward.
-    assert np.abs(off).mean() < 0.1
-
-
-def missed_by(scene, late, noise=0.5):
-    """Residuals in cameras that are late, and that were moved a little since."""
-    cameras, joints = scene.cameras, scene.joints
-    rng = np.random.default_rng(3)
-    motion = watch_motion(cameras, joints, np.gradient(joints, axis=0))
-    # As after an adjustment: all people have a small common displacement.
-    turns = Rigid.from_rotvec(rng.normal(0.0, 0.0005, (len(late), 3)), np.zeros(3)).rotation
-    pose = cameras.cam_from_world
-    moved = replace(
-        cameras,
-        cam_from_world=Rigid(turns @ pose.rotation, (turns @ pose.translation[..., None])[..., 0]),
-    )
-    shape = (len(joints), len(late), *joints.shape[1:3], 2)
-    seen, foreseen = (
-        each.project(joints.reshape(len(joints), 1, -1, 3)).reshape(shape)
-        for each in (cameras, moved)
-    )
-    seen = seen + late[:, None, None, None] * motion.image_motion + noise * rng.normal(size=shape)
-    frame, camera, person = np.nonzero(np.isfinite(seen[..., 0, 0]))
-    at = frame, camera, person
-    missed = (seen - foreseen)[at]
-    variance = np.full(missed.shape[:2], noise**2)
-    return moved, joints, motion.image_motion[at], Residuals(*at, missed, variance, 1.0)
-
-
-def test_clocks_are_told_from_the_places_of_cameras(scene):
-    late = np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0])
-    *bodies, misses = missed_by(scene, late)
-    found = ClockEquations.from_residuals(*bodies, misses).learn_clock_offsets(misses)
-    # Six cameras over 0.6 s, five people: some hundredths of a frame.
-    np.testing.assert_allclose(found, late - late.mean(), atol=0.06)
 
 
 def with_a_late_camera(scene, frames, held):
@@ -134,34 +85,6 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     assert np.nanmean(beside(right.detections.keypoints)) < 0.4 * np.nanmean(
         beside(suspects.subtract(exact).detections.keypoints)
     )
-
-
-def test_a_clock_in_the_offsets_is_not_taken_off_twice():
-    scene = plant(31, duration=2.0)
-    systematic, motion, suspects = with_a_late_camera(scene, 0.8, held=0.7)
-    held = systematic.clock_offsets_in(suspects.offsets, motion)
-    np.testing.assert_allclose(held, 0.7 * systematic.late, atol=1e-9)
-    shift = systematic.shift(motion, scene.views)
-    honest = ~scene.displaced[:, 1]
-
-    def rejected(suspects):
-        right = suspects.subtract(shift)
-        spread = learn_keypoint_spread(scene.views, right)
-        judged = judge_detections(scene.views, right, spread, FilteringSettings())
-        return judged.rejected[:, 1][honest].mean()
-
-    twice = rejected(suspects)
-    once = rejected(suspects.subtract_clock_offsets(held, motion.image_motion))
-    on_time = rejected(replace(suspects, offsets=np.zeros_like(suspects.offsets)))
-    assert once == pytest.approx(on_time, abs=1e-3)
-    assert twice > 1.5 * once
-
-
-@pytest.mark.parametrize(("held", "share"), [(-0.4, 0.0), (1.7, 1.0)])
-def test_no_more_is_of_clocks_in_offsets_than_cameras_are_late(scene, held, share):
-    systematic, motion, suspects = with_a_late_camera(scene, -0.5, held)
-    found = systematic.clock_offsets_in(suspects.offsets, motion)
-    np.testing.assert_allclose(found, share * systematic.late, atol=1e-9)
 
 
 def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):

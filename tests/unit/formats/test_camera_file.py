@@ -59,15 +59,6 @@ def test_a_moving_camera_has_one_row_a_frame(tmp_path):
     assert camera.image_size[0].tolist() == [1920, 1080]
 
 
-def test_a_row_with_a_nan_is_a_frame_without_a_camera(tmp_path):
-    arrays = moving()
-    arrays["R"][1, 0, 0] = np.nan
-    write_archive(tmp_path / "clip.npz", arrays)
-    pixels = read_camera(tmp_path / "clip.npz").project(np.zeros((1, 3)))
-    assert np.isfinite(pixels[[0, 2]]).all()
-    assert np.isnan(pixels[1]).all()
-
-
 @pytest.mark.parametrize(
     ("member", "index", "value", "message"),
     [

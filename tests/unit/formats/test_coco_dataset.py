@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from data_contracts.conventions import COCO17
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import coco_dataset
 from worldpose.geometry.cameras import Camera
@@ -57,15 +56,6 @@ def test_annotation_of_two_joints(camera):
     }
 
 
-def test_images_are_the_cameras_own_frames(camera):
-    made = dataset(camera, [[missing()], [two_joints()]], offset_frames=-2)
-    assert made["images"] == [
-        {"id": 3, "file_name": "north/000003", "width": 100, "height": 80},
-        {"id": 4, "file_name": "north/000004", "width": 100, "height": 80},
-    ]
-    assert [annotation["image_id"] for annotation in made["annotations"]] == [4]
-
-
 def test_joints_outside_the_picture_and_behind_the_camera_are_not_labelled(camera):
     person = two_joints()
     person[2] = (4.949, 0.0, 10.0)  # u = 99.49: on the last pixel
@@ -75,12 +65,3 @@ def test_joints_outside_the_picture_and_behind_the_camera_are_not_labelled(camer
     (annotation,) = dataset(camera, [[person]], observed)["annotations"]
     assert annotation["keypoints"][2::3] == [2, 2, 2] + [0] * 14
     assert annotation["keypoints"][9:15] == [0.0, 0.0, 0] * 2
-
-
-def test_the_category_is_cocos_person(camera):
-    (category,) = dataset(camera, [[missing()]])["categories"]
-    assert (category["id"], category["name"]) == (1, "person")
-    assert category["keypoints"] == list(COCO17)
-    names = {frozenset(category["keypoints"][i - 1] for i in bone) for bone in category["skeleton"]}
-    assert frozenset(("left_knee", "left_ankle")) in names
-    assert min(i for bone in category["skeleton"] for i in bone) == 1

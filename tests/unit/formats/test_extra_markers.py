@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_marker_file import read_trc
 
 from data_contracts.conventions import COCO17, FEET
 from worldpose.errors import InputError
@@ -12,11 +11,9 @@ from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.joints_file import (
     ExtraTracks,
     JointTracks,
-    fill_gaps,
     read_joints,
     write_joints,
 )
-from worldpose.formats.motion_capture import write_markers
 
 FPS = 50.0
 
@@ -89,19 +86,3 @@ def test_c3d_has_them_as_points(tracks, tmp_path):
     np.testing.assert_allclose(points, tracks.extra.joints[:, 1], atol=1e-4)
     residuals = file["data"]["meta_points"]["residuals"][0].T
     assert (residuals[1, 20], residuals[2, 22]) == (-1.0, 0.0)
-
-
-def test_trc_has_them_as_markers(tracks, tmp_path):
-    write_markers(tmp_path / "p.trc", tracks, 1, FPS)
-    _, names, _, _, markers = read_trc(tmp_path / "p.trc")
-    assert tuple(names) == (*COCO17, *FEET)
-    back = np.stack([markers[..., 0], -markers[..., 2], markers[..., 1]], axis=-1) / 1000.0
-    np.testing.assert_allclose(back[:, 17:], tracks.extra.joints[:, 1], atol=5.1e-7)
-
-
-def test_gaps_of_them_are_filled_on_request(tracks):
-    extra = fill_gaps(tracks).extra
-    assert np.isfinite(extra.joints).all()
-    assert extra.views[1, 1, 3] == 0 and np.isnan(extra.covariance[1, 1, 3]).all()
-    there = np.isfinite(tracks.extra.joints)
-    np.testing.assert_array_equal(extra.joints[there], tracks.extra.joints[there])

@@ -45,19 +45,6 @@ def test_six_to_ten_numbers_are_read(read, end):
     assert read(f"1,1,10,10,5,5{end}\n").score.tolist() == [0.5 if end else 1.0]
 
 
-def test_truth_has_a_class_and_boxes_that_do_not_count(read):
-    text = "1,1,10,10,5,5,1,1,0.8\n1,2,10,10,5,5,1,7,0.8\n1,3,10,10,5,5,0,1,0.8\n"
-    assert read(text).person.tolist() == [1]
-
-
-def test_detections_without_ids_may_share_a_frame(read):
-    assert read("1,-1,10,10,5,5,0.4\n1,-1,30,10,5,5,0.5\n").person.tolist() == [-1, -1]
-
-
-def test_a_box_may_reach_over_the_border(read):
-    assert read("1,1,-5,-5,10,10,1\n1,2,635,470,50,50,1\n").box.shape == (2, 4)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

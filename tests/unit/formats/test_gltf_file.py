@@ -15,7 +15,7 @@ from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
-from worldpose.formats.gltf_file import AnimatedBody, paint_strips, write_gltf
+from worldpose.formats.gltf_file import AnimatedBody, write_gltf
 from worldpose.geometry.cameras import Camera
 
 FPS, FRAMES = 50.0, 60
@@ -158,18 +158,6 @@ def test_the_surface_is_skinned_as_the_models(model, tmp_path):
         assert np.linalg.norm(found["surfaces"][f"{body.name}_surface"] - expected) < 1e-3
 
 
-def test_markings_are_strips_of_their_painted_width_that_face_up():
-    straight = np.array([[-2.0, 1.0, 0.0], [0.0, 1.0, 0.1], [2.0, 1.0, 0.0]])
-    vertices, triangles = paint_strips([straight, straight[:2, [1, 0, 2]]])
-    np.testing.assert_allclose(np.unique(vertices[:6, 1]), [0.94, 1.06])
-    np.testing.assert_allclose(np.unique(vertices[6:, 0]), [0.94, 1.06])
-    np.testing.assert_allclose(vertices[:3, [0, 2]], straight[:, [0, 2]])
-    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    areas = np.cross(b - a, c - a)[:, 2] / 2.0
-    assert areas.min() > 0.0
-    assert areas.sum() == pytest.approx(0.12 * 6.0)
-
-
 def test_without_a_surface_the_file_has_joints_alone(model, tmp_path):
     write(tmp_path / "a.glb", model, surface=False, markings=[], cameras={})
     content = read_glb(tmp_path / "a.glb")
@@ -177,16 +165,6 @@ def test_without_a_surface_the_file_has_joints_alone(model, tmp_path):
     names = {node["name"] for node in content["nodes"]}
     assert {f"person_007_{joint}" for joint in SKELETONS["smpl24"]} <= names
     assert content["asset"]["extras"] == NOTES
-
-
-def test_what_a_camera_of_the_format_lacks_is_in_its_extras(model, tmp_path):
-    write(tmp_path / "a.glb", model)
-    nodes = {node["name"]: node for node in read_glb(tmp_path / "a.glb")["nodes"]}
-    about = nodes["main"]["extras"]
-    assert about["image_size_px"] == [1920, 1080]
-    assert about["principal_point_px"] == [959.5, 539.5]
-    assert (about["focal_px_by_frame"][0], about["focal_px_by_frame"][7]) == (3000.0, None)
-    assert nodes["person_007"]["extras"] == {"person": 7, "kind": "mixed"}
 
 
 def test_a_clip_without_bodies_is_refused(model, tmp_path):

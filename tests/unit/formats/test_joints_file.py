@@ -47,20 +47,6 @@ def test_numpy_alone_reads_it_with_the_documented_types(tmp_path, tracks):
         }
 
 
-def test_files_of_savez_and_of_narrower_numbers_are_read(tmp_path, tracks):
-    np.savez_compressed(
-        tmp_path / "other.npz",
-        frames=tracks.frames.astype(np.int32),
-        person_ids=tracks.person_ids.astype(np.uint8),
-        joints=np.asfortranarray(tracks.joints.astype(np.float32)),
-    )
-    read = read_joints(tmp_path / "other.npz")
-    assert read.joints.dtype == np.float64
-    assert read.joints.flags["C_CONTIGUOUS"]
-    # float32 keeps 24 bits: 10 m to 1e-6.
-    np.testing.assert_allclose(read.joints, tracks.joints, rtol=1e-6)
-
-
 def test_every_truncation_is_refused(tmp_path, tracks):
     path = tmp_path / "joints.npz"
     write_joints(path, tracks)

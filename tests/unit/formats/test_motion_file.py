@@ -6,8 +6,7 @@ import pytest
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyParameters
-from worldpose.errors import InputError
-from worldpose.formats.motion_capture import stretches, write_motion
+from worldpose.formats.motion_capture import write_motion
 from worldpose.simulation.recorded_files import read_bvh
 
 FRAMES = 40
@@ -45,18 +44,6 @@ def test_the_24_joints_come_back_within_a_tenth_of_a_millimetre(model, tmp_path)
     np.testing.assert_allclose(joints, model.joints(poses), atol=1e-6)
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_locked_angles_are_right_too(model, tmp_path, sign):
-    poses = BodyParameters(
-        np.zeros((1, 10)),
-        np.array([[sign * np.pi / 2, 0.0, 0.0], [0.0, 0.0, 0.0]]),
-        np.tile([sign * np.pi / 2, 0.0, 0.0], (2, 23)),
-        np.zeros((2, 3)),
-    )
-    write_motion(tmp_path / "p.bvh", model, poses, 25.0)
-    np.testing.assert_allclose(joints_of(tmp_path / "p.bvh")[0], model.joints(poses), atol=1e-6)
-
-
 def test_a_turning_persons_angles_do_not_jump(model, tmp_path):
     turning = np.linspace(0.0, 4.0 * np.pi, FRAMES)
     poses = BodyParameters(
@@ -70,13 +57,3 @@ def test_a_turning_persons_angles_do_not_jump(model, tmp_path):
     channels = np.array([row.split() for row in rows], dtype=float)
     # Two turns in 39 steps are 18.5 degrees each.
     assert np.abs(np.diff(channels[:, 3:], axis=0)).max() < 19.0
-
-
-def test_a_gap_divides_a_motion(model, tmp_path):
-    transl = np.zeros((7, 3))
-    transl[[0, 3, 4]] = np.nan
-    poses = BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), transl)
-    assert stretches(poses) == [slice(1, 3), slice(5, 7)]
-    with pytest.raises(InputError, match="frames that all have a body"):
-        write_motion(tmp_path / "p.bvh", model, poses, 25.0)
-    assert not (tmp_path / "p.bvh").exists()

@@ -1,13 +1,7 @@
 """Arrays of npz files that others wrote: read, or refused before anything is allocated."""
 
-import ast
-import gc
 import io
-import sys
-import threading
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -29,14 +23,6 @@ def written(path, **members):
 
 def header(text):
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
-
-
-def test_arrays_come_back_in_either_order(tmp_path):
-    values = np.arange(12.0).reshape(3, 4)
-    path = written(tmp_path / "a.npz", plain=values, fortran=np.asfortranarray(values))
-    found = read_npz(path, 1000)
-    np.testing.assert_array_equal(found["plain"], values)
-    np.testing.assert_array_equal(found["fortran"], values)
 
 
 @pytest.mark.parametrize(
@@ -86,35 +72,3 @@ def test_a_packed_size_that_is_more_than_the_file_does_not_excuse_a_bomb(tmp_pat
     path.write_bytes(content)
     with pytest.raises(InputError, match="packed at most 200 to 1"):
         read_npz(path, 1 << 30)
-
-
-def test_threads_read_arrays_while_others_parse(tmp_path):
-    values = np.arange(2.0).reshape(1, 1, 1, 1, 1, 1, 1, 2)
-    path = written(tmp_path / "a.npz", **{f"part{number}": values for number in range(50)})
-    stop = threading.Event()
-
-    def parse_without_turn():
-        while not stop.is_set():
-            with suppress(SystemError):  # Python's own defect, which readers must survive
-                ast.parse("def f(a, b=(1, 2)):\n    return {a: [b]}\n" * 20)
-
-    def switch_threads(_phase, _info):
-        sum(range(100))
-
-    interval, threshold = sys.getswitchinterval(), gc.get_threshold()
-    gc.callbacks.append(switch_threads)
-    # A tree is made without interruption, except where garbage is collected.
-    gc.set_threshold(1, 10**6, 10**6)
-    sys.setswitchinterval(1e-6)
-    try:
-        with ThreadPoolExecutor(5) as threads:
-            threads.submit(parse_without_turn)
-            try:
-                found = list(threads.map(lambda _: read_npz(path, 10_000), range(200)))
-            finally:
-                stop.set()
-    finally:
-        sys.setswitchinterval(interval)
-        gc.set_threshold(*threshold)
-        gc.callbacks.remove(switch_threads)
-    assert all(np.array_equal(part, values) for each in found for part in each.values())

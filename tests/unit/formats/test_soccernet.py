@@ -1,5 +1,6 @@
-from line_sets import SOCCERNET_MARKINGS, soccernet_markings
+from line_sets import soccernet_markings
 
+from worldpose.formats.annotations.marked_images import SOCCERNET_MARKINGS
 from worldpose.pitch.template import PitchTemplate
 
 

@@ -11,10 +11,7 @@ from data_contracts.conventions import COCO17
 from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks, fill_gaps
 from worldpose.formats.tables import (
-    Positions,
     joints_table,
-    people_table,
-    strides_table,
     write_csv,
     write_parquet,
 )
@@ -85,46 +82,6 @@ def test_parquet_without_pyarrow_is_refused(tracks, tmp_path, monkeypatch):
     with pytest.raises(UsageError, match=r"pip install 'worldpose\[tables\]'"):
         write_parquet(tmp_path / "a.parquet", table, NOTES)
     assert not (tmp_path / "a.parquet").exists()
-
-
-def test_distance_adds_steps_but_no_gaps():
-    xy = np.zeros((8, 1, 2))
-    xy[:, 0, 0] = 3.0 * np.arange(8)
-    xy[:, 0, 1] = 4.0 * np.arange(8)
-    xy[3, 0] = np.nan
-    frames = np.array([0, 1, 2, 3, 4, 5, 6, 9])  # a gap of the clip's frames too
-    positions = Positions(
-        frames, np.array([5]), ["Ann"], np.zeros((8, 1), bool), xy, np.full((8, 1, 2, 2), np.nan),
-        np.array([np.nan]),
-    )  # fmt: skip
-    table = people_table(positions, FPS)
-    assert table.frame.tolist() == [0, 1, 2, 4, 5, 6, 9]
-    # Steps of 5 m: two before the gap, two after it.
-    assert table.distance_m.tolist() == [0.0, 5.0, 10.0, 10.0, 15.0, 20.0, 20.0]
-    assert set(table.name) == {"Ann"}
-
-
-def test_strides_have_the_walkers_length_and_time():
-    table = strides_table(walker(speed=2.0, stride_s=0.9), FPS)
-    # Contacts of the left foot at 0.225, 1.125, ... 4.725 s, of the right at 0.675, ... 4.275 s;
-    # the left one's first and last are at the ends, where the direction of motion is not known.
-    assert table.groupby("side").size().to_dict() == {"left": 3, "right": 4}
-    np.testing.assert_allclose(table.stride_time_s, 0.9, atol=1.01 / FPS)
-    np.testing.assert_allclose(table.stride_time_s.mean(), 0.9, atol=0.005)
-    np.testing.assert_allclose(table.stride_length_m.mean(), 1.8, atol=0.01)
-    np.testing.assert_allclose(table.speed_m_s, 2.0, atol=0.02)
-    assert not table.filled.any()
-
-
-def test_a_gap_has_no_strides_and_a_standing_person_none():
-    whole = walker()
-    joints = whole.joints.copy()
-    joints[125:130] = np.nan
-    found = strides_table(JointTracks(whole.frames, whole.person_ids, joints), FPS)
-    before, after = found.start_frame + 50 * found.stride_time_s <= 132, found.start_frame >= 137
-    assert (before | after).all()
-    assert 2 <= len(found) < len(strides_table(whole, FPS))
-    assert strides_table(walker(speed=0.0), FPS).empty
 
 
 def test_gaps_are_filled_on_the_way_and_flagged():

@@ -20,17 +20,6 @@ def refused(tmp_path):
     return check
 
 
-def test_plain_yaml_is_read(tmp_path):
-    path = tmp_path / "a.yaml"
-    path.write_bytes(b"\xef\xbb\xbfa: [1, 2.5, x]\nb: {c: true}\nmatch_id: 2024-05-01\n")
-    assert read_yaml(path) == {"a": [1, 2.5, "x"], "b": {"c": True}, "match_id": "2024-05-01"}
-    for read in (read_yaml, read_json, read_toml):
-        with pytest.raises(InputError, match="found nothing"):
-            read(tmp_path / "absent")
-        with pytest.raises(InputError, match="found something else"):
-            read(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -51,13 +51,6 @@ def test_a_matrix_that_is_not_positive_definite_is_told():
     assert not BandedFactor.of(blocks).determined
 
 
-def test_the_given_blocks_stay_as_they_are():
-    blocks, _ = banded(3, 3, np.random.default_rng(2))
-    before = blocks.copy()
-    BandedFactor.of(blocks)
-    np.testing.assert_array_equal(blocks, before)
-
-
 def test_a_system_that_rounding_spoils_is_degenerate_and_no_error_of_ours():
     blocks = np.zeros((3, 2, UNKNOWNS, UNKNOWNS))
     blocks[0] = -1e300 * np.eye(UNKNOWNS)

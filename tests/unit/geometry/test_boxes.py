@@ -9,12 +9,6 @@ def test_intersection_over_union_of_every_pair():
     np.testing.assert_allclose(found, [[1 / 3, 0.0]])
 
 
-def test_frames_are_compared_one_by_one():
-    boxes = np.array([[[0.0, 0, 2, 2]], [[1.0, 0, 3, 2]]])
-    np.testing.assert_allclose(box_iou(boxes, boxes[::-1]), [[[1 / 3]], [[1 / 3]]])
-    assert box_iou(boxes, np.empty((2, 0, 4))).shape == (2, 1, 0)
-
-
 def test_boxes_without_area_and_missing_boxes_share_nothing():
     flat, reversed_box = [1.0, 1, 1, 1], [2.0, 2, 0, 0]
     boxes = np.array([flat, reversed_box, [np.nan] * 4, [0.0, 0, 2, 2]])

@@ -4,9 +4,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.projection import fold_radius
+from worldpose.geometry.lens_models import fold_radius
 from worldpose.geometry.rays import RayStatus
 from worldpose.geometry.rigid import Rigid
 
@@ -52,15 +51,6 @@ def spokes(radii, count=12) -> np.ndarray:
 def test_fold_is_the_first_zero_of_the_slope(k1, k2, k3, squared):
     # A root of a polynomial with rounded coefficients: well conditioned in all these cases.
     np.testing.assert_allclose(fold_radius([k1, k2, 0.0, 0.0, k3]), np.sqrt(squared), rtol=1e-12)
-
-
-def test_missing_lens_has_no_known_fold():
-    assert np.isnan(fold_radius([0.1, np.nan, 0.0, 0.0, 0.0]))
-
-
-def test_fold_refuses_four_coefficients():
-    with pytest.raises(InputError, match=r"\(\.\.\., 5\), found shape \(4,\)"):
-        fold_radius(np.zeros(4))
 
 
 def test_points_at_and_beyond_the_fold_have_no_image():
@@ -112,17 +102,6 @@ def test_distortion_and_inverse_agree_with_opencv(k1, k2, p1, p2, k3):
     np.testing.assert_allclose(image, expected.reshape(-1, 2), atol=1e-15)
     # At 0.8 of the fold the slope is at least 0.1: rounding of 1e-16 grows tenfold.
     np.testing.assert_allclose(camera.normalize(image), points, atol=1e-14)
-
-
-def test_tangential_terms_bend_the_fold():
-    # x' = x + 6 p2 x^2 / 2 on the axis: with p2 = -1/6 the slope 1 - x vanishes at x = 1,
-    # though the radial part never folds.
-    camera = plane_camera(p2=-1 / 6)
-    found = camera.project_with_jacobians(on_plane([[0.99, 0.0], [1.01, 0.0]]))
-    assert found.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD]
-    # The image ends at x' = 1 - 1/2.
-    rays = camera.unproject([[0.4999, 0.0], [0.51, 0.0], [1.2, 0.0]])
-    assert rays.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD, RayStatus.BEYOND_FOLD]
 
 
 def test_missing_pixels_and_cameras_are_missing():

@@ -82,17 +82,6 @@ def test_batches_of_cameras_give_what_single_cameras_give():
             np.testing.assert_array_equal(plane[frame, index], camera.normalize(alone.points_image))
 
 
-def test_fields_broadcast_and_index():
-    camera = simple_camera(focal=np.full((7, 2), 1000.0))
-    assert camera.batch_shape == (7,)
-    assert camera.cam_from_world.batch_shape == (7,)
-    assert camera[2:5].batch_shape == (3,)
-    assert camera[-1].batch_shape == ()
-    assert len(list(camera)) == 7
-    with pytest.raises(IndexError):
-        _ = camera[0][0]
-
-
 def test_no_points_and_no_cameras_are_fine():
     assert simple_camera().project(np.empty((0, 3))).shape == (0, 2)
     empty = simple_camera(focal=np.empty((0, 2)))

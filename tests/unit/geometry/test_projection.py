@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.projection import fold_radius
+from worldpose.geometry.lens_models import fold_radius
 from worldpose.geometry.rays import RayStatus
 from worldpose.geometry.rigid import Rigid
 

@@ -1,7 +1,6 @@
 """The z-buffer against triangles whose samples can be counted by hand."""
 
 import numpy as np
-import pytest
 
 from worldpose.geometry.rasters import Samples, Surface, cover_triangles, draw_triangles, resolve
 
@@ -55,45 +54,6 @@ def test_half_a_pixel_has_half_its_samples_and_mixes_with_what_is_behind():
     assert seen.tolist() == [2]
     assert persons[1, 1] == 0
     assert (persons == -1).sum() == 8
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_the_nearer_hides_the_farther_in_any_order_and_both_count_all_their_samples(order):
-    samples = Samples.empty(0, 0, 8, 4)
-    things = {0: rectangle(0.5, 0.5, 4.5, 2.5, 9.0), 1: rectangle(2.5, 0.5, 6.5, 2.5, 11.0)}
-    for which in order:
-        assert draw(samples, things[which], which) == 4 * 2 * 4
-    assert (samples.who == 0).sum() == 32
-    assert (samples.who == 1).sum() == 16
-
-
-def test_surfaces_that_cross_are_parted_where_they_do():
-    samples = Samples.empty(0, 0, 10, 3)
-    # From 8 m on the left to 12 m on the right, across one at 10 m: they meet in the middle.
-    slanting = rectangle(0.5, 0.5, 8.5, 1.5, [8.0, 8.0, 12.0, 12.0])
-    draw(samples, slanting, 0)
-    draw(samples, rectangle(0.5, 0.5, 8.5, 1.5, 10.0), 1)
-    np.testing.assert_array_equal(samples.who[1, 1:5], 0)
-    np.testing.assert_array_equal(samples.who[1, 5:9], 1)
-
-
-def test_what_faces_away_or_has_no_image_is_not_drawn():
-    samples = Samples.empty(0, 0, 5, 5)
-    seen = rectangle(0.5, 0.5, 3.5, 3.5)
-    assert draw(samples, seen, 0, faces=np.ascontiguousarray(FACES[:, ::-1])) == 0
-    gone = seen.copy()
-    gone[0] = np.nan  # a corner of both triangles
-    assert draw(samples, gone, 0) == 0
-    assert (samples.who == -1).all()
-
-
-def test_what_moves_is_drawn_at_four_moments_of_the_shutter():
-    samples = Samples.empty(0, 0, 20, 3)
-    opened, closed = rectangle(0.5, 0.5, 2.5, 1.5), rectangle(8.5, 0.5, 10.5, 1.5)
-    assert draw(samples, opened, 0, closed) == 2 * 4
-    # Its left border is 1, 3, 5 and 7 px on at an eighth, three, five and seven eighths.
-    columns = [np.flatnonzero(samples.who[1, :, s] == 0).tolist() for s in range(4)]
-    assert sorted(columns) == [[2, 3], [4, 5], [6, 7], [8, 9]]
 
 
 def test_a_mask_has_the_pixels_whose_middles_are_covered_whichever_way_triangles_face():

@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
-from worldpose.errors import InputError
 from worldpose.geometry.rays import Rays, RayStatus, intersect_rays
-
-coordinates = st.floats(-100.0, 100.0)
-points3 = st.tuples(coordinates, coordinates, coordinates).map(np.array)
 
 
 def rays_through(origins, targets) -> Rays:
@@ -85,23 +80,3 @@ def test_large_world_coordinates_keep_their_digits():
     # As ten metres apart without the shift; solving in grid coordinates would lose 1e-5 m.
     np.testing.assert_allclose(intersect_rays(rays_through(origins, target))[0], target, rtol=0.0,
                                atol=1e-8)  # fmt: skip
-
-
-def test_rays_broadcast_and_index():
-    rays = Rays(np.zeros(3), random_rays(np.random.default_rng(0), 4, 5).directions, np.uint8(0))
-    assert rays.origins.shape == (4, 5, 3)
-    assert rays.status.shape == (4, 5)
-    assert rays[1].directions.shape == (5, 3)
-    assert rays[:, 2].directions.shape == (4, 3)
-    assert rays[..., 2].directions.shape == (4, 3)
-    assert rays[:, None].directions.shape == (4, 1, 5, 3)
-    with pytest.raises(IndexError):
-        _ = rays[1, 2, 0]
-
-
-def test_negative_weights_and_wrong_shapes_are_refused():
-    rays = random_rays(np.random.default_rng(0), 2)
-    with pytest.raises(InputError, match="no negative weight, found -1"):
-        intersect_rays(rays, [1.0, -1.0])
-    with pytest.raises(InputError, match="broadcast"):
-        Rays(np.zeros((2, 3)), np.zeros((4, 3)), np.zeros(4, np.uint8))

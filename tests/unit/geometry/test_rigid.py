@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.geometry.rigid import Rigid, nearest_rotation
+from worldpose.geometry.rigid import Rigid
 
 # Matrix products of unit-size numbers: a few roundings of 1.1e-16 each.
 ROUNDING = 1e-14
@@ -92,18 +92,6 @@ def test_tangent_update_has_the_documented_derivative(rotvec, translation, point
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_batches_broadcast_and_index():
-    batch = Rigid.from_rotvec(np.zeros((4, 1, 3)), np.arange(6.0).reshape(2, 3))
-    assert batch.batch_shape == (4, 2)
-    assert batch.apply(np.zeros((5, 3))).shape == (4, 2, 5, 3)
-    assert batch[1].batch_shape == (2,)
-    np.testing.assert_array_equal(batch[3, 1].translation, [3.0, 4.0, 5.0])
-    assert batch[..., 0].batch_shape == (4,)
-    assert batch[:, np.array([True, False])].batch_shape == (4, 1)
-    assert (batch @ batch.inverse()).batch_shape == (4, 2)
-    assert batch.retract(np.zeros(6)).batch_shape == (4, 2)
-
-
 @pytest.mark.parametrize(
     ("make", "expected", "found"),
     [
@@ -118,8 +106,3 @@ def test_batches_broadcast_and_index():
 def test_wrong_shapes_are_refused_with_both_shapes(make, expected, found):
     with pytest.raises(InputError, match=expected + ".*" + found):
         make()
-
-
-def test_missing_rotation_is_refused():
-    with pytest.raises(InputError, match="here: expected an orthonormal matrix"):
-        nearest_rotation("here", np.full((3, 3), np.nan))

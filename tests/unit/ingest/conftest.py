@@ -8,6 +8,8 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.ingest.writing import write_match
 
+CAMERA_ANGLES = {"cam1": 0.5, "cam2": -0.3}
+
 
 @pytest.fixture
 def make_people():
@@ -65,17 +67,28 @@ def spec():
 
 
 @pytest.fixture
-def match_folder(tmp_path, spec, make_people, make_camera):
+def write_tiny(tmp_path, spec, make_people, make_camera):
+    """Write the tiny match with these given cameras and further data, and return its folder."""
+
+    def write(calibrated=("cam1", "cam2"), **further):
+        folder = tmp_path / "tiny"
+        write_match(
+            folder,
+            spec,
+            calibrations={name: make_camera(name, CAMERA_ANGLES[name]) for name in calibrated},
+            observations={
+                "cam1": make_people(5, 6, seed=1),
+                "cam2": make_people(15, 6, seed=2),
+                "goal": make_people(0, 3, seed=3),
+            },
+            **further,
+        )
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def match_folder(write_tiny):
     """A complete match folder on disk; static cameras cover match frames 5 to 10."""
-    folder = tmp_path / "tiny"
-    write_match(
-        folder,
-        spec,
-        calibrations={"cam1": make_camera("cam1"), "cam2": make_camera("cam2", -0.3)},
-        observations={
-            "cam1": make_people(5, 6, seed=1),
-            "cam2": make_people(15, 6, seed=2),
-            "goal": make_people(0, 3, seed=3),
-        },
-    )
-    return folder
+    return write_tiny()

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.formats import files, keypoint_files
-from worldpose.formats.keypoint_files import read_coco_results
+from worldpose.formats import coco_results, files
+from worldpose.formats.coco_results import read_coco_results
 
 
 def person(frame=0, **changes):
@@ -28,7 +28,7 @@ def read(tmp_path):
     def read_content(content):
         path = tmp_path / "cam1.json"
         path.write_text(content if isinstance(content, str) else json.dumps(content))
-        return read_coco_results(path)
+        return read_coco_results(path).people
 
     return read_content
 
@@ -69,14 +69,12 @@ def test_box_and_score_of_found_joints_stand_in(read):
     np.testing.assert_array_equal(people.score[0], [0.5, 0.25])
 
 
-def test_person_without_joints_keeps_their_place_and_box(read):
-    nobody = person(keypoints=[0] * 51, bbox=[1, 2, 3, 4], score=0.9)
-    people = read([person(keypoints=[0] * 51), nobody, person()])
-    assert people.keypoints.shape[1] == 3
-    assert np.isnan(people.score[0, 0])
-    assert np.all(np.isnan(people.boxes[0, 0]))
-    np.testing.assert_array_equal(people.boxes[0, 1], [1, 2, 4, 6])
-    np.testing.assert_array_equal(people.score[0, 1:], np.array([0.9, 0.5], dtype=np.float32))
+def test_an_entry_without_joints_and_box_is_nobody(read):
+    boxed = person(keypoints=[0] * 51, bbox=[1, 2, 3, 4], score=0.9)
+    people = read([person(keypoints=[0] * 51), boxed, person()])
+    assert people.keypoints.shape[1] == 2
+    np.testing.assert_array_equal(people.boxes[0, 0], [1, 2, 4, 6])
+    np.testing.assert_array_equal(people.score[0], np.array([0.9, 0.5], dtype=np.float32))
 
 
 def test_data_set_annotations_may_carry_visibility(read):
@@ -93,13 +91,7 @@ def test_data_set_annotations_may_carry_visibility(read):
 @pytest.mark.parametrize(
     ("content", "place", "words"),
     [
-        (
-            [person(), with_joint(9, math.nan, 1, 0.5)],
-            "result 1, keypoints joint 9 (left_wrist)",
-            "nan",
-        ),
         ([with_joint(16, 1, math.inf, 0.5)], "result 0, keypoints joint 16 (right_ankle)", "inf"),
-        ([with_joint(0, 1, 1, math.nan)], "result 0, keypoints joint 0 (nose)", "finite"),
         ([with_joint(0, 1, 1e300, 0.5)], "result 0, keypoints joint 0 (nose)", "pixels up to"),
         ([with_joint(0, 1, 1, -0.1)], "result 0, keypoints joint 0 (nose)", "Scale"),
         ([with_joint(0, 1, 1, 8.5)], "result 0, keypoints joint 0 (nose)", "1 is certain"),
@@ -108,9 +100,10 @@ def test_data_set_annotations_may_carry_visibility(read):
         ([with_joint(2, 1, 10**400, 1)], "result 0, keypoints[7]", "a number"),
         ([person(keypoints=[1.0] * 50)], "result 0, keypoints", "51 numbers"),
         ([person(), person(keypoints=[1.0] * 75)], "result 1, keypoints", "found 75"),
+        ([person(keypoints=[1.0] * 30)], "cam1.json", "found 10 points"),
         ([person(keypoints=None)], "result 0, keypoints", "found nothing"),
         ([person(keypoints={})], "result 0, keypoints", "a mapping"),
-        ([person("3.jpg")], "result 0, image_id", "'3.jpg'"),
+        ([person("a.jpg")], "result 0, image_id", "'a.jpg'"),
         ([person(True)], "result 0, image_id", "True"),
         ([person(-1)], "result 0, image_id", "from 0"),
         ([person(2**40)], "result 0, image_id", "1099511627776"),
@@ -136,12 +129,12 @@ def test_crowd_that_would_fill_the_memory_is_refused(read, refusal, monkeypatch)
     # One frame with many people pads every other frame: 4000 frames x 200 people.
     results = [person(frame) for frame in range(4000)] + [person(0)] * 199
     assert read(results[:10]).keypoints.shape == (10, 1, 17, 2)
-    monkeypatch.setattr("worldpose.formats.keypoint_files.ARRAY_BYTES", 100 << 20)
+    monkeypatch.setattr("worldpose.formats.keypoint_sets.ARRAY_BYTES", 100 << 20)
     assert "200 people in frame 0" in refusal(results).found
 
 
 def test_results_of_several_batches_keep_their_places(read, refusal, monkeypatch):
-    monkeypatch.setattr(keypoint_files, "BATCH", 3)
+    monkeypatch.setattr(coco_results, "BATCH", 3)
     results = [person(frame, score=0.1 * frame + 0.1) for frame in range(8)]
     np.testing.assert_allclose(read(results).score[:, 0], 0.1 * np.arange(1, 9), rtol=1e-6)
     for index, wrong in ((4, person(keypoints=[1.0] * 3)), (5, person(score=-1)), (7, 3)):
@@ -194,7 +187,7 @@ def test_bytes_that_are_no_text_are_said_so(tmp_path):
     with pytest.raises(InputError, match="Save it as UTF-8"):
         read_coco_results(path)
     path.write_text(json.dumps([person()]), encoding="utf-8-sig")
-    assert len(read_coco_results(path).frame) == 1
+    assert len(read_coco_results(path).people.frame) == 1
 
 
 @settings(max_examples=100)

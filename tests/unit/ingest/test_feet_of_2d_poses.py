@@ -1,7 +1,5 @@
 """Heels and toes of 2D poses are kept beside the 17 keypoints: in memory, files and a store."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -66,24 +64,6 @@ def test_every_set_with_feet_gives_them_in_one_order(tmp_path, size, places):
     np.testing.assert_array_equal(found.boxes[0, 0], [*body.min(axis=0), *body.max(axis=0)])
 
 
-def test_feet_alone_are_no_person(tmp_path):
-    values, _ = person(26, 1)
-    values[:17] = 0.0
-    write_frame(tmp_path / "a_json", 0, [values, person(26, 2)[0]])
-    found = read_openpose_folder(tmp_path / "a_json").people
-    assert np.isnan(found.extra_confidence[0, 0]).all()
-    assert np.isfinite(found.extra_confidence[0, 1]).all()
-
-
-def test_files_keep_them(tmp_path):
-    given = people()
-    write_keypoint_arrays(tmp_path / "a.npz", given)
-    same(read_keypoint_arrays(tmp_path / "a.npz"), given)
-    plain = given.with_points(())
-    write_keypoint_arrays(tmp_path / "b.npz", plain)
-    same(read_keypoint_arrays(tmp_path / "b.npz"), plain)
-
-
 def broken(given, fault):
     extra, sure = given.extra_keypoints.copy(), given.extra_confidence.copy()
     if fault == "lone":
@@ -108,39 +88,6 @@ def test_a_wrong_file_is_refused_with_its_place(tmp_path, fault, word):
     write_keypoint_arrays(tmp_path / "a.npz", broken(people(), fault))
     with pytest.raises(InputError, match=word):
         read_keypoint_arrays(tmp_path / "a.npz")
-
-
-def test_a_person_without_joints_has_no_feet_in_a_file(tmp_path):
-    given = people()
-    given = given.without(np.ones((3, 2, 17), dtype=bool))
-    write_keypoint_arrays(tmp_path / "a.npz", given)
-    with pytest.raises(InputError, match="points only of a person"):
-        read_keypoint_arrays(tmp_path / "a.npz")
-
-
-def test_all_selections_keep_them():
-    given = people()
-    same(
-        given[1:],
-        replace(given, **{n: a[1:] for n, a in given.arrays().items()}, frame=given.frame[1:]),
-    )
-    one = given.select(slice(1, 2))
-    np.testing.assert_array_equal(one.extra_keypoints, given.extra_keypoints[:, 1:2])
-    wider = given.reindex(np.arange(3, 9))
-    np.testing.assert_array_equal(wider.extra_keypoints[1:4], given.extra_keypoints)
-    assert np.isnan(wider.extra_confidence[[0, 4, 5]]).all()
-    both = KeypointDetections.concatenate([given, given])
-    np.testing.assert_array_equal(both.extra_confidence[:, 2:], given.extra_confidence)
-
-
-def test_cameras_with_other_points_are_padded():
-    one, other = people(), people(points=(), seed=1)
-    stacked = KeypointDetections.stack(
-        [one, replace(other, extra_keypoints=None, extra_confidence=None)]
-    )
-    assert stacked.points == FEET
-    np.testing.assert_array_equal(stacked.extra_keypoints[:, 0], one.extra_keypoints)
-    assert np.isnan(stacked.extra_confidence[:, 1]).all()
 
 
 def stored(given):

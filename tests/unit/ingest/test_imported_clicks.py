@@ -103,6 +103,75 @@ def test_every_form_gives_the_same_clicks(tmp_path, write):
     assert len(drawn) == len(lines)
 
 
+@pytest.mark.parametrize("angle", [0, 90, 180, 270])
+@pytest.mark.parametrize("kind", ["polygonlabels", "vectorlabels"])
+def test_a_picture_that_the_annotator_turned_is_turned_back(tmp_path, angle, kind):
+    file = label_studio(tmp_path / "clicks", [*CLICKS.items()], [("touch_line_near", LINE)])
+    tasks = json.loads(file.read_text())
+    turn = {0: lambda x, y: (x, y), 90: lambda x, y: (100 - y, x)}
+    turn |= {180: lambda x, y: (100 - x, 100 - y), 270: lambda x, y: (y, 100 - x)}
+    for region in tasks[0]["annotations"][0]["result"][1:]:
+        region["image_rotation"], value = angle, region["value"]
+        if "points" in value:
+            turned = [turn[angle](*place) for place in value.pop("points")]
+            named = {kind: value.pop("polygonlabels")}
+            vertices = [{"x": x, "y": y} for x, y in turned]
+            value |= named | ({"points": turned} if kind[0] == "p" else {"vertices": vertices})
+            region["type"] = kind
+        else:
+            value["x"], value["y"] = turn[angle](value["x"], value["y"])
+    tasks[0]["data"]["image"] = "/data/upload/1/0a1b2c3d-east.png"
+    file.write_text(json.dumps(tasks))
+    import_clicks(file, match(tmp_path / "m"))
+    points, (drawn,) = clicked(tmp_path / "m")
+    for name, pixel in CLICKS.items():
+        np.testing.assert_allclose(points[name], pixel, atol=1e-9)
+    np.testing.assert_allclose(drawn.xy, LINE, atol=1e-9)
+
+
+def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
+    file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
+    (task,) = json.loads(file.read_text())
+    given = task["annotations"][0]["result"][1:]
+    size = {"original_width": SIZE[0], "original_height": SIZE[1]}
+    short = {"image": "east.png", "id": 1, "kp": [each["value"] | size for each in given]}
+    file.write_text(json.dumps([short]))
+    import_clicks(file, match(tmp_path / "m"))
+    points, _ = clicked(tmp_path / "m")
+    for name, pixel in CLICKS.items():
+        np.testing.assert_allclose(points[name], pixel, atol=1e-9)
+
+
+@pytest.mark.parametrize("spell", [str.upper, "{} ".format, lambda name: name.replace("_", " ")])
+def test_labels_are_known_in_any_case_and_with_spaces(tmp_path, spell):
+    clicks = [(spell(name), pixel) for name, pixel in CLICKS.items()]
+    lines = [(spell("touch_line_near"), LINE)]
+    import_clicks(cvat(tmp_path / "clicks", clicks, lines), match(tmp_path / "m"))
+    points, (drawn,) = clicked(tmp_path / "m")
+    assert points.keys() == CLICKS.keys()
+    assert drawn.name == "touch_line_near"
+
+
+def test_lines_of_soccernet_are_clicks_in_its_json_and_by_its_names(tmp_path):
+    shares = [{"x": x / SIZE[0], "y": y / SIZE[1]} for x, y in LINE]
+    outside = [{"x": 1.2, "y": 0.5}]
+    names = {"Side line bottom": shares + outside, "Goal left post left ": shares}
+    (tmp_path / "clicks.json").write_text(json.dumps({**names, "Line unknown": shares}))
+    import_clicks(tmp_path / "clicks.json", match(tmp_path / "m"), "east")
+    _, drawn = clicked(tmp_path / "m")
+    assert [each.name for each in drawn] == ["touch_line_near", "goal_post_left_near"]
+    np.testing.assert_allclose(drawn[0].xy, LINE, atol=1e-9)
+    lines = [("Side line bottom", LINE)]
+    import_clicks(cvat(tmp_path / "clicks.xml", [], lines), match(tmp_path / "n"))
+    assert clicked(tmp_path / "n")[1][0].name == "touch_line_near"
+
+
+def test_tracks_of_a_video_are_refused_with_the_way_out(tmp_path):
+    (tmp_path / "clicks").write_text("<annotations><track id='0' label='a'/></annotations>")
+    with pytest.raises(InputError, match="export as `CVAT for images`"):
+        read_marked_images(tmp_path / "clicks")
+
+
 def seen(places):
     """Pixels of world places (n, 2) from a mast behind the near touch line, looking across."""
     x, y = np.array(places).T
@@ -133,30 +202,6 @@ def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, 
     pitch = json.loads((folder / "pitch.json").read_text())
     assert pitch["points"]["at_5.50_34.00"] == [5.5, 34.0, -0.2]  # the crown falls to the line
     assert read_pitch(folder, read_spec(folder)).points.keys() == report.own_points.keys()
-
-
-def test_a_label_clicked_twice_gives_two_points_at_one_place(tmp_path):
-    folder = match(tmp_path / "m")
-    clicks = [*CLICKS.items(), ("halfway_far", (10.0, 20.0))]
-    report = import_clicks(cvat(tmp_path / "c.xml", clicks), folder)
-    (repeated,) = report.repeated
-    assert (repeated.owner, repeated.image, repeated.label) == ("east", "east.png", "halfway_far")
-    assert repeated.names == ("halfway_far", "halfway_far.again")
-    assert repeated.pixels == (CLICKS["halfway_far"], (10.0, 20.0))
-    assert clicked(folder)[0]["halfway_far.again"] == (10.0, 20.0)
-    assert report.own_points == {"halfway_far.again": (0.0, 34.0, -0.2)}
-
-
-def test_own_points_of_pitch_json_stay_and_are_labels(tmp_path):
-    own = {"width": 66.0, "points": {"stripe_3": [11.0, 33.0, -0.2]}}
-    folder = match(tmp_path / "m", pitch=own)
-    places = [(-9, 4), (3, -8), (8, 9), (1, 1)]
-    labels = [(f"({x},{y})", tuple(seen([(x, y)])[0])) for x, y in places]
-    import_clicks(cvat(tmp_path / "c.xml", [("stripe_3", (5.0, 6.0)), *labels]), folder)
-    pitch = json.loads((folder / "pitch.json").read_text())
-    assert pitch["width"] == 66.0
-    assert pitch["points"]["stripe_3"] == [11.0, 33.0, -0.2]
-    assert "at_-9.00_4.00" in pitch["points"]
 
 
 def test_images_of_a_clip_become_key_frames(tmp_path):
@@ -192,14 +237,6 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
     with pytest.raises(InputError, match=found):
         import_clicks(file, folder, owner)
     assert {each.name for each in folder.iterdir()} == {"match.yaml"}
-
-
-def test_present_clicks_are_not_overwritten(tmp_path):
-    folder = match(tmp_path / "m")
-    file = cvat(tmp_path / "c.xml", CLICKS.items())
-    import_clicks(file, folder)
-    with pytest.raises(InputError, match="no clicks there yet"):
-        import_clicks(file, folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])

@@ -6,7 +6,7 @@ from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import read_match
-from worldpose.ingest.writing import MatchAnnotations, write_match
+from worldpose.ingest.writing import MatchAnnotations
 
 
 def clicks(name="center_mark", xy=(640.0, 360.0)):
@@ -22,21 +22,9 @@ PICKED = KeyFrames(
 
 
 @pytest.fixture
-def write(tmp_path, spec, make_people, make_camera):
+def write(write_tiny):
     def write(key_frames, clip="goal"):
-        folder = tmp_path / "match"
-        write_match(
-            folder,
-            spec,
-            calibrations={name: make_camera(name) for name in ("cam1", "cam2")},
-            observations={
-                "cam1": make_people(5, 6, seed=1),
-                "cam2": make_people(15, 6, seed=2),
-                "goal": make_people(0, 3, seed=3),
-            },
-            annotations=MatchAnnotations(key_frames={clip: key_frames}),
-        )
-        return folder
+        return write_tiny(annotations=MatchAnnotations(key_frames={clip: key_frames}))
 
     return write
 

@@ -41,13 +41,6 @@ def test_written_people_come_back(path, make_people):
     assert_same(read_keypoint_arrays(path), people)
 
 
-@pytest.mark.parametrize(("frames", "detections"), [(0, 0), (4, 0), (0, 3)])
-def test_nobody_comes_back(path, make_people, frames, detections):
-    people = make_people(0, frames, detections)
-    write_keypoint_arrays(path, people)
-    assert_same(read_keypoint_arrays(path), people)
-
-
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_numpys_own_files_are_read_and_ours_by_numpy(path, make_people, save):
     people = make_people()
@@ -114,14 +107,6 @@ def test_wrong_array_is_refused_by_name(path, make_people, refusal, name, change
     assert words in str(error)
 
 
-def test_wrong_value_is_named_with_its_frame(path, make_people, refusal, monkeypatch):
-    monkeypatch.setattr(keypoint_files, "_BLOCK", 2)
-    people = make_people(100, 5)
-    people.keypoints[3, 1, 9, 0] = np.nan
-    write_keypoint_arrays(path, people)
-    assert refusal().where == f"{path}: keypoints[3, 1, 9] (frame 103)"
-
-
 def test_missing_and_further_members_are_refused(path, make_people, refusal):
     arrays = members(make_people())
     np.savez(path, **arrays, extra=np.zeros(3))
@@ -162,12 +147,3 @@ def test_arrays_beyond_the_limit_are_refused(path, make_people, refusal, monkeyp
     write_keypoint_arrays(path, make_people())
     monkeypatch.setattr(keypoint_files, "ARRAY_BYTES", 1000)
     assert refusal().expected == "at most 1000 bytes of arrays"
-
-
-def test_padding_may_be_packed_well(path, make_people):
-    """One person in a thousand places, in a file that is small whatever it fills."""
-    arrays = {name: np.asarray(array) for name, array in make_people(0, 20, 300).arrays().items()}
-    for array in arrays.values():
-        array[:, 1:] = np.nan
-    np.savez_compressed(path, frame=np.arange(20), **arrays)
-    assert read_keypoint_arrays(path).score.shape == (20, 300)

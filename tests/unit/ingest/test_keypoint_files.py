@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +6,6 @@ import pytest
 from worldpose.errors import InputError
 from worldpose.formats.keypoint_files import (
     read_observations,
-    seen_frames,
     write_keypoint_arrays,
 )
 
@@ -50,20 +48,3 @@ def test_frames_beyond_belief_are_refused(tmp_path, first, count):
     (tmp_path / "empty.json").write_text("[]")
     with pytest.raises(InputError, match="frame numbers up to"):
         read_observations(tmp_path / "empty.json", [(first, count)])
-
-
-def test_two_people_a_year_apart_do_not_fill_the_memory(tmp_path):
-    result = {"keypoints": [1.0, 1.0, 0.5] * 17}
-    content = [{"image_id": 0, **result}, {"image_id": 2**31 - 1, **result}]
-    (tmp_path / "a.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="2147483648 frames"):
-        read_observations(tmp_path / "a.json")
-
-
-def test_seen_frames_are_those_with_a_joint(make_people):
-    people = make_people(10, 5)
-    people.confidence[[0, 1, 4]] = np.nan
-    assert seen_frames(people) == (12, 13)
-    people.confidence[:] = np.nan
-    assert seen_frames(people) is None
-    assert seen_frames(make_people(0, 0, 0)) is None

@@ -66,17 +66,6 @@ def test_pitch_none_is_no_pitch_and_refused_beside_a_pitch_file(match_folder, ed
     assert error.expected == "no `pitch: none` where pitch.json lies"
 
 
-def test_named_pitch_file_is_read_and_must_be_there(match_folder, edit):
-    edit(lambda content: content.update(pitch="survey.json"))
-    assert refusal(match_folder).where.endswith("match.yaml: pitch")
-    (match_folder / "survey.json").write_text(json.dumps({"width": 64.0}))
-    assert read_match(match_folder).pitch == PitchSpec(width=64.0)
-    (match_folder / "survey.json").write_text('{"crwon": 0}')
-    assert refusal(match_folder).where.endswith("survey.json: crwon")
-    edit(lambda content: content.update(pitch="../pitch.json"))
-    assert "inside the match folder" in refusal(match_folder).expected
-
-
 def test_static_camera_without_footage_is_missing(match_folder):
     (match_folder / "detections" / "cam2.npz").unlink()
     error = refusal(match_folder)
@@ -90,44 +79,6 @@ def test_a_video_of_another_suffix_is_found_and_how_to_name_it_is_said(match_fol
     (match_folder / "videos" / "cam2.mov").write_bytes(b"video")
     (match_folder / "videos" / "cam2.old.mov").write_bytes(b"video")
     assert "name it in match.yaml: `video: videos/cam2.mov`" in refusal(match_folder).todo
-
-
-def test_a_video_in_its_usual_place_is_footage(match_folder):
-    (match_folder / "detections" / "cam2.npz").unlink()
-    (match_folder / "videos").mkdir()
-    (match_folder / "videos" / "cam2.mp4").write_bytes(b"video")
-    assert read_match(match_folder).videos == {"cam2": match_folder / "videos" / "cam2.mp4"}
-
-
-@pytest.mark.parametrize(
-    ("named", "there"),
-    [
-        ("videos/a.mp4", "videos/a.MP4"),
-        ("videos/a.Mp4", "videos/a.mp4"),
-        ("S\u00fcd/t\u00fcr.mp4", "Su\u0308d/tu\u0308r.MP4"),
-    ],
-)
-def test_a_named_file_is_found_with_another_case_of_its_ending_or_form_of_letters(
-    match_folder, edit, named, there
-):
-    path = match_folder / there
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(b"video")
-    edit(lambda content: content["cameras"][0].update(video=named))
-    assert read_match(match_folder).videos["cam1"] == path
-    edit(lambda content: content["cameras"][0].update(video=named.replace("a", "A").upper()))
-    assert "no '" in refusal(match_folder).found  # only the ending may differ
-
-
-def test_usual_files_are_found_with_endings_in_capitals(match_folder):
-    (match_folder / "detections" / "cam1.npz").rename(match_folder / "detections" / "cam1.NPZ")
-    for name in ("videos/cam2.MP4", "stills/cam2.PNG"):
-        (match_folder / name).parent.mkdir(exist_ok=True)
-        (match_folder / name).write_bytes(b"content")
-    match = read_match(match_folder)
-    assert match.detections["cam1"].name == "cam1.NPZ"
-    assert match.videos["cam2"].name == "cam2.MP4"
-    assert match.stills["cam2"].name == "cam2.PNG"
 
 
 def test_a_folder_of_images_is_footage_unless_empty(match_folder, edit):

@@ -1,12 +1,14 @@
 import json
+import re
 import unicodedata
 
 import numpy as np
 import pytest
+from calibration_writers import write_easymocap
 
-from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated
@@ -32,7 +34,8 @@ def source(tmp_path, make_camera):
 
 
 def run(source, out, **options):
-    return import_match(source / "calibration.toml", source / "detections", 25.0, out, **options)
+    folder = source / "detections"
+    return import_match(source / "calibration.toml", folder, 25.0, out, **options)[0]
 
 
 def test_other_tools_files_become_a_match(tmp_path, source):
@@ -56,34 +59,6 @@ def test_frames_keep_their_numbers_in_one_clip_over_all_cameras(tmp_path, source
         found = np.isfinite(people.score[:, 0])
         np.testing.assert_array_equal(people.frame[found], seen)
         np.testing.assert_array_equal(people.keypoints[found, 0, 0, 0], seen)
-
-
-def test_a_camera_that_saw_nobody_is_kept(tmp_path, source):
-    (source / "detections" / "left.json").write_text("[]")
-    spec = run(source, tmp_path / "m", match_id="final", pitch=None)
-    assert (spec.match_id, read_match(tmp_path / "m").pitch) == ("final", PitchSpec())
-    assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (300, 3)
-    people, _ = read_unit(read_match(tmp_path / "m"), "left")
-    assert people.keypoints.shape == (3, 0, 17, 2)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda folder: (folder / "left.json").unlink(),
-        lambda folder: (folder / "left.json").rename(folder / "middle.json"),
-        lambda folder: (folder / "further.json").write_text("[]"),
-        lambda folder: (folder / "left.npz").write_bytes(b""),
-    ],
-)
-def test_files_that_are_not_one_a_camera_are_listed_beside_the_cameras(tmp_path, source, change):
-    change(source / "detections")
-    with pytest.raises(InputError) as caught:
-        run(source, tmp_path / "m")
-    assert caught.value.expected.endswith("calibration.toml: right, left")
-    names = sorted(path.name for path in (source / "detections").iterdir())
-    assert caught.value.found == ", ".join(names)
-    assert not (tmp_path / "m").exists()
 
 
 @pytest.mark.parametrize(
@@ -154,6 +129,62 @@ def test_names_with_accents_and_spaces_become_ids_in_either_form(tmp_path, make_
     calibration = calibrate(tmp_path, make_camera, names)
     for name in names:
         film(tmp_path / "videos" / (unicodedata.normalize(form, name) + ".mp4"))
-    spec = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
+    spec, _ = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
     assert [camera.id for camera in spec.cameras] == ["Sudtribune", "Camera-1"]
     assert set(read_match(tmp_path / "m").videos) == {"Sudtribune", "Camera-1"}
+
+
+def test_a_calibration_is_scaled_to_videos_of_its_shape_and_no_others(tmp_path, make_camera):
+    calibration = calibrate(tmp_path, make_camera, ["one", "two"])
+    text = calibration.read_text().replace("[64, 48]", "[128, 96]")
+    calibration.write_text(text.replace("31.5", "63.5").replace("23.5", "47.5"))
+    for name in ("one", "two"):
+        film(tmp_path / "videos" / f"{name}.mp4")
+    _, notes = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
+    assert notes[0].startswith("one.mp4: 64 x 48 px, calibrated are 128 x 96: the calibration is")
+    before = read_calibration(calibration)["one"]
+    after = read_calibration(tmp_path / "m" / "calibration.toml")["one"]
+    assert after.image_size == (64, 48)
+    assert after.principal_point_px == pytest.approx((31.5, 23.5))
+    assert after.focal_px == pytest.approx([0.5 * focal for focal in before.focal_px])
+    calibration.write_text(text.replace("[128, 96]", "[128, 90]"))
+    with pytest.raises(InputError, match="128 x 90 px, the size in the calibration"):
+        import_videos(calibration, tmp_path / "videos", tmp_path / "n")
+
+
+def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
+    tmp_path, make_camera
+):
+    names = ["one", "two", "three"]
+    cameras = read_calibration(calibrate(tmp_path, make_camera, names))
+    folder = tmp_path / "easymocap"
+    folder.mkdir()
+    write_easymocap(folder, list(cameras.values()))
+    lens, pose = folder / "intri.yml", folder / "extri.yml"
+    lens.write_text("".join(re.findall(r"^(?![WH]_).*\n", lens.read_text(), re.MULTILINE)))
+    pose.write_text(
+        re.sub(r"(R|Rot|T)_three: .*?(?=^\S|\Z)", "", pose.read_text(), flags=re.M | re.S)
+    )
+    with pytest.raises(InputError, match="the image size of camera one"):
+        read_calibration(folder)
+    for name in names:
+        film(tmp_path / "videos" / f"{name}.mp4")
+    spec, notes = import_videos(folder, tmp_path / "videos", tmp_path / "m")
+    assert [(camera.id, camera.width) for camera in spec.cameras] == [("one", 64), ("two", 64)]
+    assert notes == ["camera three is left out: it has no pose"]
+
+
+def test_a_camera_without_a_pose_is_left_out_by_name(tmp_path, source):
+    calibration = source / "calibration.toml"
+    content = calibration.read_text()
+    lone = re.search(r"\[cam_0\].*?(?=\n\[)", content, re.DOTALL)[0]
+    lone = re.sub(r"^(rotation|translation) = .*$", r'\1 = "null"', lone, flags=re.MULTILINE)
+    third = lone.replace("cam_0", "cam_9").replace('name = "', 'name = "third_')
+    calibration.write_text(third + "\n\n" + content)
+    spec, notes = import_match(calibration, source / "detections", 25.0, tmp_path / "m")
+    assert len(spec.cameras) == 2
+    assert [note.split(":")[0] for note in notes] == [
+        f"camera third_{spec.cameras[0].id} is left out"
+    ]
+    (source / "detections" / f"third_{spec.cameras[0].id}.json").write_text("[]")
+    assert len(run(source, tmp_path / "n").cameras) == 2

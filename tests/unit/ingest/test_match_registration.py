@@ -1,6 +1,5 @@
 import hashlib
 import os
-import shutil
 import time
 
 import pytest
@@ -57,14 +56,6 @@ def test_every_file_of_the_match_is_registered_with_its_digest(folder):
     assert registered.folder == str(folder)
 
 
-def test_the_same_content_elsewhere_under_another_id_is_the_same_match(folder, tmp_path):
-    other = tmp_path / "copy"
-    shutil.copytree(folder, other)
-    text = (other / "match.yaml").read_text()
-    (other / "match.yaml").write_text(text.replace("match_id: tiny", "match_id: other"))
-    assert register(other).identity == register(folder).identity
-
-
 @pytest.mark.parametrize(
     ("name", "same"),
     [
@@ -112,14 +103,6 @@ def test_unchanged_files_are_not_read_again(folder, monkeypatch):
 
     monkeypatch.setattr(hashlib, "file_digest", refuse)
     assert register(folder, first) == first
-
-
-def test_another_folders_registration_is_no_shortcut(folder, tmp_path):
-    other = tmp_path / "copy"
-    shutil.copytree(folder, other)
-    (other / "videos" / "cam1.mp4").write_bytes(b"another video!!")
-    settle(other)  # size and time are those of the first
-    assert register(other, register(folder)).identity != register(folder).identity
 
 
 def test_an_empty_file_is_refused(folder):

@@ -54,22 +54,6 @@ def test_a_written_match_is_read_as_it_was(tmp_path, one, make_people, make_came
     ]
 
 
-def test_references_go_into_the_match_before_it_appears(tmp_path, one, make_people):
-    def write_truth(folder):
-        assert not (tmp_path / "m").exists()
-        (folder / "reference").mkdir()
-        (folder / "reference" / "joints.npz").write_bytes(b"truth")
-
-    write_match(
-        tmp_path / "m",
-        one,
-        calibrations={},
-        observations={"cam1": make_people()},
-        further=write_truth,
-    )
-    assert (tmp_path / "m" / "reference" / "joints.npz").read_bytes() == b"truth"
-
-
 def test_a_place_below_a_file_is_refused(tmp_path, one, make_people):
     (tmp_path / "file").write_bytes(b"precious")
     with pytest.raises(InputError, match="a place where a folder can be made"):
@@ -107,12 +91,6 @@ def test_a_failure_on_the_way_leaves_nothing(tmp_path, one, make_people):
             observations={"cam1": make_people()},
             further=fail,
         )
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_match_that_could_not_be_read_is_not_written(tmp_path, one):
-    with pytest.raises(InputError, match="missing camera cam1"):
-        write_match(tmp_path / "m", one, calibrations={}, observations={})
     assert list(tmp_path.iterdir()) == []
 
 

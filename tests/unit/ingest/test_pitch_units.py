@@ -47,8 +47,3 @@ def test_a_pitch_that_is_not_in_metres_is_refused(tmp_path, content, message):
 
 def test_a_pitch_of_another_size_is_taken_where_the_file_says_so(tmp_path):
     assert read(tmp_path, {"length": 61.0, "width": 43.0, "any_size": True}).length == 61.0
-
-
-def test_surveyed_points_near_the_laws_and_others_anywhere_are_taken(tmp_path):
-    points = {"corner_left_near": [-51.0, -33.0, -0.2], "dug_out": [0.0, -36.0, -0.2]}
-    assert set(read(tmp_path, {"points": points}).points) == set(points)

@@ -92,23 +92,6 @@ def test_a_trial_becomes_a_match(trial, tmp_path):
     assert given.translation == (1.0, 1.0, 5.0)
 
 
-def test_synchronised_poses_and_the_frame_range_have_precedence(trial, tmp_path):
-    for name in CAMERAS:
-        shutil.copytree(trial / "pose" / f"{name}_json", trial / "pose-sync" / f"{name}_json")
-    shutil.rmtree(trial / "pose")
-    (trial / "Config.toml").write_text("[project]\nframe_range = [11, 13]\nframe_rate = 50\n")
-    spec, _ = import_pose2sim(trial, tmp_path / "m", fps=25.0)
-    assert (spec.fps, spec.clips[0].first_frame, spec.clips[0].frame_count) == (25.0, 11, 2)
-
-
-def test_other_names_belong_to_the_cameras_in_order_and_it_says_so(trial, tmp_path):
-    cameras = {name: camera(name, x) for x, name in enumerate(("int_a", "int_b"))}
-    write_calibration_toml(trial / "calibration" / "Calib.toml", cameras)
-    spec, notes = import_pose2sim(trial, tmp_path / "m")
-    assert [one.id for one in spec.static_cameras] == ["int_a", "int_b"]
-    assert "pose: in alphabetical order, cam01_json is int_a, cam02_json is int_b" in notes
-
-
 def film(trial, size, bars=(0, 0)):
     """Videos of a size (width, height) with black bars at both sides of an axis [px]."""
     (trial / "videos").mkdir()
@@ -233,9 +216,9 @@ def spoil(trial, what):
         ("no frames", r"cam01_json: expected a .json file for each frame, found none"),
         ("not JSON", r"cam01_000010.json: expected JSON"),
         ("no people", r"cam01_000010.json: people: expected a list of at most 1000 people"),
-        ("other keypoints", r"people\[0\].pose_keypoints_2d: expected x, y .*78 \(HALPE-26\).*fo"),
+        ("other keypoints", r"people\[0\].pose_keypoints_2d: expected x, y.*26 \(HALPE-26\).*fo"),
         ("text", r"cam01_000010.json: people\[0\].pose_keypoints_2d: expected .* found 78 entries"),
-        ("infinite", r"people\[0\].pose_keypoints_2d: expected finite numbers .*found inf"),
+        ("infinite", r"people\[0\].pose_keypoints_2d: expected pixels up to .*found inf"),
         ("mixed keypoints", r"cam01_json: expected the same keypoints in all frames, found 26 in"),
         ("no number", r"first.json: expected a frame number .* Name it as cam01_000012.json"),
         ("two estimators", r"expected one file per frame, found again_10.json with the same"),

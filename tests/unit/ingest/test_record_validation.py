@@ -4,7 +4,6 @@ import pickle
 import pytest
 
 from data_contracts.match import MatchSpec
-from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.ingest.validation import validate_record
 
@@ -89,24 +88,6 @@ def test_refusal_names_key_expected_found_and_what_to_do(data, where, expected, 
     assert expected in error.expected
     assert found in error.found
     assert todo in error.todo
-
-
-def test_misspelt_key_is_named_before_the_key_that_it_leaves_missing():
-    wrong = camera()
-    wrong["hieght"] = wrong.pop("height")
-    error = refusal(match(cameras=[wrong]))
-    assert error.where == "match.yaml: cameras[0].hieght"
-    assert error.todo == "Did you mean 'height'? (1 more to correct in this file.)"
-
-
-def test_keys_of_named_entries_are_known_too():
-    error = refusal({"lines": {"half": {"strat": "a", "end": "b"}}}, PitchSpec)
-    assert error.where == "match.yaml: lines.half.strat"
-    assert "'start'" in error.todo
-
-
-def test_values_that_are_not_plain_are_refused():
-    assert "not JSON serializable" in refusal({"fps": {1, 2}}).found
 
 
 def test_refusal_travels_between_processes():

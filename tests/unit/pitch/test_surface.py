@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.pitch.template import PRIOR_STD_M, PitchTemplate, Surface
+from worldpose.pitch.template import PitchTemplate
 
 
 def test_surface_falls_to_touch_lines_and_goal_lines():
@@ -38,21 +38,3 @@ def test_derivatives_of_samples_are_those_of_their_heights():
     other = pitch.with_surface(pitch.surface + change)
     here, there = (each.sample_lines(1.0).points_world[:, 2] for each in (pitch, other))
     assert there - here == pytest.approx(pitch.samples_by_surface(1.0) @ change, abs=1e-12)
-
-
-def test_without_heights_the_surface_is_that_of_the_file_within_what_builders_make():
-    known = Surface.of(PitchTemplate.from_spec(PitchSpec(crown=0.3)))
-    assert known.shape.tolist() == [0.3, 0.0]
-    assert np.sqrt(np.diag(known.covariance)) == pytest.approx(PRIOR_STD_M)
-
-
-def test_surveyed_heights_tell_the_surface():
-    rng = np.random.default_rng(0)
-    true = PitchTemplate.from_spec(PitchSpec(crown=0.15, end_fall=0.35))
-    points = {
-        name: (x, y, z + 0.01 * rng.standard_normal()) for name, (x, y, z) in true.points.items()
-    }
-    known = Surface.of(PitchTemplate.from_spec(PitchSpec(crown=0.2, points=points)))
-    std = np.sqrt(np.diag(known.covariance))
-    assert (std < 0.02).all()
-    assert (np.abs(known.shape - true.surface) < 3.0 * std).all()

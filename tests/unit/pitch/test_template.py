@@ -67,28 +67,6 @@ def test_template_is_symmetric_about_both_axes(standard):
             np.testing.assert_allclose(twin, place * np.where(np.arange(3) == axis, -1.0, 1.0))
 
 
-def test_crown_falls_from_the_long_axis_to_the_touch_lines_and_beyond(standard):
-    # A parabola: 0 on the axis, a quarter of 0.2 m at half the way, four times as much at twice.
-    height = standard.height([0.0, 40.0, 10.0, -60.0], [0.0, 17.0, -34.0, 68.0])
-    np.testing.assert_allclose(height, [0.0, -0.05, -0.2, -0.8], atol=ROUNDING)
-    assert standard.height(0.0, [[1.0], [2.0]]).shape == (2, 1)
-    assert np.isnan(standard.height([np.nan, 0.0], [0.0, np.nan])).all()
-
-
-def test_all_markings_together_have_the_length_of_law_1(flat):
-    samples = flat.sample_lines(0.005)
-    lengths = [
-        extent(samples.points_world[samples.marking == i]) for i in range(len(samples.names))
-    ]
-    straight = 2 * 105 + 3 * 68 + 2 * (40.32 + 2 * 16.5) + 2 * (18.32 + 2 * 5.5)
-    opening = 2 * math.acos(5.5 / 9.15)
-    curved = 2 * math.pi * 9.15 + 2 * opening * 9.15 + 4 * 0.5 * math.pi * 1.0
-    # The circle's last step, at most 5 mm, is left out; chords are shorter by 1e-8 of an arc.
-    assert sum(lengths) == pytest.approx(straight + curved, abs=0.0055)
-    # Outer lines 4, halfway 1, areas 4 of 3; circle 1, penalty arcs 2, corner arcs 4.
-    assert len(samples.names) == 4 + 1 + 12 + 1 + 2 + 4
-
-
 def test_penalty_arcs_begin_and_end_on_the_line_of_the_area(standard):
     for side, inward in (("left", 1.0), ("right", -1.0)):
         arc = marking(standard, f"penalty_arc_{side}")
@@ -100,21 +78,6 @@ def test_penalty_arcs_begin_and_end_on_the_line_of_the_area(standard):
         radius = np.linalg.norm(arc[:, :2] - standard.points[f"penalty_mark_{side}"][:2], axis=1)
         np.testing.assert_allclose(radius, 9.15, atol=ROUNDING)
         assert np.abs(arc[:, 0]).min() == pytest.approx(52.5 - 20.15, abs=0.01)
-
-
-def test_samples_follow_the_crown_at_the_spacing(standard):
-    samples = standard.sample_lines(0.25)
-    points = samples.points_world
-    np.testing.assert_allclose(
-        points[:, 2], standard.height(points[:, 0], points[:, 1]), atol=1e-13
-    )
-    assert np.all(np.diff(samples.marking) >= 0)
-    assert set(samples.marking) == set(range(len(samples.names)))
-    gaps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)[np.diff(samples.marking) == 0]
-    assert gaps.max() <= 0.25 + ROUNDING
-    # 105 m and 68 m in steps of 0.25 m: both are whole numbers of steps.
-    assert len(marking(standard, "touch_line_far", 0.25)) == 421
-    assert len(marking(standard, "halfway_line", 0.25)) == 273
 
 
 def test_surveyed_points_replace_nominal_ones_and_carry_their_markings():
@@ -186,25 +149,6 @@ def test_impossible_pitches_are_refused(spec, message):
         PitchTemplate.from_spec(spec)
 
 
-def test_goals_can_be_drawn_and_are_not_painted(standard):
-    post = standard.marking_points("goal_post_left_near", 0.5)
-    ends = standard.positions(["goal_post_left_near_bottom", "goal_post_left_near_top"])
-    np.testing.assert_array_equal(post[[0, -1]], ends)
-    assert len(post) == 6  # 2.44 m in steps of at most 0.5 m
-    assert not set(standard.goals) & set(standard.sample_lines(1.0).names)
-    assert set(standard.marking_names) == {*standard.goals, *standard.sample_lines(1.0).names}
-
-
-def test_unknown_names_and_spacings_are_refused(standard):
-    with pytest.raises(InputError, match="expected the name of a point, found 'corner'"):
-        standard.positions(["corner"])
-    with pytest.raises(InputError, match="'crossbar'"):
-        standard.marking_points("crossbar", 1.0)
-    for spacing in (0.0, -1.0, math.nan):
-        with pytest.raises(InputError, match="positive distance"):
-            standard.sample_lines(spacing)
-
-
 def test_edges_of_mowing_stripes_have_names_on_either_half_and_no_paint(standard):
     spec = PitchSpec(crown=0.1, stripes={"spacing": 5.5})
     pitch = PitchTemplate.from_spec(spec)
@@ -220,14 +164,3 @@ def test_edges_of_mowing_stripes_have_names_on_either_half_and_no_paint(standard
     first = PitchTemplate.from_spec(PitchSpec(stripes={"spacing": 10.0, "first": 2.5}))
     assert [float(first.points[f"stripe_left_{n}_far"][0]) for n in (1, 5)] == [-50.0, -10.0]
     assert "stripe_left_6" not in first.unpainted  # the halfway line has its own name
-
-
-def test_a_line_of_ones_own_is_painted_unless_it_says_otherwise():
-    points = {"a": (-40.0, 0.0), "b": (40.0, 0.0)}
-    lines = {
-        "white": LineSpec(start="a", end="b"),
-        "edge": LineSpec(start="a", end="b", painted=False),
-    }
-    pitch = PitchTemplate.from_spec(PitchSpec(points=points, lines=lines))
-    assert "white" in pitch.white_names and "edge" not in pitch.white_names
-    assert {"white", "edge"} <= set(pitch.marking_names)

@@ -5,16 +5,13 @@ import json
 import cv2
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from worldpose.reports.drawing import (
-    GRASS,
     WIDTH,
     figure_data,
     picture_panels,
     png,
-    show_image,
     write_figure,
 )
 
@@ -96,23 +93,3 @@ def test_a_picture_is_shown_at_its_places_in_every_size(across):
     for x, y in [(20, 30), (770, 450), (1500, 880)]:
         u, v = (corner + (np.array([x, y]) + 0.5) * across / WIDTH).astype(int)
         np.testing.assert_allclose(shown[top + y, x], still[v, u], atol=2)
-
-
-def test_beyond_the_picture_there_is_plain_ground():
-    still = coded_places(100, 200)
-    figure, (axes,) = picture_panels(["edge"], (150.0, 50.0), (100.0, 100.0), still=still)
-    shown = drawn(figure)
-    ground = (np.array(to_rgb(GRASS)) * 255).round()
-    np.testing.assert_allclose(shown[-20, -20], ground, atol=1)
-    np.testing.assert_allclose(shown[-1520, 20], still[51, 151], atol=2)
-    assert not picture_panels(["off"], (300.0, 0.0), (50.0, 50.0), still=still)[1][0].images
-    assert len(axes.images) == 1
-
-
-def test_a_grey_picture_is_grey_and_goes_into_vector_files(tmp_path):
-    figure, (axes,) = picture_panels(["grey"], (-0.5, -0.5), (200, 100))
-    show_image(axes, coded_places(100, 200)[..., 0])
-    shown = drawn(figure)[60:-5, 5:-5]
-    assert (shown.max(-1) == shown.min(-1)).all() and np.ptp(shown) > 240
-    svg, pdf, _ = write_figure(figure, tmp_path / "a", "grey")
-    assert "data:image/png" in svg.read_text() and b"/Image" in pdf.read_bytes()

@@ -1,9 +1,9 @@
 """Markings and people drawn over images, where their camera has them."""
 
 import numpy as np
+from camera_builders import look_at_camera
 
 from data_contracts.conventions import COCO17
-from data_contracts.pitch import PitchSpec
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
@@ -11,20 +11,12 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.videos import overlay_frames
-from worldpose.simulation.scene import look_at
 
 SIZE = (322, 182)
 
 
 def camera(frames, focal=600.0):
-    pose = look_at(np.array([0.0, -60.0, 20.0]), np.array([0.0, 0.0, 0.0]), 0.0)
-    one = Camera(
-        focal=np.array([focal, focal]),
-        principal_point=np.array([160.5, 90.5]),
-        distortion=np.zeros(5),
-        cam_from_world=pose,
-        image_size=np.array(SIZE),
-    )
+    one = look_at_camera((0.0, -60.0, 20.0), (0.0, 0.0, 0.0), focal, SIZE)
     return Camera.stack([one] * frames)
 
 
@@ -61,14 +53,6 @@ def test_a_bone_is_where_the_camera_has_it():
     np.testing.assert_allclose([columns.max(), rows.max()], high, atol=1.6)
 
 
-def test_markings_are_drawn_where_there_is_a_pitch():
-    picture = drawn([11], pitch=PitchSpec())[0]
-    mark = 0.5 * camera(1)[0].project(np.array([[0.0, 5.0, 0.0]]))[0] - 0.25
-    # The halfway line, 5 m beyond the centre mark.
-    x, y = np.rint(mark).astype(int)
-    assert picture[y - 1 : y + 2, x - 1 : x + 2].any()
-
-
 def standing(places, ids):
     """People at positions (persons, 2) [m] in frame 10 and absent in frame 11."""
     model = load_open_body()
@@ -99,18 +83,3 @@ def test_bodies_are_seen_through_and_replace_bones():
     assert bones[middle([0.0, 0.0])].max() == 0
     assert 40 < skin[middle([0.0, 0.0])].max() < 0.75 * 255
     assert not drawn([11], people=people, bodies=bodies, focal=CLOSE)[0].any()
-
-
-def test_who_has_no_body_keeps_his_bones():
-    people, bodies = standing([[1.3, 0.0], [-1.3, 0.0]], [0, 1])
-    lost = bodies.poses.transl.copy()
-    lost[:, 1] = np.nan
-    poses = BodyParameters(
-        bodies.poses.betas, bodies.poses.global_orient, bodies.poses.body_pose, lost
-    )
-    one = BodyTracks(bodies.frames, bodies.person_ids, poses, bodies.model)
-    picture = drawn([10], people=people, bodies=one, focal=CLOSE)[0].astype(int)
-    expected = drawn([10], people=people, focal=CLOSE)[0].astype(int)
-    np.testing.assert_array_equal(picture[:, :80], expected[:, :80])
-    assert picture[:, :80].any()
-    assert (picture[:, 80:] != expected[:, 80:]).any()

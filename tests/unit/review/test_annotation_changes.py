@@ -56,12 +56,6 @@ def test_moved_hidden_found_added_and_deleted_are_told_apart():
     assert added.keypoints[2:4] == ((4.0, 5.0), None)
 
 
-def test_a_changed_box_of_somebody_who_was_there_is_told():
-    wider = replace(person(0), box=np.array([0.0, 0.0, 50.0, 34.0]))
-    changes = find_changes(BEFORE, [picture(wider, person(7))], "file")
-    assert (changes.edits, changes.boxes) == ((), 1)
-
-
 @pytest.mark.parametrize(
     ("back", "found"),
     [

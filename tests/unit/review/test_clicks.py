@@ -1,6 +1,5 @@
 """Corrections lie over what was clicked; what no longer applies is said, and nothing is lost."""
 
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -112,16 +111,6 @@ def test_a_marking_is_drawn_anew_removed_and_added(folder):
     assert [marking.xy for marking in drawn["a"].drawn] == [new]
     assert [marking.xy for marking in drawn["b"].drawn] == [new]
     assert replay_corrections(folder, made(again, removed)).folder.clicked["a"].drawn == ()
-
-
-def test_a_point_clicked_anew_in_the_folder_is_not_moved_back(folder):
-    """And what was built on that correction does not apply either."""
-    corrections = made(moved((9.0, 9.0), (1.0, 2.0)), moved((8.0, 8.0), (9.0, 9.0)))
-    clicked = {**folder.clicked, "a": clicks((CORNER, (2.0, 2.0)))}
-    replay = replay_corrections(replace(folder, clicked=clicked), corrections)
-    assert points(replay.folder.clicked["a"]) == {CORNER: (2.0, 2.0)}
-    assert [correction.id for correction, _ in replay.stale] == ["c0", "c1"]
-    assert "was (1.0, 2.0) when it was corrected, and is (2.0, 2.0) now" in replay.stale[0][1]
 
 
 def added(box, nose=None):

@@ -1,16 +1,13 @@
 """Evidence for a reviewer: metrics over frames, unreviewed detections, views of other cameras."""
 
-from datetime import UTC, datetime
-
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from data_contracts.review import Acceptance, DeletedDetection
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
-from worldpose.review.evidence import check_views, clip_curves, epipolar_curves, open_detections
+from worldpose.review.evidence import check_views, clip_curves, epipolar_curves
 
 
 def test_each_frame_is_counted_on_its_own():
@@ -30,59 +27,12 @@ def test_each_frame_is_counted_on_its_own():
     np.testing.assert_allclose(apart, [0.02 / 3**0.5] * 2 + [np.nan])
 
 
-FRAME = np.arange(10, 13)
-SCORE = np.array([[0.9, 0.2, np.nan], [0.5, np.nan, np.nan], [0.7, 0.2, 0.6]], dtype=np.float32)
-
-
-def left(*acceptances, edits=()):
-    found = open_detections(FRAME, SCORE, acceptances, edits)
-    assert found.people == 6
-    return list(zip(found.frame.tolist(), found.detection.tolist(), strict=True))
-
-
-def accepted(**what):
-    return Acceptance(
-        id="a", match_id="m", results={}, who="Ada", accepted_at=datetime.now(UTC), **what
-    )
-
-
-def test_all_are_left_in_the_order_of_their_scores():
-    assert left() == [(10, 1), (12, 1), (11, 0), (12, 2), (12, 0), (10, 0)]
-    found = open_detections(np.arange(0), np.empty((0, 4), dtype=np.float32), [accepted()], ())
-    assert (len(found.frame), found.people) == (0, 0)
-
-
-def test_everybody_at_least_as_certain_is_accepted_at_once():
-    # A threshold as the page shows it is the score itself, though that is stored coarser.
-    assert left(accepted(at_least=0.6)) == [(10, 1), (12, 1), (11, 0)]
-    assert left(accepted(at_least=0.0)) == []
-    assert left(accepted()) == left()
-
-
-def test_who_was_named_or_corrected_was_looked_at():
-    taken_out = DeletedDetection(camera="a", frame=12, detection=2)
-    beyond = DeletedDetection(camera="a", frame=99, detection=2)
-    named = accepted(people=((10, 1), (11, 0), (11, 7), (9, 0)))
-    assert left(named, edits=[taken_out, beyond]) == [(12, 1), (12, 0), (10, 0)]
-
-
 SIZE = np.array([1920, 1080])
 
 
-def camera(center, target, distortion=(-0.25, 0.08, 1e-3, -5e-4, 0.0), focal=1800.0):
-    """A camera that looks at a place, its image's bottom towards the ground."""
-    center, target = np.array(center, dtype=float), np.array(target, dtype=float)
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(
-        focal=np.array([focal, focal * 1.001]),
-        principal_point=np.array([955.0, 545.0]),
-        distortion=np.array(distortion),
-        cam_from_world=Rigid(rotation=rotation, translation=-rotation @ center),
-        image_size=SIZE,
-    )
+def camera(center, target):
+    lens = (-0.25, 0.08, 1e-3, -5e-4, 0.0)
+    return look_at_camera(center, target, (1800.0, 1801.8), middle=(955.0, 545.0), lens=lens)
 
 
 CAMERAS = [
@@ -127,22 +77,6 @@ def test_what_a_pixel_may_show_lies_on_its_curve_in_the_other_picture(x, y, z, p
     for line in lines:
         assert (line >= -0.5).all() and (line <= SIZE - 0.5).all()
         assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 12.0
-
-
-def test_a_ray_that_no_joint_can_be_on_has_no_curve():
-    sky = camera((0.0, -50.0, 10.0), (0.0, 0.0, 40.0))
-    assert epipolar_curves(sky, CAMERAS[1], (960.0, 100.0)) == []
-    away = camera((45.0, -48.0, 15.0), (200.0, -200.0, 1.0))
-    assert epipolar_curves(CAMERAS[0], away, (960.0, 540.0)) == []
-
-
-def test_a_level_ray_at_the_height_of_joints_is_followed_as_far_as_a_stadium_goes():
-    level = camera((-60.0, 0.0, 1.5), (0.0, 0.0, 1.5), distortion=(0.0,) * 5)
-    lines = epipolar_curves(level, CAMERAS[1], level.principal_point)
-    truth = CAMERAS[1].project(np.array([[-10.0, 0.0, 1.5], [5.0, 0.0, 1.5]]))
-    assert all(distance_to_polylines(place, lines) < 0.02 for place in truth)
-    high = camera((-60.0, 0.0, 9.0), (0.0, 0.0, 9.0), distortion=(0.0,) * 5)
-    assert epipolar_curves(high, CAMERAS[1], high.principal_point) == []
 
 
 @pytest.fixture

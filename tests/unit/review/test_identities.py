@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import xarray as xr
 from hypothesis import given as given_that
 from hypothesis import strategies as st
 
@@ -13,7 +12,6 @@ from worldpose.review.identities import (
     add_plane_tracks,
     find_sighting,
     replay_identities,
-    select_triangulated,
 )
 
 FIRST = 100
@@ -84,15 +82,6 @@ def test_what_was_merged_wrongly_is_split_again():
     assert np.array_equal(after.detection_index[:, :, order], before.detection_index)
     assert np.array_equal(after.joints[:, order], before.joints, equal_nan=True)
     assert [(join.before, join.after) for join in after.joins] == [(0, 3)]
-
-
-def test_a_name_goes_with_the_person():
-    named = NamedTrack(clip="clip", person=1, name="home-7")
-    assert replay_identities(identities(), [named]).identities.tracks[1].name == "home-7"
-    after = replay_identities(identities(), [named, merge(0, 1)]).identities
-    assert after.tracks[0].name == "home-7"
-    again = replay_identities(after, [NamedTrack(clip="clip", person=0, name=None)]).identities
-    assert again.tracks[0].name is None
 
 
 HERE = Sighting(camera="a", frame=FIRST, detection=0)
@@ -172,32 +161,3 @@ def test_people_on_the_plane_are_added_and_triangulated_ones_continued():
     assert [track.plane_frames for track in found.tracks] == [2, 0, 0, 5]
     assert (found.tracks[0].first_frame, found.tracks[0].last_frame) == (0, 4)
     np.testing.assert_array_equal(found.joints[:, :3], before.joints)
-
-
-def test_triangulation_takes_the_detections_that_it_took_without_people_on_the_plane():
-    found, before = mixed_identities(), identities()
-    ground = np.where(found.on_plane[..., None], 1.0, np.nan) * np.ones(2)
-    stored = xr.Dataset(
-        {
-            "detection_index": (("frame", "camera", "person"), found.detection_index),
-            "ground": (("frame", "person", "axis"), ground),
-        },
-        coords={"frame": found.frame, "person": found.person},
-        attrs={"tracks": [track.model_dump(mode="json") for track in found.tracks]},
-    )
-    chosen = select_triangulated(stored)
-    np.testing.assert_array_equal(chosen["person"].values, before.person)
-    np.testing.assert_array_equal(chosen["detection_index"].values, before.detection_index)
-    assert chosen["detection_index"].dtype == np.int16
-    chosen = select_triangulated(stored.sel(frame=found.frame[::2]))
-    np.testing.assert_array_equal(chosen["detection_index"].values, before.detection_index[::2])
-
-
-def test_edits_keep_the_kind_of_every_frame():
-    found = mixed_identities()
-    found.detection_index[3:5, 1, 1] = -1  # else one camera sees both people side by side
-    merged = replay_identities(found, [merge(0, 1)]).identities
-    # Person 1 is tracked in 3D in the frames in which the feet placed person 0.
-    assert merged.tracks[0].kind == "triangulated"
-    parts = replay_identities(found, [split(0, FIRST + 3)]).identities.tracks
-    assert (parts[0].kind, parts[-1].kind) == ("triangulated", "plane")

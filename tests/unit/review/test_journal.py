@@ -6,7 +6,7 @@ from multiprocessing import get_context
 
 import pytest
 
-from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest, Withdrawal
+from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest
 from worldpose.errors import CorruptionError, StoreError
 from worldpose.review.journal import append, last_decision, read_journal, requests_by_id, say
 from worldpose.store.integrity import verify
@@ -85,18 +85,6 @@ def test_a_last_entry_cut_short_at_any_byte_is_told_and_ignored(store):
     assert said(read_journal(store, "m")) == ["a", "b", "c"]
 
 
-def test_the_journal_goes_on_after_an_entry_cut_short(store):
-    say(store, "m", lambda _: [correction("a")])
-    say(store, "m", lambda _: [correction("b")])
-    last = files(store)[-1]
-    last.write_bytes(last.read_bytes()[:-10])
-    say(store, "m", lambda _: [correction("c")])
-    journal = read_journal(store, "m")
-    assert said(journal) == ["a", "c"]
-    assert [entry.number for entry in journal.entries] == [1, 3]
-    assert len(journal.damage) == 1
-
-
 @pytest.mark.parametrize("harm", ["cut", "gone"])
 def test_an_entry_that_later_ones_build_on_is_missed(store, harm):
     for name in "abc":
@@ -111,20 +99,6 @@ def test_an_entry_that_later_ones_build_on_is_missed(store, harm):
         read_journal(Store.open(store.url), "m")  # another process, which has read nothing yet
     assert said(read_journal(store, "m")) == ["a", "b", "c"], "this one has"
     assert "000003" in verify(store)[-1].path
-
-
-def test_a_journal_that_was_restored_or_made_again_is_read_anew(store):
-    for name in "abc":
-        say(store, "m", lambda _, name=name: [correction(name)])
-    for file in files(store)[1:]:
-        file.unlink()  # back to a copy of before
-    assert said(read_journal(store, "m")) == ["a"]
-    for file in files(store):
-        file.unlink()
-    other = Store.open(store.url)
-    for name in "xyz":
-        say(other, "m", lambda _, name=name: [correction(name)])
-    assert said(read_journal(store, "m")) == ["x", "y", "z"], "the same numbers, other content"
 
 
 def test_many_processes_at_once_lose_and_double_nothing(store):
@@ -143,14 +117,6 @@ def say_ten(url, writer):
     store = Store.open(url)
     for number in range(10):
         say(store, "m", lambda _, number=number: [correction(f"{writer}.{number}")])
-
-
-def test_an_entry_of_another_place_is_refused(store):
-    say(store, "m", lambda _: [correction("a")])
-    first = files(store)[0]
-    first.rename(first.with_name("000002.json"))
-    with pytest.raises(CorruptionError, match="is entry 1"):
-        read_journal(store, "m")
 
 
 def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch):
@@ -209,20 +175,3 @@ def test_the_last_verdict_on_the_same_bytes_counts(store):
     records = tuple(read_journal(store, "m").records)
     assert last_decision(records, "tracking/clip", one).verdict == "approve"
     assert list(requests_by_id(records)) == ["q1", "q2"]
-
-
-def test_what_a_journal_says_is_gathered_as_it_grows(store):
-    """Read at once, read piece by piece, and as `append` gives it."""
-    journal = read_journal(store, "m")
-    back = Withdrawal(match_id="m", correction="a", who="Ada", withdrawn_at=NOW)
-    for records in (
-        [request("q1", "1" * 64), correction("a")],
-        [correction("b"), decision("q1", "approve")],
-        [back, correction("c")],
-    ):
-        journal = append(store, journal, records)
-        assert read_journal(store, "m") == journal
-    assert read_journal(Store.open(store.url), "m") == journal
-    assert [*journal.standing] == ["b", "c"]
-    assert [*journal.corrections] == ["a", "b", "c"]
-    assert [each.kind for each in journal.questions] == ["request", "decision"]

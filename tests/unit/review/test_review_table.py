@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 from types import SimpleNamespace
 
 from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest, Withdrawal
-from flows.reports.report import MAX_ROWS, review_table
+from flows.reports.report import review_table
 
 NOW = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
 ASKED = ReviewRequest(
@@ -65,10 +65,3 @@ def test_first_clicks_of_a_person_in_a_camera_are_one_row():
         ("Bob", "corrected", table.rows[2][3]),
         ("Ada", "clicked", "1 marking in cam00"),
     ]
-
-
-def test_nobody_who_said_anything_is_no_table_and_many_are_cut():
-    assert said(ASKED) == []
-    (table,) = said(ASKED, *[decision("approve")] * (MAX_ROWS + 3))
-    assert len(table.rows) == MAX_ROWS
-    assert "3 came before" in table.heading

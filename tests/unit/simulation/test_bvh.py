@@ -76,9 +76,3 @@ def test_positions_are_those_worked_out_by_hand(tmp_path):
 def test_what_is_wrong_is_said(old, new, found, tmp_path):
     with pytest.raises(InputError, match=found):
         read_bvh(written(tmp_path, ARM.replace(old, new, 1)))
-
-
-def test_a_file_that_is_no_text_is_refused(tmp_path):
-    (tmp_path / "b.bvh").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError):
-        read_bvh(tmp_path / "b.bvh")

@@ -10,31 +10,15 @@ import pytest
 from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_joints
 from worldpose.ingest.match_folder import read_match
-from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.foreign import rigs as foreign_rigs
 from worldpose.simulation.foreign.detectors import (
     PROFILES,
-    DetectorProfile,
-    defined_joints,
-    detect_people,
-    draw_detector,
 )
-from worldpose.simulation.foreign.matches import simulate_foreign_match, simulate_foreign_scene
-from worldpose.simulation.foreign.rigs import view_people
+from worldpose.simulation.foreign.matches import simulate_foreign_match
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 
 SOURCES = Path(foreign_rigs.__file__).parent
 LAB, MIXED = FOREIGN_SCENARIOS["foreign-lab"], FOREIGN_SCENARIOS["foreign-mixed"]
-EXACT = DetectorProfile(
-    name="exact",
-    **dict.fromkeys(
-        ("definition", "personal", "view_bias", "height_bias", "noise", "floor", "swapped")
-        + ("strayed", "joint_missed", "person_missed", "smallest", "merged", "ghosts", "flashes")
-        + ("duplicates",),
-        0.0,
-    ),
-    hidden_kept=1.0,
-)
 
 
 def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
@@ -53,52 +37,6 @@ def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
     assert not any(
         name.startswith(("worldpose.body", "worldpose.body_fitting")) for name in imported
     )
-
-
-def test_an_exact_detector_reports_exact_pixels_of_the_truth():
-    scene = simulate_foreign_scene(LAB, 3, duration=0.3)
-    detector = draw_detector(EXACT, np.random.default_rng(0))
-    statures = np.array([person.skeleton.stature for person in scene.people])
-    joints = scene.truth.joints
-    personal = np.zeros((joints.shape[1], 17, 3))
-    assert defined_joints(joints, detector, personal) == pytest.approx(joints, abs=1e-12)
-    for camera in scene.cameras.values():
-        view = view_people(camera, joints, statures, None)
-        report = detect_people(
-            *(detector, view, camera.project(joints), camera.camera.image_size, scene.fps, 0.0),
-            np.random.default_rng(1),
-        )
-        frame, place = np.nonzero(report.person >= 0)
-        found = report.observations.keypoints[frame, place]
-        true = camera.project(joints)[frame, report.person[frame, place]]
-        there = np.isfinite(found[..., 0])
-        assert there.mean() > 0.2
-        assert found[there] == pytest.approx(true[there], abs=1e-3)
-
-
-def test_errors_have_the_size_that_the_profile_states():
-    profile = EXACT.model_copy(update={"noise": 0.02, "sudden": 0.5, "tail": 3.5, "limbs": 0.45})
-    scene = simulate_foreign_scene(LAB, 11, duration=4.0, people=1)
-    detector = draw_detector(profile, np.random.default_rng(0))
-    name, camera = next(iter(scene.cameras.items()))
-    joints = scene.truth.joints
-    statures = np.array([scene.people[0].skeleton.stature])
-    view = view_people(camera, joints, statures, None)
-    true = camera.project(joints)
-    off = []
-    for seed in range(20):
-        report = detect_people(
-            *(detector, view, true, camera.camera.image_size, scene.fps, 0.0),
-            np.random.default_rng(seed),
-        )
-        frame, place = np.nonzero(report.person == 0)
-        error = report.observations.keypoints[frame, place] - true[frame, 0]
-        size = view.size[frame, 0]
-        stated = 0.02 * size * (size / 100.0) ** -0.3
-        open_ = ~view.behind_self[frame, 0]
-        off.append((error[:, 7] / stated[:, None])[open_[:, 7]])
-    spread = np.nanstd(np.concatenate(off))
-    assert 0.75 < spread < 1.25, name
 
 
 def content(folder):
@@ -140,23 +78,3 @@ def test_every_scenario_makes_a_match_that_the_factory_takes(tmp_path, name):
         file = tmp_path / "match" / "reference" / "cameras" / f"{camera.id}.npz"
         pixels = read_camera(file, size).project(truth.joints.reshape(-1, 3))
         assert np.isfinite(pixels).any()
-
-
-def test_clicked_cameras_have_clicks_near_the_named_points():
-    scenario = FOREIGN_SCENARIOS["foreign-match"].model_copy(update={"given": 0.0})
-    off, cameras = [], 0
-    for seed in range(3):
-        scene = simulate_foreign_scene(scenario, seed, duration=0.2)
-        painted = PitchTemplate.from_spec(scene.pitch.painted)
-        assert scene.given == {}
-        for name, markings in scene.clicked.items():
-            cameras += len(markings.points) >= 6
-            for point in markings.points:
-                if point.name in scene.misnamed[name]:
-                    continue
-                place = scene.cameras[name].project(painted.positions([point.name]))[0]
-                off.append(np.subtract(point.xy, place))
-    assert cameras > 0.8 * 24
-    off = np.array(off)
-    assert 0.3 < np.median(np.abs(off)) / 0.6745 < 1.3
-    assert np.abs(off).max() > 4.0 * np.median(np.abs(off))  # heavy tails

@@ -1,15 +1,10 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.simulation.gait import walk
 from worldpose.simulation.matches import MatchOptions, simulate_match
-from worldpose.simulation.paths import MARGIN, STEP, GroundPath
-from worldpose.simulation.recordings import NAMES, clip_path, read_clip, read_trajectories
+from worldpose.simulation.recordings import read_clip, read_trajectories
 from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.simulation.skeletons import draw_body
 
 FRAMES = 120
 
@@ -43,46 +38,9 @@ def save(path, joints):
     return path
 
 
-def stood(heading=0.0, x=0.0, y=0.0):
-    time = np.arange(round((4.0 + 2 * MARGIN) / STEP) + 1) * STEP - MARGIN
-    return GroundPath(
-        time, np.tile([x, y], (len(time), 1)), np.full(len(time), heading), np.zeros(len(time))
-    )
-
-
 @pytest.fixture
 def file(tmp_path):
     return save(tmp_path / "walk.npz", captured())
-
-
-def same_build():
-    """A body with the skeleton's own lengths [m]."""
-    body = draw_body((1.8, 1.8), np.random.default_rng(0))
-    lengths = {"thigh": 0.40, "shank": 0.41, "upper_arm": 0.28, "forearm": 0.26, "trunk": 0.50}
-    return replace(body, **lengths, hip_half_width=0.09, shoulder_half_width=0.18)
-
-
-def test_a_played_clip_has_the_files_joints(file):
-    clip, body = read_clip(file), same_build()
-    path = clip_path(clip, stood(), body)
-    times = np.arange(60) / 60.0
-    joints, _ = walk(body, path, times, lambda x, y: 0.0 * x, np.random.default_rng(0))
-    order = [spelling for spellings in NAMES.values() for spelling in spellings[:1]][:12]
-    expected = np.stack([captured()[name][:60] for name in order], axis=1)
-    # y up, facing z, in centimetres, becomes z up, facing x, in metres.
-    expected = 0.01 * expected[..., [2, 0, 1]]
-    shift = joints[:, 5:] - expected
-    # One shift for all: the start is at the origin and the floor at the ground.
-    np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-8)
-    np.testing.assert_allclose(shift[0, 0, :2], 0.0, atol=1e-8)
-    assert joints[:, 15:, 2].min() == pytest.approx(0.08, abs=0.02)
-
-
-@pytest.mark.parametrize("scale", [0.01, 0.393701, 10.0, 0.177165])
-def test_units_are_told_by_the_length_of_legs(scale, file, tmp_path):
-    other = read_clip(save(tmp_path / "other.npz", captured(scale)))
-    # Inches and the CMU unit are given here to six digits.
-    np.testing.assert_allclose(other.points, read_clip(file).points, atol=1e-4)
 
 
 def test_a_joint_or_rate_that_is_missing_is_named(tmp_path):
@@ -105,24 +63,6 @@ def tracked(path, **changes):
     content = {"xy": np.stack([runner, keeper], axis=1), "time": TIME + 100.0, **changes}
     np.savez(path, **{name: value for name, value in content.items() if value is not None})
     return path
-
-
-def test_paths_follow_the_data(tmp_path):
-    (runner, keeper), length = read_trajectories(tracked(tmp_path / "t.npz"), 60.0)
-    assert length == pytest.approx(5.9, abs=1e-9)
-    assert runner.time[0] == pytest.approx(-MARGIN)
-    assert runner.time[-1] == pytest.approx(length + MARGIN, abs=0.01)
-    inner = (runner.time >= 0.5) & (runner.time <= 5.4)
-    # Smoothing leaves a straight run as it is; its ends are coasted half a second further in.
-    np.testing.assert_allclose(
-        runner.position[inner],
-        np.stack([4 * runner.time - 10, 0 * runner.time + 5], -1)[inner],
-        atol=1e-3,
-    )
-    np.testing.assert_allclose(runner.speed[inner], 4.0, atol=0.01)
-    np.testing.assert_allclose(runner.heading, 0.0, atol=1e-8)
-    np.testing.assert_allclose(keeper.position, np.tile([-50.0, 1.0], (len(keeper.time), 1)))
-    assert keeper.speed.max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -148,7 +88,7 @@ def test_a_match_is_driven_by_them_and_its_id_names_the_file(tmp_path):
         SCENARIOS["match"],
         1,
         tmp_path / "m",
-        MatchOptions(duration=0.4, cameras=2, trajectories=file),
+        MatchOptions(duration=0.4, cameras=2, stills=False, video=False, trajectories=file),
     )
     assert spec.match_id.startswith("match-1-0.4s-2cameras-tracks")
     assert spec.clips[0].frame_count == 20

@@ -4,14 +4,14 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from camera_builders import look_at_camera
 
 from data_contracts.cameras import LensCalibration
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.simulation.scene import look_at, place_camera
+from worldpose.simulation.scene import place_camera
 from worldpose.static_calibration.from_paint.paint import Ridges, guess_lens, straighten_paint
 from worldpose.static_calibration.parameters import step_between
 
@@ -22,13 +22,7 @@ DISTORTION = np.array([-0.30, 0.12, 0.002, -0.001, -0.02])
 
 def pinhole(center, aim, focal, size=(1280, 720), k1=0.0, roll=0.0):
     """A camera at a place that looks at another, with its principal point in the middle."""
-    return Camera(
-        focal=np.array([focal, focal]),
-        principal_point=0.5 * (np.array(size) - 1.0),
-        distortion=np.array([k1, 0.0, 0.0, 0.0, 0.0]),
-        cam_from_world=look_at(np.array(center), np.array(aim), roll),
-        image_size=np.array(size),
-    )
+    return look_at_camera(center, aim, focal, size, lens=(k1, 0.0, 0.0, 0.0, 0.0), roll=roll)
 
 
 def paint_of(camera, names, pitch=PITCH):

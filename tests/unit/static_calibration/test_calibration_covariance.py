@@ -12,7 +12,7 @@ from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 SPREAD_OUT = ClickSettings()

@@ -13,9 +13,7 @@ from clicking_people import (
     wide_camera,
 )
 
-from worldpose.static_calibration.calibration import calibrate_camera
-from worldpose.static_calibration.from_paint.paint import guess_lens
-from worldpose.static_calibration.parameters import drop_k3
+from worldpose.static_calibration.estimate import calibrate_camera
 
 
 def test_a_known_lens_lowers_the_ground_error_of_few_clicks():
@@ -45,21 +43,3 @@ def test_a_lens_that_the_clicks_contradict_makes_the_camera_weak():
         report = calibrate_camera(PITCH, clicked, SIZE, lens=lens_of(camera, rng, focal)).report
         found = [each for each in report.reasons if "contradict the given lens" in each]
         assert bool(found) == contradicted, report.reasons
-
-
-def test_k1_and_k2_bend_an_image_as_a_guessed_lens_with_k3_does():
-    guessed = guess_lens(-0.22, SIZE)
-    plain = drop_k3(guessed)
-    assert plain.distortion[4] == 0.0
-    np.testing.assert_array_equal(plain.distortion[2:4], guessed.distortion[2:4])
-    straight = np.linspace(0.0, 1.2, 60)[:, None] * [0.8, 0.6]
-    bent, same = (
-        camera.project(np.column_stack([straight, np.ones(len(straight))]))
-        for camera in (guessed, plain)
-    )
-    inside = np.hypot(*(bent - guessed.principal_point).T) < 0.5 * np.hypot(*SIZE)
-    assert inside.sum() > 40
-    away = np.linalg.norm(bent - same, axis=1)[inside]
-    assert 0.0 < away.max() < 0.006 * SIZE[0]
-    unbent = guess_lens(0.0, SIZE)
-    np.testing.assert_allclose(drop_k3(unbent).distortion, 0.0, atol=1e-9)

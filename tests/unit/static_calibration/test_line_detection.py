@@ -4,11 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from worldpose.errors import InputError
 from worldpose.static_calibration.line_detection import (
     CANDIDATES,
     CrossSections,
-    brightness,
     find_bars,
     fit_bars,
 )
@@ -71,39 +69,6 @@ def test_middle_of_a_curved_bar_is_found():
     assert abs(along) < 0.04
 
 
-def test_grass_of_two_shades_moves_no_middle():
-    picture = bars(40.3, 3.0, left=110.0, right=70.0)
-    offset, _ = fitted(picture, 39.0, 3.0, 1.0)
-    # A tenth of what an edge detector's half width would give.
-    assert abs(39.0 + offset - 40.3) < 0.1
-
-
-def test_edge_of_a_stripe_or_shadow_is_no_bar():
-    for left, right in ((80.0, 120.0), (120.0, 80.0)):
-        picture = bars(40.0, 2.0, left=left, right=right, paint=right)
-        assert np.isnan(found(picture, 38.0, 2.0)).all()
-
-
-def test_stronger_of_two_bars_comes_first():
-    picture = np.minimum(
-        bars(30.0, 3.0, paint=140.0).astype(int) + bars(46.0, 3.0).astype(int) - 80, 255
-    ).astype(np.uint8)
-    offsets = found(picture, 38.0, 3.0, reach=12.0)
-    assert offsets[:2] == pytest.approx([8.0, -8.0], abs=0.5)  # one reading
-    assert np.isnan(offsets[2:]).all()
-
-
-def test_bar_out_of_reach_is_not_found():
-    assert np.isnan(found(bars(40.0, 3.0), 20.0, 3.0, reach=10.0)).all()
-    assert np.isnan(found(bars(40.0, 3.0), 40.0, 3.0, reach=-1.0)).all()
-
-
-def test_place_at_the_border_is_read_as_far_as_there_is_picture():
-    assert found(bars(12.0, 3.0), 5.0, 3.0)[0] == pytest.approx(7.0, abs=0.5)  # one reading
-    assert np.isnan(found(bars(12.0, 3.0), -30.0, 3.0)).all()
-    assert np.isnan(fitted(bars(1.0, 3.0), 1.0, 3.0, 0.0)[0])
-
-
 def test_variance_is_that_of_the_offsets():
     rng = np.random.default_rng(1)
     clean = bars(40.3, 3.0).astype(np.float64)
@@ -122,16 +87,3 @@ def test_variance_is_that_of_the_offsets():
     )
     # 300 draws give a variance to 8 %, and the fit's rest holds the lens's misfit besides noise.
     assert 0.6 < fits[:, 0].var() / fits[:, 1].mean() < 1.5
-
-
-def test_brightness_is_luma_of_rgb():
-    picture = np.zeros((2, 3, 3), dtype=np.uint8)
-    picture[..., 1] = 100
-    assert (brightness(picture) == 59).all()  # 0.587 of green
-    assert (brightness(picture[..., 1]) == 100).all()
-
-
-def test_picture_of_other_numbers_is_refused():
-    for picture in (np.zeros((4, 4)), np.zeros((4, 4, 4), np.uint8), np.zeros(4, np.uint8)):
-        with pytest.raises(InputError, match="8-bit"):
-            brightness(picture)

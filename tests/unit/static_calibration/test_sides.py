@@ -56,14 +56,6 @@ def people():
     return rng, start + rng.normal(0.0, 2.0, (len(SECONDS), 20, 2)).cumsum(axis=0)
 
 
-def test_a_camera_turned_twice_is_itself_and_its_images_of_turned_places_are_equal():
-    own, places = camera("near"), np.array([[-25.0, 3.0, 0.0], [-31.0, -9.0, 1.8]])
-    turned = turn_camera(own)
-    assert np.allclose(turned.project(places * [-1.0, -1.0, 1.0]), own.project(places))
-    assert np.allclose(turn_camera(turned).center, own.center)
-    assert np.allclose(turned.center, own.center * [-1.0, -1.0, 1.0])
-
-
 def test_people_agree_on_the_true_side_alone(people):
     rng, places = people
     near, far = (watch(seat, places, rng) for seat in ("near", "far"))
@@ -92,14 +84,6 @@ def test_a_camera_that_sees_nobody_whom_the_others_see_is_not_guessed(people):
     assert decided.turned is None
     with pytest.raises(InputError, match=r"people that both this camera.*State the camera's side"):
         decided.require_side("image of other_end")
-
-
-def test_without_a_stated_side_nothing_is_decided_but_relative_sides_are_named(people):
-    rng, places = people
-    seen = {seat: watch(seat, places, rng) for seat in ("near", "far")}
-    decided = decide_sides(seen, (), PITCH, SECONDS)
-    assert [each.turned for each in decided.values()] == [None, None]
-    assert decided["near"].partners == ("far",)
 
 
 def test_unrelated_people_decide_nothing():

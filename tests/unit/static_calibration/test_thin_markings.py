@@ -11,7 +11,6 @@ from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.from_paint.proposal import MarkingSupport, Proposal
 from worldpose.static_calibration.from_paint.thin_paint import trace_marking
-from worldpose.static_calibration.sides import turn_name
 
 PITCH = PitchTemplate.standard()
 SIZE = (1920, 400)
@@ -61,24 +60,6 @@ def test_thin_paint_beside_its_projection_is_traced_despite_letters():
     assert np.quantile(np.abs(found[:, 1] - expected), 0.95) < 1.0
 
 
-def test_without_paint_nothing_is_traced():
-    assert len(trace_marking(as_picture(grass()), projected())) == 0
-    edge = grass()
-    edge[:190] = 150.0  # a step in brightness is no line
-    assert len(trace_marking(as_picture(edge), projected())) == 0
-
-
-def test_of_two_equal_lines_none_is_traced():
-    image = paint(paint(grass(), true_places(4.0)), true_places(-4.0))
-    assert len(trace_marking(as_picture(image), projected())) == 0
-
-
-def test_a_marking_outside_of_the_image_is_not_traced():
-    outside = projected() + [0.0, 1000.0]
-    assert len(trace_marking(as_picture(grass()), outside)) == 0
-    assert len(trace_marking(as_picture(grass()), np.full((5, 2), np.nan))) == 0
-
-
 @pytest.fixture
 def proposal():
     camera = pinhole((-24.0, -60.0, 22.0), (-33.0, -2.0, 0.0), 1300.0, k1=-0.05, roll=0.01)
@@ -89,34 +70,6 @@ def proposal():
         drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
     markings = (MarkingSupport("penalty_area_left_near", 200.0, 0.9),)
     return Proposal(camera, ClickedMarkings(drawn=tuple(drawn)), markings, 90.0, 40.0, 0.9, 0.5)
-
-
-def test_a_turned_proposal_draws_the_same_pixels_under_the_names_of_the_other_half(proposal):
-    turned = proposal.turn()
-    assert [each.name for each in turned.drawn.drawn] == [
-        *("penalty_area_right_far", "halfway_line", "center_circle", "penalty_arc_right")
-    ]
-    for before, after in zip(proposal.drawn.drawn, turned.drawn.drawn, strict=True):
-        assert before.xy == after.xy
-        lines = [
-            camera.project(PITCH.marking_points(name, 0.1))
-            for camera, name in ((proposal.camera, before.name), (turned.camera, after.name))
-        ]
-        away = np.linalg.norm(lines[0][:, None] - lines[1], axis=-1).min(axis=1)
-        assert np.nanmax(away) < 2.0
-    assert turned.markings[0].name == "penalty_area_right_far"
-    again = turned.turn()
-    assert again.drawn == proposal.drawn
-    assert np.allclose(again.camera.center, proposal.camera.center)
-
-
-def test_every_marking_of_the_template_has_a_partner():
-    names = {*PITCH.lines, *PITCH.arcs}
-    for name in names:
-        assert turn_name(name) in names
-        mine, other = (PITCH.marking_points(each, 0.5) for each in (name, turn_name(name)))
-        away = np.linalg.norm(mine[:, None] * [-1.0, -1.0, 1.0] - other, axis=-1).min(axis=1)
-        assert away.max() < 0.3
 
 
 def test_a_stored_proposal_is_read_back(proposal):

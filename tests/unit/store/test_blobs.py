@@ -47,25 +47,6 @@ def test_of_many_that_put_one_new_file_one_succeeds(store: Store) -> None:
         assert store.blobs.read(f"race/{number}") == str(done.index(True)).encode() * 1000
 
 
-def test_entries_are_those_below_a_folder(store: Store) -> None:
-    for path in ("a/b", "a/c/d", "ab", "a2/b"):
-        store.blobs.put(path, path.encode())
-    found = store.blobs.entries("a")
-    assert [(entry.path, entry.size) for entry in found] == [("a/b", 3), ("a/c/d", 5)]
-    assert all(entry.modified.tzinfo is not None for entry in found)
-    assert store.blobs.entries("nothing") == []
-
-
-def test_tree_is_removed_with_the_first_file_first(store: Store) -> None:
-    for path in ("tree/a", "tree/b/c", "tree/manifest.json", "tree2/a"):
-        store.blobs.put(path, b"x")
-    for _ in range(2):
-        store.blobs.delete_tree("tree", "manifest.json")
-    assert store.blobs.entries("tree") == []
-    assert store.blobs.exists("tree2/a")
-    assert store.blobs.staged_entries() == []
-
-
 def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

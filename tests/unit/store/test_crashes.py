@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import time
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -88,13 +86,6 @@ def test_killed_run_leaves_nothing_half_and_the_next_gives_the_same_answer(
     assert compare_stores(store, undisturbed) == []
 
 
-def test_every_commit_point_is_reached_once_or_more_and_in_order(store: Store) -> None:
-    seen: list[str] = []
-    install_fault_hook(seen.append)
-    run_once(store)
-    assert list(dict.fromkeys(seen)) == list(COMMIT_POINTS)
-
-
 def test_every_file_and_folder_is_on_disk_before_the_rename(
     folder_store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,34 +110,6 @@ def test_every_file_and_folder_is_on_disk_before_the_rename(
     assert written <= synced_at_rename
     above = {path.stat().st_ino for path in list(top.parents)[:5]}
     assert above <= synced, "the names of the result and of the folders above it are on disk too"
-
-
-def publish_slowly(url: str, ready: str) -> None:
-    def wait(point: str) -> None:
-        if point == "before_commit":
-            Path(ready).touch()
-            time.sleep(60)
-
-    install_fault_hook(wait)
-    publish(Store.open(url))
-
-
-@pytest.mark.faults
-def test_signal_before_the_commit_abandons_the_result(store: Store, tmp_path: Path) -> None:
-    ready = tmp_path / "ready"
-    process = run_process(publish_slowly, store.url, str(ready))
-    deadline = time.monotonic() + 60
-    while not ready.exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGTERM)
-    process.join(30)
-    assert process.exitcode == -signal.SIGTERM
-    check_never_half(store)
-    assert not store.has(*place())
-    publish(store)
-    check_never_half(store)
-    assert store.has(*place())
 
 
 @pytest.mark.parametrize("point", ["after_write", "during_publish", "before_commit"])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 from datetime import timedelta
 from typing import Any
 
@@ -9,35 +8,20 @@ from store_samples import (
     place,
     publish,
     run_once,
-    run_process,
     sample_arrays,
     sample_coordinates,
     sample_recipe,
-    sample_record,
 )
 
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import StoreError
 from worldpose.store import groups
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.groups import array_parts
 from worldpose.store.integrity import verify
 from worldpose.store.paths import ResultId
-from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Store
 
 NOW = timedelta(0)
-
-
-def reserve_and_die(url: str) -> None:
-    Store.open(url).reserve_run("final")
-    os._exit(9)
-
-
-def die(store: Store) -> None:
-    """A run begins and is killed."""
-    process = run_process(reserve_and_die, store.url)
-    process.join(60)
-    assert process.exitcode == 9
 
 
 def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) -> None:
@@ -55,21 +39,6 @@ def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) ->
     assert store.results() == (ResultId(*place()),)
     assert store.blobs.entries(leftover) == []
     assert verify(store) == ()
-
-
-def test_what_a_named_result_was_made_from_is_kept(folder_store: Store) -> None:
-    first = sample_recipe("first")
-    second = sample_recipe("second", inputs={first.name: recipe_key(first)})
-    publish(folder_store, first)
-    publish(folder_store, second)
-    folder_store.finish_run(sample_record(folder_store.reserve_run("final"), second))
-    assert plan_gc(folder_store, older_than=NOW).garbage == ()
-
-
-def test_young_results_and_leftovers_are_spared(store: Store) -> None:
-    publish(store)
-    store.blobs.create_staging()
-    assert plan_gc(store, older_than=timedelta(hours=1)).garbage == ()
 
 
 def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
@@ -122,27 +91,6 @@ def test_result_of_which_something_was_removed_is_not_published(
     assert folder_store.blobs.staged_entries() == []
 
 
-def test_run_that_begins_after_planning_stops_the_collection(folder_store: Store) -> None:
-    publish(folder_store)
-    plan = plan_gc(folder_store, older_than=NOW)
-    folder_store.reserve_run("final")
-    with pytest.raises(StoreError, match="Make a new plan"):
-        collect(folder_store, plan)
-    assert folder_store.has(*place())
-
-
-def test_dead_run_keeps_its_number_until_a_later_one_is_there(folder_store: Store) -> None:
-    run_once(folder_store)
-    die(folder_store)
-    assert plan_gc(folder_store, older_than=NOW).garbage == ()
-    assert run_once(folder_store) == "0003"
-    plan = plan_gc(folder_store, older_than=NOW)
-    assert [item.path for item in plan.garbage] == ["runs/final/0002.open.json"]
-    collect(folder_store, plan)
-    assert folder_store.unfinished_runs("final") == ()
-    assert run_once(folder_store) == "0004"
-
-
 def test_forgotten_runs_go_with_what_only_they_reach(folder_store: Store) -> None:
     for unit in ("one", "two", "three"):
         run_once(folder_store, sample_recipe("shared"), sample_recipe(unit))
@@ -178,14 +126,6 @@ def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(
     assert path in reason
     collect(folder_store, plan)
     assert folder_store.has(*place(sample_recipe("spare")))
-
-
-def test_absent_runs_and_empty_keeps_are_refused(folder_store: Store) -> None:
-    run_once(folder_store)
-    with pytest.raises(InputError, match="no such run"):
-        plan_gc(folder_store, forget=["final/0009"])
-    with pytest.raises(InputError, match="at least 1"):
-        plan_gc(folder_store, keep_last=0)
 
 
 def test_interrupted_collection_is_finished_by_the_next(

@@ -40,29 +40,6 @@ def all_paths(store: Store) -> list[str]:
     return ["project.json", *(entry.path for top in tops for entry in store.blobs.entries(top))]
 
 
-def test_whole_project_has_no_findings(full: Store) -> None:
-    steps: list[tuple[int, int]] = []
-    assert verify(full, progress=lambda done, total: steps.append((done, total))) == ()
-    assert steps == sorted(steps)
-    assert steps[-1][0] == steps[-1][1]
-    assert verify(full, "final") == ()
-
-
-def test_what_ends_while_all_is_checked_is_no_damage(full: Store) -> None:
-    (run,) = full.unfinished_runs("final")
-    is_over: list[bool] = []
-
-    def end_the_run(done: int, total: int) -> None:
-        if not is_over:
-            is_over.append(True)
-            publish(full, sample_recipe("later"))
-            full.finish_run(sample_record(run.run_id, sample_recipe("later")))
-
-    assert verify(full, progress=end_the_run) == ()
-    assert is_over
-    assert full.unfinished_runs("final") == ()
-
-
 def flip(store: Store, path: str, number: int) -> bytes:
     """Flips one bit of a file and returns what it was."""
     data = store.blobs.read(path)
@@ -96,25 +73,6 @@ def test_flipped_bit_in_any_record_or_manifest_is_found_there(full: Store) -> No
         assert [finding.path for finding in verify(full)] == [path]
         full.blobs.put(path, data)
     assert verify(full) == ()
-
-
-def test_lost_files_are_found_in_one_go(full: Store) -> None:
-    lost = ["project.json", *(path for path in all_paths(full) if not is_document(path))]
-    for path in lost:
-        full.blobs.delete(path)
-    found = verify(full)
-    assert [finding.path for finding in found] == sorted(lost)
-    assert all("is missing" in finding.problem for finding in found)
-
-
-def test_result_that_lost_its_manifest_is_missed_by_its_run(full: Store) -> None:
-    full.blobs.delete(ResultId(*place()).manifest_path)
-    (finding,) = verify(full)
-    assert finding.path == "runs/final/0001.json"
-    assert ResultId(*place()).path in finding.problem
-    assert finding.result is None
-    assert repair(full, [finding]) == ((), ())
-    assert full.run("final").run_id == "0001"
 
 
 def test_foreign_file_is_found(full: Store) -> None:
@@ -183,21 +141,6 @@ def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
         "matches/semi.json",
         "runs/final/0007.json",
     ]
-
-
-def test_manifest_whose_content_digest_is_not_its_files_is_found(folder_store: Store) -> None:
-    publish(folder_store)
-    manifest = folder_store.manifest(*place()).model_copy(update={"content": "0" * 64})
-    path = ResultId(*place()).manifest_path
-    folder_store.blobs.put(path, seal(manifest))
-    (finding,) = verify(folder_store)
-    assert finding.path == path
-    assert "content digest" in finding.problem
-
-
-def test_unpublished_leftovers_are_no_damage(full: Store) -> None:
-    full.blobs.put(f"{ResultId(*place(sample_recipe('dead'))).path}/zarr.json", b"half")
-    assert verify(full) == ()
 
 
 def test_repair_withdraws_what_is_damaged_and_nothing_else(full: Store) -> None:

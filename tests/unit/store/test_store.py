@@ -3,8 +3,6 @@ from __future__ import annotations
 import errno
 import os
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +21,10 @@ from store_samples import (
     sample_arrays,
     sample_coordinates,
     sample_recipe,
-    sample_record,
-    sample_registration,
     sample_work,
 )
 
 import worldpose
-from data_contracts.run import UnitFailure
 from worldpose.errors import (
     CorruptionError,
     InputError,
@@ -72,16 +67,6 @@ def test_unknown_result_is_a_store_error_that_says_what_to_run(store: Store) -> 
     assert not store.has(*place())
     with pytest.raises(StoreError, match="worldpose run final"):
         store.open_result(*place())
-
-
-def test_error_while_computing_leaves_nothing(store: Store) -> None:
-    with pytest.raises(ZeroDivisionError), store.publish(sample_work(store)) as writer:
-        writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
-        raise ZeroDivisionError
-    assert not store.has(*place())
-    assert store.results() == ()
-    assert store.blobs.staged_entries() == []
-    assert [entry.path for entry in store.blobs.entries("results")] == []
 
 
 def publish_together(url: str, barrier: object, outcome: object) -> None:
@@ -139,23 +124,6 @@ def test_manifest_of_another_result_is_corruption(folder_store: Store) -> None:
         folder_store.manifest(*place(other))
 
 
-def test_result_without_manifest_does_not_exist_but_is_not_overwritten(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "project")
-    publish(store)
-    store.blobs.delete(ResultId(*place()).manifest_path)
-    assert not store.has(*place())
-    with pytest.raises(StoreError, match="worldpose gc"):
-        publish(store)
-
-
-def test_leftovers_with_other_bytes_are_nondeterminism(bucket: str, tmp_path: Path) -> None:
-    store = Store.create(f"{bucket}/leftovers")
-    store.blobs.put(f"{ResultId(*place()).path}/joints/c/0/0/0", b"another computation")
-    with pytest.raises(NondeterminismError, match=r"joints/c/0/0/0.*worldpose gc"):
-        publish(store)
-    assert not store.has(*place())
-
-
 def test_opening_no_project_says_how_to_make_one(url: str) -> None:
     with pytest.raises(InputError, match=r"no worldpose project at .*worldpose init"):
         Store.open(url)
@@ -169,30 +137,6 @@ def test_project_of_another_contract_is_refused(store: Store) -> None:
         Store.open(store.url)
 
 
-def test_registered_matches_are_listed_and_replaced(store: Store) -> None:
-    assert store.matches() == ()
-    assert store.registration("final") is None
-    store.register(sample_registration())
-    store.register(sample_registration("semi"))
-    store.register(sample_registration(folder="/moved"))
-    assert store.matches() == ("final", "semi")
-    assert store.registration("final") == sample_registration(folder="/moved")
-    for recipe in (sample_recipe(), sample_recipe("late"), sample_recipe(match_id="semi")):
-        publish(store, recipe)
-    assert [result.unit for result in store.results("final")] == ["clip", "late"]
-    assert len(store.results()) == 3
-
-
-def test_a_unit_holds_the_ids_of_a_camera_and_a_clip_of_64_letters_each(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "project")
-    publish(store, sample_recipe("c" * 64 + "." + "d" * 64))
-    assert [len(result.unit) for result in store.results("final")] == [129]
-    with pytest.raises(InputError):
-        store.has("c" * 65, "tracking", "clip", "0" * 32)
-    with pytest.raises(InputError):
-        store.registration("c" * 65)
-
-
 @pytest.mark.parametrize("name", ["..", "a/b", "", "/etc", "a\0b", "a\n", "x" * 130, "é"])
 def test_name_that_could_leave_the_project_is_refused(tmp_path: Path, name: str) -> None:
     store = Store.create(tmp_path / "project")
@@ -204,13 +148,6 @@ def test_name_that_could_leave_the_project_is_refused(tmp_path: Path, name: str)
         store.runs(name)
     with pytest.raises(InputError):
         store.run("final", name)
-
-
-def test_run_that_names_an_absent_result_is_not_finished(folder_store: Store) -> None:
-    run_id = folder_store.reserve_run("final")
-    with pytest.raises(StoreError, match="does not have"):
-        folder_store.finish_run(sample_record(run_id, sample_recipe()))
-    assert folder_store.runs("final") == ()
 
 
 @pytest.mark.parametrize(
@@ -245,36 +182,6 @@ def test_failing_disk_is_a_store_error_and_a_retry_succeeds(
     assert verify(store) == ()
 
 
-def publish_with_little_room(url: str, outcome: object) -> None:
-    import resource
-
-    store = Store.open(url)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))
-    try:
-        publish(store)
-    except StoreError as error:
-        outcome.put(str(error))  # type: ignore[attr-defined]
-
-
-def test_chunk_that_finds_no_room_is_a_store_error(store: Store) -> None:
-    outcome = PROCESSES.Queue()
-    process = run_process(publish_with_little_room, store.url, outcome)
-    message = outcome.get(timeout=60)
-    process.join(60)
-    assert "File too large" in message
-    assert "run again" in message
-    assert not store.has(*place())
-    assert store.blobs.staged_entries() == []
-    publish(store)
-    assert verify(store) == ()
-
-
-def test_project_folder_below_a_file_is_a_store_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("here")
-    with pytest.raises(StoreError, match=r"File exists \(.*file\)"):
-        Store.create(tmp_path / "file" / "project")
-
-
 def test_absent_bucket_is_a_store_error_that_names_it(bucket: str) -> None:
     with pytest.raises(StoreError, match=r"s3://nowhere/project\.json.*AWS_ENDPOINT_URL"):
         Store.create("s3://nowhere")
@@ -295,15 +202,6 @@ def test_run_gives_its_results_by_unit(store: Store) -> None:
     assert run["tracking/clip"] is run["tracking/clip"]
     assert "Run 0001 of match final: complete" in repr(run)
     assert "tracking/late" in repr(run)
-
-
-def test_frames_of_a_run_have_times(folder_store: Store) -> None:
-    run_once(folder_store)
-    assert "time" not in worldpose.open_run(folder_store.url, "final")["tracking/clip"].coords
-    folder_store.register(sample_registration())
-    result = worldpose.open_run(folder_store.url, "final")["tracking/clip"]
-    np.testing.assert_allclose(result.time, result.frame / 50.0)
-    assert result.time.attrs["units"] == "s"
 
 
 def test_the_best_bodies_are_labelled_and_become_a_table(
@@ -339,35 +237,6 @@ def test_the_best_bodies_are_labelled_and_become_a_table(
         run.bodies("second")
 
 
-def test_absent_unit_says_what_there_is(folder_store: Store) -> None:
-    failure = UnitFailure(unit="tracking/bad", error="InputError", message="no detections")
-    run_once(folder_store)
-    folder_store.finish_run(
-        sample_record("0002", sample_recipe(), state="partial", failed=(failure,))
-    )
-    run = worldpose.open_run(folder_store.url, "final")
-    assert "tracking/bad" not in run
-    assert run.get("tracking/bad") is None
-    with pytest.raises(KeyError, match="it failed with InputError: no detections"):
-        run["tracking/bad"]
-    with pytest.raises(KeyError, match="the run has tracking/clip"):
-        run["tracking/other"]
-    assert "tracking/bad  failed: InputError" in repr(run)
-
-
-def test_library_has_no_other_names() -> None:
-    with pytest.raises(AttributeError, match="no attribute 'open_runs'"):
-        worldpose.open_runs  # noqa: B018
-
-
-def test_neither_the_library_nor_the_store_imports_zarr_until_arrays_are_used() -> None:
-    code = (
-        "import sys, worldpose, worldpose.store\n"
-        "sys.exit(bool({'zarr', 'xarray', 'obstore', 'prefect', 'dask'} & sys.modules.keys()))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 def write_sample(writer: ResultWriter) -> None:
     writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
 
@@ -398,12 +267,6 @@ def test_work_that_breaks_the_rules_is_not_published(
     with pytest.raises(error, match=told), folder_store.publish(work) as writer:
         write(writer)
     assert folder_store.results() == ()
-
-
-def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
-    work = sample_work(folder_store, sample_recipe(stage="triangulation"))
-    with pytest.raises(InternalError, match="layout of st"), folder_store.publish(work) as writer:
-        write_sample(writer)
 
 
 def test_a_key_is_computed_once_and_other_bytes_are_an_error(store: Store, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from store_samples import place
 
 from worldpose.errors import InputError
 from worldpose.store.paths import ResultId
@@ -30,15 +29,6 @@ def test_path_that_could_leave_the_project_is_refused_by_every_method(
             with pytest.raises(InputError, match="path inside a project"):
                 call()
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_result_is_known_from_its_files() -> None:
-    result = ResultId(*place())
-    assert ResultId.from_path(result.manifest_path) == result
-    assert ResultId.from_path(f"{result.path}/joints/c/0") == result
-    assert ResultId.from_path(result.path) is None
-    assert ResultId.from_path(f"runs/{result.manifest_path}") is None
-    assert ResultId.from_name("final", result.name, result.key) == result
 
 
 @pytest.mark.parametrize("key", ["", "0" * 31, "0" * 33, "G" * 32, "A" * 32, "../" + "0" * 29])

@@ -9,7 +9,6 @@ from store_samples import (
     run_once,
     run_process,
     sample_recipe,
-    sample_record,
 )
 
 from data_contracts.pin import Pin
@@ -18,23 +17,6 @@ from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import verify
 from worldpose.store.runs import list_pins, may_be_running, pin_run, unpin_run
 from worldpose.store.store import Store, open_run
-
-
-def test_runs_are_numbered_from_one(store: Store) -> None:
-    assert [run_once(store) for _ in range(3)] == ["0001", "0002", "0003"]
-    assert store.runs("final") == ("0001", "0002", "0003")
-    assert store.run("final").run_id == "0003"
-    assert store.run("final", "0001").run_id == "0001"
-    assert store.unfinished_runs("final") == ()
-    with pytest.raises(InputError, match="worldpose run semi"):
-        store.run("semi")
-
-
-def test_latest_is_the_highest_number_and_not_the_last_text(folder_store: Store) -> None:
-    for run_id in ("0009", "9999", "10000"):
-        folder_store.finish_run(sample_record(run_id))
-    assert folder_store.run("final").run_id == "10000"
-    assert folder_store.reserve_run("final") == "10001"
 
 
 def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
@@ -46,22 +28,6 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
     assert may_be_running(unfinished)
     with pytest.raises(InputError, match="an unfinished run"):
         store.run("final", "0002")
-
-
-def test_number_with_a_folder_in_its_place_is_passed_over(folder_store: Store, tmp_path) -> None:
-    run_once(folder_store)
-    (record,) = tmp_path.rglob("runs/final/0001.json")
-    record.with_name("0002.json").mkdir()
-    assert folder_store.reserve_run("final") == "0003"
-
-
-def test_record_is_written_once(store: Store) -> None:
-    record = sample_record(store.reserve_run("final"))
-    store.finish_run(record)
-    store.finish_run(record)
-    with pytest.raises(StoreError, match="was finished earlier"):
-        store.finish_run(record.model_copy(update={"state": "failed"}))
-    assert store.run("final") == record
 
 
 def test_number_that_another_run_took_and_finished_is_not_given_again(
@@ -100,12 +66,6 @@ def test_processes_get_different_numbers(store: Store) -> None:
     assert [may_be_running(run) for run in unfinished] == [False] * 12
 
 
-def test_run_on_another_machine_may_be_alive(folder_store: Store) -> None:
-    folder_store.reserve_run("final")
-    (run,) = folder_store.unfinished_runs("final")
-    assert may_be_running(run.model_copy(update={"host": "elsewhere", "pid": 2**22 + 1}))
-
-
 NOW = timedelta(0)
 
 
@@ -133,14 +93,6 @@ def test_a_pinned_run_and_its_results_outlast_all_others(two_runs: Store) -> Non
     assert two_runs.runs("final") == ("0002",)
 
 
-def test_a_pinned_run_is_forgotten_only_after_its_name(two_runs: Store) -> None:
-    pin_run(two_runs.blobs, pin("paper"))
-    with pytest.raises(InputError, match="worldpose unpin final/paper"):
-        plan_gc(two_runs, forget=["final/0001"])
-    unpin_run(two_runs.blobs, "final", "paper")
-    assert len(plan_gc(two_runs, forget=["final/0001"], older_than=NOW).garbage) == 2
-
-
 def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs: Store) -> None:
     plan = plan_gc(two_runs, keep_last=1, older_than=NOW)
     pin_run(two_runs.blobs, pin("paper"))
@@ -166,12 +118,6 @@ def test_a_name_is_one_run_s_for_good(two_runs: Store) -> None:
     assert [each.name for each in list_pins(two_runs.blobs, "final")] == ["best", "paper"]
     with pytest.raises(InputError, match="best, paper"):
         unpin_run(two_runs.blobs, "final", "other")
-
-
-@pytest.mark.parametrize("name", ["0002", "7", "latest"])
-def test_a_name_cannot_be_taken_for_a_number(two_runs: Store, name: str) -> None:
-    with pytest.raises(InputError, match="neither a number nor"):
-        pin_run(two_runs.blobs, pin(name))
 
 
 def test_a_changed_pin_is_found(two_runs: Store) -> None:

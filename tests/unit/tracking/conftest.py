@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
 
 SKELETON = np.array(
     [
@@ -39,19 +39,10 @@ def ring() -> Callable[[int], Camera]:
         cameras = []
         for n in range(count):
             angle = 2 * np.pi * (n + 0.3) / count
-            center = np.array([30 * np.cos(angle), 30 * np.sin(angle), 6.0 + n % 4])
-            forward = -center / np.linalg.norm(center)
-            right = np.cross(forward, [0.0, 0.0, 1.0])
-            right /= np.linalg.norm(right)
-            rotation = np.stack([right, np.cross(forward, right), forward])
+            center = [30 * np.cos(angle), 30 * np.sin(angle), 6.0 + n % 4]
+            lens = (-0.1, 0.02, 0.0, 0.0, 0.0)
             cameras.append(
-                Camera(
-                    focal=np.array([1500.0, 1500.0]),
-                    principal_point=np.array([960.0, 540.0]),
-                    distortion=np.array([-0.1, 0.02, 0.0, 0.0, 0.0]),
-                    cam_from_world=Rigid(rotation, -rotation @ center),
-                    image_size=np.array([1920, 1080]),
-                )
+                look_at_camera(center, (0.0, 0.0, 0.0), 1500.0, middle=(960.0, 540.0), lens=lens)
             )
         return Camera.stack(cameras)
 

@@ -9,11 +9,6 @@ detections = KeypointDetections.from_keypoints
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
-PLACES = np.array([[0.0, 0.0], [0.9, 0.2], [-3.0, 2.0], [4.0, -3.0]])
-
-
-def still(people, frames=20, places=PLACES):
-    return people(np.broadcast_to(places, (frames, *places.shape)))
 
 
 def owners(tracking):
@@ -22,26 +17,6 @@ def owners(tracking):
     values = [np.unique(index[:, :, n][index[:, :, n] >= 0]) for n in range(index.shape[2])]
     assert all(len(value) == 1 for value in values)
     return [int(value[0]) for value in values]
-
-
-def test_person_found_again_beyond_the_gate_is_counted(ring, people, seen):
-    # Stands, is unseen for 1 s, stands 1.2 m further: a step or two.
-    places = np.zeros((90, 1, 2))
-    places[70:] = [1.2, 0.0]
-    keypoints, confidence = seen(ring(5), people(places))
-    keypoints[20:70] = np.nan
-    pitch = {"pitch_size": (105.0, 68.0)}
-    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS, **pitch)
-    assert len(result.tracks) == 1
-    assert result.report.joined == 1
-    (join,) = result.joins
-    assert (join.before, join.after, join.decided) == (0, 0, True)
-    assert (join.last_frame, join.first_frame) == (19, 70)
-    slow = SETTINGS.model_copy(update={"velocity_change_std_m_s": 0.2, "rms_speed_m_s": 0.1})
-    assert (
-        len(track_people(ring(5), detections(keypoints, confidence), FPS, slow, **pitch).tracks)
-        == 2
-    )
 
 
 def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
@@ -62,56 +37,6 @@ def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
         assert not join.decided
         assert join.margin < np.log(SETTINGS.join_odds)
     assert result.joins[0].cost >= result.joins[1].cost
-
-
-def test_causal_mode_knows_nothing_of_later_frames(ring, people, seen):
-    time = np.arange(0, 2.4, 1 / FPS)[:, None, None]
-    places = PLACES + np.concatenate([np.sin(time), 0.5 * time], axis=-1)
-    keypoints, confidence = seen(ring(5), people(places))
-    keypoints[30:60, :, :2] = np.nan
-    causal = SETTINGS.model_copy(update={"causal": True})
-    whole = track_people(ring(5), detections(keypoints, confidence), FPS, causal)
-    for end in (20, 50, 62, 90):
-        part = track_people(ring(5), detections(keypoints[:end], confidence[:end]), FPS, causal)
-        known = len(part.person)
-        np.testing.assert_array_equal(part.detection_index, whole.detection_index[:end, :, :known])
-        np.testing.assert_array_equal(part.joints, whole.joints[:end, :known])
-        assert (whole.detection_index[:end, :, known:] == -1).all()
-    assert sorted(owners(whole)) == [0, 1, 2, 3]
-
-
-def test_person_whom_two_cameras_see_is_found_but_slowly(ring, people, seen):
-    keypoints, confidence = seen(ring(5), still(people, 60))
-    keypoints[:, 2:, 2] = np.nan
-    # The odds of this pair are between three and ten.
-    settings = SETTINGS.model_copy(update={"pair_odds": 10.0})
-    result = track_people(
-        ring(5), detections(keypoints, confidence), FPS, settings, pitch_size=(105.0, 68.0)
-    )
-    assert sorted(owners(result)) == [0, 1, 2, 3]
-    short = track_people(
-        ring(5),
-        detections(keypoints[:40], confidence[:40]),
-        FPS,
-        settings,
-        pitch_size=(105.0, 68.0),
-    )
-    assert sorted(owners(short)) == [0, 1, 3]
-    sooner = track_people(
-        ring(5),
-        detections(keypoints[:40], confidence[:40]),
-        FPS,
-        SETTINGS.model_copy(update={"pair_odds": 3.0}),
-        pitch_size=(105.0, 68.0),
-    )
-    assert sorted(owners(sooner)) == [0, 1, 2, 3]
-
-
-def test_both_matchings_keep_people_apart(ring, people, seen):
-    hungarian = False
-    matching = SETTINGS.model_copy(update={"hungarian": hungarian})
-    result = track_people(ring(5), detections(*seen(ring(5), still(people))), FPS, matching)
-    assert sorted(owners(result)) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(("agility", "births"), [(2.5, 2), (70.0, 1)])

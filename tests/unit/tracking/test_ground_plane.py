@@ -14,7 +14,6 @@ from worldpose.tracking.plane.clocks import estimate_plane_clocks
 from worldpose.tracking.plane.feet import (
     ANKLE_HEIGHT,
     GroundPositions,
-    count_covering_cameras,
     locate_feet,
 )
 from worldpose.tracking.plane.tracker import TriangulatedPeople, locate_tracks, track_on_plane
@@ -74,19 +73,6 @@ def test_a_box_tells_the_place_without_ankles_unless_it_ends_with_the_image(ring
     assert np.isnan(locate_feet(camera, bare, PITCH).xy).all()
 
 
-def test_the_upper_edge_of_a_box_tells_the_height(ring):
-    camera = ring(2)
-    foot, head = (
-        np.stack([camera[c].project(np.array([[2.0, 1.0, z]]))[0] for c in (0, 1)])
-        for z in (0.0, 1.83)
-    )
-    boxes = np.concatenate([head - [20, 0], foot + [20, 0]], axis=1)[None, :, None]
-    keypoints = np.full((1, 2, 1, 17, 2), np.nan)
-    bare = detections(keypoints, np.zeros((1, 2, 1, 17)))
-    found = locate_feet(camera, replace(bare, boxes=boxes), PITCH)
-    np.testing.assert_allclose(found.height, 1.83, atol=0.06)
-
-
 def test_calibration_errors_move_places_by_the_stated_covariance(ring):
     camera = ring(1)
     stated = np.zeros((1, 12, 12))
@@ -100,38 +86,6 @@ def test_calibration_errors_move_places_by_the_stated_covariance(ring):
         other = Camera.stack([step_camera(camera[0], step)])
         moved.append(locate_feet(other, detections(*seen), PITCH).xy[0, 0, 0])
     np.testing.assert_allclose(found.calibration[0, 0, 0], np.cov(np.array(moved).T), rtol=0.15)
-
-
-def test_two_people_who_cross_keep_their_tracks():
-    truth = walkers(100, [[-6.0, 0.0], [6.0, 1.2]], [[3.0, 0.0], [-3.0, 0.0]])
-    noisy = truth[:, None] + 0.05 * np.random.default_rng(1).standard_normal((100, 1, 2, 2))
-    noisy[::2] = noisy[::2, :, ::-1]  # the order of the detections says nothing
-    tracks = track_on_plane(positions_at(noisy, 0.05), FPS, pitch_size=SIZE)
-    assert tracks.xy.shape[1] == 2
-    errors = np.linalg.norm(tracks.xy[:, :, None] - truth[:, None], axis=-1)
-    assert (errors.max(axis=0).min(axis=1) < 0.2).all()
-    speeds = np.sort(tracks.velocity[50, :, 0])
-    np.testing.assert_allclose(speeds, [-3.0, 3.0], atol=0.3)
-
-
-def test_a_person_unseen_for_a_moment_keeps_the_track():
-    truth = walkers(80, [[0.0, 0.0]], [[4.0, 1.0]])
-    seen = truth[:, None].copy()
-    seen[30:45] = np.nan
-    tracks = track_on_plane(positions_at(seen), FPS, pitch_size=SIZE)
-    assert tracks.xy.shape[1] == 1
-    assert (tracks.detection_index[30:45] == -1).all()
-    assert np.linalg.norm(tracks.xy[37, 0] - truth[37, 0]) < 0.3
-
-
-def test_a_second_box_of_a_person_is_no_track_and_a_tackle_is_two_people():
-    truth = walkers(75, [[0.0, 0.0]], [[3.0, 0.0]])
-    double = np.full((75, 1, 2, 2), np.nan)
-    double[:, :, 0] = truth
-    double[20:45, :, 1] = truth[20:45] + [0.5, 0.2]
-    assert track_on_plane(positions_at(double), FPS, pitch_size=SIZE).xy.shape[1] == 1
-    tackle = walkers(75, [[0.0, 0.0], [0.0, 3.0]], [[3.0, 0.0], [3.0, -1.8]])[:, None]
-    assert track_on_plane(positions_at(tackle), FPS, pitch_size=SIZE).xy.shape[1] == 2
 
 
 def test_stated_regions_hold_the_truth():
@@ -149,29 +103,6 @@ def test_stated_regions_hold_the_truth():
         inverse = np.linalg.inv(tracks.covariance[10:, 0])
         squared.append(np.einsum("fi,fij,fj->f", off, inverse, off))
     assert 0.9 < np.mean(np.concatenate(squared) < 5.99) <= 1.0
-
-
-def test_people_beside_the_pitch_and_glimpses_are_no_tracks():
-    bench = walkers(60, [[0.0, 40.0]], [[0.0, 0.0]])[:, None]
-    assert track_on_plane(positions_at(bench), FPS, pitch_size=SIZE).xy.shape[1] == 0
-    glimpse = np.full((60, 1, 1, 2), np.nan)
-    glimpse[20:23] = 0.0
-    assert track_on_plane(positions_at(glimpse), FPS, pitch_size=SIZE).xy.shape[1] == 0
-    flag = walkers(60, [[52.4, -33.9]], [[0.0, 0.0]])[:, None]
-    assert track_on_plane(positions_at(flag), FPS, pitch_size=SIZE).xy.shape[1] == 0
-    mark = positions_at(walkers(60, [[41.5, 0.0]], [[0.0, 0.0]])[:, None])
-    mark.height[:] = 0.3
-    assert track_on_plane(mark, FPS, pitch_size=SIZE).xy.shape[1] == 0
-    nobody = np.full((60, 1, 0, 2), np.nan)
-    assert track_on_plane(positions_at(nobody), FPS, pitch_size=SIZE).xy.shape == (60, 0, 2)
-
-
-@pytest.mark.parametrize(("outside", "kept"), [(1.0, True), (2.0, False)])
-def test_an_assistant_is_tracked_and_a_person_on_a_bench_is_not(outside, kept):
-    rng = np.random.default_rng(6)
-    places = np.tile([[0.0, 34.0 + outside]], (60, 1, 1)) + 0.1 * rng.standard_normal((60, 1, 2))
-    tracks = track_on_plane(positions_at(places[:, None]), FPS, pitch_size=SIZE)
-    assert tracks.xy.shape[1] == kept
 
 
 @pytest.mark.parametrize("late", [-7.0, 3.4])
@@ -225,50 +156,6 @@ def test_a_person_keeps_the_identity_before_and_after_triangulation():
     assert np.nanmax(np.linalg.norm(again.xy[:, 0] - truth[:, 0], axis=-1)) < 0.3
 
 
-def test_a_person_whom_most_cameras_should_see_and_do_not_is_dropped(ring):
-    truth = walkers(60, [[0.0, 0.0]], [[1.0, 0.0]])
-    seen = np.full((60, 8, 1, 2), np.nan)
-    seen[:, 0] = truth
-    positions = positions_at(seen)
-    for count, people in ((8, 0), (2, 1)):
-        few = GroundPositions(
-            *(
-                getattr(positions, name)[:, :count]
-                for name in ("xy", "noise", "calibration", "height")
-            )
-        )
-        covering = count_covering_cameras(ring(8)[:count], few)
-        assert (covering[:, 0, 0] == count).all() and (covering[:, 1:] == 0).all()
-        tracks = track_on_plane(few, FPS, pitch_size=SIZE, covering=covering)
-        assert tracks.xy.shape[1] == people
-
-
-def test_parts_of_a_person_continue_the_track_and_start_none(ring):
-    camera = ring(1)
-    truth = walkers(50, [[0.0, 0.0], [6.0, 2.0]], [[1.0, 0.0], [1.0, 0.0]])
-    ends = [
-        camera[0].project(np.insert(truth.reshape(-1, 2), 2, z, axis=1)).reshape(50, 2, 2)
-        for z in (1.8, 0.0)
-    ]
-    whole = np.concatenate([ends[0] - [18, 0], ends[1] + [18, 0]], axis=-1)
-    boxes = np.full((50, 1, 3, 4), np.nan)
-    boxes[:, 0, :2] = whole
-    boxes[20:, 0, 2] = whole[20:, 0]
-    boxes[20:, 0, 2, 3] -= 0.4 * (whole[20:, 0, 3] - whole[20:, 0, 1])  # an upper body
-    confidence = np.full((50, 1, 3, 17), 0.9)
-    confidence[:, :, 2, 11:] = 0.1
-    keypoints = np.full((*confidence.shape, 2), np.nan)
-    boxed = replace(detections(keypoints, 0.2 * confidence), boxes=boxes)
-    found = locate_feet(camera, replace(boxed, confidence=np.zeros_like(confidence)), PITCH)
-    assert found.is_whole[:, 0, :2].all()  # of equally sure detections none is a part
-    found = locate_feet(camera, boxed, PITCH)
-    assert found.is_whole[:, 0, :2].all() and not found.is_whole[20:, 0, 2].any()
-    tracks = track_on_plane(found, FPS, pitch_size=SIZE)
-    assert tracks.xy.shape[1] == 2
-    everything = replace(found, is_whole=None)
-    assert track_on_plane(everything, FPS, pitch_size=SIZE).xy.shape[1] >= 2
-
-
 @pytest.mark.parametrize("outside", [False, True])
 def test_overlapping_boxes_are_two_people_where_their_joints_are_apart(ring, outside):
     """Two people behind each other stay two on the pitch; on a bench, boxes alone decide."""
@@ -302,29 +189,3 @@ def test_overlapping_boxes_are_two_people_where_their_joints_are_apart(ring, out
     keypoints[:, 0, 1] = keypoints[:, 0, 0] + 2.0  # a second box of the first person
     copied = replace(boxed, keypoints=keypoints)
     assert not locate_feet(camera, copied, PITCH).is_whole[:, 0, 1].any()
-
-
-def test_parts_with_few_detections_take_no_room_and_give_the_same_tracks():
-    places = walkers(
-        100, [[0.0, 0.0], [4.0, 1.0], [-9.0, 3.0]], [[3.0, 0.0], [-1.0, 1.0], [0.0, 2.0]]
-    )
-    places[40:, 2] = np.nan
-    whole = positions_at(
-        places[:, None] + 0.02 * np.random.default_rng(5).normal(size=(100, 1, 3, 2))
-    )
-    parts = [
-        whole.select(np.tile(np.arange(count), (len(rows), 1, 1)))
-        for count, rows in ((3, range(64)), (2, range(36)))
-    ]
-    parts[1] = replace(
-        parts[1], **{name: array[64:, :, :2] for name, array in whole.arrays().items()}
-    )
-    joined = GroundPositions.join(parts, 64)
-    assert joined.xy.shape == whole.xy.shape and joined.xy.parts[1].shape == (36, 1, 2, 2)
-    np.testing.assert_array_equal(joined.xy.whole(), whole.xy)
-    np.testing.assert_array_equal(joined.xy[70, 0, :, 0], whole.xy[70, 0, :2, 0])
-    np.testing.assert_array_equal(joined.number_seen(), whole.number_seen())
-    one, two = (track_on_plane(each, FPS, pitch_size=SIZE) for each in (whole, joined))
-    for name in ("detection_index", "xy", "covariance", "height"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
-    assert one.detection_index.shape[2] == 3

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from worldpose.tracking.plane.feet import GroundPositions
-from worldpose.tracking.plane.shirts import ShirtMemory, ShirtModel, measure_shirts
+from worldpose.tracking.plane.shirts import measure_shirts
 from worldpose.tracking.plane.tracker import track_on_plane
 
 RED, BLUE, GRASS = (200, 20, 30), (20, 40, 180), (60, 120, 50)
@@ -42,17 +42,6 @@ def test_the_colour_is_that_of_the_upper_body_with_and_without_keypoints():
     np.testing.assert_allclose(measure_shirts(image, keypoints, confidence, boxes), found)
 
 
-def test_a_shirt_behind_a_nearer_person_or_outside_of_the_image_is_not_known():
-    keypoints, confidence, boxes = people([20, 25, 195])
-    boxes[1] += [0.0, 0.0, 0.0, 6.0]  # nearer to the camera
-    image = draw([20, 25], [RED, BLUE])
-    found = measure_shirts(image, keypoints, confidence, boxes)
-    assert np.isnan(found[[0, 2]]).all()
-    np.testing.assert_allclose(found[1], lab(BLUE), atol=1e-3)
-    boxes[0] = np.nan  # no person
-    assert np.isnan(measure_shirts(image, keypoints, confidence, boxes)[0]).all()
-
-
 def meeting(colours, spread=2.0):
     """Two people who run towards each other, meet, and run back; their places and shirts."""
     rng = np.random.default_rng(2)
@@ -88,23 +77,3 @@ def test_people_of_two_teams_who_meet_and_part_are_not_exchanged():
 def test_shirts_of_one_team_decide_nothing_even_if_one_stands_in_the_shade():
     # The second person's shirt is darker, as shading makes it.
     assert ends(meeting([(200, 20, 30), (185, 18, 28)])) == [(0, 1), (1, 0)]
-
-
-def test_few_colours_and_unknown_people_tell_nothing():
-    positions = meeting([RED, BLUE])
-    assert ShirtModel.learn(positions.shirts[:5, 0], positions.xy[:5, 0]) is None
-    model = ShirtModel.learn(positions.shirts[:, 0], positions.xy[:, 0])
-    seen = np.stack([lab(RED), lab(BLUE), np.full(3, np.nan)]).astype(np.float64)
-    assert model.same_person(None, seen).tolist() == [0.0, 0.0, 0.0]
-    memory = ShirtMemory()
-    for colour in (GRASS, RED):
-        memory.see(lab(colour).astype(np.float64))
-    assert model.same_person(memory, seen).tolist() == [0.0, 0.0, 0.0]
-    for _ in range(3):
-        memory.see(lab(RED).astype(np.float64))
-    memory.see(np.full(3, np.nan))
-    red, blue, unknown = model.same_person(memory, seen)
-    # Half of all people wear red; a contradiction is bounded, as a shirt may be another's.
-    assert abs(red - np.log(0.95 * 2.0 + 0.05)) < 0.05
-    assert abs(blue - np.log(0.05)) < 0.01
-    assert unknown == 0.0

@@ -1,13 +1,9 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.errors import InputError
-from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import pixel_weights, track_people
+from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 
@@ -101,16 +97,6 @@ def test_lost_person_is_found_again_under_the_same_identity(ring, people, seen):
     assert np.isnan(result.ray_distance[50:90]).all()
 
 
-def test_track_ends_when_a_person_is_unseen_for_longer(ring, people, seen):
-    keypoints, confidence = seen(ring(5), still(people, 160))
-    keypoints[20:140] = np.nan
-    causal = SETTINGS.model_copy(update={"causal": True})
-    for setting in (causal, SETTINGS.model_copy(update={"max_join_gap_s": 2.0})):
-        result = track_people(ring(5), detections(keypoints, confidence), FPS, setting)
-        assert sorted(owners(result)) == [0, 0, 1, 1, 2, 2, 3, 3]
-        assert result.report.losses == 4
-
-
 def test_ghosts_of_two_people_in_two_cameras_make_no_tracks(ring, people, seen):
     # Two views of two people meet at four places; two of them are empty.
     camera = ring(5)[np.array([0, 1])]
@@ -134,27 +120,6 @@ def test_nan_and_zero_confidence_count_as_not_seen(ring, people, seen):
     assert (result.detection_index[:, 2, second] == -1).all()
 
 
-def test_arrays_of_different_cameras_are_refused(ring, people, seen):
-    keypoints, confidence = seen(ring(4), still(people, 3))
-    with pytest.raises(InputError, match="same clip"):
-        track_people(ring(3), detections(keypoints, confidence), FPS, SETTINGS)
-    with pytest.raises(InputError, match="expected keypoints"):
-        track_people(ring(4), detections(keypoints[:2], confidence), FPS, SETTINGS)
-
-
-def test_a_missed_person_does_not_take_the_detections_of_a_newcomer_beside(ring, people, seen):
-    # The second appears 0.5 m from the first and 0.35 m from every camera's ray to the first,
-    # hidden from three of four cameras for a moment.
-    angle = np.radians(72.0)
-    places = np.zeros((60, 2, 2))
-    places[:, 1] = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
-    keypoints, confidence = seen(ring(4), people(places))
-    keypoints[:20, :, 1] = np.nan
-    keypoints[20:24, :3, 0] = np.nan
-    result = track_people(ring(4), detections(keypoints, confidence), FPS, SETTINGS)
-    assert owners(result) == [0, 1]
-
-
 def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
     # From running at 6 m/s to lying still within 0.3 s, in a low camera rig.
     time = np.arange(0.0, 2.0, 1 / FPS)
@@ -168,45 +133,3 @@ def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
     result = track_people(ring(4), detections(*seen(ring(4), joints)), FPS, SETTINGS)
     assert owners(result) == [0]
     assert (result.detection_index >= 0).all()
-
-
-def test_weights_are_the_inverse_of_the_keypoints_variance_and_the_calibrations(ring):
-    cameras, covariance = ring(4), np.zeros((4, 12, 12))
-    exact = pixel_weights(cameras, covariance)
-    for name in ("cx", "cy"):
-        covariance[2, PARAMETERS.index(name), PARAMETERS.index(name)] = 36.0  # [px^2]
-    shifted = pixel_weights(cameras, covariance)
-    # In the image's middle people are 29 m away, where 1.75 m have 90 px: 1 + 0.02 * 90 px.
-    distance = np.linalg.norm(cameras.center[2]) * (1.0 - 1.0 / cameras.center[2, 2])
-    own = 1.0 + 0.02 * 1.75 * 1500.0 / distance
-    middle = (2, slice(8, 10), slice(15, 17))
-    assert exact[middle].mean() == pytest.approx(1.0 / own**2, rel=0.05)
-    assert shifted[middle].mean() == pytest.approx(1.0 / (own**2 + 36.0), rel=0.05)
-    assert np.array_equal(np.delete(shifted, 2, axis=0), np.delete(exact, 2, axis=0))
-
-
-def test_camera_with_an_uncertain_calibration_does_not_drag_people(ring, people, seen):
-    right, angle = ring(4), 0.012
-    keypoints, confidence = seen(right, still(people))
-    turned = np.zeros((4, 6))
-    turned[1, 1] = angle
-    given = replace(right, cam_from_world=right.cam_from_world.retract(turned))
-    covariance = np.zeros((4, 12, 12))
-    covariance[1, 1, 1] = angle**2
-    truth = people(PLACES)
-
-    def errors(stated):
-        result = track_people(
-            given,
-            detections(keypoints, confidence),
-            FPS,
-            SETTINGS,
-            pitch_size=(105.0, 68.0),
-            camera_covariance=stated,
-        )
-        assert len(result.tracks) == len(PLACES)
-        order = [owners(result).index(n) for n in range(len(PLACES))]
-        return np.linalg.norm(result.joints[5:, order] - truth, axis=-1).mean()
-
-    assert errors(None) > 0.05
-    assert errors(covariance) < 0.5 * errors(None)

@@ -7,7 +7,6 @@ import pytest
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import People
 from worldpose.detection.settings import DetectionSettings
-from worldpose.errors import InputError
 from worldpose.training import labels
 from worldpose.training.labels import read_labels
 
@@ -45,11 +44,3 @@ def test_a_folder_of_images_is_labelled_as_a_video_is(tmp_path):
     names = [f"{camera}_{number:06d}.png" for camera in ("cam00", "cam01") for number in (0, 2, 4)]
     assert [picture.path.name for picture in found] == names
     assert [picture.keypoints[0, 0, 0] for picture in found] == [0.0, 20.0, 40.0] * 2
-
-
-def test_a_failed_labelling_leaves_nothing_that_blocks_its_repetition(tmp_path):
-    videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
-    with pytest.raises(InputError):
-        labels.propose_labels(videos, 2, tmp_path / "labels", DetectionSettings())
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cam00", "cam01"]
-    assert labels.propose_labels(videos[:1], 2, tmp_path / "labels", DetectionSettings()) == 3

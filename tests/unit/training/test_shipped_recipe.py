@@ -119,36 +119,3 @@ def test_joints_are_labelled_where_three_views_agree(real_frames):
     np.testing.assert_allclose(keypoints[0, 1], [60.0, 50.0])
     assert np.isnan(keypoints[0, 0]).all()
     assert not visible[1].any()  # 39 px: too small
-
-
-def test_looks_of_real_cameras_soften_edges_and_draw_things_beside_people(monkeypatch):
-    monkeypatch.syspath_prepend(RECIPE)
-    looks = importlib.import_module("real_looks").RealLooks
-    plain = dict.fromkeys(looks.model_fields, 0.0)
-    people = np.array([[20.0, 20.0, 40.0, 40.0]])
-    image = np.full((128, 128, 3), 40, dtype=np.uint8)
-    image[20:40, 20:40] = 200
-    for name in ("coarse", "moved"):
-        seen = looks(**{**plain, name: 1.0}).augment(image, np.random.default_rng(3))
-        levels = seen[..., 0].astype(int)
-        # Of the row or the column, whichever is less steep.
-        assert min(np.abs(np.diff(line)).max() for line in (levels[30], levels[:, 30])) < 160
-    seen = looks(**{**plain, "cluttered": 1.0}).add_things(image, people, np.random.default_rng(4))
-    np.testing.assert_array_equal(seen[20:40, 20:40], image[20:40, 20:40])
-    assert (seen != image).any()
-
-
-def test_the_fit_of_a_score_map_finds_the_true_one_and_sources_weigh_alike(monkeypatch):
-    monkeypatch.syspath_prepend(RECIPE)
-    fit_score_map = importlib.import_module("score_map").fit_score_map
-    rng = np.random.default_rng(4)
-
-    def draw(count, slope, offset):
-        score = rng.uniform(0.05, 0.95, count)
-        odds = (score / (1.0 - score)) ** slope * np.exp(offset)
-        return score, rng.uniform(size=count) < odds / (1.0 + odds)
-
-    one = fit_score_map([draw(20_000, 3.0, -0.5)])
-    assert abs(one.slope - 3.0) < 0.15 and abs(one.offset + 0.5) < 0.1
-    both = fit_score_map([draw(20_000, 3.0, 1.0), draw(2_000, 3.0, -1.0)])
-    assert abs(both.offset) < 0.25

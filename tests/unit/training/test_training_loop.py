@@ -71,14 +71,6 @@ def test_the_best_weights_are_kept_and_training_stops_early():
         assert torch.equal(value, best[name]), name
 
 
-def test_training_that_makes_a_net_worse_changes_nothing():
-    training = line_fit(scores=[0.9, 0.5, 0.4, 0.3])
-    before = {name: value.clone() for name, value in training.net.state_dict().items()}
-    train(training)
-    for name, value in training.net.state_dict().items():
-        assert torch.equal(value, before[name]), name
-
-
 def test_what_is_no_checkpoint_of_this_training_is_refused(tmp_path):
     checkpoint = tmp_path / "training.checkpoint"
     train(line_fit(), checkpoint)

@@ -7,7 +7,6 @@ from worldpose.detection.interfaces import People
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.metrics import (
     average_precision,
-    calibration_error,
     correct_keypoints,
 )
 
@@ -49,16 +48,6 @@ def test_area_under_precision_over_recall(boxes, people, area):
     assert average_precision([said], [truth(people)]) == pytest.approx(area, nan_ok=True)
 
 
-def test_ignored_people_and_those_of_other_heights_do_not_count():
-    said = found([AWAY, NEAR], [0.9, 0.8])
-    assert average_precision([said], [truth([NEAR, AWAY], [False, True])]) == 1.0
-    small, strange = [200, 0, 210, 20], [400, 0, 410, 20]
-    said = found([small, strange, NEAR], [0.9, 0.8, 0.7])
-    assert average_precision([said], [truth([NEAR, small])], (30.0, 50.0)) == 1.0
-    # Of all heights: right, wrong, right.
-    assert average_precision([said], [truth([NEAR, small])]) == pytest.approx(5 / 6)
-
-
 def test_a_keypoint_within_a_fifth_of_the_torso_is_correct():
     # Shoulders 40 px apart, 30 px above both hips, which are on one point: a torso of 50 px.
     person = np.zeros((1, 17, 2))
@@ -71,11 +60,3 @@ def test_a_keypoint_within_a_fifth_of_the_torso_is_correct():
     correct = correct_keypoints(found, person)
     assert np.isnan(correct[0, 10])
     assert np.flatnonzero(correct[0] == 0.0).tolist() == [9, 11]
-
-
-def test_confidence_that_says_the_share_of_right_ones_is_calibrated():
-    confidence = np.array([0.25] * 4 + [0.75] * 4)
-    right = np.array([True, False, False, False, True, True, True, False])
-    assert calibration_error(confidence, right, classes=2) == pytest.approx(0.0)
-    # All right: 0.75 and 0.25 too modest, each for half of them.
-    assert calibration_error(confidence, np.ones(8, dtype=bool), classes=2) == pytest.approx(0.5)

@@ -4,17 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
-
-
-def look_at(center: np.ndarray, target: np.ndarray) -> Rigid:
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Rigid(rotation, -rotation @ center)
 
 
 @pytest.fixture
@@ -25,14 +17,12 @@ def ring() -> Callable[..., Camera]:
         cameras = []
         for n in range(count):
             angle = arc * n / count
-            center = np.array([30 * np.cos(angle), 30 * np.sin(angle), 8.0])
+            center = [30 * np.cos(angle), 30 * np.sin(angle), 8.0]
             cameras.append(
-                Camera(
-                    focal=np.array([1500.0, 1520.0]),
-                    principal_point=np.array([950.0, 545.0]),
-                    distortion=np.array([-0.1, 0.03, 0.001, -0.002, 0.0]),
-                    cam_from_world=look_at(center, np.array([0.0, 0.0, 1.0])),
-                    image_size=np.array([1920, 1080]),
+                look_at_camera(
+                    *(center, (0.0, 0.0, 1.0), (1500.0, 1520.0)),
+                    middle=(950.0, 545.0),
+                    lens=(-0.1, 0.03, 0.001, -0.002, 0.0),
                 )
             )
         return Camera.stack(cameras)

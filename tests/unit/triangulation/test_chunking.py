@@ -1,6 +1,3 @@
-from functools import reduce
-from operator import add
-
 import numpy as np
 import pytest
 from running_samples import FPS, MIRRORED, detections, runner
@@ -12,7 +9,6 @@ from worldpose.triangulation.estimate import (
     reconstruct_chunks,
     reconstruct_joints,
 )
-from worldpose.triangulation.report import Histogram
 from worldpose.triangulation.settings import TriangulationSettings
 
 as_detections = KeypointDetections.from_keypoints
@@ -71,42 +67,6 @@ def test_parts_give_what_the_whole_clip_gives(clip):
     assert filled.sum() == 15 * 17
 
 
-def test_every_third_frame_alone(clip):
-    camera, arrays = clip
-    seen = as_detections(*arrays)
-    model = learn_clip(camera, seen, FPS, SETTINGS)
-    every = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS))
-    third = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=64, stride=3))
-    assert len(third) == 2 and third[-1].frames.stop == len(range(0, FRAMES, 3))
-    for name in ("joints", "covariance", "views", "inliers", "exchanged", "offsets"):
-        whole = np.concatenate([getattr(part.triangulation, name) for part in every])
-        found = np.concatenate([getattr(part.triangulation, name) for part in third])
-        # Joints of a tile of the solver share their number of steps.
-        np.testing.assert_allclose(found, whole[::3], rtol=1e-6, atol=1e-8)
-    late = [part.smoothing.filled.sum() for part in third]
-    assert sum(late) == 5 * 17  # the gap of 0.3 s, and not that of 0.8 s
-
-
-def test_frames_of_a_match_share_the_maximum():
-    settings = TriangulationSettings(max_frames=1000)
-    assert [settings.stride(frames) for frames in (1, 1000, 1001, 3000, 30_000)] == [1, 1, 2, 3, 30]
-
-
-def test_reports_of_parts_add_up_to_the_clip_s(clip):
-    camera, arrays = clip
-    whole = reconstruct_joints(camera, as_detections(*arrays), FPS, SETTINGS)
-    seen = as_detections(*arrays)
-    model = learn_clip(camera, seen, FPS, SETTINGS)
-    parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
-    agreement = reduce(add, [part.triangulation.agreement for part in parts])
-    assert agreement.report(whole.triangulation.noise.factor) == whole.triangulation.report
-    changes = reduce(add, [part.smoothing.changes for part in parts])
-    report = changes.report(model.motion.acceleration, model.motion.repeated)
-    assert report.filled == whole.smoothing.report.filled
-    # A class of the histogram is half a percent wide.
-    assert report.moved_m == pytest.approx(whole.smoothing.report.moved_m, rel=0.011)
-
-
 def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
     camera, arrays = clip
     plain = as_detections(*arrays)
@@ -119,22 +79,3 @@ def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
         pass
     # 128 frames are the least that hold a margin of 100 in whole tiles of 64.
     assert max(values.most for values in watched) <= 128 + 2 * MARGIN * FPS + 2
-
-
-def test_clip_without_frames_or_people_has_one_empty_part(ring):
-    camera = ring(3)
-    for frames, persons in ((0, 2), (5, 0)):
-        keypoints, confidence, index = detections(camera, runner(5), 1.0)
-        arrays = keypoints[:frames], confidence[:frames], index[:frames, :, :persons]
-        seen = as_detections(*arrays)
-        model = learn_clip(camera, seen, FPS, SETTINGS)
-        (part,) = reconstruct_chunks(camera, seen, model, FPS, SETTINGS)
-        assert part.smoothing.joints.shape == (frames, persons, 17, 3)
-
-
-def test_histograms_know_medians_to_half_a_percent():
-    values = np.random.default_rng(0).lognormal(-3.0, 1.0, (501, 2))
-    added = Histogram.of(values[:, 0]) + Histogram.of(values[:, 1])
-    assert added.median == pytest.approx(np.median(values), rel=0.006)
-    assert Histogram.of(np.zeros(3)).median == 0.0
-    assert Histogram.of(np.empty(0)).median is None

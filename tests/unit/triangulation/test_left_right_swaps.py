@@ -5,13 +5,8 @@ from running_samples import MIRRORED, detections, runner
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
 from worldpose.triangulation.estimate import triangulate_joints
-from worldpose.triangulation.limb_lengths import find_swaps
-from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solve import SolvedJoints
 
 as_detections = KeypointDetections.from_keypoints
 
@@ -56,46 +51,3 @@ def test_noise_is_not_taken_for_an_exchange(ring):
     arrays = detections(ring(5), runner(40), 6.0)
     found = triangulate_joints(ring(5), as_detections(*arrays), SETTINGS)
     assert found.exchanged.any(axis=-1).mean() < 0.01
-
-
-@pytest.mark.parametrize(
-    ("aside", "legs_fit", "parts"),
-    [
-        # 7 against twice log(50), 7.8, for a whole body; 9, which is enough.
-        (3.2, False, []),
-        (3.4, False, [FACE, ARMS, LEGS]),
-        # The legs are the right way round: 9 against twice log(150), 10.0, for arms alone; 11.
-        (3.4, True, []),
-        (3.6, True, [ARMS]),
-    ],
-)
-def test_an_exchange_needs_as_much_evidence_as_it_is_rare(aside, legs_fit, parts):
-    camera = Camera(
-        focal=np.array([[1000.0, 1000.0]]),
-        principal_point=np.zeros((1, 2)),
-        distortion=np.zeros((1, 5)),
-        cam_from_world=Rigid(np.eye(3)[None], np.zeros((1, 3))),
-        image_size=np.array([[1920, 1080]]),
-    )
-    # Left and right wrist, left and right ankle: 5 px apart; only the left ones are seen.
-    wrist, ankle = COCO17.index("left_wrist"), COCO17.index("left_ankle")
-    joints, keypoints = np.full((1, 1, 17, 3), np.nan), np.zeros((1, 1, 1, 17, 2))
-    joints[0, 0, [wrist, ankle]] = [0.0, 0.0, 10.0]
-    joints[0, 0, [wrist + 1, ankle + 1]] = [0.05, 0.0, 10.0]
-    keypoints[..., wrist, 0] = aside
-    precision = np.zeros((1, 1, 1, 17))
-    precision[..., wrist], precision[..., ankle] = 1.0, legs_fit
-    found = SolvedJoints(
-        joints=joints,
-        covariance=np.zeros((1, 1, 17, 3, 3)),
-        views=np.zeros((1, 1, 17), np.uint8),
-        spread=np.zeros((1, 1, 17), np.float32),
-        reprojection_error=np.zeros((1, 1, 17), np.float32),
-        inliers=np.zeros((1, 1, 1, 17), np.bool_),
-        seen=np.ones((1, 1, 1, 17), np.bool_),
-    )
-    index, noise = np.zeros((1, 1, 1), np.int64), (1.0, 0.0)
-    observed = Observations.of(Rig.from_cameras(camera), keypoints, precision, index)
-    # The squared residual, minus that with sides swapped, both at most 25.
-    flags = find_swaps(observed, noise, 25.0, found)
-    assert np.flatnonzero(flags).tolist() == parts

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
@@ -146,53 +145,3 @@ def test_covariance_is_the_spread_of_a_monte_carlo(ring, seen):
     np.testing.assert_allclose(whiten @ sampled @ whiten.T, np.eye(3), atol=0.09)
     # Bias of second order only, below its own sampling error: 4 / sqrt(4000) deviations.
     assert np.abs(whiten @ errors.mean(axis=0)).max() < 4 / np.sqrt(4000)
-
-
-def test_joint_noise_is_in_metres(ring, seen):
-    # Noise that grows with the image of a person has the same effect near and far: two
-    # crossing rays with 5 cm across each give 5 cm in the plane of both.
-    cameras = ring(4)[np.array([0, 1])]
-    joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
-    metric = STATED.model_copy(update={"pixel_noise_px": 1e-6, "joint_noise_m": 0.05})
-    result = triangulate_joints(cameras, as_detections(*seen(cameras, joint)), metric)
-    # x and y by one ray each, z by both. The point is 13 degrees off axis, where the image is
-    # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
-    np.testing.assert_allclose(
-        result.covariance[0, 0, 0], np.diag([0.05**2, 0.05**2, 0.05**2 / 2]), rtol=0.06, atol=4e-6
-    )
-
-
-@pytest.mark.parametrize(
-    ("changed", "expected"),
-    [
-        ({"cameras": 3}, "expected keypoints"),
-        ({"frames": 0}, "same clip"),
-        ({"detection": 2}, "one of 2 detections"),
-        ({"covariances": 3}, "camera_covariance"),
-    ],
-)
-def test_arrays_of_different_clips_are_refused(ring, seen, changed, expected):
-    keypoints, confidence, index = seen(ring(4), some_joints())
-    index = index[: changed.get("frames", 1)]
-    index[:, 2, 1] = changed.get("detection", 1)
-    detections = as_detections(keypoints, confidence, index)
-    covariance = np.zeros((changed.get("covariances", 4), 12, 12))
-    with pytest.raises(InputError, match=expected):
-        triangulate_joints(ring(changed.get("cameras", 4)), detections, SETTINGS, covariance)
-
-
-def test_spread_is_the_widest_angle_between_rays(ring, seen):
-    # Two cameras a quarter turn apart and 8 m up: rays to a point 8 m up cross at a right angle.
-    cameras = ring(4)[np.array([0, 1])]
-    joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
-    result = triangulate_joints(cameras, as_detections(*seen(cameras, joint)), STATED)
-    np.testing.assert_allclose(result.spread, np.pi / 2, rtol=1e-6)
-
-
-def test_shared_bias_is_in_the_covariance(ring, seen):
-    keypoints, confidence, index = seen(ring(5), some_joints())
-    without = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), STATED)
-    biased = STATED.model_copy(update={"common_bias_m": 0.03})
-    result = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), biased)
-    added = result.covariance - without.covariance
-    np.testing.assert_allclose(added, np.broadcast_to(9e-4 * np.eye(3), added.shape), atol=1e-15)

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.triangulation.synchronization import shift_frames, synchronize
+from worldpose.triangulation.synchronization import synchronize
 
 LATE = np.array([-12.0, -3.5, 0.0, 2.25, 20.0])
 """Offset of each camera [frame]: its frame t shows the time t + offset."""
@@ -97,19 +96,3 @@ def test_a_camera_that_shows_other_people_has_no_offset(scene, pitch):
     assert found.reasons[3]
     rest = np.array([0, 1, 2, 4])
     assert np.abs(errors(found)[rest]).max() < 0.2
-
-
-def test_shifted_frames_lie_on_the_common_clock():
-    keypoints = np.arange(10.0)[:, None, None, None, None] + np.zeros((10, 2, 1, 17, 2))
-    given = KeypointDetections.from_keypoints(keypoints, np.ones((10, 2, 1, 17)))
-    moved = shift_frames(given, np.array([1]), np.array([3])).keypoints[:, 0, 0, 0, 0]
-    np.testing.assert_array_equal(moved, [np.nan, np.nan, np.nan, 0, 1, 2, 3, 4, 5, 6])
-
-
-def test_one_camera_has_nothing_to_be_compared_with(scene):
-    one = shifted(scene)
-    alone = with_rows(scene.static_views().detections, np.zeros((5, 1), int))
-    with pytest.raises(InputError, match="synchronization: expected two cameras or more"):
-        synchronize(turned(scene, 0.0)[:1], alone, FPS)
-    with pytest.raises(InputError, match="expected two cameras or more"):
-        synchronize(turned(scene, 0.0)[:3], one, FPS)

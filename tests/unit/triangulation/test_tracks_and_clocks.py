@@ -2,20 +2,14 @@ import numpy as np
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
+from worldpose.triangulation.clocks import estimate_clocks
 from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import segments, smooth_joints
+from worldpose.triangulation.smoothing import smooth_joints
 
 as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
-
-
-def test_segments_break_at_long_gaps_only():
-    there = np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 1, 0], dtype=bool)
-    assert segments(there, 2) == [slice(1, 6), slice(9, 10)]
-    assert segments(there[:1], 2) == []
 
 
 def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
@@ -89,28 +83,3 @@ def test_late_clocks_are_found(ring):
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
     )
-
-
-def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
-    camera = ring(4)
-    still = np.broadcast_to(runner(1), (60, 2, 17, 3))
-    clocks = estimate_clocks(camera, as_detections(*detections(camera, still, 1.0)), FPS, SETTINGS)
-    assert not clocks.determined.any()
-    assert np.isnan(clocks.late).all()
-    assert clocks.report.clock_late_frames == (None,) * 4
-
-
-def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
-    keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
-    index[4, 1, 0] = -1
-    late = np.array([0.0, 2.0, -0.5])
-    shifted = shift_in_time(as_detections(keypoints, confidence, index), late)
-    pixels, moved = shifted.keypoints, shifted.detection_index
-    np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
-    np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
-    assert (moved[:2, 1] == -1).all()
-    assert moved[6, 1, 0] == -1
-    np.testing.assert_allclose(
-        pixels[:-1, 2], 0.5 * (keypoints[:-1, 2] + keypoints[1:, 2]), atol=1e-9
-    )
-    assert (moved[-1, 2] == -1).all()

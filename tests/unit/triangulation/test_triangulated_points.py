@@ -5,13 +5,7 @@ import pytest
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.estimate import (
-    learn_clip,
-    reconstruct_chunks,
-    reconstruct_joints,
-    triangulate_joints,
-)
-from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 NOISE = 2.0
@@ -64,31 +58,3 @@ def test_points_are_found_within_their_noise(clip):
 
 def replace_settings(**changes):
     return TriangulationSettings().model_copy(update=changes)
-
-
-def test_landmarks_are_swapped_with_their_part_and_the_trunk_with_all_limbs(clip):
-    _, plain, _, _ = clip
-    names = ("left_thigh_1", "right_thigh_1", "left_trunk_1", "right_trunk_1", "left_forearm_1")
-    rng = np.random.default_rng(2)
-    shape = (*plain.score.shape, len(names))
-    given = plain.add_points(names, rng.normal(size=(*shape, 2)), rng.uniform(0.1, 1.0, shape))
-    exchanged = np.zeros((60, 6, 2, 3), dtype=bool)
-    exchanged[4, 0, 0, 2] = True
-    exchanged[5, 0, 0] = True
-    found = undo_swaps(given, exchanged).extra_keypoints
-    one, all_ = given.extra_keypoints[4, 0, 0], given.extra_keypoints[5, 0, 0]
-    np.testing.assert_array_equal(found[4, 0, 0], one[[1, 0, 2, 3, 4]])
-    np.testing.assert_array_equal(found[5, 0, 0], all_[[1, 0, 3, 2, 4]])  # a lone point stays
-
-
-def test_chunks_give_the_same_points_as_the_whole_clip(clip):
-    cameras, _, with_feet, _ = clip
-    settings = TriangulationSettings()
-    model = learn_clip(cameras, with_feet, FPS, settings)
-    whole = reconstruct_joints(cameras, with_feet, FPS, settings).triangulation.extra
-    many = with_feet[np.arange(300) % 60]
-    parts = list(reconstruct_chunks(cameras, many, model, FPS, settings, length=128))
-    assert len(parts) > 1
-    joined = np.concatenate([part.triangulation.extra.joints for part in parts])
-    np.testing.assert_array_equal(joined[:60], whole.joints)
-    np.testing.assert_allclose(joined[120:180], whole.joints, atol=1e-6)  # in other tiles

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.ingest.footage import UnitFrames, read_footage, write_still
+from worldpose.ingest.footage import write_still
 from worldpose.video.folder import index_video, open_video
 
 SIZE = (48, 64)
@@ -63,14 +63,6 @@ def test_a_dropped_picture_leaves_its_frame_empty_and_shifts_none(tmp_path):
     expected = np.full(30, -1)
     expected[shown] = np.arange(28)
     assert index.on_clock(25.0, "dropped").tolist() == expected.tolist()
-
-
-def test_uneven_times_count_for_the_nearest_frame(tmp_path):
-    rng = np.random.default_rng(4)
-    jitter = rng.integers(-15, 16, 30)  # a frame is 40 ms long: all stay nearest to their own
-    jitter[0] = 0
-    index = index_video(encode(tmp_path / "uneven.mkv", 40 * np.arange(30) + jitter))
-    assert index.on_clock(25.0, "uneven").tolist() == list(range(30))
 
 
 def test_a_video_of_another_rate_is_refused(tmp_path):
@@ -140,16 +132,3 @@ def test_images_whose_names_do_not_number_them_are_refused(tmp_path, names, mess
         write_still(tmp_path / f"{name}.png", numbered(1)[0])
     with pytest.raises(InputError, match=message):
         index_video(tmp_path).on_clock(25.0, "images")
-
-
-def test_clips_that_are_far_apart_take_only_their_own_frames_of_a_video(tmp_path):
-    path = encode(tmp_path / "a.mp4", 40 * np.arange(50))
-    size = index_video(path).size
-    clips = [("late", 40, 5), ("far", 2_000_000_000, 3), ("early", 3, 4)]
-    frames = UnitFrames(3, 2_000_000_000, 0)
-    with pytest.raises(InputError, match="clip far"):
-        read_footage(path, 25.0, size, frames, clips)
-    footage = read_footage(path, 25.0, size, frames, [clips[0], clips[2]])
-    assert footage.frame.tolist() == [3, 4, 5, 6, 40, 41, 42, 43, 44]
-    assert footage.picture.tolist() == footage.frame.tolist()
-    assert footage.missing == []

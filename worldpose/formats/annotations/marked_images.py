@@ -1,4 +1,4 @@
-"""Clicked points and drawn lines of images in the files of CVAT, Label Studio and COCO.
+"""Clicked points and drawn lines of images in files of CVAT, Label Studio, COCO and SoccerNet.
 
 Pixels follow this project: (0, 0) is the centre of the top-left pixel.
 """
@@ -36,19 +36,26 @@ class MarkedImage:
 
     Attributes:
         name: name of the image, as the file has it.
-        size: width, height [px].
+        size: width, height [px]; None where the file has shares of them in place of pixels.
         points: label and (2,) pixel of every click, in the order of the file.
         lines: label and (points, 2) pixels of every drawn line.
     """
 
     name: str
-    size: tuple[int, int]
+    size: tuple[int, int] | None
     points: tuple[tuple[str, Floats], ...]
     lines: tuple[tuple[str, Floats], ...]
 
+    def of_size(self, size: tuple[int, int]) -> MarkedImage:
+        """Return the image with pixels, in a size that the file may lack."""
+        if self.size is not None:
+            return self
+        lines = tuple((label, share * np.array(size)) for label, share in self.lines)
+        return MarkedImage(self.name, size, self.points, lines)
+
 
 def read_marked_images(path: Path) -> list[MarkedImage]:
-    """Return the images of a CVAT for images XML, Label Studio JSON or COCO keypoints JSON file.
+    """Return the images of CVAT for images XML, Label Studio JSON, COCO or SoccerNet's lines JSON.
 
     Raises:
         InputError: the file has none of these forms, or no labelled point or line.
@@ -57,13 +64,19 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
     def decode(content: bytes) -> list[MarkedImage]:
         begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
         decoders = {b"<": _read_cvat, b"[": _read_label_studio}
-        found = decoders.get(begin, _read_coco)(content)
+        try:
+            found = list(decoders.get(begin, _read_coco)(content))
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise ContentError(f"no JSON: {error}") from error
         images = [image for image in found if image.points or image.lines]
         if not images:
             raise ContentError("no labelled point or line")
         return images
 
-    expected = "labelled points as CVAT for images XML 1.1, Label Studio JSON or COCO keypoints"
+    expected = (
+        "labelled points as CVAT for images XML 1.1, Label Studio JSON or COCO keypoints, or lines "
+        "of SoccerNet"
+    )
     todo = "Export the clicks from the annotator in one of these forms."
     return decode_file(path, MAX_BYTES, decode, expected, todo)
 
@@ -72,6 +85,8 @@ def _read_cvat(content: bytes) -> Iterator[MarkedImage]:
     root = read_xml(content)
     if root.tag != "annotations":
         raise ContentError(f"the root is <{root.tag[:40]}>, not <annotations>")
+    if root.find("track") is not None:
+        raise ContentError("tracks: export as `CVAT for images`, not `for video`")
     for image in root.iter("image"):
         name = image.get("name", "")
         points: list[tuple[str, Floats]] = []
@@ -98,6 +113,10 @@ def _read_cvat(content: bytes) -> Iterator[MarkedImage]:
         yield MarkedImage(name, size, tuple(points), tuple(lines))
 
 
+_LABELS: Final = ("keypointlabels", "polygonlabels", "vectorlabels")
+"""Label Studio's kinds of regions that are read: points, and lines as polygons or vectors."""
+
+
 class _Task(Given):
     data: dict[str, Any]
     annotations: tuple[Answer, ...] = ()
@@ -106,48 +125,83 @@ class _Task(Given):
 class _Place(Given):
     x: float
     y: float
-    keypointlabels: tuple[str, ...] = Field(min_length=1, max_length=1)
 
 
-class _Outline(Given):
-    points: tuple[tuple[float, float], ...]
-    polygonlabels: tuple[str, ...] = Field(min_length=1, max_length=1)
+class _Value(Given):
+    x: float = 0.0
+    y: float = 0.0
+    points: tuple[tuple[float, float], ...] = ()
+    vertices: tuple[_Place, ...] = ()
+    keypointlabels: tuple[str, ...] = Field(default=(), max_length=1)
+    polygonlabels: tuple[str, ...] = Field(default=(), max_length=1)
+    vectorlabels: tuple[str, ...] = Field(default=(), max_length=1)
 
 
 class _Region(Given):
     type: str
     original_width: int = Field(ge=1)
     original_height: int = Field(ge=1)
-    value: dict[str, Any]
+    image_rotation: int = 0
+    value: _Value
+
+    def place(self) -> tuple[str, Floats]:
+        """Return the label and the pixels (points, 2) of the picture as it was before turning."""
+        label = getattr(self.value, self.type)
+        if not label:
+            raise ContentError(f"a region of {self.type} without a label")
+        vertices = [(each.x, each.y) for each in self.value.vertices] or self.value.points
+        x, y = np.array(vertices or [(self.value.x, self.value.y)], np.float64).T
+        turned = {0: (x, y), 90: (y, 100.0 - x), 180: (100.0 - x, 100.0 - y), 270: (100.0 - y, x)}
+        if self.image_rotation % 360 not in turned:
+            raise ContentError(f"a picture turned by {self.image_rotation} degrees")
+        size = np.array([self.original_width, self.original_height])
+        share = np.stack(turned[self.image_rotation % 360], axis=-1)
+        return label[0], share * size / 100.0 - CORNER
 
 
 def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
-    for number, task in enumerate(TypeAdapter(tuple[_Task, ...]).validate_json(content)):
+    tasks = json.loads(content)
+    if isinstance(tasks, list):
+        tasks = [_full_task(task) for task in tasks]
+    for number, task in enumerate(TypeAdapter(tuple[_Task, ...]).validate_python(tasks)):
         answers = [each for each in task.annotations if not each.was_cancelled]
         names = [value for value in task.data.values() if isinstance(value, str)]
         name = names[0] if names else f"task {number}"
-        points: list[tuple[str, Floats]] = []
-        lines: list[tuple[str, Floats]] = []
-        sizes = set()
-        for each in answers[-1].result if answers else ():
-            if each.get("type") not in ("keypointlabels", "polygonlabels"):
-                continue
-            region = _Region.model_validate(each)
-            size = (region.original_width, region.original_height)
-            sizes.add(size)
-            pixels = np.array(size) / 100.0
-            if region.type == "keypointlabels":
-                place = _Place.model_validate(region.value)
-                points.append(
-                    (place.keypointlabels[0], np.array([place.x, place.y]) * pixels - CORNER)
-                )
-            else:
-                outline = _Outline.model_validate(region.value)
-                lines.append((outline.polygonlabels[0], np.array(outline.points) * pixels - CORNER))
+        regions = [
+            _Region.model_validate(each)
+            for each in (answers[-1].result if answers else ())
+            if each.get("type") in _LABELS
+        ]
+        sizes = {(region.original_width, region.original_height) for region in regions}
         if len(sizes) > 1:
             raise ContentError(f"{name}: regions of images of {len(sizes)} sizes")
+        shapes = [(region.type, *region.place()) for region in regions]
+        points = ((label, at[0]) for kind, label, at in shapes if kind == "keypointlabels")
+        lines = ((label, at) for kind, label, at in shapes if kind != "keypointlabels")
         if sizes:
             yield MarkedImage(name, sizes.pop(), tuple(points), tuple(lines))
+
+
+def _full_task(task: Any) -> Any:  # noqa: ANN401
+    """Return a task of the export JSON as it is, and one of JSON_MIN in that form."""
+    if not isinstance(task, dict) or "data" in task:
+        return task
+    regions = [
+        {
+            "type": kind,
+            "original_width": each.get("original_width"),
+            "original_height": each.get("original_height"),
+            "value": each,
+        }
+        for entry in task.values()
+        if isinstance(entry, list)
+        for each in entry
+        if isinstance(each, dict)
+        for kind in _LABELS
+        if kind in each
+    ]
+    names = {key: value for key, value in task.items() if isinstance(value, str)}
+    return {"data": names, "annotations": [{"result": regions}]}
 
 
 class _Category(Given):
@@ -168,10 +222,11 @@ class _Dataset(Given):
 
 
 def _read_coco(content: bytes) -> Iterator[MarkedImage]:
-    try:
-        dataset = _Dataset.model_validate(json.loads(content))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ContentError(f"no JSON: {error}") from error
+    given = json.loads(content)
+    if isinstance(given, dict) and SOCCERNET_MARKINGS.keys() & {name.strip() for name in given}:
+        yield _read_soccernet(given)
+        return
+    dataset = _Dataset.model_validate(given)
     names = {category.id: category.keypoints for category in dataset.categories}
     for image in dataset.images:
         points = []
@@ -189,3 +244,42 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
                 if visible > 0:
                     points.append((label, np.array([x, y])))
         yield MarkedImage(image.file_name, (image.width, image.height), tuple(points), ())
+
+
+class _Share(Given):
+    x: float
+    y: float
+
+
+def _read_soccernet(given: dict[str, Any]) -> MarkedImage:
+    """Return the image of SoccerNet's lines: shares of width and height by names of markings."""
+    lines = []
+    for name, places in TypeAdapter(dict[str, tuple[_Share, ...]]).validate_python(given).items():
+        # Annotators drag ends past the border, where nothing is visible.
+        inside = [(at.x, at.y) for at in places if 0.0 <= at.x <= 1.0 and 0.0 <= at.y <= 1.0]
+        if inside and "unknown" not in name.lower():  # SoccerNet's word for lines of no name
+            lines.append((name, np.array(inside)))
+    return MarkedImage("picture", None, (), tuple(lines))
+
+
+def _soccernet_markings() -> dict[str, str]:
+    names = {
+        "Side line top": "touch_line_far",
+        "Side line bottom": "touch_line_near",
+        "Middle line": "halfway_line",
+        "Circle central": "center_circle",
+    }
+    for side, left_post, right_post in (("left", "near", "far"), ("right", "far", "near")):
+        names[f"Side line {side}"] = f"goal_line_{side}"
+        names[f"Circle {side}"] = f"penalty_arc_{side}"
+        for theirs, ours in (("Big", "penalty_area"), ("Small", "goal_area")):
+            for part, place in (("main", "front"), ("top", "far"), ("bottom", "near")):
+                names[f"{theirs} rect. {side} {part}"] = f"{ours}_{side}_{place}"
+        names[f"Goal {side} crossbar"] = f"crossbar_{side}"
+        names[f"Goal {side} post left"] = f"goal_post_{side}_{left_post}"
+        names[f"Goal {side} post right"] = f"goal_post_{side}_{right_post}"
+    return names
+
+
+SOCCERNET_MARKINGS: Final = _soccernet_markings()
+"""Names of the pitch template by SoccerNet's names."""

@@ -1,16 +1,19 @@
 """The Levenberg-Marquardt loop: trial steps, acceptance, damping and stopping rule.
 
 A problem plugs in a function that returns the state after a damped step. It linearizes, and solves
-its normal equations in their own structure: dense, block-banded, or with points eliminated.
+its normal equations in their own structure: dense, block-banded, or with points eliminated. A loop
+that is compiled as a whole applies the same rules: `is_better` and `next_damping`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+
+from worldpose.compiled import compile_kernel
 
 
 class State(Protocol):
@@ -24,28 +27,22 @@ class State(Protocol):
 S = TypeVar("S", bound=State)
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """Course of the damping, and the stopping rule.
+class Damping(NamedTuple):
+    """Course of the damping.
 
     Attributes:
-        damping: initial Marquardt damping [1].
+        start: initial Marquardt damping [1].
         decrease: factor that divides the damping after an accepted step [1].
+        lowest: lower limit [1].
+        highest: the loop ends if a rejected step raises the damping beyond it [1].
         increase: factor on the damping after a rejected step [1].
-        min_damping: lower limit [1].
-        max_damping: the loop ends if a rejected step raises the damping beyond it [1].
-        iterations: maximum number of steps, accepted or rejected.
-        converged: whether the costs before and after a trial step end the loop; the loop asks for
-            rejected steps, too.
     """
 
-    damping: float
+    start: float
     decrease: float
-    min_damping: float
-    iterations: int
-    converged: Callable[[float, float], bool]
+    lowest: float
+    highest: float = np.inf
     increase: float = 8.0
-    max_damping: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,27 +62,45 @@ class Minimum(Generic[S]):
     converged: bool
 
 
-def minimize(state: S, step: Callable[[S, float], S], schedule: Schedule) -> Minimum[S]:
-    """Return the state of minimum cost near a start.
+@compile_kernel
+def is_better(before: float, after: float) -> bool:
+    """Return whether a step from one cost to another is accepted: one to NaN never is."""
+    return after < before
 
-    A step is accepted if it decreases the cost; one to a cost that is not finite never is.
+
+@compile_kernel
+def next_damping(damping: float, accepted: bool, course: Damping) -> float:
+    """Return the damping after an accepted or a rejected step."""
+    if accepted:
+        return max(damping / course.decrease, course.lowest)
+    return damping * course.increase
+
+
+def minimize(
+    state: S,
+    step: Callable[[S, float], S],
+    course: Damping,
+    iterations: int,
+    converged: Callable[[S, S], bool],
+) -> Minimum[S]:
+    """Return the state of minimum cost near a start.
 
     Args:
         state: the start, of finite cost.
         step: returns the state after a damped step from a state.
-        schedule: damping and stopping rule.
+        course: damping.
+        iterations: maximum number of steps, accepted or rejected.
+        converged: whether the states before and after a trial step end the loop; the loop asks
+            for rejected steps, too.
     """
-    damping, costs, done, iteration = schedule.damping, [state.cost], False, 0
-    while iteration < schedule.iterations and not done:
+    damping, costs, done, iteration = course.start, [state.cost], False, 0
+    while iteration < iterations and not done and damping <= course.highest:
         iteration += 1
         trial = step(state, damping)
-        done = schedule.converged(state.cost, trial.cost)
-        if trial.cost < state.cost:
+        done = converged(state, trial)
+        accepted = is_better(state.cost, trial.cost)
+        damping = next_damping(damping, accepted, course)
+        if accepted:
             state = trial
             costs.append(state.cost)
-            damping = max(damping / schedule.decrease, schedule.min_damping)
-        else:
-            damping *= schedule.increase
-            if damping > schedule.max_damping:
-                break
     return Minimum(state, tuple(costs), iteration, done)

@@ -14,17 +14,16 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compile_kernel
-from worldpose.geometry.projection import distort, project_point
-
-STEPS = 12
-"""Parameters per camera, in the order of `worldpose.static_calibration.PARAMETERS`."""
+from worldpose.geometry.camera_model import STEP, observe, project_point
+from worldpose.geometry.lens_models import load_camera
+from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
 
 _ROUNDING: Final = 1e-10
 """Share of a diagonal entry of a point's normal equations below which it is rounding error [1]:
 rays that meet at an angle under 2e-5 rad."""
 
 
-class Evidence(NamedTuple):
+class PointObservations(NamedTuple):
     """Priors and observations of the points, sorted by point."""
 
     anchors: Floats
@@ -60,7 +59,7 @@ class CameraEquations(NamedTuple):
 def eliminate(
     cameras: Floats,
     points: Floats,
-    evidence: Evidence,
+    observed: PointObservations,
     damping: float,
     first: int,
     last: int,
@@ -74,26 +73,26 @@ def eliminate(
     columns, rows = equations.columns, equations.rows
     blocks, gradient = equations.blocks, equations.gradient
     rows[:] = 0.0
-    by_camera = np.empty((2, STEPS))
+    by_camera = np.empty((2, STEP))
     by_point = np.empty((2, 3))
     normal = np.empty(6)
     slope = np.empty(3)
-    mixed = np.empty((cameras.shape[0], 3, STEPS))
+    mixed = np.empty((cameras.shape[0], 3, STEP))
     for p in range(first, last):
-        known = evidence.information[p]
-        start, end = evidence.first_of[p], evidence.first_of[p + 1]
-        _prior(points[p], evidence.anchors[p], known, normal, slope)
+        known = observed.information[p]
+        start, end = observed.first_of[p], observed.first_of[p + 1]
+        _prior(points[p], observed.anchors[p], known, normal, slope)
         for o in range(start, end):
-            c = evidence.camera_of[o]
-            w, dx, dy = _observe(cameras, c, points, p, evidence, o, by_camera, by_point)
-            for i in range(STEPS):
+            c = observed.camera_of[o]
+            w, dx, dy = _observe(cameras, points, p, observed, o, by_camera, by_point)
+            for i in range(STEP):
                 left, right = w * by_camera[0, i], w * by_camera[1, i]
                 gradient[c, i] += left * dx + right * dy
                 for j in range(i + 1):
                     blocks[c, i, j] += left * by_camera[0, j] + right * by_camera[1, j]
             for j in range(3):
                 left, right = w * by_point[0, j], w * by_point[1, j]
-                for i in range(STEPS):
+                for i in range(STEP):
                     mixed[o - start, j, i] = left * by_camera[0, i] + right * by_camera[1, i]
             _add_point(w, dx, dy, by_point, normal, slope)
         if known == np.inf:
@@ -105,8 +104,8 @@ def eliminate(
         rows[row, -1], rows[row + 1, -1] = z0, z1
         rows[row + 2, -1] = (slope[2] - d * z0 - e * z1) / f
         for o in range(start, end):
-            camera = evidence.camera_of[o]
-            for i in range(STEPS):
+            camera = observed.camera_of[o]
+            for i in range(STEP):
                 column = columns[camera, i]
                 if column >= 0:
                     y0 = mixed[o - start, 0, i] / a
@@ -120,27 +119,27 @@ def eliminate(
 def substitute(
     cameras: Floats,
     points: Floats,
-    evidence: Evidence,
+    observed: PointObservations,
     damping: float,
     steps: Floats,
     trial: Floats,
 ) -> None:
     """Write the points after a step (cameras, 12) of the cameras, damped as in the elimination."""
-    by_camera = np.empty((2, STEPS))
+    by_camera = np.empty((2, STEP))
     by_point = np.empty((2, 3))
     normal = np.empty(6)
     slope = np.empty(3)
     for p in range(len(points)):
         trial[p] = points[p]
-        known = evidence.information[p]
+        known = observed.information[p]
         if known == np.inf:
             continue
-        _prior(points[p], evidence.anchors[p], known, normal, slope)
-        for o in range(evidence.first_of[p], evidence.first_of[p + 1]):
-            c = evidence.camera_of[o]
-            w, dx, dy = _observe(cameras, c, points, p, evidence, o, by_camera, by_point)
+        _prior(points[p], observed.anchors[p], known, normal, slope)
+        for o in range(observed.first_of[p], observed.first_of[p + 1]):
+            c = observed.camera_of[o]
+            w, dx, dy = _observe(cameras, points, p, observed, o, by_camera, by_point)
             # The residual after the camera's step, to first order.
-            for i in range(STEPS):
+            for i in range(STEP):
                 dx += by_camera[0, i] * steps[c, i]
                 dy += by_camera[1, i] * steps[c, i]
             _add_point(w, dx, dy, by_point, normal, slope)
@@ -155,26 +154,21 @@ def substitute(
 
 
 @compile_kernel
-def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
+def cost(cameras: Floats, points: Floats, observed: PointObservations) -> float:
     """Return the robust sum of squares with the points' priors; infinite if one has no image."""
     total = 0.0
     for p in range(len(points)):
-        known = evidence.information[p]
+        known = observed.information[p]
         if 0.0 < known < np.inf:
             for j in range(3):
-                total += known * (points[p, j] - evidence.anchors[p, j]) ** 2
-        for o in range(evidence.first_of[p], evidence.first_of[p + 1]):
-            camera = cameras[evidence.camera_of[o]]
-            at = project_point(camera, points[p, 0], points[p, 1], points[p, 2])
-            if at[0] != 0:
+                total += known * (points[p, j] - observed.anchors[p, j]) ** 2
+        for o in range(observed.first_of[p], observed.first_of[p + 1]):
+            camera = load_camera(cameras, observed.camera_of[o])
+            status, u, v, _ = project_point(camera, points[p, 0], points[p, 1], points[p, 2])
+            if status != 0:
                 return np.inf
-            dx = camera[0] * at[1] + camera[2] - evidence.image[o, 0]
-            dy = camera[1] * at[2] + camera[3] - evidence.image[o, 1]
-            squared = evidence.weight[o] * (dx * dx + dy * dy)
-            scale = evidence.scale[o]
-            if scale < np.inf:
-                squared = scale * scale * np.log1p(squared / (scale * scale))
-            total += squared
+            dx, dy = u - observed.image[o, 0], v - observed.image[o, 1]
+            total += cauchy_loss(observed.weight[o] * (dx * dx + dy * dy), observed.scale[o])
     return total
 
 
@@ -229,55 +223,22 @@ def _pivot(left: float, whole: float) -> float:
 @compile_kernel
 def _observe(
     cameras: Floats,
-    c: int,
     points: Floats,
     p: int,
-    evidence: Evidence,
+    observed: PointObservations,
     o: int,
     by_camera: Floats,
     by_point: Floats,
 ) -> tuple[float, float, float]:
-    """Write both Jacobians of observation `o` of point `p`; return its weight and residual [px].
-
-    Scalars without views of rows take a quarter of the time.
-    """
-    fx, fy = cameras[c, 0], cameras[c, 1]
-    r00, r01, r02 = cameras[c, 9], cameras[c, 10], cameras[c, 11]
-    r10, r11, r12 = cameras[c, 12], cameras[c, 13], cameras[c, 14]
-    r20, r21, r22 = cameras[c, 15], cameras[c, 16], cameras[c, 17]
-    px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-    x = r00 * px + r01 * py + r02 * pz + cameras[c, 18]
-    y = r10 * px + r11 * py + r12 * pz + cameras[c, 19]
-    z = r20 * px + r21 * py + r22 * pz + cameras[c, 20]
-    a, b = x / z, y / z
-    k1, k2, k3 = cameras[c, 4], cameras[c, 5], cameras[c, 8]
-    xd, yd, dxx, dxy, dyy = distort(a, b, k1, k2, cameras[c, 6], cameras[c, 7], k3)
-    # By the point in the camera's frame: g of the column, h of the row.
-    gx, gy = fx * dxx / z, fx * dxy / z
-    hx, hy = fy * dxy / z, fy * dyy / z
-    gz, hz = -(gx * a + gy * b), -(hx * a + hy * b)
-    by_point[0, 0] = gx * r00 + gy * r10 + gz * r20
-    by_point[0, 1] = gx * r01 + gy * r11 + gz * r21
-    by_point[0, 2] = gx * r02 + gy * r12 + gz * r22
-    by_point[1, 0] = hx * r00 + hy * r10 + hz * r20
-    by_point[1, 1] = hx * r01 + hy * r11 + hz * r21
-    by_point[1, 2] = hx * r02 + hy * r12 + hz * r22
-    by_camera[0, 0], by_camera[1, 0] = y * gz - z * gy, y * hz - z * hy
-    by_camera[0, 1], by_camera[1, 1] = z * gx - x * gz, z * hx - x * hz
-    by_camera[0, 2], by_camera[1, 2] = x * gy - y * gx, x * hy - y * hx
-    by_camera[0, 3], by_camera[1, 3] = gx, hx
-    by_camera[0, 4], by_camera[1, 4] = gy, hy
-    by_camera[0, 5], by_camera[1, 5] = gz, hz
-    by_camera[0, 6], by_camera[1, 6] = fx * xd, fy * yd
-    by_camera[0, 7], by_camera[1, 7] = 1.0, 0.0
-    by_camera[0, 8], by_camera[1, 8] = 0.0, 1.0
-    s = a * a + b * b
-    by_camera[0, 9], by_camera[1, 9] = fx * a * s, fy * b * s
-    by_camera[0, 10], by_camera[1, 10] = fx * a * s * s, fy * b * s * s
-    by_camera[0, 11], by_camera[1, 11] = fx * a * s * s * s, fy * b * s * s * s
-    dx = fx * xd + cameras[c, 2] - evidence.image[o, 0]
-    dy = fy * yd + cameras[c, 3] - evidence.image[o, 1]
-    weight, scale = evidence.weight[o], evidence.scale[o]
-    if scale < np.inf:
-        weight /= 1.0 + weight * (dx * dx + dy * dy) / (scale * scale)
-    return weight, dx, dy
+    """Write both Jacobians of observation `o` of point `p`; return its weight and residual [px]."""
+    _, u, v, _ = observe(
+        load_camera(cameras, observed.camera_of[o]),
+        points[p, 0],
+        points[p, 1],
+        points[p, 2],
+        by_camera,
+        by_point,
+    )
+    dx, dy = u - observed.image[o, 0], v - observed.image[o, 1]
+    weight = observed.weight[o]
+    return weight * cauchy_weight(weight * (dx * dx + dy * dy), observed.scale[o]), dx, dy

@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.match import Side
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.losses import cauchy_weight
+from worldpose.geometry.rigid import Rigid
 from worldpose.geometry.rows import Index, take_rows
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.from_paint.paint import ORIENTATIONS, PaintMap
@@ -52,6 +55,18 @@ class Candidates:
     centers: Floats
     focals: Floats
     radial: Floats
+
+    @property
+    def cameras(self) -> Camera:
+        """Batch (k,) of cameras whose pixels count from the middle of the image."""
+        shift = -np.einsum("kij,kj->ki", self.rotations, self.centers)
+        return Camera(
+            focal=np.repeat(self.focals[:, None], 2, axis=1),
+            principal_point=np.zeros(2),
+            distortion=self.radial[:, None] * np.eye(5)[0],
+            cam_from_world=Rigid(self.rotations, shift),
+            image_size=np.ones(2, dtype=np.int64),
+        )
 
     def __len__(self) -> int:
         return len(self.focals)
@@ -283,26 +298,15 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
         )
 
 
-def _project(candidates: Candidates, points: Floats) -> tuple[Floats, Flags]:
-    """Return pixels (k, n, 2) from the middle of the image, and whether they exist."""
-    local = np.einsum("kij,knj->kni", candidates.rotations, points - candidates.centers[:, None])
-    depth = local[..., 2]
-    front = depth > 1.0
-    flat = local[..., :2] / np.where(front, depth, 1.0)[..., None]
-    square = (flat**2).sum(-1)
-    radial = candidates.radial[:, None]
-    front &= 1.0 + 3.0 * radial * square > 0.0  # before the lens folds
-    stretch = (1.0 + radial * square) * candidates.focals[:, None]
-    return flat * stretch[..., None], front
-
-
 def project_markings(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> SeenMarkings:
     """Return the samples in the images of candidates, with the paint nearest to them."""
     width, height = paint.size
     places = samples.points_world
     step = 0.25
-    pixels, front = _project(candidates, places)
-    ahead, ahead_front = _project(candidates, places + step * samples.along_world)
+    cameras = candidates.cameras
+    pixels, ahead = cameras.project(places), cameras.project(places + step * samples.along_world)
+    seen = np.isfinite(pixels).all(-1) & np.isfinite(ahead).all(-1)
+    pixels, ahead = np.where(seen[..., None], pixels, 0.0), np.where(seen[..., None], ahead, 0.0)
     way = ahead - pixels
     normals = np.arctan2(way[..., 1], way[..., 0]) + 0.5 * np.pi
     steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
@@ -311,7 +315,7 @@ def project_markings(paint: PaintMap, samples: LineSamples, candidates: Candidat
     spacing[:-1] += 0.5 * steps * inner
     spacing[1:] += 0.5 * steps * inner
     image = pixels + 0.5 * np.array([width - 1, height - 1])
-    inside = front & ahead_front & (image > 1.0).all(-1) & (image < [width - 2, height - 2]).all(-1)
+    inside = seen & (image > 1.0).all(-1) & (image < [width - 2, height - 2]).all(-1)
     lengths = np.where(inside, np.hypot(way[..., 0], way[..., 1]) / step * spacing, 0.0)
     # A marking that runs towards the camera does not count for more than its image.
     lengths = np.minimum(lengths, 60.0)
@@ -400,35 +404,19 @@ def _step(
     residual = ((target - seen.pixels) * across).sum(-1)
     used = (seen.distances < radius) & (seen.lengths > 0.0)
     weight = np.where(used, np.minimum(seen.lengths, 20.0) / 8.0, 0.0)
-    weight /= 1.0 + (residual / (radius / 3.0)) ** 2
+    weight *= cauchy_weight(residual**2, radius / 3.0)
     residual = np.where(used, residual, 0.0)
-    local = np.einsum(
-        "kij,knj->kni", candidates.rotations, samples.points_world - candidates.centers[:, None]
-    )
-    depth = np.where(used, local[..., 2], 1.0)
-    x, y = np.where(used, local[..., 0], 0.0) / depth, np.where(used, local[..., 1], 0.0) / depth
-    square, radial = x**2 + y**2, candidates.radial[:, None]
-    focal = candidates.focals[:, None]
-    stretch = 1.0 + radial * square
-    # Derivative of the pixel, along the normal, by the flat place (x, y).
-    normal_x, normal_y = across[..., 0], across[..., 1]
-    inward = 2.0 * radial * (x * normal_x + y * normal_y)
-    by_x, by_y = (
-        focal * (stretch * normal_x + inward * x),
-        focal * (stretch * normal_y + inward * y),
-    )
-    by_point = np.stack([by_x, by_y, -(by_x * x + by_y * y)], axis=-1) / depth[..., None]
-    point = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None]
-    radially = focal * (x * normal_x + y * normal_y)
-    rows = np.concatenate(
+    projected = candidates.cameras.project_with_jacobians(samples.points_world)
+    by_step = np.concatenate(
         [
-            np.cross(point, by_point),
-            -np.einsum("kni,kij->knj", by_point, candidates.rotations),
-            (stretch * radially)[..., None],
-            (square * radially)[..., None],
+            projected.d_pose[..., :3],
+            -projected.d_points,
+            seen.pixels[..., None],
+            projected.d_distortion[..., :1],
         ],
         axis=-1,
     )
+    rows = np.einsum("knd,kndj->knj", across, np.where(used[..., None, None], by_step, 0.0))
     weighted = rows * weight[..., None]
     system = np.einsum("kni,knj->kij", weighted, rows)
     right = np.einsum("kni,kn->ki", weighted, residual)
@@ -437,13 +425,15 @@ def _step(
     # of an unknown lens, so that a wrong name does not bend the image.
     corner_std = (0.005, 0.02)[int(bool(paint.lens.distortion.any()))]
     radial_info = (corner / corner_std) ** 2 if free[1] else np.full(len(candidates), 1e12)
-    damping = np.tile([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 4.0 if free[0] else 1e12, 0.0], (len(x), 1))
-    damping[:, 7] = radial_info
-    system += damping[:, :, None] * np.eye(8)
+    trust = np.tile(
+        [1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 4.0 if free[0] else 1e12, 0.0], (len(candidates), 1)
+    )
+    trust[:, 7] = radial_info
+    system += trust[:, :, None] * np.eye(8)
     if free[1]:
         right[:, 7] -= radial_info * candidates.radial
     # The roll is the height of the camera's right axis; it turns by the rotation step.
-    roll, by_roll = candidates.rotations[:, 0, 2] - rolls, np.zeros((len(x), 8))
+    roll, by_roll = candidates.rotations[:, 0, 2] - rolls, np.zeros((len(candidates), 8))
     by_roll[:, 1], by_roll[:, 2] = candidates.rotations[:, 2, 2], -candidates.rotations[:, 1, 2]
     system += by_roll[:, :, None] * by_roll[:, None, :] / roll_std**2
     right -= by_roll * roll[:, None] / roll_std**2

@@ -152,20 +152,6 @@ def write_hybrik_all(folder, bodies, camera):
     return path
 
 
-def write_hybrik_one(folder, bodies, camera, person=1):
-    seen = in_camera(bodies, camera)
-    content = {
-        "pred_thetas": matrices(seen)[person].reshape(FRAMES, 216),
-        "pred_betas": single(np.ones((FRAMES, 10))),
-        "transl": single(seen.transl[person]),
-        "bbox": boxes_of(bodies, camera)[person],
-        "img_path": np.array([f"out/raw_images/clip-{n + 1:06d}.png" for n in range(FRAMES)]),
-    }
-    path = folder / "res.pk"
-    path.write_bytes(pickle.dumps(content))
-    return path
-
-
 def write_humans4d(folder, bodies, camera):
     import joblib
 

@@ -1,0 +1,35 @@
+"""Cameras of tests, by where they stand and what they look at."""
+
+import numpy as np
+
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+
+
+def look_at_camera(
+    center, aim, focal, size=(1920, 1080), *, middle=None, lens=(0.0,) * 5, roll=0.0
+):
+    """Return a camera at a place [m] that has another at its principal point, with a level horizon.
+
+    Args:
+        center: of the camera (3,) [m].
+        aim: what it looks at (3,) [m].
+        focal: length [px], or two of them.
+        size: of the image [px].
+        middle: principal point [px]; None = the middle of the image.
+        lens: OpenCV's five coefficients.
+        roll: about the line of sight [rad].
+    """
+    center, aim = np.array(center, dtype=float), np.array(aim, dtype=float)
+    forward = (aim - center) / np.linalg.norm(aim - center)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    level = np.stack([right, np.cross(forward, right), forward])
+    rotation = Rigid.from_rotvec(np.array([0.0, 0.0, roll]), np.zeros(3)).rotation @ level
+    return Camera(
+        focal=np.broadcast_to(np.array(focal, dtype=float), 2),
+        principal_point=0.5 * (np.array(size) - 1.0) if middle is None else np.array(middle),
+        distortion=np.array(lens),
+        cam_from_world=Rigid(rotation, -rotation @ center),
+        image_size=np.array(size),
+    )

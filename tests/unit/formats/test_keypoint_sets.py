@@ -1,0 +1,204 @@
+"""The order of the points in files of 2D poses: by name, by model, by lengths in the images."""
+
+import json
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17, FEET
+from worldpose.body.keypoints import BODY25
+from worldpose.errors import InputError
+from worldpose.formats.coco_results import read_coco_results
+from worldpose.formats.detection_files import read_openpose_folder
+from worldpose.formats.keypoint_files import read_people
+from worldpose.formats.keypoint_sets import order_by_names
+
+# A standing person in pixels, 400 px tall, of which each set has some points.
+BODY = {
+    "nose": (0, 0),
+    "left_eye": (8, -8),
+    "right_eye": (-8, -8),
+    "left_ear": (18, -4),
+    "right_ear": (-18, -4),
+    "left_shoulder": (40, 60),
+    "right_shoulder": (-40, 60),
+    "left_elbow": (50, 130),
+    "right_elbow": (-50, 130),
+    "left_wrist": (55, 195),
+    "right_wrist": (-55, 195),
+    "left_hip": (25, 190),
+    "right_hip": (-25, 190),
+    "left_knee": (28, 290),
+    "right_knee": (-28, 290),
+    "left_ankle": (30, 390),
+    "right_ankle": (-30, 390),
+    "neck": (0, 55),
+    "mid_hip": (0, 190),
+    "head_top": (0, -30),
+    "spine": (0, 130),
+    "thorax": (0, 60),
+    "left_big_toe": (40, 410),
+    "left_small_toe": (48, 405),
+    "left_heel": (26, 400),
+    "right_big_toe": (-40, 410),
+    "right_small_toe": (-48, 405),
+    "right_heel": (-26, 400),
+}
+BODY_25B = (*COCO17, "neck", "head_top", *FEET)
+COCO18 = (*BODY25[:8], *BODY25[9:19])
+HUMAN36M = (
+    *("mid_hip", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"),
+    *("spine", "thorax", "nose", "head_top", "left_shoulder", "left_elbow", "left_wrist"),
+    *("right_shoulder", "right_elbow", "right_wrist"),
+)
+
+
+def points(names, confidence=0.9):
+    """x, y, confidence of each point of a person, in a file's order."""
+    return [v for name in names for v in (500 + BODY[name][0], 300 + BODY[name][1], confidence)]
+
+
+def results(path, names, **more):
+    """Write a list of results of two frames."""
+    people = [{"image_id": n, "keypoints": points(names), **more} for n in (0, 1)]
+    path.write_text(json.dumps(people))
+    return path
+
+
+def frames(folder, names, count=2, key="pose_keypoints_2d"):
+    """Write a folder of OpenPose's frames."""
+    folder.mkdir()
+    for n in range(count):
+        text = json.dumps({"people": [{key: points(names)}]})
+        (folder / f"cam_{n:012d}_keypoints.json").write_text(text)
+    return folder
+
+
+def assert_body(people):
+    """Assert that the first person has each joint of COCO-17 at its place."""
+    wanted = np.array([BODY[name] for name in COCO17]) + (500, 300)
+    np.testing.assert_allclose(people.keypoints[0, 0], wanted)
+    if people.points:
+        wanted = np.array([BODY[name] for name in FEET]) + (500, 300)
+        np.testing.assert_allclose(people.extra_keypoints[0, 0], wanted)
+
+
+@pytest.mark.parametrize(
+    ("names", "kind", "feet"),
+    [
+        (COCO17, "COCO-17", False),
+        (COCO18, "COCO-18", False),
+        (BODY25, "BODY_25", True),
+        (BODY_25B, "BODY_25B", True),
+    ],
+)
+def test_a_silent_file_is_told_by_its_lengths_on_each_route(tmp_path, names, kind, feet):
+    for found in (
+        read_coco_results(results(tmp_path / "a.json", names)),
+        read_openpose_folder(frames(tmp_path / "a_json", names)),
+        read_people(frames(tmp_path / "old_json", names, key="pose_keypoints")),
+    ):
+        assert (found.kind, bool(found.people.points)) == (kind, feet)
+        assert_body(found.people)
+
+
+def test_a_stated_model_counts_if_its_size_fits(tmp_path):
+    folder = frames(tmp_path / "a_json", BODY_25B)
+    assert read_openpose_folder(folder, "BODY_25B").kind == "BODY_25B"
+    assert read_openpose_folder(folder, "BODY_25").kind == "BODY_25"
+    assert read_openpose_folder(folder, "Body_with_feet").kind == "BODY_25B"
+
+
+def test_points_of_human36m_are_refused_by_name(tmp_path):
+    with pytest.raises(InputError, match=r"found .* order of Human3\.6M"):
+        read_coco_results(results(tmp_path / "a.json", HUMAN36M))
+
+
+@pytest.mark.parametrize(
+    "spell",
+    [
+        str,
+        lambda name: name.replace("_", " ").title(),
+        lambda name: "".join(part.title() for part in name.split("_")),
+        lambda name: name.replace("left_", "l_").replace("right_", "r_"),
+        lambda name: "_".join(reversed(name.split("_"))) if name[:4] in ("left", "righ") else name,
+        lambda name: name.replace("left_", "L").replace("right_", "R"),
+    ],
+)
+def test_names_decide_the_order_in_any_spelling(tmp_path, spell):
+    names = list(reversed(BODY_25B))
+    if spell("left_eye") == "Leye":
+        names = names[6:]  # toes are spelled in words
+    order = order_by_names("file", [spell(name) for name in names])
+    assert [names[place] for place in order.joints] == list(COCO17)
+    assert [names[place] for place in order.feet] == (list(FEET) if len(names) == 25 else [])
+
+
+def data_set(path, images, names=COCO17):
+    """Write a COCO data set with a person in each image, and the names of its points."""
+    people = [{"image_id": each["id"], "keypoints": points(names, 2)} for each in images]
+    category = {"id": 1, "name": "person", "keypoints": list(names)}
+    content = {"annotations": people, "images": images, "categories": [category]}
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_data_set_gives_names_of_points_and_numbers_of_images(tmp_path):
+    images = [{"id": 7001 + n, "file_name": f"cam/a_{5 * n}.jpg"} for n in range(3)]
+    found = read_coco_results(data_set(tmp_path / "a.json", images, list(reversed(BODY_25B))))
+    assert_body(found.people)
+    np.testing.assert_array_equal(found.people.frame, [0, 5, 10])
+
+
+@pytest.mark.parametrize(
+    ("images", "names", "place", "words"),
+    [
+        ([{"id": 1, "file_name": "a.jpg"}], COCO17, "images[0]", "file_name with the frame"),
+        ([{"id": 1}], COCO17, "images[0]", "found nothing"),
+        (
+            [{"id": n, "file_name": f"cam{n}/000000.jpg"} for n in (1, 2)],
+            COCO17,
+            "images",
+            "2 images with 1 numbers",
+        ),
+        ([{"id": 1, "file_name": "a1.jpg"}], HUMAN36M, "categories", "Human3.6M"),
+    ],
+)
+def test_a_data_set_that_does_not_say_is_refused(tmp_path, images, names, place, words):
+    with pytest.raises(InputError) as caught:
+        read_coco_results(data_set(tmp_path / "a.json", images, names))
+    assert caught.value.where.endswith(place)
+    assert words in str(caught.value)
+
+
+def test_alphapose_numbers_its_images_by_their_names(tmp_path):
+    more = {"score": 2.9, "box": [450, 250, 100, 500], "idx": [0.0]}
+    path = results(tmp_path / "a.json", COCO17, **more)
+    people = json.loads(path.read_text())
+    for person, name in zip(people, ("a_10.jpg", "x/a_2.jpg"), strict=True):
+        person["image_id"] = name
+    path.write_text(json.dumps(people))
+    found = read_coco_results(path).people
+    np.testing.assert_array_equal(found.frame, [2, 10])
+    np.testing.assert_array_equal(found.boxes[0, 0], [450, 250, 550, 750])
+
+
+def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
+    folder = frames(tmp_path / "a_json", COCO17, 4)
+    sure = {"pose_keypoints_2d": points(COCO17, 1.26)}
+    nobody = {"pose_keypoints_2d": [float("nan")] * 51}
+    lame = {"pose_keypoints_2d": [float("nan")] * 3 + points(COCO17)[3:]}
+    (folder / "cam_000000000001_keypoints.json").write_text(json.dumps({"people": [sure, nobody]}))
+    (folder / "cam_000000000002_keypoints.json").write_text("")
+    (folder / "cam_000000000003_keypoints.json").write_text(json.dumps({"people": [lame]}))
+    found = read_openpose_folder(folder)
+    assert found.changes == (17, 1, 1)
+    assert found.people.confidence[1, 0].max() == 1.0
+    people = np.isfinite(found.people.score).sum(axis=1)
+    np.testing.assert_array_equal(people, [1, 1, 0, 1])
+    assert np.isnan(found.people.confidence[3, 0, 0])
+    same = [{"image_id": 1, **{"keypoints": one["pose_keypoints_2d"]}} for one in (sure, nobody)]
+    (tmp_path / "a.json").write_text(json.dumps(same))
+    listed = read_coco_results(tmp_path / "a.json")
+    assert listed.changes == (17, 1, 0)
+    np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])

@@ -1,0 +1,293 @@
+"""Calibration of every frame of a broadcast clip from a few key frames (M1 to M6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data_contracts.arrays import Floats, Image
+from data_contracts.broadcast_calibration import KeyFrame
+from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
+from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, join_evidence
+from worldpose.broadcast_calibration.key_frames import calibrate_keys
+from worldpose.broadcast_calibration.learned_noise import (
+    LearnedNoise,
+    Weights,
+    correlation_time,
+    displace_by_size,
+    estimate_flow_share,
+    estimate_smoothness,
+    learn_noise,
+)
+from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.pitch_errors import PitchErrors
+from worldpose.broadcast_calibration.players import (
+    FeedOffset,
+    People,
+    PlayerNoise,
+    estimate_feed_offset,
+    match,
+    player_evidence,
+)
+from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.report import (
+    BroadcastCalibration,
+    JointFit,
+    TrackedClip,
+    report_calibration,
+)
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.shots import require_one_shot
+from worldpose.broadcast_calibration.solver import ClipSolution, descend, solve
+from worldpose.broadcast_calibration.tracking import Chain, Followed, chain, follow
+from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
+from worldpose.errors import InputError
+from worldpose.pitch.template import PitchTemplate
+
+Pictures = Callable[[], Iterator[Image]]
+"""Starts a new pass over all frames of the clip, grey (height, width), in order."""
+
+
+@dataclass(frozen=True, eq=False)
+class BroadcastClip:
+    """Images, key frames and people of one clip.
+
+    Attributes:
+        key_frames: clicks in one frame or more.
+        pictures: starts a new pass over the clip's grey frames: one to track, and one per
+            iteration.
+        fps: frames per second.
+        people: joints of the static cameras, and keypoints in the clip; None = markings alone.
+        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of moving people in the frames; those of
+            `people` if None.
+        where: clip or file, for messages.
+        first: number of the clip's first frame in its video; key frames and messages use the
+            numbers of the video.
+        proposed: the key frames are proposals: they start the fit and are no evidence in it, since
+            they come from the paint that the fit measures in every frame.
+    """
+
+    key_frames: Sequence[KeyFrame]
+    pictures: Pictures
+    fps: float
+    people: People | None = None
+    boxes: Floats | None = None
+    where: str = "broadcast clip"
+    first: int = 0
+    proposed: bool = False
+
+    @property
+    def moving_boxes(self) -> Floats | None:
+        """Boxes (frames, detections, 4) [px] of moving people; None without any."""
+        if self.boxes is None and self.people is not None:
+            return self.people.boxes
+        return self.boxes
+
+
+def calibrate_broadcast(
+    pitch: PitchTemplate,
+    clip: BroadcastClip,
+    settings: BroadcastCalibrationSettings = BroadcastCalibrationSettings(),  # noqa: B008
+) -> BroadcastCalibration:
+    """Return the calibrated camera of every frame.
+
+    The steps are: calibrate key frames with one center; follow static points from frame to frame;
+    detect painted lines in every frame; match players of the static cameras with detections in the
+    clip; fit all frames jointly.
+
+    Args:
+        pitch: the stadium's template.
+        clip: images, key frames and people.
+        settings: weights, noise and gates.
+
+    Raises:
+        InputError: the clip has cuts, or no key frame is usable.
+        DegenerateError: the evidence does not determine the camera of every frame.
+
+    Note:
+        M1 to M6; paper section "Broadcasting Camera Calibration" and its supplement.
+    """
+    return refine(pitch, clip, track(pitch, clip, settings), settings)
+
+
+def track(
+    pitch: PitchTemplate, clip: BroadcastClip, settings: BroadcastCalibrationSettings
+) -> TrackedClip:
+    """Return cameras from key frames and followed points (M2); see `calibrate_broadcast`."""
+    key_frames, where, first = clip.key_frames, clip.where, clip.first
+    wanted = {key.frame - first for key in key_frames}
+    if len(wanted) < len(key_frames):
+        raise InputError(
+            where,
+            expected="every key frame once",
+            found=f"{sorted(key.frame for key in key_frames)}",
+            todo="Put all clicks of a frame into one entry.",
+        )
+    kept: dict[int, Image] = {}
+    followed = follow(
+        _keep_frames(clip.pictures(), wanted, kept), clip.moving_boxes, settings.flow_points
+    )
+    missing = sorted(wanted - set(kept))
+    if missing:
+        raise InputError(
+            where,
+            expected=f"key frames from {first} to {first + len(followed)}",
+            found=f"{[first + number for number in missing]}",
+            todo="Number frames as the video has them, from 0.",
+        )
+    require_one_shot(followed, settings.cut_share, where, first)
+    height, width = next(iter(kept.values())).shape
+    keys = calibrate_keys(pitch, key_frames, (width, height), kept, settings, where, first)
+    links = chain([int(n) for n in keys.frames], keys.camera, followed, settings.flow_outlier)
+    return TrackedClip(keys, links, _select_flow(followed, links, settings))
+
+
+def refine(
+    pitch: PitchTemplate,
+    clip: BroadcastClip,
+    tracked: TrackedClip,
+    settings: BroadcastCalibrationSettings,
+) -> BroadcastCalibration:
+    """Return the joint fit of all frames (M3 to M6); see `calibrate_broadcast`."""
+    people, boxes, fps = clip.people, clip.moving_boxes, clip.fps
+    learned = LearnedNoise(PitchErrors.of(pitch, settings))
+    first_errors = learned.errors
+    camera = tracked.chain.camera
+    spread = estimate_smoothness(camera, fps)
+    if not settings.smooth:
+        # Smoothness of the rotation still bridges frames without evidence.
+        spread[3:] = np.inf
+    clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
+    if clip.proposed:
+        clicks = PointEvidence.none()
+    deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
+    share = estimate_flow_share(
+        tracked.chain, tracked.keys.frames, deviation, settings.flow_drift_px
+    )
+    noise, matches = PlayerNoise(0.0, 0.0), None
+    surface = tracked.keys.surface
+    offset: FeedOffset | None = None
+    before = camera
+    for number in range(settings.passes):  # one or more
+        samples = FieldSamples.of(pitch, learned.errors, surface)
+        lines, corrected = follow_lines(camera, samples, clip.pictures(), boxes, settings)
+        before = corrected if number == 0 else before
+        parts = [learned.errors.rescale(clicks, first_errors), lines]
+        if people is not None and settings.player_weight > 0.0:
+            if offset is None:
+                # Before any fit includes these players.
+                offset = estimate_feed_offset(corrected, people)
+                if settings.feed_offset == "correct" and offset.determined:
+                    people = people.later(offset.frames)
+            matches = match(corrected, people)
+            players, noise = player_evidence(corrected, people, matches, settings)
+            parts.append(players)
+        problem = ClipProblem(
+            points=PointEvidence.none(),
+            flow=tracked.flow,
+            prior=build_prior(settings.prior, corrected.focal, corrected.image_size),
+            weights=TermWeights(
+                field=settings.field_weight,
+                player=settings.player_weight / max(noise.frames, 1.0),
+                flow=settings.flow_weight * share,
+            ),
+            smoothness=spread,
+            flow_loss=settings.loss_scale,
+        )
+        problem, solution, learned = _fit_and_learn(
+            join_evidence(parts), corrected, learned, problem, settings.max_iterations
+        )
+        camera = solution.camera
+        shown = problem.of_size(solution.paint_offsets)
+        surface = pitch.surface + (learned.errors.size_m * shown)[2:]
+    if settings.solver == "adam":
+        solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
+    lasting = correlation_time(tracked.chain.camera, fps)
+    uncertainty = compute_uncertainty(
+        solution, problem, settings.line_shift_px, settings.player_shift, lasting
+    )
+    weights = Weights(
+        flow_deviation_px=deviation,
+        flow_share=share,
+        smooth_log_focal=_finite_or_zero(spread[3]),
+        smooth_k1=_finite_or_zero(spread[4]),
+        smooth_k2=_finite_or_zero(spread[5]),
+        smooth_frames=lasting,
+        player_share=noise.share,
+        player_frames=noise.frames,
+    )
+    fit = JointFit(
+        solution.camera,
+        before,
+        uncertainty,
+        displace_by_size(problem, solution),
+        matches,
+        weights,
+        offset,
+        learned.describe(pitch, problem, solution),
+    )
+    report = report_calibration(tracked, fit, pitch, settings, clip.first)
+    return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
+
+
+def _fit_and_learn(
+    points: PointEvidence,
+    camera: MovingCamera,
+    learned: LearnedNoise,
+    start: ClipProblem,
+    iterations: int,
+) -> tuple[ClipProblem, ClipSolution, LearnedNoise]:
+    """Return fits that alternate with the spreads that their residuals show, until these settle.
+
+    Args:
+        points: evidence of the assumed noise.
+        camera: initial camera.
+        learned: spreads so far.
+        start: the terms that no spread changes, without points.
+        iterations: maximum solver iterations of one fit.
+    """
+    for left in reversed(range(4)):
+        weights = start.weights._replace(flow=start.weights.flow / learned.lasting)
+        problem = replace(start, points=learned.scale_noise(points), weights=weights)
+        solution = solve(camera, problem, iterations)
+        camera, before = solution.camera, learned
+        learned = learn_noise(problem, solution, learned)
+        if left == 0 or learned.is_near(before):
+            break
+        points = learned.errors.rescale(points, before.errors)
+    return problem, solution, learned
+
+
+def _select_flow(
+    followed: Sequence[Followed], links: Chain, settings: BroadcastCalibrationSettings
+) -> FlowEvidence:
+    """Return the followed points consistent with the camera, with their measured deviation."""
+    kept = links.kept
+    counts = [int(mine.sum()) for mine in kept]
+    none = np.empty((0, 2))
+    residual = np.concatenate([none, *(r[m] for r, m in zip(links.residual, kept, strict=True))])
+    seen = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
+    return FlowEvidence(
+        frame=np.repeat(np.arange(len(followed)), counts),
+        start=np.concatenate([none, *(p.start[m] for p, m in zip(followed, kept, strict=True))]),
+        end=np.concatenate([none, *(p.end[m] for p, m in zip(followed, kept, strict=True))]),
+        deviation=np.full(sum(counts), max(seen, settings.flow_noise_px)),
+    )
+
+
+def _keep_frames(
+    pictures: Iterator[Image], wanted: set[int], kept: dict[int, Image]
+) -> Iterator[Image]:
+    """Yield all frames, and store the wanted ones in `kept`."""
+    for number, picture in enumerate(pictures):
+        if number in wanted:
+            kept[number] = picture
+        yield picture
+
+
+def _finite_or_zero(value: float) -> float:
+    """Return a spread for a record, which cannot hold infinity: 0 means none."""
+    return float(value) if np.isfinite(value) else 0.0

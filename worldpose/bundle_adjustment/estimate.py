@@ -1,0 +1,130 @@
+"""Adjustment of cameras to people and markings, with acceptance per camera (B1-B3)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from worldpose.bundle_adjustment.adjuster import Adjuster, merge_cameras, place_people
+from worldpose.bundle_adjustment.clip import Clip, learn_confidence, propose_frames
+from worldpose.bundle_adjustment.held_out_validation import (
+    Verdict,
+    compare_errors,
+    judge_cameras,
+    pool_evidence,
+)
+from worldpose.bundle_adjustment.report import (
+    BundleAdjustment,
+    describe_motion,
+    explain_decision,
+    refuse_all,
+)
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.geometry.cameras import Camera
+
+
+def adjust_cameras(
+    clip: Clip,
+    settings: BundleAdjustmentSettings = BundleAdjustmentSettings(),  # noqa: B008
+) -> BundleAdjustment:
+    """Return cameras adjusted to markings and people, where held-out people confirm the change.
+
+    People are split into groups. Each group in turn is held out of an adjustment and validates its
+    cameras: keypoints of the group in a camera against its joints from the other cameras, in frames
+    that are held out too. A camera whose held-out loss rises stays unchanged, and so does a
+    calibrated camera of a rig of more than four whose loss falls by no more than chance explains.
+    Where a calibrated camera's loss rises by more, or too few keypoints judge it, the others are
+    adjusted without it. Finally the accepted cameras are adjusted to all people.
+
+    Args:
+        clip: calibrated cameras and triangulated people.
+        settings: evidence, weights, acceptance.
+
+    Note:
+        B1-B3; paper section "Bundle Adjustment".
+    """
+    other = "refused: this camera shows other people than the other cameras under the same ids"
+    proposed = propose_frames(
+        clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views
+    )
+    used = np.flatnonzero(np.isin(clip.detections.frame, settings.chosen_frames))
+    used = used if settings.chosen_frames else proposed
+    judged = propose_frames(
+        clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views, used
+    )
+    judged = judged if len(judged) else used
+    placed = place_people(clip, used)
+    clip = learn_confidence(clip, np.union1d(used, judged))
+    adjuster = Adjuster(clip, settings, used, judged, placed)
+    count = len(clip.clicks)
+    if settings.evidence == "markings_and_players" and not len(adjuster.observations.points):
+        return refuse_all(clip, "no person has enough inlier cameras", proposed, used, judged)
+    if settings.evidence == "markings" and not any(c.inlier.any() for c in clip.clicks):
+        return refuse_all(clip, "no camera has a clicked marking", proposed, used, judged)
+    before, other_people = adjuster.before, adjuster.other_people
+    fixed = other_people.copy()
+    first: Verdict | None = None
+    objection = ""
+    while True:
+        after = adjuster.held_out_errors(fixed)
+        comparison = compare_errors(before, after)
+        first = first or comparison
+        evidence = pool_evidence(before, after, ~other_people)
+        confirmed, agrees = judge_cameras(comparison, adjuster.stand_alone, settings.min_judges)
+        if (confirmed | fixed).all():
+            raised = adjuster.find_objection(before, after, fixed)
+            if not raised:
+                break
+            objection = raised
+            # Markings hold calibrated cameras, which may still change without the others.
+            confirmed = adjuster.stand_alone
+        if settings.evidence == "markings_and_players":
+            adjuster.consistent |= agrees & ~fixed & ~other_people
+        fixed |= ~confirmed
+        # People need a second camera, and without them one camera's markings are no evidence.
+        if fixed.all() or (~fixed | adjuster.consistent & adjuster.stand_alone).sum() < 2:
+            fixed[:] = True
+            break
+    freely = adjuster.adjust(other_people)
+    last = freely if fixed.all() or (fixed == other_people).all() else adjuster.adjust(fixed)
+    own = adjuster.uncertainty(last)
+    cameras = merge_cameras(~fixed, last.cameras, clip.cameras)
+    motion = np.where(fixed[:, None], 0.0, camera_motion(clip.cameras, cameras))
+    return BundleAdjustment(
+        clip=clip,
+        cameras=cameras,
+        covariance=np.where(fixed[:, None, None], clip.covariance, own),
+        accepted=~fixed,
+        reasons=tuple(
+            other
+            if other_people[c]
+            else explain_decision(
+                first, c, not fixed[c], settings, objection, adjuster.stand_alone[c]
+            )
+            + ("" if fixed[c] else describe_motion(motion[c]))
+            for c in range(count)
+        ),
+        proposed=clip.detections.frame[proposed],
+        used=clip.detections.frame[used],
+        judged=clip.detections.frame[judged],
+        noise=adjuster.noise,
+        verdict=first,
+        evidence=evidence,
+        motion=motion,
+        refused=freely.cameras,
+    )
+
+
+def camera_motion(before: Camera, after: Camera) -> Floats:
+    """Return the motion (cameras, 3) of cameras: of center [m], axes [rad] and focal length [1]."""
+    turned = before.cam_from_world.rotation @ after.cam_from_world.rotation.swapaxes(1, 2)
+    # Use the chord: the trace loses half of the digits of a small angle.
+    chord = np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    return np.stack(
+        [
+            np.linalg.norm(after.center - before.center, axis=1),
+            2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)),
+            after.focal[:, 0] / before.focal[:, 0] - 1.0,
+        ],
+        axis=1,
+    )

@@ -1,0 +1,317 @@
+"""Reader of COCO keypoint results: a JSON list of people, or a data set with `annotations`.
+
+Per person: `image_id`; `keypoints`, x y c of each point, where c is the confidence (in a data set
+perhaps COCO's visibility 0, 1, 2) and 0 means missing; `bbox` or `box` (x y width height) and
+`score` are optional: the defaults are the box of the found joints and their mean confidence. Within
+each frame, people keep the file's order. AlphaPose, MMPose and detectors of COCO write this form.
+
+The frame is a whole `image_id`, or the last number in an `image_id` that is a file's name. In a
+data set it is the last number in the `file_name` of the image. `worldpose.formats.keypoint_sets`
+says how the points are told.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path, PureWindowsPath
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from data_contracts.records import FRAME_LIMIT
+from worldpose.errors import InputError
+from worldpose.formats.archives import PACKED_BYTES, PACKED_RATIO
+from worldpose.formats.files import JsonItems
+from worldpose.formats.keypoint_sets import (
+    COORDINATE_LIMIT,
+    MAX_CONFIDENCE,
+    PeopleFile,
+    clean_points,
+    order_by_names,
+    order_by_points,
+    people_by_frame,
+    unknown_size,
+)
+
+JSON_BYTES: Final = 1 << 30
+"""Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""
+BATCH: Final = 4096
+"""Results per batch of Python objects."""
+MAX_POINTS: Final = 1000
+"""Maximum points of a person."""
+
+_POINTS: Final = "x, y, confidence of each point"
+_COUNT_TODO: Final = "Export all points, and 0, 0, 0 where one is missing."
+_CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 0 is missing."
+_NUMBER_TODO: Final = (
+    "Number the images from 0 in the order of the video, in image_id or file_name."
+)
+
+
+def read_coco_results(path: Path) -> PeopleFile:
+    """Return the people of a results file by rising frame, without frames that have no people.
+
+    The function reads in batches: the arrays bound the memory, not Python objects.
+
+    Raises:
+        InputError: the file is unreadable, or has points of an unknown set, a confidence of another
+            scale, no frame number, or too many people per frame; the error names file, result and
+            point.
+    """
+    items = JsonItems(path, "annotations", JSON_BYTES, keep=("images", "categories"))
+    batches = [_read_batch(path, results, first) for first, results in _batches(path, items)]
+    if not items.has_list:
+        raise InputError(
+            str(path),
+            expected="a list of COCO keypoint results, or a COCO data set with `annotations`",
+            found=_shorten(items.other),
+            todo="Export the poses as COCO keypoint results.",
+        )
+    found = _join(path, batches)
+    points = found.points
+    if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
+        points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
+    sure = points[..., 2]
+    wrong_scale = (sure < 0) | (sure > MAX_CONFIDENCE)  # NaN is a missing point
+    _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", _CONFIDENCE_TODO)
+    names = _point_names(path, items.kept.get("categories"))
+    where = f"{path}: categories" if names else str(path)
+    if names and len(names) != points.shape[1] and len(points):
+        raise _wrong(where, f"names of {points.shape[1]} keypoints", f"{len(names)} names")
+    order = order_by_names(where, names) if names else order_by_points(where, points)
+    points, changed = clean_points(points[:, order.places])
+    frames = _frames(path, found.images, items.kept.get("images"))
+    people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, _limit(path))
+    return PeopleFile(people, order.name, changed._replace(nobody=nobody))
+
+
+def _limit(path: Path) -> int:
+    """Return the most bytes of arrays: a full frame pads all others, in a small file too."""
+    return max(PACKED_BYTES, PACKED_RATIO * path.stat().st_size)
+
+
+class _Results(NamedTuple):
+    """Some results: their images' ids, points (n, points, 3), boxes (n, 4) and scores (n,)."""
+
+    images: list[int | str]
+    points: NDArray[np.float32]
+    boxes: NDArray[np.float64]
+    scores: NDArray[np.float64]
+
+
+def _join(path: Path, batches: Sequence[_Results]) -> _Results:
+    """Return all results, which must have the same points."""
+    sizes = sorted({batch.points.shape[1] for batch in batches})
+    if len(sizes) > 1:
+        raise _wrong(str(path), "the same points of all people", f"{sizes[0]} and {sizes[1]}")
+    if not batches:
+        empty = np.empty
+        return _Results([], empty((0, 17, 3), np.float32), empty((0, 4)), empty(0))
+    images = list(chain.from_iterable(batch.images for batch in batches))
+    arrays = zip(*(batch[1:] for batch in batches), strict=True)
+    return _Results(images, *(np.concatenate(each) for each in arrays))
+
+
+def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Yield batches of results, each with the index of its first result in the file."""
+    batch: list[dict[str, Any]] = []
+    for index, result in enumerate(items):
+        if type(result) is not dict:
+            expected = "a mapping with image_id and keypoints"
+            raise _result_error(path, index, "", expected, _shorten(result))
+        batch.append(result)
+        if len(batch) == BATCH:
+            yield index + 1 - BATCH, batch
+            batch = []
+    if batch:
+        yield index + 1 - len(batch), batch
+
+
+def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:
+    images = _images(path, results, first)
+    given = results[0].get("keypoints")
+    width = len(given) if type(given) is list and len(given) % 3 == 0 else 51
+    if not 0 < width <= 3 * MAX_POINTS:
+        raise unknown_size(f"{path}: result {first}, keypoints", width // 3)
+    table = _table(path, results, range(len(results)), "keypoints", width, first)
+    points = table.reshape(-1, width // 3, 3)
+    near = ~np.any(np.abs(points) > COORDINATE_LIMIT, axis=-1)
+    certain = f"pixels up to {COORDINATE_LIMIT:g} (a missing point is 0, 0, 0)"
+    _require_right(path, points, near, first, certain, _COUNT_TODO)
+    for result in results:
+        if result.get("bbox") is None:
+            result["bbox"] = result.get("box")
+    boxes = _optional(path, results, "bbox", 4, first)
+    scores = _optional(path, results, "score", 1, first)[:, 0]
+    return _Results(images, points.astype(np.float32), boxes, scores)
+
+
+def _images(path: Path, results: list[dict[str, Any]], first: int) -> list[int | str]:
+    """Return the id of each result's image: a number, or a file's name."""
+    images = [result.get("image_id") for result in results]
+    for index, image in enumerate(images, first):
+        if not (type(image) is int and image >= 0) and not (type(image) is str and image):
+            what = "the frame, a whole number from 0, or the name of an image"
+            raise _result_error(path, index, "image_id", what, _shorten(image), _NUMBER_TODO)
+    return images  # type: ignore[return-value] # checked
+
+
+def _frames(path: Path, images: Sequence[int | str], listed: object) -> NDArray[np.int64]:
+    """Return the frame of each result from its image's id, or from the images of the data set."""
+    frame_of: dict[Any, int] = {}
+    if isinstance(listed, list) and listed:
+        frame_of = _listed_frames(path, listed)
+    frames = np.empty(len(images), np.int64)
+    for index, image in enumerate(images):
+        frame = frame_of.get(image) if frame_of else image if type(image) is int else None
+        if frame is None and not frame_of:
+            frame = _last_number(str(image))
+        if frame is None:
+            what = "an id of `images`" if frame_of else "a number in the name of the image"
+            raise _result_error(path, index, "image_id", what, _shorten(image), _NUMBER_TODO)
+        if frame > FRAME_LIMIT:
+            what = f"the frame, a whole number from 0 to {FRAME_LIMIT}"
+            todo = "Write the number of the picture in the video as image_id."
+            raise _result_error(path, index, "image_id", what, _shorten(image), todo)
+        frames[index] = frame
+    return frames
+
+
+def _listed_frames(path: Path, listed: Sequence[Any]) -> dict[Any, int]:
+    """Return the frame of each image of a data set: the last number in its file's name."""
+    frames: dict[Any, int] = {}
+    for index, image in enumerate(listed):
+        name = image.get("file_name") if isinstance(image, dict) else None
+        number = _last_number(name) if isinstance(name, str) else None
+        where = f"{path}: images[{index}]"
+        if number is None or type(image.get("id")) not in (int, str):
+            raise _wrong(where, "an id, and file_name with the frame's number", _shorten(name))
+        frames[image["id"]] = number
+    if len(set(frames.values())) < len(listed):
+        found = f"{len(listed)} images with {len(set(frames.values()))} numbers"
+        raise _wrong(f"{path}: images", "file_names of one camera whose last numbers differ", found)
+    return frames
+
+
+def _last_number(name: str) -> int | None:
+    """Return the last number in the name of a file, without its folders and ending."""
+    numbers = re.findall(r"\d{1,18}", PureWindowsPath(name).stem)
+    return int(numbers[-1]) if numbers else None
+
+
+def _point_names(path: Path, categories: object) -> list[str]:
+    """Return the names of the points in `categories`; none where it has none."""
+    listed = categories if isinstance(categories, list) else []
+    given = [each for each in listed if isinstance(each, dict)]
+    names = [tuple(each["keypoints"]) for each in given if isinstance(each.get("keypoints"), list)]
+    names = [each for each in names if each]
+    if len(set(names)) > 1:
+        people = [n for each, n in zip(given, names, strict=False) if each.get("name") == "person"]
+        if len(people) != 1:
+            raise _wrong(f"{path}: categories", "the keypoints of one category", f"{len(names)}")
+        names = people
+    return list(names[0]) if names else []
+
+
+def _table(
+    path: Path,
+    results: list[dict[str, Any]],
+    indices: Sequence[int],
+    key: str,
+    width: int,
+    first: int,
+) -> NDArray[np.float64]:
+    """Return entry `key` of some results as (results, width), including NaN and infinity."""
+    rows = [results[index].get(key) for index in indices]
+    if width == 1:
+        rows = [[row] for row in rows]
+    well_formed = set(map(type, rows)) <= {list} and set(map(len, rows)) <= {width}  # type: ignore[arg-type]
+    # Check types, since numpy would accept "1" and True as numbers.
+    if well_formed and set(map(type, chain.from_iterable(rows))) <= {int, float}:  # type: ignore[arg-type]
+        try:
+            return np.array(rows, dtype=np.float64).reshape(-1, width)
+        except OverflowError:  # an integer beyond float64
+            pass
+    raise _find_error(path, rows, [first + index for index in indices], key, width)
+
+
+def _find_error(
+    path: Path, rows: list[Any], indices: Sequence[int], key: str, width: int
+) -> InputError:
+    what = f"{width} numbers: {_POINTS}" if key == "keypoints" else f"{width} numbers"
+    todo = _COUNT_TODO if key == "keypoints" else "Correct the file."
+    for index, row in zip(indices, rows, strict=True):
+        if type(row) is not list:
+            return _result_error(path, index, key, what, _shorten(row), todo)
+        if len(row) != width:
+            return _result_error(path, index, key, what, f"{len(row)}", todo)
+        for place, number in enumerate(row):
+            fits = type(number) is float or (type(number) is int and number.bit_length() < 1024)
+            if not fits:
+                return _result_error(path, index, f"{key}[{place}]", "a number", _shorten(number))
+    raise AssertionError("called for a table without a fault")
+
+
+def _require_right(
+    path: Path,
+    points: NDArray[np.floating],
+    right: NDArray[np.bool_],
+    first: int,
+    expected: str,
+    todo: str,
+) -> None:
+    if not np.all(right):
+        index, point = (int(i) for i in np.argwhere(~right)[0])
+        found = ", ".join(f"{number:g}" for number in points[index, point])
+        named = points.shape[1] == len(COCO17)
+        place = (
+            f"keypoints joint {point} ({COCO17[point]})" if named else f"keypoints, point {point}"
+        )
+        raise _result_error(path, first + index, place, expected, f"x, y, c = {found}", todo)
+
+
+def _optional(
+    path: Path, results: list[dict[str, Any]], key: str, width: int, first: int
+) -> NDArray[np.float64]:
+    """Return entry `key` as (results, width) [px], or scores; NaN rows if absent or null."""
+    given = [index for index, result in enumerate(results) if result.get(key) is not None]
+    values = np.full((len(results), width), np.nan)
+    table = _table(path, results, given, key, width, first)
+    # The last two of a box are its size; neither they nor a score can be negative.
+    fits = (np.abs(table) <= COORDINATE_LIMIT).all(axis=1) & (table[:, -2:] >= 0).all(axis=1)
+    if not np.all(fits):
+        row = int(np.argmin(fits))
+        what = "a finite score from 0" if key == "score" else "x, y, width and height [px]"
+        raise _result_error(path, first + given[row], key, what, f"{table[row].tolist()}")
+    values[given] = table
+    return values
+
+
+def _result_error(
+    path: Path,
+    index: int,
+    place: str,
+    expected: str,
+    found: str,
+    todo: str = "Correct the file.",
+) -> InputError:
+    where = f"{path}: result {index}" + (f", {place}" if place else "")
+    return InputError(where, expected=expected, found=found, todo=todo)
+
+
+def _wrong(where: str, expected: str, found: str) -> InputError:
+    todo = _NUMBER_TODO if "images" in where else "Correct the file."
+    return InputError(where, expected=expected, found=found, todo=todo)
+
+
+def _shorten(value: object) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, dict | list):
+        return f"a {'list' if isinstance(value, list) else 'mapping'} of {len(value)}"
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,348 @@
+"""Sets of keypoints of pose estimators, and one rule for what their files say.
+
+A file's own words decide the order of its points: the names of `categories`, or the name of a
+model. Where it is silent, the number of points decides, and lengths in the images decide between
+two sets of one size. Points that worldpose does not use are left out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import AnyFloats, Flags, Floats
+from data_contracts.conventions import COCO17, FEET
+from data_contracts.keypoints import KeypointDetections
+from worldpose.body.keypoints import BODY25
+from worldpose.errors import InputError
+
+MAX_CONFIDENCE: Final = 2.0
+"""Largest confidence that counts as 1 [1]: peaks of heat maps and of SimCC exceed 1; a larger one
+belongs to another scale."""
+ARRAY_BYTES: Final = 4 << 30
+"""Maximum size of one file's arrays [byte]; two hours of 25 people at 50 Hz are 2 GB."""
+PEOPLE_LIMIT: Final = 1000
+"""Maximum people per frame of one camera; a stadium's stands in one image have a few hundred."""
+COORDINATE_LIMIT: Final = 1e6
+"""Maximum absolute coordinate of a keypoint or box corner [px]."""
+
+
+class PointOrder(NamedTuple):
+    """The order of points in an estimator's files."""
+
+    name: str
+    joints: tuple[int, ...]
+    """(17,) places of COCO-17's joints."""
+    feet: tuple[int, ...] = ()
+    """(6,) places of `FEET`; none if it has no feet."""
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Places of all points that are used."""
+        return (*self.joints, *self.feet)
+
+
+def _order(name: str, points: Sequence[str]) -> PointOrder:
+    feet = tuple(map(points.index, FEET)) if set(FEET) <= set(points) else ()
+    return PointOrder(name, tuple(map(points.index, COCO17)), feet)
+
+
+_COCO18: Final = (*BODY25[:8], *BODY25[9:19])  # OpenPose's BODY_25 without mid-hip and feet
+_FIRST17: Final = tuple(range(17))
+_HALPE_FEET: Final = (20, 22, 24, 21, 23, 25)
+_SETS: Final = {
+    17: (PointOrder("COCO-17", _FIRST17),),
+    18: (_order("COCO-18", _COCO18),),
+    25: (_order("BODY_25", BODY25), PointOrder("BODY_25B", _FIRST17, tuple(range(19, 25)))),
+    26: (PointOrder("HALPE-26", _FIRST17, _HALPE_FEET),),
+    33: (PointOrder("BlazePose", (0, 2, 5, 7, 8, *range(11, 17), *range(23, 29))),),
+    68: (PointOrder("HALPE-68", _FIRST17, _HALPE_FEET),),
+    133: (PointOrder("COCO-WholeBody", _FIRST17, tuple(range(17, 23))),),
+    135: (PointOrder("BODY_135", _FIRST17, tuple(range(19, 25))),),
+    136: (PointOrder("HALPE-136", _FIRST17, _HALPE_FEET),),
+}
+"""Sets that are read, by their number of points; the first is the usual one."""
+SIZES: Final = tuple(_SETS)
+"""Numbers of points that are read."""
+KNOWN_SETS: Final = ", ".join(
+    f"{size} ({' or '.join(order.name for order in orders)})" for size, orders in _SETS.items()
+)
+MODELS: Final = {
+    "body_with_feet": "HALPE-26",
+    "halpe_26": "HALPE-26",
+    "halpe_68": "HALPE-68",
+    "halpe_136": "HALPE-136",
+    "whole_body": "COCO-WholeBody",
+    "whole_body_wrist": "COCO-WholeBody",
+    "coco_133": "COCO-WholeBody",
+    "coco_133_wrist": "COCO-WholeBody",
+    "body": "COCO-17",
+    "coco_17": "COCO-17",
+    "coco": "COCO-18",
+    "body_25": "BODY_25",
+    "body_25b": "BODY_25B",
+    "body_135": "BODY_135",
+    "blazepose": "BlazePose",
+}
+"""Pose2Sim's names of models and the sets that they give."""
+
+_BONES: Final = {
+    "thigh": ((11, 13), (12, 14)),
+    "shank": ((13, 15), (14, 16)),
+    "upper arm": ((5, 7), (6, 8)),
+    "forearm": ((7, 9), (8, 10)),
+    "eye to nose": ((0, 1), (0, 2)),
+}
+"""Pairs of COCO-17's joints, left and right, whose lengths tell an order."""
+_LENGTHS: Final = np.array([0.43, 0.42, 0.29, 0.26, 0.045])
+"""Usual lengths of these [m], of which only ratios count."""
+_HUMAN36M: Final = (4, 5, 1, 2, 5, 6, 2, 3, 11, 12, 14, 15, 12, 13, 15, 16, 9, 10, 9, 10)
+"""The same pairs in Human3.6M's 17 points; it has no eyes, so nose to head stands for them."""
+_HUMAN36M_LENGTHS: Final = np.array([0.43, 0.42, 0.29, 0.26, 0.115])
+_MARGIN: Final = 0.3
+"""How much better another order must explain the lengths [log]. Right orders of recordings and of
+the simulation miss by 0.03 to 0.15, wrong ones by 0.5 or more."""
+_PLAUSIBLE: Final = 0.3
+"""Largest misfit of the order that explains them [log]."""
+_SAMPLE: Final = 2000
+"""People whose lengths are compared; more add nothing."""
+
+
+def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
+    """Return the order of points whose names a file gives, in any usual spelling.
+
+    Raises:
+        InputError: a joint of COCO-17 is missing, or two names are the same.
+    """
+    plain = [_plain(str(name)) for name in names]
+    missing = [joint for joint in COCO17 if joint not in plain]
+    if missing or any(plain.count(joint) > 1 for joint in (*COCO17, *FEET)):
+        unknown = [str(n) for n, one in zip(names, plain, strict=True) if one not in COCO17]
+        kind = " (Human3.6M?)" if {"thorax", "spine"} & set(plain) and len(plain) == 17 else ""
+        raise InputError(
+            where,
+            expected="the names of COCO's 17 joints, each once: " + ", ".join(COCO17),
+            found=f"{', '.join(unknown) or ', '.join(map(str, names))}{kind}; missing are "
+            + (", ".join(missing) or "none"),
+            todo="Export the points of COCO-17, or name them so.",
+        )
+    return _order("named points", plain)
+
+
+def _plain(name: str) -> str:
+    """Return `left_shoulder` for Left Shoulder, LShoulder, shoulder-left or l_shoulder."""
+    words = re.sub(r"([a-z])([A-Z])", r"\1 \2", re.sub(r"^([LR])([A-Z])", r"\1 \2", name.strip()))
+    tokens = re.findall(r"[a-z0-9]+", words.lower())
+    if len(tokens) == 1:
+        parts = "eye|ear|shoulder|elbow|wrist|hip|knee|ankle"
+        joined = re.fullmatch(rf"(left|right|l|r)({parts})", tokens[0])
+        tokens = list(joined.groups()) if joined else tokens
+    sides = {"l": "left", "left": "left", "r": "right", "right": "right"}
+    side = [sides[token] for token in tokens if token in sides]
+    part = [token for token in tokens if token not in sides]
+    if any("toe" in token for token in part):
+        part = ["small" if any("small" in token for token in part) else "big", "toe"]
+    return "_".join([*side[:1], *part])
+
+
+def order_by_points(where: str, points: AnyFloats, stated: str | None = None) -> PointOrder:
+    """Return the order of points whose number alone is known, and perhaps a model.
+
+    Args:
+        where: file, for messages.
+        points: (people, points, 3) x, y [px] and confidence; 0 = missing.
+        stated: name in `MODELS`, which counts if it has this number of points.
+
+    Raises:
+        InputError: no set has this number of points, or their lengths are those of another set.
+    """
+    size = points.shape[1]
+    orders = _SETS.get(size, ())
+    if not orders:
+        raise unknown_size(where, size)
+    named = MODELS.get((stated or "").strip().lower())
+    for order in orders:
+        if order.name == named:
+            return order
+    misfits = [_misfit(points, _pairs(order), _LENGTHS) for order in orders]
+    chosen = orders[0]
+    for order, misfit in zip(orders, misfits, strict=True):
+        if misfit <= _PLAUSIBLE and misfits[0] - misfit >= _MARGIN:
+            chosen = order
+    if size == len(COCO17):
+        other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
+        if other <= _PLAUSIBLE and misfits[0] - other >= _MARGIN:
+            raise InputError(
+                where,
+                expected="the 17 joints in COCO's order",
+                found="thighs, shanks and arms as in the order of Human3.6M",
+                todo="Estimate poses with a model of COCO, or write COCO's joints.",
+            )
+    return chosen
+
+
+def unknown_size(where: str, size: int) -> InputError:
+    """Return the error of a set of points that no known estimator has."""
+    return InputError(
+        where,
+        expected=f"x, y and confidence of each point, of {KNOWN_SETS} points",
+        found=f"{size} points",
+        todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
+    )
+
+
+def _pairs(order: PointOrder) -> NDArray[np.int64]:
+    pairs: NDArray[np.int64] = np.array(order.joints)[np.array(list(_BONES.values()))]
+    return pairs
+
+
+def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> float:
+    """Return the mean deviation of people's lengths [log] from the usual ones; NaN if unknown.
+
+    Args:
+        points: (people, points, 3).
+        pairs: (bones, 2, 2) places of the ends of the left and right bone.
+        lengths: (bones,) usual lengths, of which only ratios count.
+    """
+    some = points[:: max(1, len(points) // _SAMPLE)]
+    place = np.where(some[..., 2:] > 0.0, some[..., :2], np.nan).astype(np.float64)
+    span = np.linalg.norm(place[:, pairs[..., 0]] - place[:, pairs[..., 1]], axis=-1)
+    known = np.isfinite(span).any(axis=0)
+    if known.sum() < known.size - 2:  # the face may be hidden
+        return float("nan")
+    typical = np.nanmedian(span[:, known], axis=0)
+    usual = np.broadcast_to(lengths[:, None], known.shape)[known]
+    ratio = np.log(np.maximum(typical, 1e-9) / usual)
+    return float(np.abs(ratio - np.median(ratio)).mean())
+
+
+class Changes(NamedTuple):
+    """How often a file's points were changed to be read."""
+
+    clamped: int = 0
+    """Confidences above 1, which count as 1."""
+    nobody: int = 0
+    """Entries without a known joint, which are no people."""
+    empty: int = 0
+    """Empty files of frames."""
+
+
+class PeopleFile(NamedTuple):
+    """People of one camera in a file or folder."""
+
+    people: KeypointDetections
+    """COCO-17, and `FEET` if the set has them; other points are left out."""
+    kind: str | None
+    """Name of the set of points; None without people."""
+    changes: Changes
+
+
+def clean_points(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], Changes]:
+    """Return points (people, points, 3) with confidences of at most 1, and what was changed.
+
+    A point that is not finite is missing, as one of confidence 0 is: x, y and confidence are 0.
+    """
+    there = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0.0)
+    clean = np.where(there[..., None], points, np.float32(0.0))
+    clamped = int((clean[..., 2] > 1.0).sum())
+    clean[..., 2] = np.minimum(clean[..., 2], 1.0)
+    return clean, Changes(clamped)
+
+
+def people_by_frame(
+    path: Path,
+    frames: NDArray[np.int64],
+    points: NDArray[np.float32],
+    boxes: Floats | None = None,
+    scores: Floats | None = None,
+    limit: int = ARRAY_BYTES,
+) -> tuple[KeypointDetections, int]:
+    """Return people by rising frame, and the number of entries that are nobody.
+
+    Args:
+        path: the file, for messages.
+        frames: (n,) frame of each entry.
+        points: (n, 17 or 23, 3) COCO-17 and perhaps `FEET`; confidence 0 = missing.
+        boxes: (n, 4) x, y, width, height [px]; NaN or None = that of the joints.
+        scores: (n,) NaN or None = the mean confidence of the joints.
+        limit: maximum size of the arrays [byte].
+
+    Raises:
+        InputError: too many people in a frame, or arrays that are too large.
+    """
+    found: Flags = np.asarray(points[..., 2] > 0)
+    seen: Flags = np.asarray(found[:, : len(COCO17)].any(axis=1))
+    boxed: Flags = np.zeros(len(seen), np.bool_)
+    if boxes is not None:
+        boxed = np.asarray(np.isfinite(boxes).all(axis=1))
+    kept = seen | boxed
+    points, found, seen = points[kept], found[kept], seen[kept]
+    boxed, frames = boxed[kept], frames[kept]
+    found &= seen[:, None]
+    values = np.where(found[..., None], points, np.float32(np.nan))
+    joints = values[:, : len(COCO17)]
+    corners = np.full((len(values), 4), np.nan)
+    corners[seen, :2] = np.nanmin(joints[seen, :, :2], axis=1)
+    corners[seen, 2:] = np.nanmax(joints[seen, :, :2], axis=1)
+    if boxes is not None:
+        given = boxes[kept][boxed]
+        corners[boxed] = np.concatenate([given[:, :2], given[:, :2] + given[:, 2:]], axis=1)
+    score = np.full(len(values), np.nan)
+    score[seen] = np.nanmean(joints[seen, :, 2], axis=1)
+    if scores is not None:
+        score = np.where(np.isnan(scores[kept]), score, scores[kept])
+
+    order = np.argsort(frames, kind="stable")
+    frame, first, count = np.unique(frames[order], return_index=True, return_counts=True)
+    most = int(count.max(initial=0))
+    _require_room(path, frame, count, points.shape[1], limit)
+    row = np.repeat(np.arange(len(frame)), count)
+    slot = np.arange(len(frames)) - np.repeat(first, count)
+
+    def pad(given: NDArray[np.floating]) -> NDArray[np.float32]:
+        dense = np.full((len(frame), most, *given.shape[1:]), np.nan, dtype=np.float32)
+        dense[row, slot] = given[order]
+        return dense
+
+    people = KeypointDetections(
+        keypoints=pad(joints[..., :2]),
+        confidence=pad(joints[..., 2]),
+        boxes=pad(corners),
+        score=pad(score),
+        frame=frame,
+    )
+    if points.shape[1] > len(COCO17):
+        feet = pad(values[:, len(COCO17) :])
+        people = replace(
+            people, points=FEET, extra_keypoints=feet[..., :2], extra_confidence=feet[..., 2]
+        )
+    return people, int((~kept).sum())
+
+
+def _require_room(
+    path: Path, frame: NDArray[np.int64], count: NDArray[np.int64], points: int, limit: int
+) -> None:
+    """Raise InputError for too many people in a frame, or too large arrays."""
+    most = int(count.max(initial=0))
+    fullest = frame[np.argmax(count)] if len(count) else 0
+    if most > PEOPLE_LIMIT:
+        raise InputError(
+            str(path),
+            expected=f"at most {PEOPLE_LIMIT} people per frame",
+            found=f"{most} in frame {fullest}",
+            todo="Check image_id, or keep the detections of each image with the highest scores.",
+        )
+    limit = min(limit, ARRAY_BYTES)
+    if len(frame) * most * 4 * (3 * points + 5) > limit:
+        raise InputError(
+            str(path),
+            expected=f"frames and people that fit into {limit} bytes",
+            found=f"{most} people in frame {fullest}",
+            todo="Check image_id.",
+        )

@@ -1,0 +1,79 @@
+"""Calibration of one static camera from clicks in its image (C1-C5)."""
+
+from __future__ import annotations
+
+from data_contracts.arrays import Image
+from data_contracts.cameras import LensCalibration
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.click_outliers import fit_inliers_at_best_noise
+from worldpose.static_calibration.evidence import check_amount, gather_evidence
+from worldpose.static_calibration.explanations import check_determined, find_explanation, try_k3
+from worldpose.static_calibration.fit import build_problem
+from worldpose.static_calibration.initialization import find_start, fit_from_starts
+from worldpose.static_calibration.line_refinement import refine_and_judge
+from worldpose.static_calibration.report import StaticCalibration, build_report
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+
+
+def calibrate_camera(
+    pitch: PitchTemplate,
+    clicked: ClickedMarkings,
+    image_size: tuple[int, int],
+    *,
+    picture: Image | None = None,
+    settings: StaticCalibrationSettings | None = None,
+    where: str = "clicked markings",
+    lens: LensCalibration | None = None,
+    start: Camera | None = None,
+) -> StaticCalibration:
+    """Return the camera of an image, its covariance and its report.
+
+    Stage 1 finds starts: homographies of the flattened pitch, or plausible cameras where clicks
+    are too few for one. Stage 2 fits pose, focal length, principal point and distortion on the
+    crowned pitch, and excludes outliers among the clicks. Stage 3 refines on the painted lines of
+    the image, if there is one.
+
+    Args:
+        pitch: the stadium's template.
+        clicked: named points, and pixels along named markings.
+        image_size: width, height [px].
+        picture: (height, width) or (height, width, 3); without it there is no stage 3.
+        settings: noise, prior and thresholds; the defaults if None.
+        where: file or camera, for messages.
+        lens: a lens that was calibrated before, the prior of focal length, principal point and
+            distortion; its k1, k2 and k3 are then all solved for. None = not known.
+        start: a camera near the answer, which replaces stage 1. Where the markings are their own
+            image after half a turn, it decides the side.
+
+    Raises:
+        InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
+            clicks contradict each other, or they do not determine the camera; the message says
+            which clicks to add.
+
+    Note:
+        C1-C5; paper section "Static Camera Calibration".
+    """
+    stated = settings or StaticCalibrationSettings()
+    if lens is not None:
+        stated = stated.model_copy(update={"distortion": "k1_k2_k3"})
+    evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
+    check_amount(evidence, pitch, where)
+    problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
+    if start is None:
+        near = find_start(problem, stated)
+    else:
+        near, _ = fit_from_starts(problem, start.numbers[None], stated.wrong_click)
+    found = fit_inliers_at_best_noise(problem, near, stated)
+    found = find_explanation(found, pitch, stated)
+    check_determined(found, pitch)
+    found = try_k3(found)
+    estimate, lines = found.estimate, None
+    if picture is not None and stated.lines:
+        found, lines = refine_and_judge(found, pitch, picture)
+        if lines.venue is not None:
+            estimate = lines.estimate.estimate
+            pitch = pitch.with_surface(lines.estimate.surface)
+    report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
+    return StaticCalibration(estimate, report)
