@@ -12,7 +12,8 @@ from registry import Table, Tables, benchmark, duration, seeds
 from data_contracts.arrays import Floats
 from worldpose.body.body_file import load_open_body
 from worldpose.body.model import BodyModel
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
@@ -20,7 +21,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 LIMBS = ((16, 18), (18, 20), (1, 4), (4, 7), (1, 2), (16, 17))

@@ -45,7 +45,7 @@ from worldpose.static_calibration.venue import join_cameras
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.clocks import shift_in_time
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.synchronization import Synchronization, shift_frames, synchronize
 from worldpose.video.files import VideoReader

@@ -19,7 +19,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 PUBLISHED = {3: 9.9, 2: 18.3}

@@ -21,7 +21,7 @@ from common import (
 from registry import DATA, SET, Table, Tables, benchmark, integer, option
 
 from flows.results.best_results import JointDefinition, joint_tracks
-from worldpose.body_fitting.objective import perceived_joints
+from worldpose.body_fitting.evidence import perceived_joints
 from worldpose.errors import WorldposeError
 from worldpose.ingest.importing import import_match
 from worldpose.store.store import Store, open_run

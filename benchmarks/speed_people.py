@@ -25,14 +25,15 @@ from worldpose.body.differentiable import DifferentiableBody
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior, start_poses
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.geometry.cameras import Camera
 from worldpose.tracking.ray_matching import match_greedily, match_optimally, ray_affinity
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 KERNEL = TriangulationSettings(learn_noise=False, offsets="none", undo_swaps=False)

@@ -14,24 +14,30 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
-from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip, read_rows
+from tasks.clip_inputs import (
+    ChunkedRows,
+    ClipInputs,
+    open_tracked_clip,
+    read_rows,
+    triangulation_settings,
+)
 from tasks.triangulation import camera_errors
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.body.body_file import digest_of_body, find_body
 from worldpose.body.model import BodyModel
-from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_in_windows
 from worldpose.body_fitting.bones import Shape
-from worldpose.body_fitting.fit_quality import FitMetrics, SeenClip, compare_held_out, far_offsets
+from worldpose.body_fitting.estimate import fit_in_windows
+from worldpose.body_fitting.evidence import Ground
+from worldpose.body_fitting.held_out import SeenClip, compare_held_out
 from worldpose.body_fitting.monocular import MonocularPoses
-from worldpose.body_fitting.objective import Ground
 from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_constraints
+from worldpose.body_fitting.report import FitMetrics, far_offsets
+from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.review.identities import select_triangulated
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.limb_lengths import undo_swaps
-from worldpose.triangulation.passes import ExtraJoints
-from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.results import ExtraJoints
 
 MEASURED_FRAMES: Final = 1000
 """Frames of a clip from which medians of metrics are computed."""
@@ -43,7 +49,7 @@ def body_fitting(inputs: UnitInputs, result: ResultWriter) -> None:
     people = open_people(inputs)
     fit = write_fit(inputs, result, BODY_FITTING, people, inputs)
     clip, placed = people.clip, inputs.made_from(f"retriangulation/{inputs.unit}")
-    settings = placed.made_from(f"triangulation/{inputs.unit}").settings(TriangulationSettings)
+    settings = triangulation_settings(placed, inputs.unit)
     seen = SeenClip(clip.cameras, camera_errors(inputs, clip), people, settings, clip.fps)
     held_out = compare_held_out(*_fitting_basis(people, inputs), seen, fit)
     if held_out is not None:
@@ -179,9 +185,7 @@ class _Frames:
 def open_people(inputs: UnitInputs, views: Views | None = None) -> ClipPeople:
     """Open the tracked and triangulated people of the unit's clip."""
     placed = inputs.open(f"retriangulation/{inputs.unit}")
-    tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
-    clip = open_clip(inputs).assign_people(tracks["detection_index"].values)
-    return ClipPeople(clip, placed, views)
+    return ClipPeople(open_tracked_clip(inputs), placed, views)
 
 
 def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
@@ -252,7 +256,7 @@ def write_fit(
     windows = fit_in_windows(model, people, settings, ground, further.known_shapes)
     with inputs.open_spool() as spool:
         for part, bodies in windows:
-            spool.add(_part_arrays(bodies))
+            spool.add(frame_arrays(bodies))
             evidence = people.read(part)
             spool.add(further.of_part(part, bodies, evidence))
             metrics.add(bodies, evidence.joints, (people.clip.cameras, _Frames(people, part)))
@@ -289,7 +293,7 @@ def write_fit(
     return fit
 
 
-def _part_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
+def frame_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
     """Return the stored arrays with a frame dimension."""
     arrays: dict[str, NDArray[Any]] = {
         "global_orient": fit.parameters.global_orient,

@@ -9,7 +9,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
-from tasks.clip_inputs import ClipInputs, open_frames, open_venue, select_frames
+from tasks.clip_inputs import (
+    ClipInputs,
+    open_frames,
+    open_venue,
+    select_frames,
+    triangulation_settings,
+)
 from tasks.unit import UnitInputs, unit_task
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
@@ -19,7 +25,6 @@ from worldpose.errors import UsageError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.store.writer import ResultWriter
-from worldpose.triangulation.settings import TriangulationSettings
 
 
 @unit_task
@@ -69,7 +74,7 @@ def _open_people(inputs: UnitInputs, settings: BundleAdjustmentSettings) -> _Peo
     placed = {clip: inputs.open(f"triangulation/{clip}") for clip in clips}
     frames = {clip: placed[clip]["frame"].values for clip in clips}
     total = sum(count for _, count in sources["clips"].values())
-    stride = _triangulation_settings(inputs).stride(total)
+    stride = triangulation_settings(inputs, clips[0]).stride(total)
     for clip in clips:
         start, count = sources["clips"][clip]
         inside = [frame for frame in settings.chosen_frames if 0 <= frame - start < count]
@@ -109,12 +114,6 @@ def _open_people(inputs: UnitInputs, settings: BundleAdjustmentSettings) -> _Peo
     return people
 
 
-def _triangulation_settings(inputs: UnitInputs) -> TriangulationSettings:
-    """Return the settings of the first triangulation, which all clips share."""
-    clip = next(iter(inputs.sources["clips"]))
-    return inputs.made_from(f"triangulation/{clip}").settings(TriangulationSettings)
-
-
 def _open_clip(inputs: UnitInputs, people: _People, opened: ClipInputs) -> Clip:
     """Return the calibrated cameras, their clicks, and their detections of `people`."""
     pitch = opened.raise_pitch(inputs.pitch)
@@ -128,7 +127,7 @@ def _open_clip(inputs: UnitInputs, people: _People, opened: ClipInputs) -> Clip:
         detections=opened.detections[:].assign_people(people.detection_index),
         joints=people.joints,
         views=people.views,
-        triangulation=_triangulation_settings(inputs),
+        triangulation=triangulation_settings(inputs, next(iter(people.clip_frames))),
         pitch=pitch,
         on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
         names=tuple(opened.camera_ids),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
 from typing import Any
@@ -13,14 +13,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Integers
+from data_contracts.arrays import ClipArray, Flags, Integers, Singles
 from data_contracts.detection import redetection_name
-from data_contracts.keypoints import EXTRA_ARRAYS, KeypointDetections
+from data_contracts.keypoints import EXTRA_ARRAYS, KEYPOINT_ARRAYS, KeypointDetections
 from tasks.unit import UnitInputs
+from worldpose.filtering.feedback import Feedback, align_results, apply_feedback
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.pitch.template import PitchTemplate
+from worldpose.review.identities import select_triangulated
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.store import Store
+from worldpose.triangulation.settings import TriangulationSettings
 
 PAGE = 256
 """Frames per read."""
@@ -74,49 +77,24 @@ def read_rows(array: xr.DataArray, rows: NDArray[np.int64]) -> NDArray[Any]:
     return np.concatenate(parts)
 
 
-class StoredArray:
-    """One array of all cameras' detections in a store, padded to the same number, read in pages.
-
-    Rejected keypoints count as not detected. Filtering results of a detection index do not apply to
-    people redetected at that index since.
+class PagedArray:
+    """An array that is read in pages, the last of which stay in memory.
 
     Attributes:
-        shape: (frames, cameras, detections, ...).
+        shape: (frames, ...).
     """
 
-    def __init__(
-        self,
-        clips: Sequence[xr.Dataset],
-        name: str,
-        rejected: xr.DataArray | None = None,
-        shift: xr.DataArray | None = None,
-        *,
-        redetected: bool = True,
-    ) -> None:
-        """Open the arrays.
-
-        Args:
-            clips: detections of each camera.
-            name: name of the array.
-            rejected: (frames, cameras, detections, 17), keypoints to leave out.
-            shift: (frames, cameras, detections, 17, 2) [px], systematic error to subtract.
-            redetected: include redetected people.
-        """
-        arrays = [clip[name] for clip in clips]
-        detections = max(1, *(array.sizes["detection"] for array in arrays))
-        frames, _, *rest = arrays[0].shape
-        self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
-        self._arrays = [ChunkedRows(array) for array in arrays]
-        self._clips = clips
-        self._redetected = redetected
-        self._rejected = None if rejected is None else ChunkedRows(rejected)
-        self._shift = None if shift is None else ChunkedRows(shift)
-        is_small = math.prod(self.shape) * np.dtype(np.float32).itemsize <= SMALL_BYTES
-        self._page = lru_cache(None if is_small else PAGES)(self._read)
+    def __init__(self, shape: tuple[int, ...], read: Callable[[slice], NDArray[Any]]) -> None:
+        """Open an array of a shape, whose rows `read` returns."""
+        self.shape = shape
+        is_small = math.prod(shape) * np.dtype(np.float32).itemsize <= SMALL_BYTES
+        self._page = lru_cache(None if is_small else PAGES)(
+            lambda number: read(slice(number * PAGE, min((number + 1) * PAGE, shape[0])))
+        )
         self._reading = Lock()
 
     def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
-        """Return some frames as float64; NaN beyond a camera's number of detections."""
+        """Return some frames as float64."""
         row = np.arange(self.shape[0])[frames]
         out = np.empty((len(row), *self.shape[1:]))
         for number in np.unique(row // PAGE).tolist():
@@ -126,53 +104,90 @@ class StoredArray:
             out[here] = page[row[here] - number * PAGE]
         return out
 
-    def _read(self, number: int) -> NDArray[np.float32]:
-        start, stop = number * PAGE, min((number + 1) * PAGE, self.shape[0])
-        page = np.full((stop - start, *self.shape[1:]), np.nan, dtype=np.float32)
-        rows = slice(start, stop)
-        for camera, array in enumerate(self._arrays):
-            part = array[rows]
-            page[:, camera, : part.shape[1]] = part
-        if self._shift is not None:
-            page -= _align_results(self._clips, self._shift[rows], page.shape, rows)
-            for camera, clip in enumerate(self._clips):
-                if "shift" in clip:
-                    page[:, camera, : clip.sizes["detection"]] -= clip["shift"][rows].values
-        if self._rejected is not None:
-            rejected = _align_results(self._clips, self._rejected[rows], page.shape[:4], rows)
-            page[rejected] = np.nan
-        if not self._redetected:
-            page[_mark_redetected(self._clips, page.shape[:3], rows)] = np.nan
-        return page
 
-
-def _align_results(
-    clips: Sequence[xr.Dataset], before: NDArray[Any], shape: tuple[int, ...], rows: slice
-) -> NDArray[Any]:
-    """Return filtering results of the previous iteration for current detections; zero for new ones.
+class StoredFeedback:
+    """Results of the previous iteration in a store, read by frames.
 
     Args:
-        clips: detections of each camera.
-        before: (rows, cameras, previous detections, ...), results in these frames.
-        shape: (rows, cameras, detections, ...) shape of the result.
-        rows: slice of the frames.
+        cameras: detections of each camera, with redetected people.
+        filtering: rejected keypoints and shifts of the same frames; None = first iteration.
+        filtered: leave out rejected keypoints.
+        shifted: subtract the systematic errors of keypoints.
+        redetected: keep redetected people.
     """
-    out = np.zeros(shape, dtype=before.dtype)
-    both = min(shape[2], before.shape[2])
-    out[:, :, :both] = before[:, :, :both]
-    out[_mark_redetected(clips, shape[:3], rows)] = 0
-    return out
+
+    def __init__(
+        self,
+        cameras: Sequence[xr.Dataset],
+        filtering: xr.Dataset | None = None,
+        *,
+        filtered: bool = True,
+        shifted: bool = True,
+        redetected: bool = True,
+    ) -> None:
+        used = {"rejected": filtered, "shift": shifted}
+        self._cameras, self._hide = cameras, not redetected
+        self._results = {
+            name: ChunkedRows(filtering[name])
+            for name, wanted in used.items()
+            if wanted and filtering is not None
+        }
+
+    def apply(self, name: str, values: Singles, rows: slice) -> Singles:
+        """Return some frames of an array of detections with the results applied."""
+        needed = {"keypoints": ("shift", "rejected"), "confidence": ("rejected",)}.get(name, ())
+        found = {each: self._results[each][rows] for each in needed if each in self._results}
+        if not found and not self._hide:
+            return values
+        own = None
+        if "shift" in found:
+            own = np.zeros(values.shape, np.float32)
+            _fill_cameras(own, [each.get("shift") for each in self._cameras], rows)
+        marked = mark_redetected(self._cameras, rows)
+        feedback = Feedback(marked, found.get("rejected"), found.get("shift"), own, self._hide)
+        return apply_feedback(name, values, feedback)
 
 
-def _mark_redetected(
-    clips: Sequence[xr.Dataset], shape: tuple[int, ...], rows: slice
-) -> NDArray[np.bool_]:
-    """Return a mask (rows, cameras, detections) of redetected people."""
-    found = np.zeros(shape, dtype=np.bool_)
-    for camera, clip in enumerate(clips):
-        if "found_again" in clip:
-            found[:, camera, : clip.sizes["detection"]] = clip["found_again"][rows].values >= 0
-    return found
+def mark_redetected(cameras: Sequence[xr.Dataset], rows: slice) -> Flags:
+    """Return which detections (frames, cameras, detections) of some frames are redetected."""
+    most = max(1, *(camera.sizes["detection"] for camera in cameras))
+    frames = len(range(*rows.indices(cameras[0].sizes["frame"])))
+    found = np.full((frames, len(cameras), most), -1)
+    _fill_cameras(found, [each.get("found_again") for each in cameras], rows)
+    return np.asarray(found >= 0)
+
+
+def _fill_cameras(out: NDArray[Any], arrays: Sequence[xr.DataArray | None], rows: slice) -> None:
+    """Write some frames of each camera's array to `out` (frames, cameras, detections, ...)."""
+    for camera, array in enumerate(arrays):
+        if array is not None:
+            out[:, camera, : array.shape[1]] = array[rows].values
+
+
+def open_detections(
+    cameras: Sequence[xr.Dataset], frame: Integers, feedback: StoredFeedback
+) -> KeypointDetections[ClipArray]:
+    """Return the detections of all cameras, read in pages; NaN beyond a camera's number of them."""
+    aligned, points = align_points(cameras)
+    most = max(1, *(camera.sizes["detection"] for camera in cameras))
+
+    def open_array(name: str) -> PagedArray:
+        stored = [ChunkedRows(camera[name]) for camera in aligned]
+        frames, _, *rest = aligned[0][name].shape
+        shape = (frames, len(stored), most, *rest)
+
+        def read(rows: slice) -> Singles:
+            page = np.full((rows.stop - rows.start, *shape[1:]), np.nan, dtype=np.float32)
+            for camera, array in enumerate(stored):
+                part = array[rows]
+                page[:, camera, : part.shape[1]] = part
+            return feedback.apply(name, page, rows)
+
+        return PagedArray(shape, read)
+
+    names = [array.name for array in (*KEYPOINT_ARRAYS, *(EXTRA_ARRAYS if points else ()))]
+    arrays: dict[str, Any] = {name: open_array(name) for name in names}
+    return KeypointDetections[ClipArray](**arrays, frame=frame, points=points)
 
 
 @dataclass(frozen=True)
@@ -188,6 +203,7 @@ class ClipInputs:
         fps: frames per second of match time.
         surface: (2,) crown and end fall of the pitch that the cameras show [m]; None = as in
             pitch.json.
+        person: (persons,) ids of the tracked people; none before tracking.
     """
 
     camera_ids: tuple[str, ...]
@@ -196,20 +212,18 @@ class ClipInputs:
     detections: KeypointDetections[ClipArray]
     fps: float
     surface: NDArray[np.float64] | None = None
+    person: NDArray[np.integer] = field(default_factory=lambda: np.empty(0, dtype=np.int32))
 
     def raise_pitch(self, pitch: PitchTemplate | None) -> PitchTemplate | None:
         """Return a pitch, if there is one, with the surface that the cameras show."""
         return pitch if pitch is None or self.surface is None else pitch.with_surface(self.surface)
-
-    def assign_people(self, detection_index: NDArray[np.integer]) -> ClipInputs:
-        """Return the clip with tracked people (frames, cameras, persons)."""
-        return replace(self, detections=self.detections.assign_people(detection_index))
 
 
 NOTHING = {
     **dict.fromkeys(("keypoints", "confidence", "boxes", "score"), np.nan),
     "found_again": -1,
     "shift": 0.0,
+    "rejected": False,
 }
 """Fill values of padded detections."""
 ADJUSTED = "bundle_adjustment/cameras"
@@ -231,18 +245,29 @@ def open_clip(
         shifted: subtract the systematic errors of keypoints.
         redetected: include redetected people.
     """
-    frame = inputs.frames
-    where = slice(int(frame[0]), int(frame[-1]))
+    where = slice(int(inputs.frames[0]), int(inputs.frames[-1]))
     seen = _open_cameras(inputs, where)
-    rejected, shift = _load_filtering_results(inputs, {inputs.unit: where})
-    return _make_inputs(
-        inputs,
-        frame,
-        seen,
-        rejected if filtered else None,
-        shift if shifted else None,
-        redetected=redetected,
+    name = f"filtering/{inputs.unit}"
+    filtering = inputs.open(name).sel(frame=where) if name in inputs else None
+    feedback = StoredFeedback(
+        seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
     )
+    return _open_inputs(inputs, open_detections(seen, inputs.frames, feedback))
+
+
+def open_tracked_clip(
+    inputs: UnitInputs, *, filtered: bool = True, shifted: bool = True
+) -> ClipInputs:
+    """Open the unit's clip with its tracked people that are triangulated; as `open_clip`."""
+    clip = open_clip(inputs, filtered=filtered, shifted=shifted)
+    tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
+    people = clip.detections.assign_people(tracks["detection_index"].values)
+    return replace(clip, detections=people, person=tracks["person"].values)
+
+
+def triangulation_settings(inputs: UnitInputs, clip: str) -> TriangulationSettings:
+    """Return the settings of the first triangulation of a clip, which all clips share."""
+    return inputs.made_from(f"triangulation/{clip}").settings(TriangulationSettings)
 
 
 def select_frames(stored: xr.Dataset, frame: NDArray[np.int64]) -> xr.Dataset:
@@ -258,7 +283,7 @@ def select_frames(stored: xr.Dataset, frame: NDArray[np.int64]) -> xr.Dataset:
     return stored.isel(frame=slice(int(places[0]), int(places[-1]) + 1, step))
 
 
-def load_dropped_boxes(inputs: UnitInputs) -> NDArray[np.bool_] | None:
+def load_dropped_boxes(inputs: UnitInputs) -> Flags | None:
     """Return boxes dropped by the previous iteration (frames, cameras, detections), if any."""
     before = f"filtering/{inputs.unit}"
     if before not in inputs:
@@ -266,8 +291,7 @@ def load_dropped_boxes(inputs: UnitInputs) -> NDArray[np.bool_] | None:
     dropped = inputs.open(before)["dropped"]
     frame = dropped["frame"].values
     seen = _open_cameras(inputs, slice(frame[0], frame[-1]))
-    detections = max(1, *(clip.sizes["detection"] for clip in seen))
-    return _align_results(seen, dropped.values, (*dropped.shape[:2], detections), slice(None))
+    return align_results(dropped.values, mark_redetected(seen, slice(None)))
 
 
 def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
@@ -282,9 +306,14 @@ def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> 
         )
         for c in range(len(inputs.sources["cameras"]))
     ]
+    filtering = [
+        inputs.open(name)[["rejected", "shift"]].sel(frame=frame)
+        for clip, frame in frames.items()
+        if (name := f"filtering/{clip}") in inputs
+    ]
+    feedback = StoredFeedback(seen, _concatenate_clips(filtering) if filtering else None)
     frame = np.concatenate(list(frames.values()))
-    some = _make_inputs(inputs, frame, seen, *_load_filtering_results(inputs, frames))
-    return replace(some, detections=some.detections[: len(frame)])
+    return _open_inputs(inputs, open_detections(seen, frame, feedback)[: len(frame)])
 
 
 def _open_cameras(inputs: UnitInputs, where: slice) -> list[xr.Dataset]:
@@ -308,69 +337,15 @@ def _concatenate_clips(clips: Sequence[xr.Dataset]) -> xr.Dataset:
     return xr.concat(padded, dim="frame")
 
 
-def _load_filtering_results(
-    inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64] | slice]
-) -> tuple[xr.DataArray | None, xr.DataArray | None]:
-    """Return rejections and shifts by the previous iteration by frame; None in the first one."""
-    clips = [
-        inputs.open(name)[["rejected", "shift"]].sel(frame=where)
-        for clip, where in frames.items()
-        if (name := f"filtering/{clip}") in inputs
-    ]
-    if not clips:
-        return None, None
-    merged = clips[0]
-    if len(clips) > 1:
-        most = max(clip.sizes["detection"] for clip in clips)
-        nothing = {"rejected": False, "shift": 0.0}
-        padded = [
-            clip.pad(detection=(0, most - clip.sizes["detection"]), constant_values=nothing)
-            for clip in clips
-        ]
-        merged = xr.concat(padded, dim="frame")
-    return merged["rejected"], merged["shift"]
-
-
-def _make_inputs(
-    inputs: UnitInputs,
-    frame: NDArray[np.int64],
-    seen: Sequence[xr.Dataset],
-    rejected: xr.DataArray | None,
-    shift: xr.DataArray | None,
-    *,
-    redetected: bool = True,
-) -> ClipInputs:
-    """Open match frames with each camera's detections.
-
-    The cameras are the adjusted ones if these are an input.
-    """
+def _open_inputs(inputs: UnitInputs, detections: KeypointDetections[ClipArray]) -> ClipInputs:
+    """Return detections with their cameras: the adjusted ones if these are an input."""
     camera_ids = tuple(inputs.sources["cameras"])
     cameras, covariance, surface = _load_cameras(inputs, camera_ids)
-    seen, points = _align_points(seen)
-    extra = [
-        StoredArray(seen, array.name, redetected=redetected) if points else None
-        for array in EXTRA_ARRAYS
-    ]
-    return ClipInputs(
-        camera_ids=camera_ids,
-        cameras=cameras,
-        camera_covariance=covariance,
-        detections=KeypointDetections[ClipArray](
-            keypoints=StoredArray(seen, "keypoints", rejected, shift, redetected=redetected),
-            confidence=StoredArray(seen, "confidence", rejected, redetected=redetected),
-            boxes=StoredArray(seen, "boxes", redetected=redetected),
-            score=StoredArray(seen, "score", redetected=redetected),
-            frame=frame,
-            points=points,
-            extra_keypoints=extra[0],
-            extra_confidence=extra[1],
-        ),
-        surface=surface,
-        fps=float(inputs.sources["fps"]),
-    )
+    fps = float(inputs.sources["fps"])
+    return ClipInputs(camera_ids, cameras, covariance, detections, fps, surface)
 
 
-def _align_points(seen: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], tuple[str, ...]]:
+def align_points(seen: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], tuple[str, ...]]:
     """Return the detections of all cameras with the same points besides COCO-17, and their names.
 
     A camera without a point that another has gets NaN.

@@ -24,11 +24,13 @@ from tasks.clip_inputs import (
     ClipInputs,
     load_dropped_boxes,
     open_clip,
+    open_tracked_clip,
     read_rows,
+    triangulation_settings,
 )
 from tasks.detection import footage_index, require_weights
 from tasks.unit import UnitInputs, unit_task
-from worldpose.body_fitting.objective import perceived_joints
+from worldpose.body_fitting.evidence import perceived_joints
 from worldpose.compiled import map_in_threads
 from worldpose.detection.models import load_pose, load_score_map
 from worldpose.detection.pipeline import Place
@@ -226,16 +228,14 @@ class _Case:
 
 def _open_case(inputs: UnitInputs) -> _Case:
     unit = inputs.unit
-    tracks = select_triangulated(inputs.open(f"tracking/{unit}"))
     bodies = inputs.open_first(f"refitting/{unit}", f"body_fitting/{unit}")
     placed = inputs.open(f"retriangulation/{unit}")
-    clip = open_clip(inputs, filtered=False, shifted=False)
     return _Case(
-        clip=clip.assign_people(tracks["detection_index"].values),
+        clip=open_tracked_clip(inputs, filtered=False, shifted=False),
         bodies=_Bodies(bodies, placed["common_bias"].values),
         placed=placed,
         dropped=load_dropped_boxes(inputs),
-        triangulation=inputs.made_from(f"triangulation/{unit}").settings(TriangulationSettings),
+        triangulation=triangulation_settings(inputs, unit),
     )
 
 
@@ -296,8 +296,7 @@ def _held_out(
     used = suspects.detections
     keypoints = used.keypoints
     if not case.first:
-        clip = open_clip(inputs).assign_people(case.clip.detections.detection_index)
-        used = clip.detections[frames]
+        used = open_tracked_clip(inputs).detections[frames]
         whole = open_clip(inputs, filtered=False, redetected=False)
         keypoints = whole.detections.keypoints[frames]
     found = measure_held_out(case.clip.cameras, used, keypoints, case.triangulation)
@@ -328,7 +327,7 @@ def redetection(inputs: UnitInputs, result: ResultWriter) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _CameraCase:
     """A clip in one camera, and the bodies of the previous iteration.
 
     Attributes:
@@ -372,7 +371,7 @@ class _View:
         )
 
 
-def _open_view(inputs: UnitInputs) -> _View:
+def _open_view(inputs: UnitInputs) -> _CameraCase:
     name, clip = inputs.sources["camera"], inputs.sources["clip"]
     detected = KeypointDetections.from_arrays(inputs.open(f"detection/{inputs.unit}"))
     detection = inputs.made_from(f"detection/{inputs.unit}")
@@ -399,7 +398,7 @@ def _open_view(inputs: UnitInputs) -> _View:
     seen = find_detected_people(index, fits, dropped)
     edits = detection.sources.get("edits", [])
     seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
-    noise = inputs.made_from(f"triangulation/{clip}").settings(TriangulationSettings).noise
+    noise = triangulation_settings(inputs, clip).noise
     suspects = TriangulatedDetections(
         KeypointDetections.from_keypoints(
             detected.keypoints[:, None].astype(np.float64),
@@ -411,7 +410,7 @@ def _open_view(inputs: UnitInputs) -> _View:
         dropped[:, None],
         noise,
     )
-    return _View(
+    return _CameraCase(
         camera=camera,
         surface=adjusted.attrs["surface"],
         detection=detection,
@@ -432,7 +431,7 @@ def _spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
     return learn_keypoint_spread(views, suspects)
 
 
-def _search(inputs: UnitInputs, case: _View, sought: MissingPeople) -> KeypointDetections:
+def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> KeypointDetections:
     """Run the pose net of `detection` where people are expected."""
     settings = case.detection.settings(DetectionSettings)
     if not len(sought.frame):
@@ -452,7 +451,7 @@ def _search(inputs: UnitInputs, case: _View, sought: MissingPeople) -> KeypointD
 
 
 def _pictures(
-    inputs: UnitInputs, case: _View, places: NDArray[np.int64]
+    inputs: UnitInputs, case: _CameraCase, places: NDArray[np.int64]
 ) -> Iterator[tuple[int, Image | None]]:
     """Yield the images of some frame indices in order, without those that the video lacks.
 
@@ -468,7 +467,7 @@ def _pictures(
 
 
 def _arrays(
-    case: _View, sought: MissingPeople, results: KeypointDetections, verdicts: Verdicts
+    case: _CameraCase, sought: MissingPeople, results: KeypointDetections, verdicts: Verdicts
 ) -> dict[str, NDArray[Any]]:
     """Return all detections at their indices, followed by the redetected people."""
     before = case.detected.arrays()

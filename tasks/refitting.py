@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.body_fitting import REFITTING
 from data_contracts.keypoints import KeypointDetections
-from tasks.body_fitting import FurtherArrays, find_same_body, open_people, write_fit
+from tasks.body_fitting import (
+    FurtherArrays,
+    find_same_body,
+    frame_arrays,
+    open_people,
+    write_fit,
+)
 from tasks.broadcast_calibration import BroadcastInputs, open_broadcast
 from tasks.clip_inputs import select_frames
 from tasks.unit import UnitInputs, figures_of, unit_task
-from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence
 from worldpose.body_fitting.bones import Shape, pool_shapes
-from worldpose.body_fitting.fit_quality import report_fit
 from worldpose.body_fitting.monocular import (
     MonocularEstimates,
     MonocularPoses,
@@ -36,6 +40,8 @@ from worldpose.body_fitting.ray_constraints import (
     identify_people,
     shift_frames,
 )
+from worldpose.body_fitting.report import report_fit
+from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.broadcast_calibration.uncertainty import static_covariance
 from worldpose.geometry.cameras import Camera, camera_from_arrays
@@ -208,15 +214,9 @@ def _write_plane_bodies(inputs: UnitInputs, result: ResultWriter) -> None:
     result.write(
         REFITTING,
         arrays={
+            **{name: values[:, kept] for name, values in frame_arrays(fit).items()},
             "betas": fit.betas[kept],
             "betas_covariance": fit.betas_covariance[kept],
-            "global_orient": fit.parameters.global_orient[:, kept],
-            "body_pose": fit.parameters.body_pose[:, kept],
-            "transl": fit.parameters.transl[:, kept],
-            "joints": fit.joints[:, kept],
-            "covariance": fit.covariance[:, kept],
-            "filled": fit.filled[:, kept],
-            "guided": fit.guided[:, kept],
             "joint_offsets": fit.offsets,
             "recognised": np.asarray(bodies.views[:, kept].any(axis=-1)),
             "pooled": np.zeros(int(kept.sum()), dtype=np.bool_),

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.triangulation import RETRIANGULATION, TRIANGULATION
-from tasks.clip_inputs import ClipInputs, open_clip
+from tasks.clip_inputs import ClipInputs, open_tracked_clip, triangulation_settings
 from tasks.unit import UnitInputs, figures_of, unit_task
-from worldpose.review.identities import select_triangulated
 from worldpose.store.writer import ResultWriter
-from worldpose.triangulation.chunking import learn_clip, reconstruct_chunks
-from worldpose.triangulation.passes import DetectorModel, Triangulation
+from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
+from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import Smoothing
 
 
 @unit_task
@@ -32,8 +30,8 @@ def triangulation(inputs: UnitInputs, result: ResultWriter) -> None:
 @unit_task
 def retriangulation(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the joints by adjusted cameras, with covariance."""
-    first = inputs.made_from(f"triangulation/{inputs.unit}")
-    _write_joints(inputs, first.settings(TriangulationSettings), result, RETRIANGULATION)
+    settings = triangulation_settings(inputs, inputs.unit)
+    _write_joints(inputs, settings, result, RETRIANGULATION)
 
 
 def _write_joints(
@@ -44,10 +42,9 @@ def _write_joints(
     stride: int = 1,
 ) -> None:
     """Triangulate every `stride`-th frame of the unit's clip in chunks, and write the joints."""
-    tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
-    index = tracks["detection_index"].values
-    clip = open_clip(inputs).assign_people(index)
+    clip = open_tracked_clip(inputs)
     detections, covariance = clip.detections, camera_errors(inputs, clip)
+    index = detections.detection_index
     model = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
     with inputs.open_spool() as spool:
@@ -63,10 +60,10 @@ def _write_joints(
             arrays=spool.arrays()
             | {"clock_late": model.clocks.late, "clock_error": model.clocks.standard_error}
             | _bias_arrays(model.detector, clip.detections.points, settings),
-            coordinates={"frame": detections.frame[::stride], "person": tracks["person"].values},
+            coordinates={"frame": detections.frame[::stride], "person": clip.person},
             attributes={"camera": list(clip.camera_ids), **clip.detections.labels()},
         )
-    agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)
+    agreement = reduce(add, agreements).report(model.detector.last_noise.factor)
     if agreement.joints == 0 and index.shape[2]:
         most = int(np.count_nonzero(index >= 0, axis=1).max())
         reason = (

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from data_contracts.pitch import PitchSpec as PitchSpec
     from data_contracts.static_calibration import ClickedMarkings as ClickedMarkings
     from worldpose.body.body_file import find_body as find_body
-    from worldpose.body_fitting.body_fit import ClipEvidence as ClipEvidence
-    from worldpose.body_fitting.body_fit import fit_bodies as fit_bodies
+    from worldpose.body_fitting.estimate import fit_bodies as fit_bodies
     from worldpose.body_fitting.ray_constraints import find_ray_constraints as find_ray_constraints
+    from worldpose.body_fitting.results import ClipEvidence as ClipEvidence
     from worldpose.body_fitting.settings import BodyFittingSettings as BodyFittingSettings
     from worldpose.broadcast_calibration.estimate import BroadcastClip as BroadcastClip
     from worldpose.broadcast_calibration.estimate import (
@@ -69,9 +69,9 @@ if TYPE_CHECKING:
     from worldpose.store.store import open_run as open_run
     from worldpose.tracking.settings import TrackingSettings as TrackingSettings
     from worldpose.tracking.tracker import track_people as track_people
-    from worldpose.triangulation.chunking import reconstruct_joints as reconstruct_joints
+    from worldpose.triangulation.estimate import reconstruct_joints as reconstruct_joints
+    from worldpose.triangulation.estimate import triangulate_joints as triangulate_joints
     from worldpose.triangulation.limb_lengths import undo_swaps as undo_swaps
-    from worldpose.triangulation.passes import triangulate_joints as triangulate_joints
     from worldpose.triangulation.settings import TriangulationSettings as TriangulationSettings
     from worldpose.video.folder import open_video as open_video
 
@@ -86,7 +86,7 @@ _MODULES: Final = {
     "ClickedMarkings": "data_contracts.static_calibration",
     "Clicks": "worldpose.bundle_adjustment.clip",
     "Clip": "worldpose.bundle_adjustment.clip",
-    "ClipEvidence": "worldpose.body_fitting.body_fit",
+    "ClipEvidence": "worldpose.body_fitting.results",
     "DetectionSettings": "worldpose.detection.settings",
     "EvaluationSettings": "worldpose.evaluation.matching",
     "InputError": "worldpose.errors",
@@ -108,7 +108,7 @@ _MODULES: Final = {
     "evaluate_joints": "worldpose.evaluation.metrics",
     "find_body": "worldpose.body.body_file",
     "find_ray_constraints": "worldpose.body_fitting.ray_constraints",
-    "fit_bodies": "worldpose.body_fitting.body_fit",
+    "fit_bodies": "worldpose.body_fitting.estimate",
     "open_run": "worldpose.store.store",
     "open_video": "worldpose.video.folder",
     "read_cameras": "worldpose.formats.calibration_forms",
@@ -118,9 +118,9 @@ _MODULES: Final = {
     "read_still": "worldpose.ingest.footage",
     "read_unit": "worldpose.ingest.footage",
     "reconstruct": "worldpose.pipeline",
-    "reconstruct_joints": "worldpose.triangulation.chunking",
+    "reconstruct_joints": "worldpose.triangulation.estimate",
     "track_people": "worldpose.tracking.tracker",
-    "triangulate_joints": "worldpose.triangulation.passes",
+    "triangulate_joints": "worldpose.triangulation.estimate",
     "undo_swaps": "worldpose.triangulation.limb_lengths",
     "write_joints": "worldpose.formats.joints_file",
 }

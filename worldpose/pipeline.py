@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.body.body_file import find_body
-from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.ray_constraints import find_ray_constraints
+from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.report import BroadcastCalibration
@@ -31,9 +32,9 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.tracking.tracker import Tracking, track_people
-from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.limb_lengths import undo_swaps
-from worldpose.triangulation.passes import Triangulation
+from worldpose.triangulation.results import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.video.folder import open_video
 

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from worldpose.body.body_file import find_body
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
@@ -29,7 +30,7 @@ from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 SCENARIO: Final = "penalty-box"

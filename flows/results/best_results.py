@@ -18,9 +18,8 @@ from data_contracts.tracking import Track
 from flows.stage import Match
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.body_fitting.body_fit import random_covariance
+from worldpose.body_fitting.evidence import perceived_joints, random_covariance
 from worldpose.body_fitting.extra_points import perceived_points
-from worldpose.body_fitting.objective import perceived_joints
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions

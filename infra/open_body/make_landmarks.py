@@ -1,4 +1,4 @@
-"""Prints the table of surface landmarks of the open body (`worldpose.body.keypoints.LANDMARKS`).
+"""Prints the table of surface landmarks of the open body (`worldpose.body.keypoints`).
 
     python infra/open_body/make_landmarks.py [--pairs 32]
 
@@ -35,7 +35,7 @@ MAX_UNLIKE_M = 0.002
 """Largest distance of a vertex from its partner's mirror image [m]."""
 
 
-def choose(pairs: int) -> dict[str, tuple[int, int]]:
+def choose(pairs: int) -> dict[str, list[tuple[int, int]]]:
     """Return the left and right vertex by the name without its side."""
     model = load_open_body()
     segment_of = {joint: name for name, joints in SEGMENTS.items() for joint in joints}
@@ -52,13 +52,12 @@ def choose(pairs: int) -> dict[str, tuple[int, int]]:
     while len(chosen) < pairs:
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    found: dict[str, tuple[int, int]] = {}
+    found: dict[str, list[tuple[int, int]]] = {}
     for name in SEGMENTS:
         own = [int(candidates[k]) for k in chosen if owner[candidates[k]] == name]
         along = 2 if name == "foot" else 0 if "arm" in name else 1
         own.sort(key=lambda vertex: -model.template[vertex, along])
-        for number, vertex in enumerate(own, start=1):
-            found[f"{name}_{number}"] = vertex, int(partner[vertex])
+        found[name] = [(vertex, int(partner[vertex])) for vertex in own]
     return found
 
 
@@ -66,9 +65,8 @@ def main() -> None:
     """Print the entries."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pairs", type=int, default=32)
-    for name, both in choose(parser.parse_args().pairs).items():
-        for side, vertex in zip(("left", "right"), both, strict=True):
-            print(f'        "{side}_{name}": {vertex},')
+    for name, pairs in choose(parser.parse_args().pairs).items():
+        print(f'    "{name}": {tuple(pairs)},')
 
 
 if __name__ == "__main__":

@@ -20,103 +20,64 @@ from data_contracts.conventions import COCO17
 from worldpose.body.model import JOINTS, SMPL_VERTICES, BodyModel, BodyParameters
 from worldpose.errors import InputError
 
+
+def _both(*parts: str) -> tuple[str, ...]:
+    """Return the left and the right of each part."""
+    return tuple(f"{side}_{part}" for part in parts for side in ("left", "right"))
+
+
 JOINT_NAMES: Final = (
     "pelvis",
-    "left_hip",
-    "right_hip",
+    *_both("hip"),
     "spine1",
-    "left_knee",
-    "right_knee",
+    *_both("knee"),
     "spine2",
-    "left_ankle",
-    "right_ankle",
+    *_both("ankle"),
     "spine3",
-    "left_foot",
-    "right_foot",
+    *_both("foot"),
     "neck",
-    "left_collar",
-    "right_collar",
+    *_both("collar"),
     "head",
-    "left_shoulder",
-    "right_shoulder",
-    "left_elbow",
-    "right_elbow",
-    "left_wrist",
-    "right_wrist",
-    "left_hand",
-    "right_hand",
+    *_both("shoulder", "elbow", "wrist", "hand"),
 )
 """The model's joints in order."""
 
 JOINT_OF_POINT: Final = MappingProxyType(
     {"mid_hip": 0} | {name: number for number, name in enumerate(JOINT_NAMES)}
 )
+_LANDMARK_PAIRS: Final = {
+    "head": ((20, 21), (58, 57), (1299, 1301), (1376, 1362)),
+    "trunk": (
+        (2016, 2015),
+        (2190, 2189),
+        (2337, 2338),
+        (2721, 2722),
+        (2894, 2895),
+        (2977, 2976),
+        (3603, 3604),
+        (3795, 3794),
+    ),
+    "pelvis": ((4757, 4758), (4765, 4766)),
+    "upper_arm": ((2653, 2654), (2382, 2381), (2032, 2031)),
+    "forearm": ((3421, 3420), (2854, 2853)),
+    "thigh": (
+        (4840, 4839),
+        (4971, 4970),
+        (5006, 5007),
+        (5068, 5069),
+        (5114, 5115),
+        (5157, 5156),
+        (5287, 5286),
+    ),
+    "shank": ((5358, 5359), (5439, 5438), (5489, 5488), (5591, 5590)),
+    "foot": ((6863, 6862), (6109, 6108)),
+}
 LANDMARKS: Final = MappingProxyType(
     {
-        "left_head_1": 20,
-        "right_head_1": 21,
-        "left_head_2": 58,
-        "right_head_2": 57,
-        "left_head_3": 1299,
-        "right_head_3": 1301,
-        "left_head_4": 1376,
-        "right_head_4": 1362,
-        "left_trunk_1": 2016,
-        "right_trunk_1": 2015,
-        "left_trunk_2": 2190,
-        "right_trunk_2": 2189,
-        "left_trunk_3": 2337,
-        "right_trunk_3": 2338,
-        "left_trunk_4": 2721,
-        "right_trunk_4": 2722,
-        "left_trunk_5": 2894,
-        "right_trunk_5": 2895,
-        "left_trunk_6": 2977,
-        "right_trunk_6": 2976,
-        "left_trunk_7": 3603,
-        "right_trunk_7": 3604,
-        "left_trunk_8": 3795,
-        "right_trunk_8": 3794,
-        "left_pelvis_1": 4757,
-        "right_pelvis_1": 4758,
-        "left_pelvis_2": 4765,
-        "right_pelvis_2": 4766,
-        "left_upper_arm_1": 2653,
-        "right_upper_arm_1": 2654,
-        "left_upper_arm_2": 2382,
-        "right_upper_arm_2": 2381,
-        "left_upper_arm_3": 2032,
-        "right_upper_arm_3": 2031,
-        "left_forearm_1": 3421,
-        "right_forearm_1": 3420,
-        "left_forearm_2": 2854,
-        "right_forearm_2": 2853,
-        "left_thigh_1": 4840,
-        "right_thigh_1": 4839,
-        "left_thigh_2": 4971,
-        "right_thigh_2": 4970,
-        "left_thigh_3": 5006,
-        "right_thigh_3": 5007,
-        "left_thigh_4": 5068,
-        "right_thigh_4": 5069,
-        "left_thigh_5": 5114,
-        "right_thigh_5": 5115,
-        "left_thigh_6": 5157,
-        "right_thigh_6": 5156,
-        "left_thigh_7": 5287,
-        "right_thigh_7": 5286,
-        "left_shank_1": 5358,
-        "right_shank_1": 5359,
-        "left_shank_2": 5439,
-        "right_shank_2": 5438,
-        "left_shank_3": 5489,
-        "right_shank_3": 5488,
-        "left_shank_4": 5591,
-        "right_shank_4": 5590,
-        "left_foot_1": 6863,
-        "right_foot_1": 6862,
-        "left_foot_2": 6109,
-        "right_foot_2": 6108,
+        f"{side}_{part}_{number}": vertex
+        for part, pairs in _LANDMARK_PAIRS.items()
+        for number, pair in enumerate(pairs, start=1)
+        for side, vertex in zip(("left", "right"), pair, strict=True)
     }
 )
 """Vertices of landmarks of the surface, in mirrored pairs that cover all segments but hands and
@@ -170,20 +131,11 @@ BODY25: Final = (
 
 CHALLENGE15: Final = (
     "nose",
-    "right_shoulder",
-    "left_shoulder",
-    "right_elbow",
-    "left_elbow",
-    "right_wrist",
-    "left_wrist",
-    "right_hip",
-    "left_hip",
-    "right_knee",
-    "left_knee",
-    "right_ankle",
-    "left_ankle",
-    "right_big_toe",
-    "left_big_toe",
+    *(
+        f"{side}_{part}"
+        for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe")
+        for side in ("right", "left")
+    ),
 )
 """The joints of the FIFA skeletal tracking challenge in its order."""
 
@@ -195,18 +147,7 @@ SKELETONS: Final = MappingProxyType(
         "evaluated14": (
             "nose",
             "neck",
-            "left_shoulder",
-            "right_shoulder",
-            "left_elbow",
-            "right_elbow",
-            "left_wrist",
-            "right_wrist",
-            "left_hip",
-            "right_hip",
-            "left_knee",
-            "right_knee",
-            "left_ankle",
-            "right_ankle",
+            *_both("shoulder", "elbow", "wrist", "hip", "knee", "ankle"),
         ),
         "challenge15": CHALLENGE15,
         "smpl24": JOINT_NAMES,

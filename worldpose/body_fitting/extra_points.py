@@ -25,31 +25,15 @@ from worldpose.body.keypoints import (
     point_segments,
 )
 from worldpose.body.model import SMPL_VERTICES, BodyModel, BodyParameters
-from worldpose.body_fitting.objective import Evidence
-from worldpose.body_fitting.solver import Shapes, Solver
+from worldpose.body_fitting.evidence import PersonEvidence
+from worldpose.body_fitting.poses import PoseSolver
+from worldpose.body_fitting.results import ExtraFit
+from worldpose.body_fitting.shapes import Shapes
 from worldpose.compiled import map_in_threads
-from worldpose.triangulation.passes import ExtraJoints
+from worldpose.triangulation.results import ExtraJoints
 
 MIRROR: Final = np.array([-1.0, 1.0, 1.0])
 """Of vectors in the axes of the unposed body: left, up, forward."""
-
-
-@dataclass(frozen=True, eq=False)
-class ExtraFit:
-    """Points besides COCO-17 of fitted bodies.
-
-    Attributes:
-        points: (points,) names.
-        joints: (frames, persons, points, 3) [m], world, where the body model has them.
-        covariance: (frames, persons, points, 3, 3) [m^2].
-        offsets: (points, 3) [m] left, up and forward in the axes of the point's segment: from the
-            body's point to the detector's.
-    """
-
-    points: tuple[str, ...]
-    joints: Floats
-    covariance: Floats
-    offsets: Floats
 
 
 def known_points(model: BodyModel, points: Sequence[str]) -> tuple[str, ...]:
@@ -71,14 +55,8 @@ def select_points(extra: ExtraJoints, points: tuple[str, ...]) -> ExtraJoints:
     )
 
 
-def with_points(solver: Solver, points: tuple[str, ...]) -> Solver:
-    """Return the solver of poses that also knows these points, and bends ankles and toes."""
-    chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
-    return replace(solver, chained=chained, prior=solver.prior.add_feet())
-
-
-def move_points(solver: Solver, points: tuple[str, ...], offsets: Floats) -> Solver:
-    """Return the solver of `with_points` with the points where the detector has them."""
+def move_points(solver: PoseSolver, points: tuple[str, ...], offsets: Floats) -> PoseSolver:
+    """Return a solver that knows these points with them where the detector has them."""
     its = point_segments(solver.chained.model, points)
     return replace(solver, chained=solver.chained.move_points(len(COCO17), its, offsets))
 
@@ -100,9 +78,9 @@ def perceived_points(
 
 
 def learn_point_offsets(
-    solver: Solver,
+    solver: PoseSolver,
     points: tuple[str, ...],
-    people: Mapping[int, Evidence],
+    people: Mapping[int, PersonEvidence],
     shapes: Shapes,
     fps: float,
 ) -> tuple[Floats, Floats, Floats]:
@@ -112,7 +90,7 @@ def learn_point_offsets(
     time, from the median absolute deviation: errors that views share and that differ by pose.
 
     Args:
-        solver: result of `with_points`.
+        solver: solver that knows the points.
         points: names of the points.
         people: joints and points of each person in some seconds.
         shapes: betas of each person, and offsets of the joints.
@@ -208,7 +186,7 @@ def densest_interval(known: NDArray[np.integer], fps: float) -> slice:
 
 
 def feet_determined(
-    model: BodyModel, points: tuple[str, ...], evidence: Evidence, fps: float
+    model: BodyModel, points: tuple[str, ...], evidence: PersonEvidence, fps: float
 ) -> NDArray[np.bool_]:
     """Return the frames in which points determine the left and right foot (frames, 2)."""
     its = point_segments(model, points)
@@ -238,64 +216,30 @@ class PointModel:
         systematic: (points, 3, 3) [m^2], covariance of the offsets and of the common bias.
     """
 
-    solver: Solver
+    solver: PoseSolver
     points: tuple[str, ...]
     offsets: Floats
     modelled: Floats
     systematic: Floats
 
-    def add(self, person: int, own: Evidence, extra: ExtraJoints, fps: float) -> Evidence:
+    def add(
+        self, person: int, own: PersonEvidence, extra: ExtraJoints, fps: float
+    ) -> PersonEvidence:
         """Return a person's evidence with the points, in the frames of both."""
         covariance = extra.covariance[:, person] - self.modelled[..., None] * np.eye(3)
         return own.add_points(extra.joints[:, person], covariance, fps, self.solver.settings)
 
-
-@dataclass(frozen=True, eq=False)
-class PointArrays:
-    """Points besides COCO-17 of a fit in progress.
-
-    Attributes:
-        model: points of the clip.
-        joints: (frames, persons, points, 3) [m], world.
-        covariance: (frames, persons, points, 3, 3) [m^2].
-    """
-
-    model: PointModel
-    joints: Floats
-    covariance: Floats
-
-    @classmethod
-    def empty(cls, model: PointModel, frames: int, persons: int) -> PointArrays:
+    def empty_fit(self, frames: int, persons: int) -> ExtraFit:
         """Return arrays without any point."""
-        shape = (frames, persons, len(model.points), 3)
-        return cls(model, np.full(shape, np.nan), np.full((*shape, 3), np.nan))
-
-    def put(self, person: int, span: slice, bodies: BodyParameters, random: Floats) -> None:
-        """Write one person's points.
-
-        Args:
-            person: index of the person.
-            span: frames of the person.
-            bodies: (frames,) with their feet.
-            random: (frames, points, 3, 3) [m^2], covariance of the poses.
-        """
-        keypoints = fold_keypoints(self.model.solver.chained.model, self.model.points)
-        self.joints[span, person] = keypoints(bodies)
-        self.covariance[span, person] = random + self.model.systematic
-
-    def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
-        """Remove a person from frames of a span."""
-        self.joints[span, person][gone] = np.nan
-        self.covariance[span, person][gone] = np.nan
-
-    def fit(self) -> ExtraFit:
-        """Return the complete points."""
-        return ExtraFit(self.model.points, self.joints, self.covariance, self.model.offsets)
+        shape = (frames, persons, len(self.points), 3)
+        return ExtraFit(
+            self.points, np.full(shape, np.nan), np.full((*shape, 3), np.nan), self.offsets
+        )
 
 
 def learn_points(
-    solver: Solver,
-    people: Mapping[int, tuple[Evidence, ExtraJoints]],
+    solver: PoseSolver,
+    people: Mapping[int, tuple[PersonEvidence, ExtraJoints]],
     shapes: Shapes,
     fps: float,
 ) -> PointModel:
@@ -309,7 +253,9 @@ def learn_points(
     """
     found = next(iter(people.values()))[1]
     points, settings = found.points, solver.settings
-    solver = with_points(solver, points)
+    # It also bends ankles and toes.
+    chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
+    solver = replace(solver, chained=chained, prior=solver.prior.add_feet())
     # With the bias in their covariance the points hardly move the bodies: residuals show it.
     whole = {
         person: own.add_points(extra.joints[:, 0], extra.covariance[:, 0], fps, settings)

@@ -19,8 +19,15 @@ from data_contracts.conventions import COCO17
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel
-from worldpose.body_fitting.body_fit import BodyFit
 from worldpose.body_fitting.bones import DEFINITION_STD_M, shorten_limbs
+from worldpose.body_fitting.evidence import (
+    ANKLES,
+    JOINT_SPREAD,
+    MIN_INFORMATION,
+    Ground,
+    PersonEvidence,
+    ankle_height,
+)
 from worldpose.body_fitting.monocular import (
     CORRELATION_S,
     PRIOR_SPREAD,
@@ -29,27 +36,13 @@ from worldpose.body_fitting.monocular import (
     MonocularPrior,
     place_monocular_poses,
 )
-from worldpose.body_fitting.objective import (
-    ANKLES,
-    JOINT_SPREAD,
-    MIN_INFORMATION,
-    Evidence,
-    Ground,
-    Pose,
-    Track,
-    ankle_height,
-)
 from worldpose.body_fitting.pose_space import SIZE, load_pose_prior, nearest_known
+from worldpose.body_fitting.poses import PoseSolver, pose_covariance
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
+from worldpose.body_fitting.residuals import PersonObjective, Pose
+from worldpose.body_fitting.results import BodyFit, FittedArrays
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.solver import (
-    FittedArrays,
-    Piece,
-    Solver,
-    pose_covariance,
-    solve_shapes,
-    spread_intervals,
-)
+from worldpose.body_fitting.shapes import Piece, solve_shapes, spread_intervals
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.plane.kalman import CORRELATION_S as PLACE_CORRELATION_S
@@ -133,7 +126,7 @@ def fit_bodies_on_plane(
     # Gauss-Newton steps: a start from monocular poses is farther away than one from joints.
     settings = settings.model_copy(update={"steps": max(settings.steps, 10)})
     keypoints = fold_keypoints(model, COCO17)
-    solver = Solver(ChainedKeypoints.of(keypoints), load_pose_prior(), settings, ground)
+    solver = PoseSolver(ChainedKeypoints.of(keypoints), load_pose_prior(), settings, ground)
     lifted = _lift_keypoints(evidence)
     poses = place_monocular_poses(estimates, evidence.camera, evidence.number, lifted)
     mean = Pose(
@@ -209,7 +202,7 @@ class _Person:
 
 @dataclass(frozen=True, eq=False)
 class _Clip:
-    """Evidence and monocular poses of a clip.
+    """PersonEvidence and monocular poses of a clip.
 
     Attributes:
         solver: body, prior, settings and ground.
@@ -219,7 +212,7 @@ class _Clip:
         agreeing: (frames, persons), poses that agree with the keypoints.
     """
 
-    solver: Solver
+    solver: PoseSolver
     evidence: PlaneEvidence
     lifted: Floats
     poses: MonocularPoses
@@ -253,7 +246,7 @@ class _Clip:
         fps: float,
         *,
         for_shape: bool,
-    ) -> Track:
+    ) -> PersonObjective:
         """Return the evidence of a person in some frames, `rows`, at the rate `fps` [1/s].
 
         For the shape, smoothness and pose prior hardly count, and limbs are shortened by the
@@ -267,7 +260,7 @@ class _Clip:
             np.eye(3 + SIZE) / PRIOR_SPREAD**2,
             1.0 + CORRELATION_S * fps,
         )
-        return Track(
+        return PersonObjective(
             self.solver.chained,
             self._observe(person, rows, fps, shorten=for_shape),
             self.solver.prior,
@@ -280,7 +273,7 @@ class _Clip:
 
     def _observe(
         self, person: int, rows: NDArray[np.int64], fps: float, *, shorten: bool
-    ) -> Evidence:
+    ) -> PersonEvidence:
         """Return lines of sight of the keypoints, and the distance of the hips by the place."""
         evidence, settings = self.evidence, self.solver.settings
         camera = evidence.camera[rows]
@@ -319,7 +312,7 @@ class _Clip:
         )[..., 0]
         joints[:, HIPS] = hips + moved
         information[~np.isfinite(joints).all(axis=-1)] = 0.0
-        return Evidence(joints, information)
+        return PersonEvidence(joints, information)
 
     def _sight(self, person: int, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Return the horizontal directions of sight (rows, 3) and the places (rows, 3) [m]."""
@@ -343,7 +336,7 @@ class _Clip:
             pieces.append(Piece(person, track, pose))
         return pieces
 
-    def turn_round(self, track: Track, start: Pose, offsets: Floats) -> Floats:
+    def turn_round(self, track: PersonObjective, start: Pose, offsets: Floats) -> Floats:
         """Return joints (frames, 17, 3) [m] of the body fitted to estimates turned half round."""
         assert track.monocular_prior is not None
         half = Rigid.from_rotvec([0.0, np.pi, 0.0], np.zeros(3)).rotation
@@ -381,7 +374,7 @@ class _Clip:
         return np.asarray(shared[:, None] + line[..., :, None] * line[..., None, :])
 
 
-def stand_on_ground(solver: Solver, pose: Pose, place: Floats) -> Pose:
+def stand_on_ground(solver: PoseSolver, pose: Pose, place: Floats) -> Pose:
     """Return a pose with its mid-hip above `place` (frames, 2) [m], lower ankle on the ground."""
     assert solver.ground is not None
     model = solver.chained.model

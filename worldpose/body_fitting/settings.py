@@ -56,7 +56,7 @@ class BodyFittingSettings(Record):
     components do; the proportions of real people vary more."""
     acceleration_m_s2: float = Field(default=20.0, ge=1e-6, le=10000)
     """Standard deviation of the hips' acceleration per axis [m/s^2]; other joints have multiples
-    of it (`objective.ACCELERATION_SCALE`). Players have 2 to 4 on average;
+    of it (`residuals.ACCELERATION_SCALE`). Players have 2 to 4 on average;
     smoothing to that cuts swings short (G-MPJPE of a match 26 mm at 8, 23 mm at 12)."""
     acceleration_loss_scale: float = Field(default=6.0, ge=1e-6, le=1000)
     """Deviation at which an acceleration has half its weight [standard deviations]: kicks. Jerk

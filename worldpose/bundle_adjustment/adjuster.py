@@ -38,7 +38,7 @@ from worldpose.bundle_adjustment.uncertainty import (
 )
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 
 _SMALL_RIG: Final = 4
 """Maximum cameras of a rig in which cameras with a covariance change together or not at all [1]:

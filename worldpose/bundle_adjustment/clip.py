@@ -15,7 +15,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rows import take_rows
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.report import StaticCalibration
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 

@@ -25,7 +25,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import cauchy_loss
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
 

@@ -18,7 +18,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.static_calibration.report import image_problems
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 
 
 def adjustment_arrays(

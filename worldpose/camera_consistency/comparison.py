@@ -30,7 +30,7 @@ PIVOT_RANGE: Final = (3.0, 150.0)
 """Range of distances of the pivot of rotation from the camera [m]."""
 
 
-class View(NamedTuple):
+class CameraRays(NamedTuple):
     """Rays of one camera's detections.
 
     Attributes:
@@ -121,7 +121,7 @@ class Comparison:
             [np.isfinite(v.rays[..., 0]).any(axis=-1).sum(axis=1).mean() for v in self.views]
         )
 
-    def view(self, c: int, hypothesis: Hypothesis, frames: Integers | None = None) -> View:
+    def view(self, c: int, hypothesis: Hypothesis, frames: Integers | None = None) -> CameraRays:
         """Return a camera's rays under a hypothesis, in frames (n,), -1 = none, or sampled ones."""
         camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
         points = self._keypoints[c if hypothesis.source is None else hypothesis.source]
@@ -132,13 +132,15 @@ class Comparison:
         known = np.isfinite(points).all(axis=-1)
         rays[known] = camera.unproject(points[known]).directions
         spread = np.full(points.shape[:2], self._pixel_noise[c] / float(camera.focal.mean()))
-        return View(rays, np.array(camera.center), spread)
+        return CameraRays(rays, np.array(camera.center), spread)
 
     def times(self, hypothesis: Hypothesis) -> Integers:
         """Return the camera's frame at each sampled frame under a hypothesis; -1 = none."""
         return self.sample if hypothesis.time is None else hypothesis.time
 
-    def scores(self, view: View, partner: View, at: Integers, there: Integers) -> Floats:
+    def scores(
+        self, view: CameraRays, partner: CameraRays, at: Integers, there: Integers
+    ) -> Floats:
         """Return the matches (n,) of two views at pairs of their frames; -1 = no frame."""
         # Contiguous: numba compiles a kernel again for every other memory layout.
         times = np.ascontiguousarray(at), np.ascontiguousarray(there)
@@ -312,7 +314,7 @@ def chance_noise(chance: float) -> float:
     return 0.3 * math.sqrt(float(chance) + 0.05)
 
 
-def _orbit(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View]:
+def _orbit(view: CameraRays, partner: CameraRays, degrees: Sequence[float]) -> Iterator[CameraRays]:
     """Yield the view rotated about the vertical through the point that both cameras look at.
 
     It shows as many people at the same heights as before, at wrong positions: a translation would
@@ -326,7 +328,7 @@ def _orbit(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View
         yield view._replace(rays=rays, center=pivot + turn @ (view.center - pivot))
 
 
-def _meeting_place(view: View, partner: View) -> Floats:
+def _meeting_place(view: CameraRays, partner: CameraRays) -> Floats:
     """Return the point (3,) [m] on a view's mean ray that is nearest to its partner's."""
     ray, other = (_mean_ray(each) for each in (view, partner))
     way = partner.center - view.center
@@ -335,7 +337,7 @@ def _meeting_place(view: View, partner: View) -> Floats:
     return np.asarray(view.center + np.clip(depth, PIVOT_RANGE[0], PIVOT_RANGE[1]) * ray)
 
 
-def _mean_ray(view: View) -> Floats:
+def _mean_ray(view: CameraRays) -> Floats:
     """Return the mean direction (3,) of a view's rays."""
     known = np.isfinite(view.rays[..., 0])
     mean = view.rays[known].sum(axis=0)
@@ -356,9 +358,9 @@ def _pack(keypoints: Floats) -> Floats:
 
 @compile_kernel
 def pair_scores(
-    view: View,
+    view: CameraRays,
     frames: Integers,
-    partner: View,
+    partner: CameraRays,
     partner_frames: Integers,
     heights: tuple[float, float],
     joint_noise: float,

@@ -144,7 +144,7 @@ class _BufferedFrame:
 
 
 @dataclass
-class _Track:
+class _BoxTrack:
     """Last frame, box and score of a track, and its number of sightings."""
 
     number: int
@@ -160,7 +160,7 @@ class BoxCleaner:
         self._settings = settings
         self._tracker = BoxTracker(settings.high_score_threshold, settings.track_buffer_frames)
         self._held: deque[_BufferedFrame] = deque()
-        self._tracks: dict[int, _Track] = {}
+        self._tracks: dict[int, _BoxTrack] = {}
         self._searched = 0
         self._last: int | None = None
         self.bridged = self.flickers = 0
@@ -195,14 +195,14 @@ class BoxCleaner:
             self._held[-1].boxes[int(track)] = box, float(score)
             before = self._tracks.get(int(track))
             if before is None:
-                self._tracks[int(track)] = _Track(number, box, float(score))
+                self._tracks[int(track)] = _BoxTrack(number, box, float(score))
                 continue
             if 1 < number - before.number <= lag:
                 self._fill(int(track), before, number, box, float(score))
             before.number, before.box, before.score = number, box, float(score)
             before.sightings += 1
 
-    def _fill(self, track: int, before: _Track, number: int, box: Floats, score: float) -> None:
+    def _fill(self, track: int, before: _BoxTrack, number: int, box: Floats, score: float) -> None:
         """Interpolate boxes linearly between two sightings of a track."""
         for held in self._held:
             if before.number < held.number < number and held.image is not None:

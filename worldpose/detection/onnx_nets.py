@@ -157,14 +157,15 @@ def fit_crops(boxes: Floats, size: tuple[int, int], padding: float) -> Floats:
     return np.hstack([corner, scale[:, None]])
 
 
-def cut_crops(image: Image, frames: Floats, size: tuple[int, int], fill: int = 0) -> Image:
+def cut_crops(image: Image, frames: Floats, size: tuple[int, int]) -> Image:
     """Return the crops (boxes, height, width, 3), smoothed where they are smaller than the frame.
+
+    They are black beyond the frame's border.
 
     Args:
         image: the whole frame.
         frames: (boxes, 3) crops from `fit_crops`.
         size: width, height of a crop [px].
-        fill: grey level beyond the frame's border.
     """
     import cv2  # late: it takes 0.2 s, and planning a run does not need it
 
@@ -179,7 +180,7 @@ def cut_crops(image: Image, frames: Floats, size: tuple[int, int], fill: int = 0
             last = np.ceil([left + scale * size[0], top + scale * size[1]]).astype(int) + step
             part = image[first[1] : max(last[1], first[1]), first[0] : max(last[0], first[0])]
             if not part.size:
-                crop[:] = fill
+                crop[:] = 0
                 continue
             target = (-(-part.shape[1] // step), -(-part.shape[0] // step))
             padded = cv2.copyMakeBorder(
@@ -202,7 +203,6 @@ def cut_crops(image: Image, frames: Floats, size: tuple[int, int], fill: int = 0
             crop,
             cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             cv2.BORDER_CONSTANT,
-            (fill, fill, fill),
         )
     return crops
 

@@ -16,7 +16,7 @@ from worldpose.detection.suppression import suppress
 
 
 @dataclass(frozen=True)
-class View:
+class ImageTile:
     """A part of a frame as input of a detector.
 
     Attributes:
@@ -71,16 +71,16 @@ class TiledDetector:
             people.append(suppress(People.concatenate(seen), self._overlap))
         return people
 
-    def _views(self, width: int, height: int) -> Iterator[View]:
+    def _views(self, width: int, height: int) -> Iterator[ImageTile]:
         fit = min(self._size[0] / width, self._size[1] / height)
-        yield View(0, 0, fit)
+        yield ImageTile(0, 0, fit)
         for zoom in self._zooms:
             if zoom > fit:
                 across = _starts(round(width * zoom), self._size[0], self._view_overlap)
                 down = _starts(round(height * zoom), self._size[1], self._view_overlap)
-                yield from (View(x, y, zoom) for y in down for x in across)
+                yield from (ImageTile(x, y, zoom) for y in down for x in across)
 
-    def _uncut_people(self, view: View, people: People, width: int, height: int) -> People:
+    def _uncut_people(self, view: ImageTile, people: People, width: int, height: int) -> People:
         """Return the people that no inner edge of the view cuts, in frame pixels."""
         x0, y0, x1, y1 = people.boxes.T
         right, low = round(width * view.scale), round(height * view.scale)
@@ -102,7 +102,7 @@ def _starts(length: int, view: int, overlap: float) -> list[int]:
     return [round(start) for start in np.linspace(0, length - view, count)]
 
 
-def _cut(image: Image, views: Sequence[View], size: tuple[int, int]) -> list[Image]:
+def _cut(image: Image, views: Sequence[ImageTile], size: tuple[int, int]) -> list[Image]:
     """Return each view of one frame, filled with grey beyond the frame's border."""
     import cv2  # late: it takes 0.2 s, and planning a run does not need it
 

@@ -11,7 +11,7 @@ from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 FARTHEST: Final = 0.2

@@ -348,9 +348,9 @@ def judge_detections(
     open_ = dropped | ~taken
     open_ &= np.isfinite(suspects.detections.keypoints[..., 0]).sum(-1) >= settings.min_keypoints
     for n in np.unique(np.nonzero(open_)[0]):
-        others = _find_best_bodies(n, open_[n], views, suspects, spread, settings)
-        at = n, others.camera, others.detection
-        fits[at], similarity[at], distance[at] = others.fits, others.similarity, others.distance
+        where, *best = _find_best_bodies(n, open_[n], views, suspects, spread, settings)
+        at = n, *where
+        fits[at], similarity[at], distance[at] = best
     dropped = (dropped | suspects.dropped) & (fits < 0)
     with np.errstate(invalid="ignore"):
         rejected = distance > settings.max_deviation
@@ -414,25 +414,6 @@ def _is_fit(
     return np.asarray(enough & alike)
 
 
-@dataclass(frozen=True, eq=False)
-class _BestBodies:
-    """Detections of one frame that fit a body, and the best body of each; (n,) each.
-
-    Attributes:
-        camera: index of the camera.
-        detection: index among the camera's detections.
-        fits: index of the person.
-        similarity: similarity of bones [1].
-        distance: (n, 17) distances in standard deviations.
-    """
-
-    camera: Places
-    detection: Places
-    fits: Places
-    similarity: Floats
-    distance: Floats
-
-
 def _find_best_bodies(
     n: int,
     open_: Flags,
@@ -440,13 +421,18 @@ def _find_best_bodies(
     suspects: TriangulatedDetections,
     spread: Spread,
     settings: FilteringSettings,
-) -> _BestBodies:
-    """Return the bodies that a frame's open detections (cameras, detections) fit best."""
+) -> tuple[tuple[Places, Places], Places, Floats, Floats]:
+    """Return the bodies that a frame's open detections (cameras, detections) fit best.
+
+    Returns:
+        Cameras and indices (n,) of the detections that fit a body, and of each: the index of the
+        person, the similarity of bones [1], and distances (n, 17) in standard deviations.
+    """
     camera, place = np.nonzero(open_)
     persons = views.image.shape[2]
     if not persons:
         none = np.empty(0, dtype=np.int64)
-        return _BestBodies(none, none, none, np.empty(0), np.empty((0, len(COCO17))))
+        return (none, none), none, np.empty(0), np.empty((0, len(COCO17)))
     cameras, people = np.repeat(camera, persons), np.tile(np.arange(persons), len(camera))
     places = np.repeat(place, persons)
     rows = _compare(
@@ -463,4 +449,4 @@ def _find_best_bodies(
     best = np.where(good, share + 1e-3 * alike.reshape(-1, persons), -np.inf).argmax(axis=1)
     found = np.flatnonzero(good.any(axis=1))
     row = found * persons + best[found]
-    return _BestBodies(camera[found], place[found], best[found], alike[row], away[row])
+    return (camera[found], place[found]), best[found], alike[row], away[row]

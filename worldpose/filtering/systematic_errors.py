@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body_fitting.objective import body_axes
+from worldpose.body_fitting.evidence import body_axes
 from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.filtering.judging import (
     BodyViews,

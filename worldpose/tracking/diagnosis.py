@@ -14,8 +14,9 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Flags, Floats
+from data_contracts.arrays import ClipArray, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import size_ratios
@@ -24,6 +25,36 @@ from worldpose.tracking.settings import TrackingSettings
 
 SAMPLES: Final = 24
 """Most frames in which detections are compared."""
+WINDOW: Final = 400
+"""Most frames that the diagnosis uses."""
+MATCH: Final = np.dtype(
+    [
+        # Between the lines of the rays of one joint, up to a right one [rad].
+        ("angle", np.float64),
+        # Between those rays [m].
+        ("distance", np.float64),
+        # Limb lengths relative to an adult's [1]; NaN where unknown.
+        ("size", np.float64),
+        # Mean height of the joints over z = 0 [m].
+        ("height", np.float64),
+        # Distance from the first camera [m].
+        ("depth", np.float64),
+    ]
+)
+"""Two detections that may show one person; medians over the joints."""
+
+
+@dataclass(frozen=True)
+class NoPeople:
+    """Cause of an empty tracking result.
+
+    Attributes:
+        cause: one word.
+        message: the reason with its numbers, and what to do, in full sentences.
+    """
+
+    cause: str
+    message: str
 
 
 @dataclass(frozen=True)
@@ -33,20 +64,17 @@ class PairMatches:
     Attributes:
         cameras: indices of the two.
         possible: largest possible number of matches.
-        table: (matches, 5): angle between the lines of the rays of one joint, up to a right one
-            [rad]; distance between those rays [m]; limb lengths relative to an adult's [1], NaN
-            where unknown; mean height of the joints over z = 0 [m]; distance from the first camera
-            [m].
+        matches: (matches,) of `MATCH`.
     """
 
     cameras: tuple[int, int]
     possible: int
-    table: Floats
+    matches: NDArray[np.void]
 
     @property
     def count(self) -> int:
         """Number of matches."""
-        return len(self.table)
+        return len(self.matches)
 
     @property
     def share(self) -> float:
@@ -61,7 +89,7 @@ class PairMatches:
     @property
     def angle(self) -> float:
         """Median angle between rays [rad]."""
-        return float(np.median(self.table[:, 0]))
+        return float(np.median(self.matches["angle"]))
 
 
 def match_pair(
@@ -87,15 +115,17 @@ def match_pair(
         p, q = p[np.isfinite(p[..., 0]).any(-1)], q[np.isfinite(q[..., 0]).any(-1)]
         possible += min(len(p), len(q))
         rows.append(_match_detections(origins[a], p, origins[b], q, least))
-    return PairMatches(pair, possible, np.concatenate([np.empty((0, 5)), *rows]))
+    return PairMatches(pair, possible, np.concatenate([np.empty(0, MATCH), *rows]))
 
 
-def _match_detections(origin: Floats, p: Floats, other: Floats, q: Floats, least: int) -> Floats:
-    """Return the table of partners, by unit rays (n, 17, 3) and (m, 17, 3) of two cameras."""
+def _match_detections(
+    origin: Floats, p: Floats, other: Floats, q: Floats, least: int
+) -> NDArray[np.void]:
+    """Return the partners, by unit rays (n, 17, 3) and (m, 17, 3) of two cameras."""
     baseline = other - origin
     length = float(np.linalg.norm(baseline))
     if not length > 0.0:
-        return np.empty((0, 5))
+        return np.empty(0, MATCH)
     axis = baseline / length
     off = np.maximum(
         _epipolar_angles(axis, p, q) / _joint_spreads(q)[None, :, None],
@@ -112,7 +142,7 @@ def _match_detections(origin: Floats, p: Floats, other: Floats, q: Floats, least
             row = _locate_match(origin, p[n], baseline, q[m])
             if row is not None:
                 found.append(row)
-    return np.array(found).reshape(-1, 5)
+    return np.array(found, MATCH)
 
 
 def _epipolar_angles(axis: Floats, p: Floats, q: Floats) -> Floats:
@@ -129,8 +159,10 @@ def _joint_spreads(rays: Floats) -> Floats:
     return np.asarray(np.sqrt(np.nanmean(((rays - middle) ** 2).sum(axis=-1), axis=1)))
 
 
-def _locate_match(origin: Floats, p: Floats, baseline: Floats, q: Floats) -> list[float] | None:
-    """Return the row of one match; None behind a camera."""
+def _locate_match(
+    origin: Floats, p: Floats, baseline: Floats, q: Floats
+) -> tuple[float, ...] | None:
+    """Return one match; None behind a camera."""
     cosine = (p * q).sum(axis=-1)
     sine = np.linalg.norm(np.cross(p, q), axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -145,26 +177,7 @@ def _locate_match(origin: Floats, p: Floats, baseline: Floats, q: Floats) -> lis
     size = float(np.nanmedian(limbs)) if np.isfinite(limbs).any() else math.nan
     angle = float(np.nanmedian(np.arctan2(sine, np.abs(cosine))))
     distance = float(np.nanmean(np.linalg.norm(near - far, axis=-1)))
-    return [angle, distance, size, float(np.nanmean(joints[:, 2])), float(np.nanmedian(s))]
-
-
-WINDOW: Final = 400
-"""Most frames that the diagnosis uses."""
-
-
-@dataclass(frozen=True)
-class NoPeople:
-    """Cause of an empty tracking result.
-
-    Attributes:
-        cause: one word.
-        message: the reason with its numbers, and what to do, in full sentences.
-        evidence: the numbers by name.
-    """
-
-    cause: str
-    message: str
-    evidence: dict[str, float]
+    return angle, distance, size, float(np.nanmean(joints[:, 2])), float(np.nanmedian(s))
 
 
 def diagnose_no_people(
@@ -188,11 +201,12 @@ def diagnose_no_people(
         ground: whether people stand on z = 0.
         births: tracks that began and were dropped again.
     """
-    usable = _usable_detections(detections, settings.min_joints)
+    joints = _count_joints(detections)
+    usable = joints >= settings.min_joints
     present = np.asarray(usable.any(axis=-1))
     counts = usable.sum(axis=(0, 2))
-    detected = {name: float(n) for name, n in zip(camera_ids, counts, strict=True)}
-    empty = _explain_missing_detections(present, detected, detections, settings)
+    detected = dict(zip(camera_ids, counts.tolist(), strict=True))
+    empty = _explain_missing_detections(present, detected, joints, settings)
     if empty is not None:
         return empty
     frames = _common_window(present)
@@ -204,7 +218,6 @@ def diagnose_no_people(
             "same_place",
             f"{together} are at the same place ({extent:.3g} m apart): their rays meet nowhere but "
             "there. Two cameras must stand apart; is one of them given twice?",
-            {"cameras_apart_m": extent},
         )
     matches = [
         match_pair(cameras, rays, pair, 0, settings.min_joints)
@@ -220,7 +233,6 @@ def diagnose_no_people(
             f"detections of {a} and {b} fit each other in several ways, and in no frame one way is "
             "clearly likelier: two cameras at the height of people see all of them on one line. "
             "Add a camera, or mount one higher.",
-            {"matches": float(best.count)},
         )
     # Cameras at nearly one position share few people if they look in different directions.
     some = [each for each in matches if (each.agrees if best.agrees else each.count)]
@@ -234,7 +246,6 @@ def diagnose_no_people(
             "one_camera_each",
             "no place where the people of one camera may be is in the image of another: every "
             "person is seen by one camera. Two cameras must show the same people.",
-            detected,
         )
     return NoPeople(
         "cameras_contradict",
@@ -242,7 +253,6 @@ def diagnose_no_people(
         f"{best.possible} detections have a partner on their epipolar lines. Camera poses or "
         "lenses are wrong, files belong to other cameras, or the cameras show different people: "
         "compare each camera's projection of the scene with its image.",
-        {"matches": float(best.count), "possible": float(best.possible)},
     )
 
 
@@ -262,8 +272,8 @@ def _all_pairs_have_rivals(
     return some
 
 
-def _usable_detections(detections: KeypointDetections[ClipArray], least: int) -> Flags:
-    """Return which detections (frames, cameras, detections) have enough joints."""
+def _count_joints(detections: KeypointDetections[ClipArray]) -> Integers:
+    """Return the number of joints of each detection (frames, cameras, detections)."""
     keypoints, confidence = detections.keypoints, detections.confidence
     rows = [
         np.count_nonzero(
@@ -271,57 +281,45 @@ def _usable_detections(detections: KeypointDetections[ClipArray], least: int) ->
             & np.isfinite(keypoints[start : start + WINDOW][..., 0]),
             axis=-1,
         )
-        >= least
         for start in range(0, confidence.shape[0], WINDOW)
     ]
-    return np.concatenate(rows) if rows else np.zeros(confidence.shape[:3], dtype=np.bool_)
+    return np.concatenate(rows) if rows else np.zeros(confidence.shape[:3], dtype=np.int64)
 
 
 def _explain_missing_detections(
-    present: Flags,
-    detected: dict[str, float],
-    detections: KeypointDetections[ClipArray],
-    settings: TrackingSettings,
+    present: Flags, detected: dict[str, int], joints: Integers, settings: TrackingSettings
 ) -> NoPeople | None:
     """Return the reason if detections cannot be compared at all, else None."""
     seeing = [name for name, count in detected.items() if count > 0]
-    counts = ", ".join(f"{name} {count:.0f}" for name, count in detected.items())
+    if not seeing and joints.any():
+        return NoPeople(
+            "too_few_keypoints",
+            f"the most complete of {np.count_nonzero(joints)} detections has {joints.max()} "
+            f"keypoints; tracking.min_joints asks for {settings.min_joints}.",
+        )
     if not seeing:
-        any_, most = _usable_detections(detections, 1).sum(), 0
-        while any_ and _usable_detections(detections, most + 1).any():
-            most += 1
-        if any_:
-            return NoPeople(
-                "too_few_keypoints",
-                f"the most complete of {any_} detections has {most} keypoints; "
-                f"tracking.min_joints asks for {settings.min_joints}.",
-                {"detections": float(any_), "keypoints": float(most)},
-            )
         return NoPeople(
             "no_detections",
             "no camera has a detection in this clip. Look at the detections, at the clip's frames "
             "in match.yaml, and at what the pitch filter removed.",
-            detected,
         )
     if len(seeing) == 1:
+        counts = ", ".join(f"{name} {count}" for name, count in detected.items())
         return NoPeople(
-            "one_camera",
-            f"one camera alone has detections ({counts}). A person needs two.",
-            detected,
+            "one_camera", f"one camera alone has detections ({counts}). A person needs two."
         )
-    if not (np.count_nonzero(present, axis=1) >= 2).any():
-        spans = ", ".join(
-            f"{name} {frames[0]} to {frames[-1]}"
-            for name, column in zip(detected, present.T, strict=True)
-            if len(frames := np.flatnonzero(column))
-        )
-        return NoPeople(
-            "never_together",
-            "no two cameras have detections in the same frame; frames of the clip with "
-            f"detections: {spans}. Look at offset_frames and at the clip's frames in match.yaml.",
-            detected,
-        )
-    return None
+    if (np.count_nonzero(present, axis=1) >= 2).any():
+        return None
+    spans = ", ".join(
+        f"{name} {frames[0]} to {frames[-1]}"
+        for name, column in zip(detected, present.T, strict=True)
+        if len(frames := np.flatnonzero(column))
+    )
+    return NoPeople(
+        "never_together",
+        "no two cameras have detections in the same frame; frames of the clip with "
+        f"detections: {spans}. Look at offset_frames and at the clip's frames in match.yaml.",
+    )
 
 
 def _common_window(present: Flags) -> slice:
@@ -353,21 +351,14 @@ def _explain_limit(
     best = agreeing[0]
     a, b = (names[n] for n in best.cameras)
     apart = float(np.linalg.norm(np.subtract(*cameras.center[list(best.cameras)])))
-    angle, distance, _, height, depth = np.median(best.table, axis=0).tolist()
-    known = best.table[np.isfinite(best.table[:, 2]), 2]
+    angle, distance, height, depth = (
+        float(np.median(best.matches[name])) for name in ("angle", "distance", "height", "depth")
+    )
+    known = best.matches["size"][np.isfinite(best.matches["size"])]
     size = float(np.median(known)) if len(known) else math.nan
     seen = f"{best.count} of {best.possible} detections of {a} and {b} match"
     if best.agrees:
         seen = f"{a} and {b} agree on their people ({best.count} of {best.possible} detections)"
-    evidence = {
-        "matches": float(best.count),
-        "angle_deg": math.degrees(angle),
-        "cameras_apart_m": apart,
-        "depth_m": depth,
-        "ray_distance_m": distance,
-        "height_m": height,
-        **({"size": size} if math.isfinite(size) else {}),
-    }
     widest, least = max(each.angle for each in agreeing), settings.min_angle_rad
     (small, large), (low, high) = settings.size_range, settings.body_heights_m
     limits = (
@@ -403,8 +394,22 @@ def _explain_limit(
     )
     for exceeded, cause, reason in limits:
         if exceeded:
-            return NoPeople(cause, f"{seen}, but {reason}", evidence)
-    return _explain_drop(seen, evidence, math.degrees(widest), settings, births)
+            return NoPeople(cause, f"{seen}, but {reason}")
+    if births:
+        return NoPeople(
+            "too_short",
+            f"{seen}, but none was seen for long enough: {births} tracks were started and dropped; "
+            f"tracking.min_track_s asks for {settings.min_track_s:g} s, and frames with fewer than "
+            f"{settings.birth_views} cameras count at most {settings.pair_evidence:g} where the "
+            f"odds that two detections are one person are below {settings.pair_odds:g}.",
+        )
+    return NoPeople(
+        "limits_together",
+        f"{seen}, and no limit of tracking alone refuses them (angle {math.degrees(widest):.2g} "
+        f"degrees, {distance:.2f} m between rays, {size:.2g} times an adult's size), but no group "
+        "of detections passes all of them. Loosen tracking.min_angle_rad, epipolar_gate_m or "
+        "size_range.",
+    )
 
 
 def _guess_unit(size: float) -> str:
@@ -412,30 +417,6 @@ def _guess_unit(size: float) -> str:
     units = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
     off, unit = min((abs(math.log(size / factor)), name) for factor, name in units.items())
     return f"translations seem to be in {unit}" if off < 0.3 else "is the unit the metre?"
-
-
-def _explain_drop(
-    seen: str, evidence: dict[str, float], widest: float, settings: TrackingSettings, births: int
-) -> NoPeople:
-    """Return why people within each limit, by rays of `widest` [degrees], have no track."""
-    if not births:
-        return NoPeople(
-            "limits_together",
-            f"{seen}, and no limit of tracking alone refuses them (angle {widest:.2g} degrees, "
-            f"{evidence['ray_distance_m']:.2f} m between rays, "
-            f"{evidence.get('size', math.nan):.2g} times an adult's size), but no group of "
-            "detections passes all of them. Loosen tracking.min_angle_rad, epipolar_gate_m or "
-            "size_range.",
-            evidence,
-        )
-    return NoPeople(
-        "too_short",
-        f"{seen}, but none was seen for long enough: {births} tracks were started and dropped; "
-        f"tracking.min_track_s asks for {settings.min_track_s:g} s, and frames with fewer than "
-        f"{settings.birth_views} cameras count at most {settings.pair_evidence:g} where the odds "
-        f"that two detections are one person are below {settings.pair_odds:g}.",
-        {**evidence, "tracks": float(births)},
-    )
 
 
 def _explain_clock_offset(
@@ -469,7 +450,6 @@ def _explain_clock_offset(
         f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
         f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
         f"% as match.yaml has them: correct offset_frames of one of them by {abs(shift)}.",
-        {"shift_frames": float(shift), "share": share, "share_now": now.share},
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +90,6 @@ def track_people(
     detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TrackingSettings = TrackingSettings(),  # noqa: B008
-    progress: Callable[[int, int], None] | None = None,
     *,
     pitch_size: tuple[float, float] | None = None,
     people: int | None = None,
@@ -108,7 +106,6 @@ def track_people(
             or less excludes a keypoint.
         fps: frames per second [1/s].
         settings: gates, least views and times.
-        progress: called with frames done and frames in all.
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
         people: most people at once; None = any number.
@@ -154,8 +151,6 @@ def track_people(
         for offset in range(len(weights)):
             if not (is_empty[offset] and tracker.is_idle):
                 tracker.step(start + offset, directions[offset], weights[offset])
-            if progress is not None:
-                progress(start + offset + 1, frames)
     return _build_result(tracker, frames, pitch_size)
 
 

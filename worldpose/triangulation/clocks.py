@@ -7,6 +7,7 @@ motion in d frames.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,9 +22,9 @@ from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import geman_mcclure_weight
 from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import solve_joints
+from worldpose.triangulation.solve import solve_joints
 
 GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
 """Deviations accepted in each pass: clocks three frames apart put a runner's rays half a metre
@@ -103,14 +104,11 @@ def estimate_clocks(
             part: KeypointDetections,
             late: Floats = late,
             loose: TriangulationSettings = loose,
-        ) -> _Sums:
-            common = shift_in_time(part, late)
-            moving = MovingJoints.find(rig, common, fps, loose)
-            return _sum_equations(moving, common.detection_index.shape[2], count)
+        ) -> PersonSums:
+            return sum_equations(MovingJoints.find(rig, shift_in_time(part, late), fps, loose))
 
-        sums = list(map_in_threads(sum_up, seen))
-        information = np.concatenate([each.information for each in sums])
-        score = np.concatenate([each.score for each in sums])
+        sums = PersonSums.join(list(map_in_threads(sum_up, seen)))
+        information, score = sums.information, sums.score
         # A common offset moves people along their path and changes no residual.
         inverse = np.linalg.inv(information.sum(axis=0) + np.eye(count) / unknown**2)
         step = inverse @ score.sum(axis=0)
@@ -124,7 +122,7 @@ def estimate_clocks(
         share = np.minimum(own / np.maximum(own.sum(axis=0), 1e-12), 0.5)
         left = ((score - information @ step) / (1.0 - share)) @ centered.T
         stated = np.einsum("cd,de,ce->c", centered, information.sum(axis=0), centered)
-        alike = ALIKE * _common_score(sums)
+        alike = sums.common_score()
         error = np.sqrt(np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2)
         error = np.minimum(error, unknown)
         known = error < settings.max_clock_error_frames
@@ -148,32 +146,35 @@ def choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sums:
-    """Normal equations of the clock offsets from one interval.
+class PersonSums:
+    """Normal equations of each person in some intervals, with the joints free to follow.
 
     Attributes:
-        information: (persons, cameras, cameras) [1/frame^2].
-        score: (persons, cameras) [1/frame]; `late` grows by the solution of the sum.
-        along: (cameras,) sum of weight x image motion x image scale [1/(frame m)]: the score of a
-            shift of people along their path.
-        misses: (cameras,) sum of weighted squared residuals [1].
-        scale: (cameras,) sum of weight x squared image scale [1/m^2].
+        information: (persons, unknowns, unknowns) [1/frame^2], camera by camera.
+        score: (persons, unknowns) [1/frame]; the offsets grow by the solution of the sum.
+        shared: (3, cameras), for a shift of people along their path: sum of weight x image motion x
+            image scale [1/(frame m)], of weighted squared residuals [1], and of weight x squared
+            image scale [1/m^2].
     """
 
     information: Floats
     score: Floats
-    along: Floats
-    misses: Floats
-    scale: Floats
+    shared: Floats
 
+    @classmethod
+    def join(cls, parts: Sequence[PersonSums]) -> PersonSums:
+        """Return the sums of all intervals."""
+        return cls(
+            np.concatenate([part.information for part in parts]),
+            np.concatenate([part.score for part in parts]),
+            np.sum([part.shared for part in parts], axis=0),
+        )
 
-def _common_score(sums: list[_Sums]) -> Floats:
-    """Return the score (cameras,) of people shifted along their path by a typical residual."""
-    along = np.sum([each.along for each in sums], axis=0)
-    misses = np.sum([each.misses for each in sums], axis=0)
-    scale = np.sum([each.scale for each in sums], axis=0)
-    usual = np.sqrt(np.divide(misses, 2.0 * scale, out=np.zeros_like(scale), where=scale > 0.0))
-    return np.asarray(along * usual)
+    def common_score(self) -> Floats:
+        """Return the score (cameras,) of an error that all people in a camera have in common."""
+        along, misses, scale = self.shared
+        usual = np.divide(misses, 2.0 * scale, out=np.zeros_like(scale), where=scale > 0.0)
+        return np.asarray(ALIKE * along * np.sqrt(usual))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +185,7 @@ class MovingJoints:
         at: (n, 3) [m], world.
         velocity: (n, 3) [m/frame].
         person: (n,).
+        rig: the cameras.
     """
 
     at: Floats
@@ -192,7 +194,7 @@ class MovingJoints:
     _known: NDArray[np.bool_]
     _pixels: AnyFloats
     _precision: Floats
-    _rig: Rig
+    rig: Rig
     _settings: TriangulationSettings
 
     @classmethod
@@ -202,7 +204,7 @@ class MovingJoints:
         """Return the joints with a velocity, of detections by person on the common clock."""
         pixels, index = people.keypoints, people.detection_index
         precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
-        observations = Observations.from_rig(rig, pixels, precision, index)
+        observations = Observations.of(rig, pixels, precision, index)
         joints = solve_joints(observations, settings).joints
         # Half the time over which velocity is computed is 0.06 s.
         half = max(1, round(0.06 * fps))
@@ -219,12 +221,12 @@ class MovingJoints:
         Derivatives (n, 2, 18) of pixels by points and cameras, misses (n, 2) [px], their weights
         (n,) [1/px^2] and scales (n,) [px/m].
         """
-        n, row = len(self.at), self._rig.cameras[camera]
+        n, row = len(self.at), self.rig.cameras[camera]
         image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, 18))
         given, status = np.ascontiguousarray(self.at[None]), np.empty((1, n), np.uint8)
         camera_model.project_with_jacobians(row[None], given, image, jacobian, status)
         miss = self._pixels[:, camera][self._known] - image[0]
-        depth = self.at @ self._rig.depths[camera, :3] + self._rig.depths[camera, 3]
+        depth = self.at @ self.rig.depths[camera, :3] + self.rig.depths[camera, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             size = row[0] / depth
             variance = self._settings.pixel_noise_px**2 + (size * self._settings.joint_noise_m) ** 2
@@ -240,36 +242,49 @@ class MovingJoints:
         )
 
 
-def _sum_equations(moving: MovingJoints, persons: int, count: int) -> _Sums:
-    """Return the normal equations from the residuals of an interval of frames."""
-    n, person = len(moving.at), moving.person
-    # Point block: matrix (n, 3, 3) and right side; mixed block; clock block.
-    matrix, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    mixed = np.zeros((count, n, 3))
-    information, score = np.zeros((persons, count, count)), np.zeros((persons, count))
-    aside, misses, scale = np.zeros(count), np.zeros(count), np.zeros(count)
+def sum_equations(moving: MovingJoints, *, with_cameras: bool = False) -> PersonSums:
+    """Return the normal equations of each person from the residuals of an interval of frames.
+
+    The unknowns of a camera are its clock offset [frame] and, if `with_cameras`, its rotation [rad]
+    and the logarithm of its focal length.
+    """
+    rig, person = moving.rig, moving.person
+    n, count, width = len(moving.at), len(rig.cameras), 5 if with_cameras else 1
+    matrix, right = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3, 1))
+    mixed, own = np.zeros((n, count, width, 3)), np.zeros((n, count, width, width))
+    score, shared = np.zeros((n, count, width)), np.zeros((3, count))
     for camera in range(count):
         derivatives, miss, weight, size = moving.look(camera)
-        jacobian = np.ascontiguousarray(derivatives[..., :3])
-        way = (jacobian @ moving.velocity[..., None])[..., 0]
-        weighed = (weight[:, None, None] * jacobian).swapaxes(-1, -2)
-        matrix += weighed @ jacobian
-        right += (weighed @ miss[..., None])[..., 0]
-        mixed[camera] = (weighed @ way[..., None])[..., 0]
-        aside[camera] = (weight * np.sqrt((way**2).sum(axis=-1)) * size).sum()
-        misses[camera] = (weight * (miss**2).sum(axis=-1)).sum()
-        scale[camera] = (weight * size**2).sum()
-        along = weight * (way**2).sum(axis=-1), weight * (way * miss).sum(axis=-1)
-        information[:, camera, camera] = np.bincount(person, along[0], persons)
-        score[:, camera] = np.bincount(person, along[1], persons)
-    inverse = np.linalg.inv(matrix + 1e-9 * np.eye(3))
-    for one in range(persons):
+        by_point = np.ascontiguousarray(derivatives[..., :3])
+        columns = by_point @ moving.velocity[..., None]
+        motion = np.linalg.norm(columns[..., 0], axis=-1)
+        if with_cameras:
+            focal = (derivatives[..., 9:11] * rig.cameras[camera, :2]).sum(axis=-1, keepdims=True)
+            columns = np.concatenate([columns, derivatives[..., 3:6], focal], axis=-1)
+        held_points = (weight[:, None, None] * by_point).swapaxes(-1, -2)
+        held = (weight[:, None, None] * columns).swapaxes(-1, -2)
+        matrix += held_points @ by_point
+        right += held_points @ miss[..., None]
+        mixed[:, camera], own[:, camera] = held @ by_point, held @ columns
+        score[:, camera] = (held @ miss[..., None])[..., 0]
+        shared[0, camera] = (weight * motion * size).sum()
+        shared[1, camera] = (weight * (miss**2).sum(axis=-1)).sum()
+        shared[2, camera] = (weight * size**2).sum()
+    flat = mixed.reshape(n, count * width, 3)
+    follows = flat @ np.linalg.inv(matrix)
+    left = score.reshape(n, count * width) - (follows @ right)[..., 0]
+    people = np.unique(person)
+    information = np.zeros((len(people), count, width, count, width))
+    total = np.zeros((len(people), count * width))
+    for number, one in enumerate(people):
         its = person == one
-        own = mixed[:, its]
-        follows = (own[..., None, :] @ inverse[its])[..., 0, :].reshape(count, -1)
-        information[one] -= follows @ own.reshape(count, -1).T
-        score[one] -= follows @ right[its].ravel()
-    return _Sums(information, score, aside, misses, scale)
+        moved, pulled = (
+            each[its].swapaxes(0, 1).reshape(count * width, -1) for each in (follows, flat)
+        )
+        information[number] = -(moved @ pulled.T).reshape(information.shape[1:])
+        information[number, range(count), :, range(count)] += own[its].sum(axis=0)
+        total[number] = left[its].sum(axis=0)
+    return PersonSums(information.reshape(len(people), *(count * width,) * 2), total, shared)
 
 
 def read_frames(

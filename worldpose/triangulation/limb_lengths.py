@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_LIMBS
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
@@ -24,9 +24,9 @@ from worldpose.compiled import compile_kernel
 from worldpose.geometry import camera_model
 from worldpose.geometry.camera_model import project_point
 from worldpose.geometry.lens_models import load_camera
-from worldpose.triangulation.observations import Observations
+from worldpose.triangulation.residuals import Observations
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import Solution, solve_joints
+from worldpose.triangulation.solve import SolvedJoints, solve_joints
 
 PAIRS: Final = np.array(
     [
@@ -59,7 +59,7 @@ def find_swaps(
     observations: Observations,
     noise: tuple[float, float],
     limit: float,
-    found: Solution,
+    found: SolvedJoints,
 ) -> Flags:
     """Return the left-right swaps of body parts (frames, cameras, persons, parts).
 
@@ -88,33 +88,30 @@ def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDete
     """
     if not exchanged.any():
         return detections
-    keypoints, confidence = detections.keypoints.copy(), detections.confidence.copy()
+    joints = detections.keypoints.copy(), detections.confidence.copy()
     for part in range(exchanged.shape[-1]):
-        frame, camera, person = np.nonzero(exchanged[..., part])
-        detection = detections.detection_index[frame, camera, person]
-        place = tuple(each[:, None] for each in (frame, camera, detection))
-        of_part = PAIRS[part == PART_OF]
-        for right, seen in ((keypoints, detections.keypoints), (confidence, detections.confidence)):
-            right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
-    swapped = replace(detections, keypoints=keypoints, confidence=confidence)
+        _swap(joints, detections.detection_index, exchanged[..., part], PAIRS[part == PART_OF])
+    swapped = replace(detections, keypoints=joints[0], confidence=joints[1])
     if detections.extra_keypoints is None or detections.extra_confidence is None:
         return swapped
-    points = detections.points
-    extra, sure = detections.extra_keypoints.copy(), detections.extra_confidence.copy()
+    extra = detections.extra_keypoints.copy(), detections.extra_confidence.copy()
     names = list(EXCHANGED_PARTS)
     limbs = exchanged[..., [names.index(part) for part in ("arms", "legs")]].all(axis=-1)
     for name in (*names, ""):
-        of_part = _point_pairs(points, name)
         its = exchanged[..., names.index(name)] if name else limbs
-        frame, camera, person = np.nonzero(its)
-        detection = detections.detection_index[frame, camera, person]
-        place = tuple(each[:, None] for each in (frame, camera, detection))
-        for right, seen in (
-            (extra, detections.extra_keypoints),
-            (sure, detections.extra_confidence),
-        ):
-            right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
-    return swapped.add_points(points, extra, sure)
+        pairs = _point_pairs(detections.points, name)
+        _swap(extra, detections.detection_index, np.asarray(its), pairs)
+    return swapped.add_points(detections.points, *extra)
+
+
+def _swap(
+    arrays: tuple[AnyFloats, ...], index: NDArray[np.integer], its: Flags, pairs: NDArray[np.int64]
+) -> None:
+    """Swap pairs (pairs, 2) of keypoints in place, of the detections of marked people."""
+    frame, camera, person = np.nonzero(its)
+    place = frame[:, None], camera[:, None], index[frame, camera, person][:, None]
+    for array in arrays:
+        array[(*place, pairs.ravel())] = array[(*place, pairs[:, ::-1].ravel())]
 
 
 def _point_pairs(points: tuple[str, ...], part: str) -> NDArray[np.int64]:
@@ -134,14 +131,15 @@ def _find_swaps(
     observations: Observations,
     noise: tuple[float, float],
     limit: float,
-    found: Solution,
+    found: SolvedJoints,
     pairs: NDArray[np.int64],
     part_of: NDArray[np.int64],
     exchanged: Flags,
 ) -> None:
     """Write `exchanged` (frames, cameras, persons, parts)."""
     keypoints, precision = observations.keypoints, observations.precision
-    index, shift, cameras = observations.detection_index, observations.shift, observations.cameras
+    index, shift = observations.detection_index, observations.shift
+    cameras = observations.rig.cameras
     joints, covariance = found.joints, found.covariance
     seen, inliers = found.seen, found.inliers
     frames, count, persons = index.shape
@@ -211,7 +209,7 @@ STRANGE: Final = 4.0
 """Squared deviation of a length from which other pairs are tried [variances]."""
 
 
-def limb_lengths(found: Solution) -> Floats:
+def limb_lengths(found: SolvedJoints) -> Floats:
     """Return the limb lengths of all persons (persons, limbs) [m]; NaN where unknown.
 
     A length is the median over the frames with three inlier views of both ends, or over all frames
@@ -239,7 +237,7 @@ def limb_lengths(found: Solution) -> Floats:
 def repair_limb_lengths(
     observations: Observations,
     settings: TriangulationSettings,
-    found: Solution,
+    found: SolvedJoints,
     lengths: Floats,
 ) -> None:
     """Re-triangulate, in place, ends with few inlier views of limbs of wrong length.
@@ -288,7 +286,7 @@ class _Points:
 
 
 def _select_end(
-    observations: Observations, found: Solution, end: tuple[int, int, int], doubtful: bool
+    observations: Observations, found: SolvedJoints, end: tuple[int, int, int], doubtful: bool
 ) -> Observations:
     """Return one limb end's observations: one frame, one detection per camera, one joint."""
     frame, person, joint = end
@@ -317,13 +315,13 @@ class _Choices:
 
     points: _Points
     cost: Floats
-    tried: Solution | None
+    tried: SolvedJoints | None
 
 
 def _list_choices(
     observations: Observations,
     settings: TriangulationSettings,
-    found: Solution,
+    found: SolvedJoints,
     end: tuple[int, int, int],
 ) -> _Choices:
     """Return the positions of an end from pairs of views and their inliers."""
@@ -340,7 +338,7 @@ def _list_choices(
         detection_index=np.zeros((*used.shape, 1), np.int64),
     )
 
-    def solve_from(views: NDArray[np.bool_]) -> tuple[Solution, Floats]:
+    def solve_from(views: NDArray[np.bool_]) -> tuple[SolvedJoints, Floats]:
         some = np.where(views, weights, 0.0)[:, :, None, None]
         solution = solve_joints(repeated._replace(precision=some), settings)
         return solution, _misfit(observations, settings.noise, solution.joints[:, 0, 0])
@@ -361,7 +359,7 @@ def _choose(
     choices: list[_Choices],
     long: Floats,
     limit: float,
-    found: Solution,
+    found: SolvedJoints,
     chain: tuple[int, int, int, int],
 ) -> None:
     """Set the two ends of an arm or a leg to their best candidates, in place."""
@@ -416,7 +414,8 @@ def _deviation(upper: _Points, lower: _Points, long: Floats | float) -> tuple[Fl
 def _misfit(observations: Observations, noise: tuple[float, float], points: Floats) -> Floats:
     """Return squared errors of views (points, cameras) [variances]; 0 without an observation."""
     pixels, weights = observations.keypoints[0, :, 0, 0], observations.precision[0, :, 0, 0]
-    cameras, depths, shift = observations.cameras, observations.depths, observations.shift
+    cameras, depths, _ = observations.rig
+    shift = observations.shift
     at = np.broadcast_to(points, (len(weights), *points.shape))
     image = np.empty((*at.shape[:-1], 2))
     camera_model.project(cameras, np.ascontiguousarray(at), image)

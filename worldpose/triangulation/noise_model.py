@@ -17,20 +17,15 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.triangulation.batched_gauss_newton import (
-    EXTRA,
+from worldpose.triangulation.residuals import (
     LANES,
-    LEVERAGE,
-    PRECISION,
-    ROWS,
-    SCALE,
-    SQUARED,
-    STATE,
-    USED,
-    weigh,
+    Buffers,
+    Observations,
+    Rig,
+    read_tile,
+    write_leverages,
 )
-from worldpose.triangulation.observations import Observations, Rig, gather, linearize
-from worldpose.triangulation.solving import consensus
+from worldpose.triangulation.solve import find_consensus
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +107,10 @@ def learn_noise(
     for _ in range(4):
         precision = model.precision(confidence)
         _residuals(
-            Observations.from_rig(rig, detections.keypoints, precision, index, shift),
+            Observations.of(rig, detections.keypoints, precision, index, shift),
             noise,
             limit,
+            Buffers.of(count),
             squares.reshape(-1, count),
             known.reshape(-1, count),
             freedom.reshape(-1, count),
@@ -152,6 +148,7 @@ def _residuals(
     observations: Observations,
     noise: tuple[float, float],
     limit: float,
+    buffers: Buffers,
     squares: Floats,
     known: Floats,
     freedom: Floats,
@@ -160,26 +157,23 @@ def _residuals(
 
     The first two are in units of the stated variance; all are 0 where a view is not used.
     """
-    cameras, depths = observations.cameras, observations.depths
-    tiles, state = np.empty((len(cameras), ROWS * LANES)), np.empty(STATE * LANES)
-    total = len(squares)
+    rig, tiles, state = observations.rig, buffers.tiles, buffers.state[0]
+    point, total = state["point"], len(squares)
     for first in range(0, total, LANES):
-        gather(observations, first, tiles)
-        for camera in range(len(cameras)):
-            linearize(tiles[camera], cameras, camera)
-        consensus(tiles, depths, noise, limit, state)
-        for camera in range(len(cameras)):
-            tile, depth = tiles[camera], depths[camera]
-            weigh(tile, depth, noise, state)
+        read_tile(observations, first, tiles)
+        find_consensus(rig, noise, limit, buffers)
+        for camera in range(len(tiles)):
+            tile, depth = tiles[camera], rig.depths[camera]
+            write_leverages(tile, depth, noise, state)
             for j in range(min(LANES, total - first)):
-                free = 2.0 - tile[LEVERAGE + j]
-                if tile[USED + j] > 0.0 and free > 1e-6:
-                    z = depth[0] * state[j] + depth[1] * state[LANES + j]
-                    z += depth[2] * state[2 * LANES + j] + depth[3]
-                    base = noise[0] ** 2 + tile[SCALE + j] / (z * z) * noise[1] ** 2
-                    extra = tile[EXTRA + j] / base
-                    squares[first + j, camera] = tile[SQUARED + j] * (
-                        1.0 / tile[PRECISION + j] + extra
+                free = 2.0 - tile["leverage"][j]
+                if tile["used"][j] > 0.0 and free > 1e-6:
+                    z = depth[0] * point[0, j] + depth[1] * point[1, j]
+                    z += depth[2] * point[2, j] + depth[3]
+                    base = noise[0] ** 2 + tile["scale"][j] / (z * z) * noise[1] ** 2
+                    extra = tile["extra"][j] / base
+                    squares[first + j, camera] = tile["squared"][j] * (
+                        1.0 / tile["precision"][j] + extra
                     )
                     known[first + j, camera] = extra
                     freedom[first + j, camera] = free

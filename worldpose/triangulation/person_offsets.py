@@ -9,37 +9,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.batched_gauss_newton import (
-    EXTRA,
-    LANES,
-    MATRIX,
-    POINT,
-    PRECISION,
-    RIGHT,
-    ROWS,
-    SCALE,
-    SHARPNESS,
-    STATE,
-    USED,
-    A,
-    B,
-    step,
-)
 from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.observations import Observations, Rig, gather, linearize, no_shift
-from worldpose.triangulation.reports import Histogram
+from worldpose.triangulation.report import Histogram
+from worldpose.triangulation.residuals import (
+    Buffers,
+    Observations,
+    Rig,
+    State,
+    Tile,
+    Tiles,
+    no_shift,
+    read_tile,
+)
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import Solution, solve_joints
+from worldpose.triangulation.solve import SolvedJoints, solve_joints, take_step
 
 RADIAL = [0, 1, 4]
 """k1, k2, k3 among the five coefficients."""
@@ -109,7 +103,7 @@ def stated_errors(
 def learn_factor(
     observations: Observations,
     noise: tuple[float, float],
-    first: Solution,
+    first: SolvedJoints,
     stated: Floats,
 ) -> float:
     """Return the most probable factor on the stated variance for a sample of frames.
@@ -123,12 +117,12 @@ def learn_factor(
     # The last update changes it by a few percent.
     for _ in range(6 if known.any() else 0):
         offsets, variance = np.zeros((*stated.shape, 2)), np.zeros(stated.shape)
-        _body_offsets(
+        _solve_bodies(
             observations._replace(shift=no_shift()),
             noise,
-            first.joints,
-            first.inliers,
+            first,
             factor * stated,
+            Buffers.of(stated.shape[1]),
             offsets,
             variance,
             np.empty((0, 0, 0, 3, 3)),
@@ -143,7 +137,7 @@ def learn_factor(
 def estimate_offsets(
     observations: Observations,
     noise: tuple[float, float],
-    first: Solution,
+    first: SolvedJoints,
     variance: Floats,
 ) -> tuple[Floats, Floats]:
     """Return the most probable offsets of people in the images, estimated with the joints.
@@ -164,12 +158,12 @@ def estimate_offsets(
     """
     offsets, unknown = np.zeros((*variance.shape, 2)), np.zeros(variance.shape)
     further = np.zeros((*first.joints.shape, 3))
-    _body_offsets(
+    _solve_bodies(
         observations._replace(shift=no_shift()),
         noise,
-        first.joints,
-        first.inliers,
+        first,
         variance,
+        Buffers.of(variance.shape[1]),
         offsets,
         unknown,
         further,
@@ -193,7 +187,7 @@ def estimate_midhip_shift(
     middle = detections.keypoints[..., HIPS, :].mean(axis=-2, keepdims=True, dtype=np.float64)
     sure = detections.confidence[..., HIPS].min(axis=-1, keepdims=True)
     precision = NoiseModel.nominal(1).precision(sure)
-    observed = Observations.from_rig(rig, middle, precision, index)
+    observed = Observations.of(rig, middle, precision, index)
     joints = solve_joints(observed, settings).joints[:, :, 0]
     image = np.empty((len(rig.cameras), joints[..., 0].size, 2))
     points = np.ascontiguousarray(np.broadcast_to(joints.reshape(1, -1, 3), (*image.shape[:2], 3)))
@@ -207,131 +201,186 @@ def estimate_midhip_shift(
     return np.concatenate([shift, np.zeros((*index.shape, 1))], axis=-1)
 
 
+class _Equations(NamedTuple):
+    """Normal equations of a person's offsets, two unknowns per camera.
+
+    Attributes:
+        matrix: (unknowns, unknowns).
+        right: (unknowns,).
+        mixed: (3, unknowns) products of one joint and the offsets.
+    """
+
+    matrix: Floats
+    right: Floats
+    mixed: Floats
+
+
 @compile_kernel
-def _body_offsets(
+def _solve_bodies(
     observations: Observations,
     noise: tuple[float, float],
-    joints: Floats,
-    inliers: NDArray[np.bool_],
+    first: SolvedJoints,
     prior: Floats,
+    buffers: Buffers,
     offsets: Floats,
     variance: Floats,
     further: Floats,
 ) -> None:
-    """Write the most probable offsets of people in the images, estimated with the joints.
-
-    All joints of a person in one image share the same offset, normal with variance `prior`. The
-    joints are eliminated (Schur complement), which leaves two unknowns per camera.
+    """Minimize E_body of each person; the joints are eliminated (Schur complement).
 
     Args:
         observations: observations of all tracked people, without a shift.
         noise: [px], [m].
-        joints: (frames, persons, joints, 3) [m] solved without offsets.
-        inliers: (frames, cameras, persons, joints).
-        prior: (frames, cameras, persons) [px^2].
+        first: joints and inliers without offsets.
+        prior: (frames, cameras, persons) tau^2 [px^2].
+        buffers: buffers of the kernel.
         offsets: (frames, cameras, persons, 2) [px], written.
         variance: (frames, cameras, persons) [px^2] per axis, of the offsets, written.
         further: (frames, persons, joints, 3, 3) [m^2], contribution of the offsets to the joints'
             covariance, written; no frames = not wanted.
     """
-    cameras, depths = observations.cameras, observations.depths
     frames, count, persons = observations.detection_index.shape
     joint_count = observations.precision.shape[3]
-    tiles, state = np.empty((count, ROWS * LANES)), np.zeros(STATE * LANES)
+    joints, inliers = first.joints, first.inliers
+    tiles, state, depths = buffers.tiles, buffers.state[0], observations.rig.depths
     slot = np.empty(count, np.int64)
     for t in range(frames):
         for n in range(persons):
-            for c in range(count):
-                tiles[c, PRECISION : PRECISION + LANES] = 0.0
-            gather(observations, (t * persons + n) * joint_count, tiles)
-            size = 0
-            for c in range(count):
-                linearize(tiles[c], cameras, c)
-                tiles[c, USED : USED + LANES] = 0.0
-                some = False
-                for j in range(joint_count):
-                    if inliers[t, c, n, j]:
-                        tiles[c, USED + j] = 1.0
-                        some = True
-                slot[c] = -1
-                if some and prior[t, c, n] > 0.0:
-                    slot[c] = size
-                    size += 2
+            read_tile(observations, (t * persons + n) * joint_count, tiles)
+            size = _assign_unknowns(inliers[t, :, n], prior[t, :, n], tiles, slot)
             if size == 0:
                 continue
             for j in range(joint_count):
                 for k in range(3):
-                    state[POINT + k * LANES + j] = joints[t, n, j, k]
-            state[SHARPNESS : SHARPNESS + LANES] = 0.0
-            step(tiles, depths, noise, state)
+                    state["point"][k, j] = joints[t, n, j, k]
+            state["sharpness"][:] = 0.0
+            take_step(tiles, depths, noise, state)
             h, right = np.zeros((size, size)), np.zeros(size)
+            w = np.zeros((3, size))
+            equations = _Equations(h, right, w)
             for c in range(count):
                 if slot[c] >= 0:
                     h[slot[c], slot[c]] = h[slot[c] + 1, slot[c] + 1] = 1.0 / prior[t, c, n]
             # Rows of `moves` follow each other in memory, so that inner loops are vector code.
-            w, moves = np.zeros((3, size)), np.zeros((joint_count, 3, size))
+            moves = np.zeros((joint_count, 3, size))
             for j in range(joint_count):
-                if not math.isfinite(joints[t, n, j, 0]):
-                    continue
-                x, y, z = joints[t, n, j]
-                w[:] = 0.0
-                for c in range(count):
-                    at = slot[c]
-                    if at < 0 or tiles[c, USED + j] == 0.0:
-                        continue
-                    tile, p = tiles[c], depths[c]
-                    inverse = 1.0 / (p[0] * x + p[1] * y + p[2] * z + p[3])
-                    g = tile[PRECISION + j]
-                    weight = g / (
-                        noise[0] ** 2
-                        + tile[SCALE + j] * inverse * inverse * noise[1] ** 2
-                        + g * tile[EXTRA + j]
-                    )
-                    for axis in range(2):
-                        o = (A if axis == 0 else B) + j
-                        a, b, d = tile[o], tile[o + LANES], tile[o + 2 * LANES]
-                        e = (a * x + b * y + d * z + tile[o + 3 * LANES]) * inverse
-                        w[0, at + axis] = weight * (a - e * p[0]) * inverse
-                        w[1, at + axis] = weight * (b - e * p[1]) * inverse
-                        w[2, at + axis] = weight * (d - e * p[2]) * inverse
-                        h[at + axis, at + axis] += weight
-                        # The errors are projection less observation: the offset's sign flips.
-                        right[at + axis] -= weight * e
-                xx, xy, xz = (
-                    state[MATRIX + j],
-                    state[MATRIX + LANES + j],
-                    state[MATRIX + 2 * LANES + j],
-                )
-                yy, yz = state[MATRIX + 3 * LANES + j], state[MATRIX + 4 * LANES + j]
-                zz = state[MATRIX + 5 * LANES + j]
-                both = moves[j]
-                for i in range(size):
-                    u, v, q = w[0, i], w[1, i], w[2, i]
-                    both[0, i] = u * xx + v * xy + q * xz
-                    both[1, i] = u * xy + v * yy + q * yz
-                    both[2, i] = u * xz + v * yz + q * zz
-                    for k in range(3):
-                        right[i] -= both[k, i] * state[RIGHT + k * LANES + j]
-                for i in range(size):
-                    u, v, q = both[0, i], both[1, i], both[2, i]
-                    for k in range(size):
-                        h[i, k] -= u * w[0, k] + v * w[1, k] + q * w[2, k]
+                if math.isfinite(joints[t, n, j, 0]):
+                    w[:] = 0.0
+                    for c in range(count):
+                        if slot[c] >= 0 and tiles[c]["used"][j] > 0.0:
+                            at, point = slot[c], joints[t, n, j]
+                            _add_view(tiles[c], depths[c], noise, j, point, at, equations)
+                    _eliminate_joint(state, j, equations, moves[j])
             covariance = np.linalg.inv(h)
             for c in range(count):
                 at = slot[c]
-                if at < 0:
-                    continue
-                for axis in range(2):
-                    total = 0.0
-                    for k in range(size):
-                        total += covariance[at + axis, k] * right[k]
-                    offsets[t, c, n, axis] = total
-                variance[t, c, n] = 0.5 * (covariance[at, at] + covariance[at + 1, at + 1])
+                if at >= 0:
+                    for axis in range(2):
+                        total = 0.0
+                        for k in range(size):
+                            total += covariance[at + axis, k] * right[k]
+                        offsets[t, c, n, axis] = total
+                    variance[t, c, n] = 0.5 * (covariance[at, at] + covariance[at + 1, at + 1])
             if len(further):
-                rows = moves.reshape(3 * joint_count, size)
-                spread = rows @ covariance
-                for j in range(joint_count):
-                    for i in range(3):
-                        for k in range(i + 1):
-                            total = (rows[3 * j + i] * spread[3 * j + k]).sum()
-                            further[t, n, j, i, k] = further[t, n, j, k, i] = total
+                _spread_offsets(moves, covariance, further[t, n])
+
+
+@compile_kernel
+def _assign_unknowns(
+    inliers: NDArray[np.bool_], prior: Floats, tiles: Tiles, slot: NDArray[np.int64]
+) -> int:
+    """Mark a person's inliers (cameras, joints) as used; return the number of unknowns.
+
+    Args:
+        inliers: (cameras, joints).
+        prior: (cameras,) [px^2].
+        tiles: (cameras,) tiles of the person; `used` is written.
+        slot: (cameras,) place of a camera's two unknowns, written; -1 = none.
+    """
+    size = 0
+    for c in range(len(tiles)):
+        used = tiles[c]["used"]
+        used[:] = 0.0
+        some = False
+        for j in range(inliers.shape[1]):
+            if inliers[c, j]:
+                used[j] = 1.0
+                some = True
+        slot[c] = -1
+        if some and prior[c] > 0.0:
+            slot[c] = size
+            size += 2
+    return size
+
+
+@compile_kernel
+def _add_view(
+    tile: Tile,
+    p: Floats,
+    noise: tuple[float, float],
+    j: int,
+    point: Floats,
+    at: int,
+    equations: _Equations,
+) -> None:
+    """Add one view of a joint to the equations of its camera's offset.
+
+    Args:
+        tile: observations of the camera.
+        p: (4,) depth of the camera.
+        noise: [px], [m].
+        j: the joint.
+        point: (3,) [m], its position.
+        at: place of the camera's unknowns.
+        equations: `mixed` is written, the others are added to.
+    """
+    h, right, w = equations.matrix, equations.right, equations.mixed
+    x, y, z = point
+    inverse = 1.0 / (p[0] * x + p[1] * y + p[2] * z + p[3])
+    g = tile["precision"][j]
+    weight = g / (
+        noise[0] ** 2 + tile["scale"][j] * inverse * inverse * noise[1] ** 2 + g * tile["extra"][j]
+    )
+    for axis in range(2):
+        a, b, d, s = tile["a"][0, j], tile["a"][1, j], tile["a"][2, j], tile["a"][3, j]
+        if axis == 1:
+            a, b, d, s = tile["b"][0, j], tile["b"][1, j], tile["b"][2, j], tile["b"][3, j]
+        e = (a * x + b * y + d * z + s) * inverse
+        w[0, at + axis] = weight * (a - e * p[0]) * inverse
+        w[1, at + axis] = weight * (b - e * p[1]) * inverse
+        w[2, at + axis] = weight * (d - e * p[2]) * inverse
+        h[at + axis, at + axis] += weight
+        # The errors are projection less observation: the offset's sign flips.
+        right[at + axis] -= weight * e
+
+
+@compile_kernel
+def _eliminate_joint(state: State, j: int, equations: _Equations, moves: Floats) -> None:
+    """Subtract what the joint, free to move, explains; write its motion `moves` (3, unknowns)."""
+    h, right, w = equations.matrix, equations.right, equations.mixed
+    matrix = state["matrix"]
+    xx, xy, xz = matrix[0, j], matrix[1, j], matrix[2, j]
+    yy, yz, zz = matrix[3, j], matrix[4, j], matrix[5, j]
+    for i in range(len(right)):
+        u, v, q = w[0, i], w[1, i], w[2, i]
+        moves[0, i] = u * xx + v * xy + q * xz
+        moves[1, i] = u * xy + v * yy + q * yz
+        moves[2, i] = u * xz + v * yz + q * zz
+        for k in range(3):
+            right[i] -= moves[k, i] * state["right"][k, j]
+    for i in range(len(right)):
+        u, v, q = moves[0, i], moves[1, i], moves[2, i]
+        for k in range(len(right)):
+            h[i, k] -= u * w[0, k] + v * w[1, k] + q * w[2, k]
+
+
+@compile_kernel
+def _spread_offsets(moves: Floats, covariance: AnyFloats, further: Floats) -> None:
+    """Write the covariance (joints, 3, 3) [m^2] that offsets give to joints that follow them."""
+    rows = moves.reshape(3 * len(moves), len(covariance))
+    spread = rows @ covariance
+    for j in range(len(moves)):
+        for i in range(3):
+            for k in range(i + 1):
+                total = (rows[3 * j + i] * spread[3 * j + k]).sum()
+                further[j, i, k] = further[j, k, i] = total

@@ -1,12 +1,11 @@
 """Smoothed joints of whole tracks, and the typical accelerations that smoothing needs.
 
-A joint over time is the least-squares answer to reprojection errors and a penalty on acceleration.
+A joint over time minimizes E_track of `residuals`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,39 +17,24 @@ from worldpose.compiled import map_in_threads
 from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.limb_lengths import undo_swaps
-from worldpose.triangulation.observations import (
-    PersonTrack,
-    Rig,
-    observe_person,
-)
-from worldpose.triangulation.passes import Triangulation
-from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
+from worldpose.triangulation.report import Changes, Histogram
+from worldpose.triangulation.residuals import Rig
+from worldpose.triangulation.results import MotionModel, Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import (
+    PersonKeypoints,
     TrackCosts,
     held_out_cost,
     prepare_tiles,
+    select_person,
     solve_segment,
     solve_tiles,
 )
 
 
-@dataclass(frozen=True, eq=False)
-class MotionModel:
-    """Motion prior of smoothing.
-
-    Attributes:
-        acceleration: (joints,) standard deviation per axis [m/s^2].
-        repeated: frames whose errors count as one, at least 1.
-    """
-
-    acceleration: Floats
-    repeated: float
-
-
 def learn_motion(
     rig: Rig,
-    tracks: Iterable[PersonTrack],
+    tracks: Iterable[PersonKeypoints],
     joints: int,
     fps: float,
     settings: TriangulationSettings,
@@ -79,7 +63,7 @@ def learn_motion(
     correlation, energy = np.zeros(lag + 1), 0.0
     odd = np.arange(len(rig.cameras)) % 2 == 1
 
-    def predict(track: PersonTrack) -> list[tuple[int, list[Floats], Floats]]:
+    def predict(track: PersonKeypoints) -> list[tuple[int, list[Floats], Floats]]:
         """Return each joint with its costs (candidates,) of both halves, and its errors."""
         pixels, weights, points = track.pixels, track.precision, track.joints
         found = []
@@ -162,30 +146,6 @@ def _whiten_errors(
     return np.where(squared <= limit, error, np.nan)
 
 
-@dataclass(frozen=True)
-class Smoothing:
-    """Smoothed joints of whole tracks.
-
-    Attributes:
-        joints: (frames, persons, 17, 3) [m], world; NaN outside tracks and in long gaps.
-        covariance: (frames, persons, 17, 3, 3) [m^2], growing into gaps.
-        filled: (frames, persons, 17) bool, interpolated between two triangulated frames.
-        motion: motion prior.
-        changes: counts and distances behind `report`.
-    """
-
-    joints: Floats
-    covariance: Floats
-    filled: NDArray[np.bool_]
-    motion: MotionModel
-    changes: Changes
-
-    @property
-    def report(self) -> SmoothingReport:
-        """The metrics of these frames."""
-        return self.changes.report(self.motion.acceleration, self.motion.repeated)
-
-
 def smooth_joints(
     cameras: Camera,
     detections: KeypointDetections,
@@ -216,7 +176,7 @@ def smooth_joints(
     if motion is None:
         chosen = choose_stretches(np.asarray(raw.views.any(axis=-1)), fps)
         tracks = (
-            observe_person(detections, precision, raw.offsets, raw.joints, person, part)
+            select_person(detections, precision, raw.offsets, raw.joints, person, part)
             for person, part in chosen
         )
         motion = learn_motion(rig, tracks, raw.joints.shape[2], fps, settings)
@@ -226,7 +186,7 @@ def smooth_joints(
     repeated = motion.repeated
 
     def smooth_person(person: int) -> None:
-        track = observe_person(detections, precision, raw.offsets, raw.joints, person)
+        track = select_person(detections, precision, raw.offsets, raw.joints, person)
         weights = track.precision / repeated
         for joint in range(raw.joints.shape[2]):
             given = raw.joints[:, person, joint]

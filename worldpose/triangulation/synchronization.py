@@ -27,14 +27,15 @@ from worldpose.tracking.plane.feet import locate_feet
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.clocks import (
-    ALIKE,
     GATES,
     SETTLED,
     MovingJoints,
+    PersonSums,
     choose_intervals,
     shift_in_time,
+    sum_equations,
 )
-from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 
 MAX_SPAN: Final = 30
@@ -232,13 +233,16 @@ def _estimate_fractions(
         common = shift_in_time(people, late)
         rig = Rig.from_cameras(cameras)
         intervals = choose_intervals((frames, count, people.detection_index.shape[2]), length)
-        sums = [_sum_part(rig, common[part], fps, loose) for part in intervals]
-        parts = [each for found, _ in sums for each in found]
-        if not parts:
+        parts = [
+            sum_equations(MovingJoints.find(rig, common[part], fps, loose), with_cameras=True)
+            for part in intervals
+        ]
+        groups = sum(len(part.score) for part in parts)
+        if not groups:
             break
+        sums = PersonSums.join(parts)
+        information, score = sums.information, sums.score
         prior = np.tile([1.0 / unknown_clock**2, *PRIOR], count)
-        information = np.stack([matrix for matrix, _ in parts])
-        score = np.stack([right for _, right in parts])
         inverse = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
         step = inverse @ score.sum(axis=0)
         clock = slice(None, None, COLUMNS)
@@ -246,13 +250,10 @@ def _estimate_fractions(
         told = np.diagonal(information.sum(axis=0))[clock] > 1.0 / unknown_clock**2
         rows = inverse[clock] - told @ inverse[clock] / max(1, told.sum())
         left = (score - information @ step) @ rows.T
-        groups = len(parts)
         stated = np.diagonal(rows @ information.sum(axis=0) @ rows.T)
         scatter = (left**2).sum(axis=0) * groups / max(1, groups - 1)
         # The common error of all people in a camera does not show in their scatter.
-        along, misses, scale = np.sum([each for _, each in sums], axis=0)
-        usual = np.sqrt(np.divide(misses, 2.0 * scale, out=np.zeros(count), where=scale > 0.0))
-        alike = rows[:, clock] ** 2 @ (ALIKE * along * usual) ** 2
+        alike = rows[:, clock] ** 2 @ sums.common_score() ** 2
         # A rotation that the people do not tell is as uncertain as its prior.
         assumed = rows**2 @ prior
         error = np.sqrt(np.maximum(scatter, stated) + alike + assumed)
@@ -263,51 +264,6 @@ def _estimate_fractions(
         if np.abs(change).max() < SETTLED and gate == GATES[-1]:
             break
     return late, error
-
-
-def _sum_part(
-    rig: Rig, people: KeypointDetections, fps: float, settings: TriangulationSettings
-) -> tuple[list[tuple[Floats, Floats]], Floats]:
-    """Return the normal equations of clocks and cameras from each person in an interval.
-
-    The unknowns of a camera are its clock offset [frame], its rotation [rad] and the logarithm of
-    its focal length.
-    """
-    count = len(rig.cameras)
-    shared = np.zeros((3, count))
-    moving = MovingJoints.find(rig, people, fps, settings)
-    person, n = moving.person, len(moving.at)
-    if not n:
-        return [], shared
-    point, columns = np.zeros((n, count, 2, 3)), np.zeros((n, count, 2, COLUMNS))
-    miss, weight = np.zeros((n, count, 2)), np.zeros((n, count))
-    for camera in range(count):
-        derivatives, miss[:, camera], weight[:, camera], size = moving.look(camera)
-        point[:, camera] = derivatives[..., :3]
-        columns[:, camera, :, 0] = (derivatives[..., :3] @ moving.velocity[..., None])[..., 0]
-        columns[:, camera, :, 1:4] = derivatives[..., 3:6]
-        focal = rig.cameras[camera, :2]
-        columns[:, camera, :, 4] = (derivatives[..., 9:11] * focal).sum(axis=-1)
-        motion = np.linalg.norm(columns[:, camera, :, 0], axis=-1)
-        shared[0, camera] = (weight[:, camera] * motion * size).sum()
-        shared[1, camera] = (weight[:, camera, None] * miss[:, camera] ** 2).sum()
-        shared[2, camera] = (weight[:, camera] * size**2).sum()
-    weighed = weight[..., None, None] * columns
-    matrix = np.einsum("ncij,nc,ncik->njk", point, weight, point) + 1e-9 * np.eye(3)
-    right = np.einsum("ncij,nc,nci->nj", point, weight, miss)
-    mixed = np.einsum("ncik,ncij->nckj", weighed, point).reshape(n, count * COLUMNS, 3)
-    own = np.einsum("ncik,ncil->nckl", weighed, columns)
-    score = np.einsum("ncik,nci->nck", weighed, miss).reshape(n, -1)
-    follows = np.linalg.solve(matrix, np.swapaxes(mixed, 1, 2))
-    score = score - np.einsum("njk,nj->nk", follows, right)
-    found = []
-    for one in np.unique(person):
-        its = person == one
-        whole = -np.einsum("nkj,njl->kl", mixed[its], follows[its])
-        blocks = whole.reshape(count, COLUMNS, count, COLUMNS)
-        blocks[np.arange(count), :, np.arange(count)] += own[its].sum(axis=0)
-        found.append((whole, score[its].sum(axis=0)))
-    return found, shared
 
 
 def shift_frames(

@@ -1,4 +1,4 @@
-"""Joints of a whole track, from reprojection errors and a penalty on acceleration.
+"""E_track of one joint: minimization over all frames of its track.
 
 The unknowns x, y, z of all frames form a symmetric matrix whose entries lie within six places of
 the diagonal: a frame's own 3x3 block, and an acceleration ties each coordinate to those of two
@@ -13,29 +13,69 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.triangulation.batched_gauss_newton import (
+from worldpose.triangulation.residuals import (
     LANES,
-    MATRIX,
-    POINT,
-    PRECISION,
-    RIGHT,
-    ROWS,
-    SHARPNESS,
-    SQUARED,
-    STATE,
-    USED,
-    accumulate,
-    clear,
-)
-from worldpose.triangulation.observations import (
+    TILE,
+    Buffers,
     Observations,
     Rig,
-    gather,
-    linearize,
+    State,
+    Tiles,
+    add_data,
+    add_smoothness,
+    clear,
+    read_tile,
 )
 
 BAND: Final = 6
+
+
+class PersonKeypoints(NamedTuple):
+    """Keypoints of one person over an interval of frames.
+
+    Attributes:
+        pixels: (joints, cameras, frames, 2) [px], offsets subtracted.
+        precision: (joints, cameras, frames) precision as in `Observations`.
+        joints: (frames, joints, 3) [m], triangulated; NaN where unknown.
+    """
+
+    pixels: Floats
+    precision: Floats
+    joints: Floats
+
+
+def select_person(
+    detections: KeypointDetections,
+    precision: Floats,
+    offsets: Floats,
+    joints: Floats,
+    person: int,
+    frames: slice = slice(None),
+) -> PersonKeypoints:
+    """Return one person's keypoints.
+
+    Args:
+        detections: detections of all people.
+        precision: (frames, cameras, detections, joints) precision of the keypoints.
+        offsets: (frames, cameras, persons, 2) [px] to subtract.
+        joints: (frames, persons, joints, 3) [m], triangulated.
+        person: index of the person.
+        frames: frames to include.
+    """
+    index = detections.detection_index[frames, :, person]
+    # Whole rows of joints: `take_along_axis` would index every number, at ten times the time.
+    row, camera = np.ogrid[: index.shape[0], : index.shape[1]]
+    place = row, camera, np.maximum(index, 0)
+    pixels = detections.keypoints[frames][place] - offsets[frames, :, person, None]
+    weights = precision[frames][place]
+    weights = np.where((index >= 0)[..., None], weights, np.nan)
+    return PersonKeypoints(
+        pixels=np.ascontiguousarray(pixels.transpose(2, 1, 0, 3)),
+        precision=np.ascontiguousarray(weights.transpose(2, 1, 0)),
+        joints=joints[frames, person],
+    )
 
 
 class TrackCosts(NamedTuple):
@@ -72,48 +112,47 @@ def solve_segment(
     return solve_tiles(prepare_tiles(pixels, weights, rig), given, rig, costs)
 
 
-def solve_tiles(tiles: Floats, given: Floats, rig: Rig, costs: TrackCosts) -> tuple[Floats, Floats]:
+def solve_tiles(tiles: Tiles, given: Floats, rig: Rig, costs: TrackCosts) -> tuple[Floats, Floats]:
     """Return what `solve_segment` does, from the tiles of its observations."""
     frames = np.arange(len(given))
     known = np.isfinite(given[:, 0])
     columns = [np.interp(frames, frames[known], column[known]) for column in given.T]
     points = np.stack(columns, axis=-1)
     covariance = np.empty((len(points), 3, 3))
-    _solve_track(tiles, rig.depths, costs, points, covariance)
+    _solve_track(tiles, rig.depths, costs, Buffers.of(0).state, points, covariance)
     return points, covariance
 
 
-def prepare_tiles(pixels: Floats, weights: Floats, rig: Rig) -> Floats:
-    """Return tiles of one joint's observations, one lane per frame; all are used."""
+def prepare_tiles(pixels: Floats, weights: Floats, rig: Rig) -> Tiles:
+    """Return tiles (parts, cameras) of one joint's observations, one lane per frame; all used."""
     count, frames = weights.shape
-    tiles = np.empty((-(-frames // LANES), count, ROWS * LANES))
+    tiles = np.zeros((-(-frames // LANES), count), TILE)
     index = np.zeros((1, count, 1), np.int64)
-    shape = (1, count, 1, frames)
     image = pixels.reshape(1, count, 1, frames, 2)
-    _write_tiles(Observations.from_rig(rig, image, weights.reshape(shape), index), tiles)
+    precision = weights.reshape(1, count, 1, frames)
+    # One frame, one person, a "joint" per frame.
+    _write_tiles(Observations.of(rig, image, precision, index), tiles)
+    tiles["used"] = 1.0
     return tiles
 
 
 @compile_kernel
-def _write_tiles(observations: Observations, tiles: Floats) -> None:
-    """Write the tiles of a track's observations (one frame, one person, a "joint" per frame)."""
-    cameras = observations.cameras
+def _write_tiles(observations: Observations, tiles: Tiles) -> None:
+    """Write the tiles (parts, cameras) of a track's observations."""
     for part in range(len(tiles)):
-        gather(observations, part * LANES, tiles[part])
-        for camera in range(len(cameras)):
-            linearize(tiles[part, camera], cameras, camera)
-            tiles[part, camera, USED : USED + LANES] = 1.0
+        read_tile(observations, part * LANES, tiles[part])
 
 
 @compile_kernel
 def _solve_track(
-    tiles: Floats,
+    tiles: Tiles,
     depths: Floats,
     costs: TrackCosts,
+    state: Tiles,
     points: Floats,
     covariance: Floats,
 ) -> None:
-    """Minimize reprojection errors and the acceleration penalty over the points of a track.
+    """Minimize E_track over the points of a track.
 
     Observations have a Geman-McClure loss of scale `costs.limit`.
 
@@ -121,15 +160,15 @@ def _solve_track(
         tiles: tiles of `prepare_tiles`.
         depths: (cameras, 4).
         costs: weights of errors.
+        state: (1,) room for a state.
         points: (frames, 3) [m], initial values; written.
         covariance: (frames, 3, 3) [m^2], written.
     """
     frames = len(points)
     size = 3 * frames
     band, right = np.empty((size, BAND + 1)), np.empty(size)
-    state = np.empty(STATE * LANES)
     for _ in range(12):
-        _write_equations(tiles, depths, costs, points, state, band, right)
+        _write_equations(tiles, depths, costs, points, state[0], band, right)
         _factorize(band)
         _substitute(band, right)
         largest = 0.0
@@ -147,79 +186,82 @@ def _solve_track(
                 covariance[t, a, b] = covariance[t, b, a] = value
 
 
-@compile_kernel
 def held_out_cost(
-    tiles: Floats, depths: Floats, noise: tuple[float, float], limit: float, points: Floats
+    tiles: Tiles, depths: Floats, noise: tuple[float, float], limit: float, points: Floats
 ) -> float:
-    """Return the sum of the loss over the observations of a track at given points."""
-    state = np.empty(STATE * LANES)
-    total = 0.0
+    """Return E_data, summed over the observations of a track at given points."""
+    return float(_sum_costs(tiles, depths, noise, limit, points, Buffers.of(0).state))
+
+
+@compile_kernel
+def _sum_costs(
+    tiles: Tiles,
+    depths: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    points: Floats,
+    states: Tiles,
+) -> float:
+    state, total = states[0], 0.0
     for part in range(len(tiles)):
-        _place(points, part, state)
-        state[SHARPNESS : SHARPNESS + LANES] = 1.0 / limit
-        clear(state)
+        _add_part(tiles[part], depths, noise, limit, points, part, state)
         for camera in range(len(depths)):
-            tile = tiles[part, camera]
-            accumulate(tile, depths[camera], noise, state)
+            precision, errors = tiles[part, camera]["precision"], tiles[part, camera]["squared"]
             for j in range(min(LANES, len(points) - part * LANES)):
-                if tile[PRECISION + j] > 0.0:
-                    squared = tile[SQUARED + j]
+                if precision[j] > 0.0:
+                    squared = errors[j]
                     total += limit if squared == math.inf else limit * squared / (limit + squared)
     return total
 
 
 @compile_kernel
-def _place(points: Floats, part: int, state: Floats) -> None:
-    """Copy the points of one tile into its state."""
+def _add_part(
+    tiles: Tiles,
+    depths: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    points: Floats,
+    part: int,
+    state: State,
+) -> None:
+    """Write the equations of E_data of 64 frames to a state, with a loss of scale `limit`."""
     for j in range(LANES):
         t = min(part * LANES + j, len(points) - 1)
         for axis in range(3):
-            state[POINT + axis * LANES + j] = points[t, axis]
+            state["point"][axis, j] = points[t, axis]
+    state["sharpness"][:] = 1.0 / limit
+    clear(state)
+    for camera in range(len(depths)):
+        add_data(tiles[camera], depths[camera], noise, state)
 
 
 @compile_kernel
 def _write_equations(
-    tiles: Floats,
+    tiles: Tiles,
     depths: Floats,
     costs: TrackCosts,
     points: Floats,
-    state: Floats,
+    state: State,
     band: Floats,
     right: Floats,
 ) -> None:
     """Write the Gauss-Newton matrix by rows, `band[i, k]` = entry (i, i - k), and right side."""
-    noise, limit, penalty = costs.noise, costs.limit, costs.penalty
+    matrix, side = state["matrix"], state["right"]
     frames = len(points)
     band[:] = 0.0
     for part in range(len(tiles)):
-        _place(points, part, state)
-        state[SHARPNESS : SHARPNESS + LANES] = 1.0 / limit
-        clear(state)
-        for camera in range(len(depths)):
-            accumulate(tiles[part, camera], depths[camera], noise, state)
+        _add_part(tiles[part], depths, costs.noise, costs.limit, points, part, state)
         for j in range(min(LANES, frames - part * LANES)):
             i = 3 * (part * LANES + j)
-            band[i, 0] = state[MATRIX + j]
-            band[i + 1, 1] = state[MATRIX + LANES + j]
-            band[i + 2, 2] = state[MATRIX + 2 * LANES + j]
-            band[i + 1, 0] = state[MATRIX + 3 * LANES + j]
-            band[i + 2, 1] = state[MATRIX + 4 * LANES + j]
-            band[i + 2, 0] = state[MATRIX + 5 * LANES + j]
+            band[i, 0], band[i + 1, 1], band[i + 2, 2] = matrix[0, j], matrix[1, j], matrix[2, j]
+            band[i + 1, 0], band[i + 2, 1], band[i + 2, 0] = (
+                matrix[3, j],
+                matrix[4, j],
+                matrix[5, j],
+            )
             for axis in range(3):
-                right[i + axis] = state[RIGHT + axis * LANES + j]
-    for t in range(2, frames):
-        for axis in range(3):
-            i = 3 * t + axis
-            bend = points[t, axis] - 2.0 * points[t - 1, axis] + points[t - 2, axis]
-            right[i] -= penalty * bend
-            right[i - 3] += 2.0 * penalty * bend
-            right[i - 6] -= penalty * bend
-            band[i, 0] += penalty
-            band[i - 3, 0] += 4.0 * penalty
-            band[i - 6, 0] += penalty
-            band[i, 3] -= 2.0 * penalty
-            band[i - 3, 3] -= 2.0 * penalty
-            band[i, 6] += penalty
+                right[i + axis] = side[axis, j]
+    add_smoothness(points, costs.penalty, band, right)
 
 
 @compile_kernel

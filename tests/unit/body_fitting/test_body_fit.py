@@ -5,10 +5,11 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.model import BodyParameters
-from worldpose.body_fitting import windows
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.fit_quality import report_fit
-from worldpose.body_fitting.objective import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting import estimate
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.evidence import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.report import report_fit
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
 
@@ -75,7 +76,7 @@ def test_long_tracks_are_solved_in_windows_with_the_same_result(monkeypatch):
     joints[1200:1230, 0, :9] = np.nan
     evidence = ClipEvidence(joints, covariance, 50.0)
     whole = fit_bodies(MODEL, evidence, SETTINGS)
-    monkeypatch.setattr(windows, "WINDOW_FRAMES", 300)
+    monkeypatch.setattr(estimate, "WINDOW_FRAMES", 300)
     fit = fit_bodies(MODEL, evidence, SETTINGS)
     gone = np.isnan(fit.joints[:, 0, 0, 0])
     np.testing.assert_array_equal(gone, np.isnan(whole.joints[:, 0, 0, 0]))

@@ -8,10 +8,11 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.conventions import FEET
 from worldpose.body.keypoints import fold_keypoints
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.extra_points import perceived_points
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.triangulation.passes import ExtraJoints
+from worldpose.triangulation.results import ExtraJoints
 
 POINTS = fold_keypoints(MODEL, FEET)
 SETTINGS = BodyFittingSettings()

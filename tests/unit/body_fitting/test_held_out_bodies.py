@@ -9,11 +9,12 @@ from walking_bodies import KEYPOINTS, MODEL, walker
 
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
-from worldpose.body_fitting.fit_quality import SeenClip, compare_held_out
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.held_out import SeenClip, compare_held_out
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 SETTINGS = BodyFittingSettings()

@@ -7,7 +7,7 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.model import BodyParameters
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.monocular import (
     PRIOR_SPREAD,
     MonocularPoses,
@@ -18,6 +18,7 @@ from worldpose.body_fitting.monocular import (
     read_monocular,
 )
 from worldpose.body_fitting.pose_space import GATHER
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera

@@ -5,13 +5,9 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.objective import (
-    Contacts,
-    Evidence,
-    Pose,
-    Track,
-)
+from worldpose.body_fitting.evidence import Contacts, PersonEvidence
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
+from worldpose.body_fitting.residuals import PersonObjective, Pose
 from worldpose.body_fitting.settings import BodyFittingSettings
 
 
@@ -23,9 +19,11 @@ def track():
     joints[1, 0, 4] = np.nan
     settings = BodyFittingSettings()
     contacts = Contacts(np.ones((5, 2)), np.ones((4, 2)), np.full((5, 2), 0.07))
-    evidence = Evidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
+    evidence = PersonEvidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
     chained = ChainedKeypoints.of(KEYPOINTS)
-    made = Track(chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts)
+    made = PersonObjective(
+        chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts
+    )
     angles = truth.body_pose @ GATHER.T + 0.1 * rng.standard_normal((5, 30))
     pose = Pose(truth.transl + 0.01, truth.global_orient, angles, truth.betas[0])
     return made, pose

@@ -10,8 +10,8 @@ from scipy.special import chdtri
 from walking_bodies import KEYPOINTS, MODEL, walker
 
 from worldpose.body.model import BodyParameters
+from worldpose.body_fitting.evidence import ankle_height
 from worldpose.body_fitting.monocular import parse_monocular
-from worldpose.body_fitting.objective import ankle_height
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid

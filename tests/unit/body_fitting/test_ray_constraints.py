@@ -8,10 +8,11 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.model import BodyParameters
-from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.ray_constraints import (
     find_ray_constraints,
 )
+from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 
 CAMERA = broadcast(1)

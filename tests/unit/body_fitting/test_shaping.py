@@ -7,11 +7,12 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.pose_space import load_pose_prior
+from worldpose.body_fitting.poses import PoseSolver
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.solver import Solver, fit_shapes, spread_intervals
+from worldpose.body_fitting.shapes import fit_shapes, spread_intervals
 
 SETTINGS = BodyFittingSettings()
-SOLVER = Solver(ChainedKeypoints.of(KEYPOINTS), load_pose_prior(), SETTINGS, None)
+SOLVER = PoseSolver(ChainedKeypoints.of(KEYPOINTS), load_pose_prior(), SETTINGS, None)
 
 
 def height(betas):

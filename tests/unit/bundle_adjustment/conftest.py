@@ -7,7 +7,7 @@ from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.residuals import AdjustmentProblem
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import PARAMETERS, step_camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 

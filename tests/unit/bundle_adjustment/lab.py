@@ -14,7 +14,7 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 FPS = 25.0

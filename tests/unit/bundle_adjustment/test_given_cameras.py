@@ -10,7 +10,7 @@ from lab import joint_error, make_lab, triangulated
 from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 
 CASES = {
     "exact": {},

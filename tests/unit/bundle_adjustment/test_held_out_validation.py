@@ -14,7 +14,7 @@ from worldpose.bundle_adjustment.held_out_validation import (
 )
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 
 
 def test_true_cameras_are_judged_by_the_noise_alone(clip):

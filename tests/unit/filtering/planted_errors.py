@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldpose.body_fitting.objective import perceived_joints
+from worldpose.body_fitting.evidence import perceived_joints
 from worldpose.filtering.judging import TriangulatedDetections, view_bodies
 from worldpose.geometry.cameras import Camera
 from worldpose.simulation.scenarios import SCENARIOS

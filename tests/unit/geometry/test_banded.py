@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from worldpose.body_fitting.objective import UNKNOWNS
-from worldpose.body_fitting.solver import factor
+from worldpose.body_fitting.poses import factor
+from worldpose.body_fitting.residuals import UNKNOWNS
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
 

@@ -8,7 +8,7 @@ from test_pose2sim_import import person, write_frame
 from data_contracts.conventions import FEET
 from data_contracts.ingest import INGEST
 from data_contracts.keypoints import KeypointDetections
-from tasks.clip_inputs import StoredArray, _align_points
+from tasks.clip_inputs import StoredFeedback, open_detections
 from worldpose.errors import InputError
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
@@ -109,11 +109,11 @@ def test_a_store_keeps_them_and_labels_them():
 
 def test_a_clip_aligns_the_points_of_its_cameras():
     one, two, plain = people(), people(points=FEET[:3], seed=1), people(seed=2).with_points(())
-    clips, points = _align_points([stored(one), stored(two), stored(plain)])
-    assert points == FEET
-    read = StoredArray(clips, "extra_keypoints")[:]
+    clips = [stored(each) for each in (one, two, plain)]
+    opened = open_detections(clips, one.frame, StoredFeedback(clips))
+    assert opened.points == FEET
+    read = opened[:].extra_keypoints
     np.testing.assert_array_equal(read[:, 0], one.extra_keypoints)
     np.testing.assert_array_equal(read[:, 1, :, :3], two.extra_keypoints)
     assert np.isnan(read[:, 1, :, 3:]).all() and np.isnan(read[:, 2]).all()
-    clips, points = _align_points([stored(plain)])
-    assert points == () and "extra_keypoints" not in clips[0]
+    assert open_detections(clips[2:], plain.frame, StoredFeedback(clips[2:])).points == ()

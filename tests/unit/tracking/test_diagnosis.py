@@ -1,5 +1,6 @@
 """Each reason for finding no person is diagnosed from the detections, with numbers."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -62,7 +63,8 @@ def test_detections_with_too_few_keypoints(ring, people, seen):
     keypoints, confidence = seen(ring(4), walk(people))
     keypoints[..., 4:, :] = np.nan
     found = reason(ring(4), keypoints, confidence)
-    assert (found.cause, found.evidence["keypoints"]) == ("too_few_keypoints", 4)
+    assert found.cause == "too_few_keypoints"
+    assert "1280 detections has 4 keypoints" in found.message
     assert "min_joints asks for 5" in found.message
 
 
@@ -88,8 +90,8 @@ def test_cameras_side_by_side(ring, people, seen):
     found = reason(cameras, *seen(cameras, walk(people), noise=0.3))
     assert found.cause == "narrow_angle"
     # 0.46 m at 30 m: 0.88 degrees.
-    assert found.evidence["angle_deg"] == pytest.approx(0.88, rel=0.2)
-    assert found.evidence["cameras_apart_m"] == pytest.approx(0.46)
+    angle = float(re.search(r"meet at ([0-9.]+) degrees", found.message)[1])
+    assert angle == pytest.approx(0.88, rel=0.2)
     assert "0.46 m apart" in found.message
     assert "asks for 5.7 (0.1 rad)" in found.message
 
@@ -101,7 +103,8 @@ def test_translations_in_another_unit(ring, people, seen, factor, unit):
     keypoints, confidence = seen(ring(4), walk(people))
     found = reason(moved(ring(4), factor * ring(4).center), keypoints, confidence, ground=False)
     assert found.cause == "wrong_size"
-    assert found.evidence["size"] == pytest.approx(factor, rel=0.1)
+    size = float(re.search(r"these are ([0-9.e+]+) times", found.message)[1])
+    assert size == pytest.approx(factor, rel=0.1)
     assert unit in found.message
 
 
@@ -110,7 +113,8 @@ def test_a_world_whose_zero_is_not_the_ground(ring, people, seen):
     raised = moved(ring(4), ring(4).center + [0.0, 0.0, 4.0])
     found = reason(raised, keypoints, confidence)
     assert found.cause == "wrong_height"
-    assert found.evidence["height_m"] == pytest.approx(5.1, abs=0.2)
+    height = float(re.search(r"at z = ([0-9.]+) m", found.message)[1])
+    assert height == pytest.approx(5.1, abs=0.2)
 
 
 def test_a_clock_that_is_off(ring, people, seen):
@@ -128,7 +132,7 @@ def test_a_clock_that_is_off(ring, people, seen):
         SETTINGS,
     )
     found = diagnose_no_people(*given, ground=True)
-    assert (found.cause, found.evidence["shift_frames"]) == ("clock", late)
+    assert found.cause == "clock"
     assert f"by {abs(late)}" in found.message
 
 

@@ -3,7 +3,7 @@ import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import (
+from worldpose.triangulation.estimate import (
     MARGIN,
     learn_clip,
     reconstruct_chunks,

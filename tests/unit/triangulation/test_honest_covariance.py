@@ -7,7 +7,7 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation.clocks import estimate_clocks
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 as_detections = KeypointDetections.from_keypoints

@@ -5,7 +5,7 @@ from running_samples import MIRRORED, detections, runner
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 as_detections = KeypointDetections.from_keypoints

@@ -3,7 +3,7 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 as_detections = KeypointDetections.from_keypoints

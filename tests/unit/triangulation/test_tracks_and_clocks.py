@@ -2,9 +2,8 @@ import numpy as np
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import reconstruct_joints
 from worldpose.triangulation.clocks import estimate_clocks
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import smooth_joints
 

@@ -5,8 +5,7 @@ import pytest
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.chunking import reconstruct_joints
-from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
 NOISE = 2.0

@@ -47,7 +47,7 @@ _Step = tuple[Floats, Floats, Floats, Floats]
 
 
 @dataclass(eq=False)
-class Track:
+class PlaneTrack:
     """One person while the filter runs; the state is place and velocity (4,) [m, m/s]."""
 
     state: Floats

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats, Singles
 from worldpose.tracking.plane.feet import FrameBlocks, GroundPositions
-from worldpose.tracking.plane.kalman import Motion, Track, compare
+from worldpose.tracking.plane.kalman import Motion, PlaneTrack, compare
 from worldpose.tracking.plane.paths import (
     MIN_TRACK_S,
     PlanePath,
@@ -113,8 +113,8 @@ def track_on_plane(
     motion = Motion.at(fps)
     shirts = _learn_shirts(positions)
     is_seen = positions.number_seen() > 0
-    running: list[Track] = []
-    ended: list[Track] = []
+    running: list[PlaneTrack] = []
+    ended: list[PlaneTrack] = []
     for frame in range(frames):
         for track in running:
             track.predict(motion)
@@ -211,7 +211,7 @@ def locate_tracks(
         if triangulated_xy is not None and (index >= 0).any():
             fixed = triangulated_xy[:, person]
         seen = np.flatnonzero((index >= 0).any(axis=1) | np.isfinite(fixed[:, 0]))
-        track: Track | None = None
+        track: PlaneTrack | None = None
         for frame in range(seen[0], seen[-1] + 1) if len(seen) else ():
             if track is not None:
                 track.predict(motion)
@@ -229,16 +229,16 @@ def locate_tracks(
 
 
 def _sight(
-    track: Track | None, sight: tuple[Floats, Floats], frame: int, clock: float = 0.0
-) -> Track:
+    track: PlaneTrack | None, sight: tuple[Floats, Floats], frame: int, clock: float = 0.0
+) -> PlaneTrack:
     """Return the track after a place and its covariance were seen; a new one without a track."""
     if track is None:
-        return Track.start(*sight, frame)
+        return PlaneTrack.start(*sight, frame)
     track.correct(*sight, clock)
     return track
 
 
-def _is_lost(track: Track, frame: int, dt: float) -> bool:
+def _is_lost(track: PlaneTrack, frame: int, dt: float) -> bool:
     """Return whether a track ends; a new one soon, because it may be a part of another person."""
     if track.person < 0 and track.seen * dt < MIN_TRACK_S:
         return (frame - track.last_whole) * dt > 0.2
@@ -256,7 +256,7 @@ def _learn_shirts(positions: GroundPositions) -> list[ShirtModel | None]:
 
 
 def _update(
-    tracks: list[Track],
+    tracks: list[PlaneTrack],
     positions: GroundPositions,
     image: tuple[int, int],
     clock: float,
@@ -291,7 +291,7 @@ def _update(
                 track = unseen[pairs[column]]
                 track.correct(places[column], noise[column], clock)
             elif is_whole:
-                track = Track.start(places[column], noise[column], frame)
+                track = PlaneTrack.start(places[column], noise[column], frame)
                 tracks.append(track)
             else:
                 continue
@@ -303,7 +303,7 @@ def _update(
 
 
 def _match(
-    tracks: list[Track],
+    tracks: list[PlaneTrack],
     places: Floats,
     noise: Floats,
     clock: float,
@@ -329,7 +329,7 @@ def _match(
     return [(int(row), int(column)) for row, column in pairs if near[row, column]]
 
 
-def _follow_triangulated(tracks: list[Track], places: Floats, frame: int) -> None:
+def _follow_triangulated(tracks: list[PlaneTrack], places: Floats, frame: int) -> None:
     """Correct the tracks of triangulated people; one who has none takes a track nearby."""
     followed = {track.person: track for track in tracks if track.person >= 0}
     here = np.flatnonzero(np.isfinite(places[:, 0])).tolist()

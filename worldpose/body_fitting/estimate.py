@@ -1,13 +1,21 @@
-"""Bodies of every person of a clip: shape, then position, orientation and angles per frame.
+"""Order of body fitting (S1-S4): the objective is in `residuals`.
 
-Quality metrics of a fit need no ground truth.
+1. Shapes, from bone lengths, then together with the detector's offsets and coarse poses of some
+   seconds of each person (`shapes`).
+2. Offsets of points besides COCO-17, from the poses of two seconds (`extra_points`).
+3. Poses of all frames with fixed shapes and offsets, in windows (`poses`): from hips and torso, by
+   Gauss-Newton steps; feet stand from the middle of the steps on.
+4. Poses again, of people with few well-determined joints, towards monocular poses (`monocular`).
+5. Covariance of the keypoints; gaps that are too long are dropped.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +24,10 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
-from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body.model import BodyModel
 from worldpose.body_fitting.bones import Shape
+from worldpose.body_fitting.evidence import Ground, PersonEvidence, random_covariance
 from worldpose.body_fitting.extra_points import (
-    ExtraFit,
-    PointArrays,
     PointModel,
     densest_interval,
     feet_determined,
@@ -28,194 +35,16 @@ from worldpose.body_fitting.extra_points import (
     learn_points,
     select_points,
 )
-from worldpose.body_fitting.monocular import MonocularPoses, MonocularPrior, monocular_priors
-from worldpose.body_fitting.objective import Evidence, Ground
+from worldpose.body_fitting.monocular import MonocularPrior, monocular_priors
 from worldpose.body_fitting.pose_space import load_pose_prior, nearest_matrices
-from worldpose.body_fitting.ray_constraints import RayConstraints
+from worldpose.body_fitting.poses import PoseSolver, pose_covariance
+from worldpose.body_fitting.results import BodyFit, ClipEvidence, EvidenceSource, FittedArrays
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.solver import (
-    FittedArrays,
-    Shapes,
-    Solver,
-    fit_shapes,
-    pose_covariance,
-    spread_intervals,
-)
-from worldpose.body_fitting.windows import long_gaps, split_windows, trim_people
+from worldpose.body_fitting.shapes import Shapes, fit_shapes, spread_intervals
 from worldpose.compiled import map_in_threads
-from worldpose.errors import InputError
-from worldpose.triangulation.passes import ExtraJoints
 
-
-@dataclass(frozen=True, eq=False)
-class BodyFit:
-    """Bodies of one clip.
-
-    Attributes:
-        betas: (persons, shapes); NaN for a person without any joint.
-        parameters: (frames, persons), NaN where a person is missing.
-        betas_covariance: (persons, shapes, shapes).
-        joints: (frames, persons, 17, 3) [m], world: COCO-17 keypoints of the bodies.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: poses by the objective, the
-            detector's offsets, each person's own, and different joint definitions of detector and
-            body model: offsets and shape together follow the detector.
-        filled: (frames, persons), bodies in frames without any joint of theirs.
-        guided: (frames, persons), bodies fitted with a monocular pose.
-        offsets: (17, 3) [m] forward, left and up: from a body's joints to the detector's.
-        extra: points besides COCO-17; None without evidence about any.
-    """
-
-    betas: Floats
-    parameters: BodyParameters
-    betas_covariance: Floats
-    joints: Floats
-    covariance: Floats
-    filled: NDArray[np.bool_]
-    guided: NDArray[np.bool_]
-    offsets: Floats
-    extra: ExtraFit | None = None
-
-    @classmethod
-    def of(cls, arrays: FittedArrays, shapes: Shapes) -> BodyFit:
-        """Return the fit of complete arrays."""
-        betas = np.broadcast_to(arrays.betas, (*arrays.orient.shape[:2], arrays.betas.shape[-1]))
-        return cls(
-            arrays.betas,
-            BodyParameters(betas, arrays.orient, arrays.body_pose, arrays.transl),
-            arrays.betas_covariance,
-            arrays.joints,
-            arrays.covariance,
-            arrays.filled,
-            arrays.guided,
-            shapes.offsets,
-        )
-
-    def __getitem__(self, frames: slice) -> BodyFit:
-        """Return the bodies in some frames."""
-        return self._join([self], frames)
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[BodyFit]) -> BodyFit:
-        """Return the bodies of consecutive parts of a clip."""
-        return cls._join(parts, slice(None))
-
-    @staticmethod
-    def _join(parts: Sequence[BodyFit], frames: slice) -> BodyFit:
-        def join(name: str, of: Sequence[object] = parts) -> NDArray[Any]:
-            return np.concatenate([getattr(part, name)[frames] for part in of])
-
-        first = parts[0]
-        moving = [part.parameters for part in parts]
-        names = ("betas", "global_orient", "body_pose", "transl")
-        points = [part.extra for part in parts if part.extra is not None]
-        return replace(
-            first,
-            parameters=BodyParameters(*(join(name, moving) for name in names)),
-            joints=join("joints"),
-            covariance=join("covariance"),
-            filled=join("filled"),
-            guided=join("guided"),
-            extra=replace(
-                points[0], joints=join("joints", points), covariance=join("covariance", points)
-            )
-            if points
-            else None,
-        )
-
-
-class EvidenceSource(Protocol):
-    """Evidence about the bodies of a clip that is read by frames: a long clip exceeds memory."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Number of frames and of persons."""
-
-    @property
-    def fps(self) -> float:
-        """Frames per second [1/s]."""
-
-    def read_joints(self, frames: slice) -> ClipEvidence:
-        """Return the triangulated joints and points of some frames."""
-
-    def read(self, frames: slice) -> ClipEvidence:
-        """Return all evidence in some frames."""
-
-
-@dataclass(frozen=True, eq=False)
-class ClipEvidence:
-    """Evidence about the bodies of one clip.
-
-    Attributes:
-        joints: (frames, persons, 17, 3) [m], world, COCO-17; NaN where missing.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`.
-        fps: [1/s].
-        common_bias: (17,) per axis, error that all views share [m]; None = none.
-        ray_constraints: lines of sight of joints that are not triangulated, for the same frames and
-            persons; a person without joints is present as long as these last.
-        monocular_poses: poses of the same frames and persons, used where few joints are well
-            determined (S4).
-        shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
-            joints of a person together: no number of joints reduces it. NaN = unknown in this
-            frame; None = none.
-        extra: points besides COCO-17 of the same frames and persons; None = none.
-
-    Raises:
-        InputError: the shapes do not match.
-    """
-
-    joints: Floats
-    covariance: Floats
-    fps: float
-    common_bias: Floats | None = None
-    ray_constraints: Sequence[RayConstraints] = ()
-    monocular_poses: MonocularPoses | None = None
-    shared_covariance: Floats | None = None
-    extra: ExtraJoints | None = None
-
-    def __post_init__(self) -> None:
-        shape = self.joints.shape
-        if len(shape) != 4 or shape[2:] != (17, 3) or self.covariance.shape != (*shape, 3):
-            raise InputError(
-                "body fitting",
-                expected="joints (frames, persons, 17, 3), covariance (frames, persons, 17, 3, 3)",
-                found=f"{shape} and {self.covariance.shape}",
-                todo="Give triangulated joints with their covariance.",
-            )
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Number of frames and of persons."""
-        frames, persons = self.joints.shape[:2]
-        return frames, persons
-
-    @property
-    def bias(self) -> Floats:
-        """(17,) per axis, error that all views share [m]; 0 where none is known."""
-        return np.zeros(17) if self.common_bias is None else self.common_bias
-
-    @property
-    def joint_seen(self) -> Flags:
-        """(frames, persons, 17), joints with a covariance."""
-        return np.asarray(
-            np.isfinite(self.joints).all(-1) & np.isfinite(self.covariance).all((-1, -2))
-        )
-
-    def read_joints(self, frames: slice) -> ClipEvidence:
-        """Return the evidence in some frames."""
-        return self.read(frames)
-
-    def read(self, frames: slice) -> ClipEvidence:
-        """Return the evidence in some frames."""
-        monocular, shared, extra = self.monocular_poses, self.shared_covariance, self.extra
-        return replace(
-            self,
-            joints=self.joints[frames],
-            covariance=self.covariance[frames],
-            ray_constraints=[view[frames] for view in self.ray_constraints],
-            monocular_poses=None if monocular is None else monocular[frames],
-            shared_covariance=None if shared is None else shared[frames],
-            extra=None if extra is None else extra[frames],
-        )
+WINDOW_FRAMES: Final = 3000
+"""Frames that are solved together: a person's equations take 60 KB per frame."""
 
 
 def fit_bodies(
@@ -256,7 +85,7 @@ def fit_in_windows(
     """
     clip = _learn_clip(
         evidence,
-        Solver(
+        PoseSolver(
             ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
         ),
         known_shapes or {},
@@ -267,7 +96,7 @@ def fit_in_windows(
 
 
 def _learn_clip(
-    evidence: EvidenceSource, solver: Solver, known_shapes: Mapping[int, Shape]
+    evidence: EvidenceSource, solver: PoseSolver, known_shapes: Mapping[int, Shape]
 ) -> _ClipBodies:
     """Return the shapes and offsets of a clip."""
     (frames, persons), fps = evidence.size, evidence.fps
@@ -353,7 +182,7 @@ class _ClipBodies:
         points: points besides COCO-17; None without evidence about any.
     """
 
-    solver: Solver
+    solver: PoseSolver
     shapes: Shapes
     spans: Mapping[int, slice]
     fps: float
@@ -375,19 +204,18 @@ class _ClipBodies:
             if (last := min(span.stop, window.stop)) > max(span.start, window.start)
         }
         people, present = _gather_evidence(evidence, covariance, spans, settings)
-        extra = points = None
+        model = self.solver.chained.model
+        result = FittedArrays.empty(model, *evidence.size)
         if self.points is not None and evidence.extra is not None:
-            extra = PointArrays.empty(self.points, *evidence.size)
-            points = select_points(evidence.extra, self.points.points)
+            result = replace(result, extra=self.points.empty_fit(*evidence.size))
+            extra = select_points(evidence.extra, self.points.points)
             people = {
-                person: self.points.add(person, own, points[spans[person]], fps)
+                person: self.points.add(person, own, extra[spans[person]], fps)
                 for person, own in people.items()
             }
         core = slice(kept.start - window.start, kept.stop - window.start)
         spans, people = trim_people(spans, people, core.start, core.stop)
         solver = self.solver if self.points is None else self.points.solver
-        model = self.solver.chained.model
-        result = FittedArrays.empty(model, *evidence.size)
 
         def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
             own, span = people[person], spans[person]
@@ -401,8 +229,10 @@ class _ClipBodies:
             bodies = result.put(
                 solver, person, span, pose, (places[:, :17], spread), self.shapes, determined
             )
-            if extra is not None:
-                extra.put(person, span, bodies, random[:, 17:])
+            if self.points is not None and result.extra is not None:
+                keypoints = fold_keypoints(model, self.points.points)
+                result.extra.joints[span, person] = keypoints(bodies)
+                result.extra.covariance[span, person] = random[:, 17:] + self.points.systematic
 
         for _ in map_in_threads(fit_person, spans):
             pass
@@ -423,15 +253,15 @@ class _ClipBodies:
             gone = long_gaps(present[span, person], settings.max_filled_gap_s * fps)
             shared = evidence.shared_covariance
             moving = None if shared is None else nearest_matrices(shared[span, person])[:, None]
-            for arrays in (result,) if extra is None else (result, extra):
-                arrays.drop(person, span, gone)
-                if moving is not None:
-                    arrays.covariance[span, person] += moving
+            result.drop(person, span, gone)
+            if moving is not None:
+                result.covariance[span, person] += moving
+                if result.extra is not None:
+                    result.extra.covariance[span, person] += moving
         for person in self.spans:  # also of people who are not in this window
             result.betas[person] = self.shapes.people[person].betas
             result.betas_covariance[person] = self.shapes.people[person].covariance
         fit = BodyFit.of(result, self.shapes)
-        fit = fit if extra is None else replace(fit, extra=extra.fit())
         return fit if kept == window else fit[core]
 
 
@@ -440,15 +270,16 @@ def _gather_evidence(
     covariance: Floats,
     spans: Mapping[int, slice],
     settings: BodyFittingSettings,
-) -> tuple[dict[int, Evidence], Flags]:
+) -> tuple[dict[int, PersonEvidence], Flags]:
     """Return each person's joints and lines of sight, and the frames (frames, persons) with any."""
     fps, present = evidence.fps, np.asarray(evidence.joint_seen.any(-1))
     for view in evidence.ray_constraints:
         present = present | view.seen
 
-    def gather(person: int) -> Evidence:
+    def gather(person: int) -> PersonEvidence:
         span = spans[person]
-        own = Evidence.of(evidence.joints[span, person], covariance[span, person], fps, settings)
+        joints = evidence.joints[span, person]
+        own = PersonEvidence.of(joints, covariance[span, person], fps, settings)
         for view in evidence.ray_constraints:
             points, across = view.points[span, person], view.across[span, person]
             own = own.add_rays(points, across, fps, settings)
@@ -458,18 +289,43 @@ def _gather_evidence(
     return by_person, present
 
 
-def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
-    """Return the covariance of joints without most of the bias that the shared offsets model.
+def split_windows(
+    frames: int, fps: float, settings: BodyFittingSettings
+) -> Iterator[tuple[slice, slice]]:
+    """Yield frames that are solved together, and those of them that are kept."""
+    # Motion ties a pose to those within some tenths of a second.
+    margin = math.ceil(max(3.0, 2.0 * settings.max_filled_gap_s) * fps)
+    size = max(WINDOW_FRAMES, 2 * margin)
+    starts = range(0, frames, size) if frames > size + margin else (0,)
+    for start in starts:
+        stop = start + size if len(starts) > 1 and start + size < frames else frames
+        first, last = max(0, start - margin), min(frames, stop + margin)
+        yield slice(first, last), slice(start, stop)
 
-    It is that of joints where the detector sees them.
 
-    Args:
-        covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
-        common_bias: (17,) per axis [m], included in `covariance`.
+def trim_people(
+    spans: Mapping[int, slice], people: Mapping[int, PersonEvidence], first: int, last: int
+) -> tuple[dict[int, slice], dict[int, PersonEvidence]]:
+    """Return frames and evidence of people from their first observation in a window to the last.
+
+    People without any observation in the frames from `first` to `last` are left out.
     """
-    # 1 cm per axis stays; the shared offsets model the rest.
-    modelled = np.maximum(common_bias**2 - 0.01**2, 0.0)
-    random = covariance.astype(np.float64)
-    for axis in range(3):
-        random[..., axis, axis] -= modelled
-    return random
+    trimmed, evidence = {}, {}
+    for person, span in spans.items():
+        here = np.flatnonzero(people[person].known.any(axis=1))
+        if ((here + span.start >= first) & (here + span.start < last)).any():
+            own = slice(int(here[0]), int(here[-1]) + 1)
+            trimmed[person] = slice(span.start + own.start, span.start + own.stop)
+            its = people[person]
+            evidence[person] = PersonEvidence(its.joints[own], its.information[own])
+    return trimmed, evidence
+
+
+def long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:
+    """Return the frames in gaps of more than `max_frames` frames."""
+    places = np.flatnonzero(seen)
+    long = np.zeros(len(seen), dtype=bool)
+    for first, last in itertools.pairwise(places):
+        if last - first - 1 > max_frames:
+            long[first + 1 : last] = True
+    return long

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.records import Record
+from worldpose.triangulation.solve import SolvedJoints
 
 LEAST: Final = 1e-7
 WIDTH: Final = 0.005
@@ -139,6 +140,38 @@ class Agreement:
             noise_factor=noise_factor,
             misplacement_m=tuple(each.median for each in self.misplaced),
         )
+
+
+def count_agreement(
+    solved: SolvedJoints,
+    covariance: Floats,
+    index: NDArray[np.integer],
+    exchanged: NDArray[np.bool_],
+    misplaced: tuple[Histogram, ...],
+) -> Agreement:
+    """Return the agreement between the views of some frames."""
+    views, seen = solved.views, solved.seen
+    found = views > 0
+    used = seen & found[:, None]
+    trace = np.einsum("...ii", covariance)[found]
+    return Agreement(
+        found=int(found.sum()),
+        undetermined=int((seen.any(axis=1) & ~found).sum()),
+        seen=int(np.count_nonzero(seen)),
+        views=int(views[found].sum(dtype=np.int64)),
+        used=_by_camera(used),
+        agreed=_by_camera(solved.inliers),
+        error=Histogram.of(solved.reprojection_error[found]),
+        deviation=Histogram.of(np.sqrt(trace)),
+        people=_by_camera(np.asarray(index >= 0)),
+        exchanged=_by_camera(np.asarray(exchanged.any(axis=-1))),
+        misplaced=misplaced,
+    )
+
+
+def _by_camera(there: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the number of true entries of (frames, cameras, ...), by camera."""
+    return np.array([np.count_nonzero(there[:, c]) for c in range(there.shape[1])], np.int64)
 
 
 @dataclass(frozen=True, eq=False)
