@@ -251,7 +251,7 @@ def test_a_still_of_another_size_is_said_at_its_field(place, footage, tmp_path):
     content = a_match(video["name"], camera={"still": video["name"]})
     ada.post(f"{DRAFTS}/{draft}/files/{still['id']}/removal", json={})
     (problem,) = save(ada, view, content).json()["problems"]
-    assert "expected a PNG or JPEG image" in problem["message"]
+    assert "expected an image of at most" in problem["message"]
 
 
 def test_frames_of_an_uploaded_video_are_shown(place, footage):

@@ -203,11 +203,11 @@ def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -
     rotations = np.array([camera.rotation for camera in cameras])
     centers = -np.einsum("cij,ci->cj", rotations, [camera.translation for camera in cameras])
     distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
-    if distance == 0.0:
+    if not centers.any() and (rotations == np.eye(3)).all():
         raise InputError(
             f"{path}: translation",
-            expected="cameras at different places",
-            found="all at one place: a calibration before the poses were found",
+            expected="the poses of the cameras",
+            found="zero in all: a calibration before the poses were found",
             todo="Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
             "cameras by clicks or by worldpose locate-cameras.",
         )

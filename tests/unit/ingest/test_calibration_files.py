@@ -235,3 +235,11 @@ def test_entities_are_refused_in_any_encoding(tmp_path):
     path.write_bytes(text.encode("utf-16"))
     with pytest.raises(InputError, match="a document type"):
         read_calibration(path)
+
+
+def test_poses_that_are_all_zero_are_told_to_be_lenses(tmp_path, make_camera):
+    zero = {"rotation": tuple(map(tuple, np.eye(3).tolist())), "translation": (0.0, 0.0, 0.0)}
+    cameras = {n: make_camera(n, 0.1).model_copy(update=zero) for n in ("a", "b")}
+    write_calibration_toml(tmp_path / "c.toml", cameras)
+    with pytest.raises(InputError, match="found zero in all: .* worldpose import --lens"):
+        read_calibration(tmp_path / "c.toml")

@@ -264,7 +264,7 @@ def test_a_bad_entry_is_refused_with_its_place(tmp_path, form, old, new, message
             "board that stands or lies",
         ),
         ({"translation": np.array([1.0, 2.0])}, r"translation: expected numbers of shape \(3,\)"),
-        ({"translation": np.zeros(3)}, "all at one place"),
+        ({"translation": np.zeros(3)}, "positions in millimetres"),
     ],
 )
 def test_a_bad_opencap_file_is_refused(tmp_path, changes, message):
