@@ -241,5 +241,5 @@ def test_poses_that_are_all_zero_are_told_to_be_lenses(tmp_path, make_camera):
     zero = {"rotation": tuple(map(tuple, np.eye(3).tolist())), "translation": (0.0, 0.0, 0.0)}
     cameras = {n: make_camera(n, 0.1).model_copy(update=zero) for n in ("a", "b")}
     write_calibration_toml(tmp_path / "c.toml", cameras)
-    with pytest.raises(InputError, match="found zero in all: .* worldpose import --lens"):
+    with pytest.raises(InputError, match=r"found zero in all: .* worldpose import --lens"):
         read_calibration(tmp_path / "c.toml")
