@@ -9,6 +9,7 @@ PREFECT_SERVER_API_AUTH_STRING is set. This one does not start without it.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import gc
 import os
 import resource
@@ -20,16 +21,24 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from starlette.datastructures import Headers
+
 from flows.orchestration.prefect_environment import SERVER_LOGIN
-from flows.web.host_guard import HostGuard
+from flows.web.host_guard import SAFE_METHODS, HostGuard
 from flows.web.http_server import serve_http
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_CONNECTIONS: Final = 1000
 """Maximum open connections: every run and every one of its workers has several."""
+BUSY: Final = 503
+REPETITIONS: Final = 8
+"""Repetitions of a request that the busy database refused; with the pauses below they last 4 s
+without their own time."""
+PAUSE_SECONDS: Final = 0.5
+"""Pause before each repetition [s]."""
 
 
 def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
@@ -57,7 +66,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     app = create_app(ephemeral=is_embedded, final=True)
     gc.freeze()
     gc.enable()
-    return HostGuard(app, names)
+    return HostGuard(RepeatBusy(app), names)
 
 
 def _let_dashboard_be_written() -> None:
@@ -86,6 +95,63 @@ def serve(host: str, port: int, names: Iterable[str]) -> None:
         server_header=False,
         timeout_graceful_shutdown=2,
     )
+
+
+class RepeatBusy:
+    """ASGI middleware that repeats changes of browsers that Prefect refuses.
+
+    SQLite has one writer. A transaction that reads and then writes fails at once if another one
+    wrote in between, and Prefect then answers 503. Prefect's clients retry; its dashboard reports
+    an error, and the run or schedule that a person submitted does not exist.
+
+    Args:
+        app: Prefect's server, which has undone all that a refused request had written.
+        pause_s: pause before each repetition [s].
+    """
+
+    def __init__(self, app: ASGIApp, pause_s: float = PAUSE_SECONDS) -> None:
+        self.app, self.pause_s = app, pause_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request; only browsers send `Sec-Fetch-Mode`."""
+        is_change = scope["type"] == "http" and scope["method"] not in SAFE_METHODS
+        if not is_change or "sec-fetch-mode" not in Headers(scope=scope):
+            await self.app(scope, receive, send)
+            return
+        body: list[Message] = []
+        while not body or body[-1].get("more_body", False):
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return
+            body.append(message)
+        for left in range(REPETITIONS, -1, -1):
+            if not await self._is_refused(scope, body, receive, send, may_repeat=left > 0):
+                return
+            await asyncio.sleep(self.pause_s)
+
+    async def _is_refused(
+        self, scope: Scope, body: list[Message], receive: Receive, send: Send, *, may_repeat: bool
+    ) -> bool:
+        """Ask Prefect once; withhold an answer after which to repeat, and return True then."""
+        unread = iter(body)
+        is_refused = False
+
+        async def read() -> Message:
+            return next(unread, None) or await receive()
+
+        async def answer(message: Message) -> None:
+            nonlocal is_refused
+            if message["type"] == "http.response.start":
+                is_refused = may_repeat and message["status"] == BUSY
+            if not is_refused:
+                await send(message)
+
+        try:
+            await self.app(dict(scope), read, answer)
+        except Exception:  # of the database, raised once more after it was answered
+            if not is_refused:
+                raise
+        return is_refused
 
 
 def main() -> None:
