@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "method").glob("*.md"))
-NAME = re.compile(r"`(worldpose\.[\w.]+)`")
+NAME = re.compile(r"`((?:worldpose|tasks|flows)\.[\w.]+)`")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

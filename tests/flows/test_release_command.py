@@ -16,12 +16,18 @@ pytestmark = pytest.mark.usefixtures("server")
 
 
 @pytest.fixture(scope="module")
-def exporting(tiny_run, tmp_path_factory):
+def project(tiny_run, tmp_path_factory):
+    """A copy of the project, since a release pins its run."""
+    return shutil.copytree(tiny_run, tmp_path_factory.mktemp("pinned") / "project")
+
+
+@pytest.fixture(scope="module")
+def exporting(project, tmp_path_factory):
     """Arguments of an export of the tiny match as a release."""
     licence = tmp_path_factory.mktemp("licence") / "LICENCE.txt"
     licence.write_text("For tests alone.\n")
     forms = [word for form in ("worldpose", "coco", "joints") for word in ("--format", form)]
-    release = ("--release", "first", "--licence", licence, "--project", tiny_run)
+    release = ("--release", "first", "--licence", licence, "--project", project)
     return ("export", TINY, *forms, *release)
 
 
@@ -65,8 +71,8 @@ def test_a_release_passes_its_check_and_a_changed_one_fails_by_name(released, tm
     assert "transposed_rotation: R is world_from_cam" in worldpose("check", spoilt).out
 
 
-def test_the_run_of_a_release_is_never_collected(released, tiny_run):
-    store = Store.open(tiny_run)
+def test_the_run_of_a_release_is_never_collected(released, project):
+    store = Store.open(project)
     manifest = json.loads((released / "manifest.json").read_text())
     match, run = manifest["match_id"], manifest["run_id"]
     assert [(pin.name, pin.run_id) for pin in list_pins(store.blobs, match)] == [

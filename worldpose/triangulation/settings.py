@@ -34,7 +34,8 @@ class TriangulationSettings(Record):
     per axis from hand-made labels (Shelf); 10 of these are noise of the views."""
     max_deviation: float = Field(default=3.5, ge=1e-6, le=1e6)
     """Observations farther than this from the joint, in standard deviations, are rejected [1]: 0.2
-    % of correct ones (chi-square, two degrees of freedom)."""
+    % of correct ones (chi-square, two degrees of freedom). It is also the limit for left-right
+    swaps and limb lengths, and the scale of the losses of smoothing and clocks."""
     min_views: int = Field(default=2, ge=2, le=1000)
     """Minimum inlier cameras [1]; a joint with fewer is missing."""
     min_angle_rad: float = Field(default=0.1, ge=1e-6, le=10)
