@@ -19,9 +19,9 @@ from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Observations
 from worldpose.bundle_adjustment.residuals import (
-    AdjustmentProblem,
     AdjustmentSolution,
     KeypointNoise,
+    free_joints_problem,
 )
 from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.bundle_adjustment.solver import solve
@@ -459,20 +459,8 @@ def adjust_poses(
     information[1, 3:6, 3:6] += fixed_information * np.outer(away, away)
     if fixed:
         information += fixed_information * fixed_information * np.eye(12)
-    variance = (observed.noise * noise.scale) ** 2 * noise.correlation
-    problem = AdjustmentProblem(
-        cameras=cameras,
-        free=free,
-        camera_information=information,
-        points=observed.points,
-        point_information=np.zeros(len(observed.points)),
-        point_of=observed.point_of,
-        camera_of=observed.camera_of,
-        image=observed.image,
-        weight=1.0 / variance,
-        scale=np.full(len(variance), LOSS_SCALE / np.sqrt(noise.correlation)),
-        names=tuple(lens.id for lens in lenses),
-    )
+    names = tuple(lens.id for lens in lenses)
+    problem = free_joints_problem(cameras, free, information, observed, noise, LOSS_SCALE, names)
     return solve(
         problem, SolverSettings(max_iterations=100, min_cost_change=1e-6), covariance=covariance
     )

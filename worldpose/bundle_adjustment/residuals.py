@@ -69,7 +69,7 @@ class AdjustmentProblem:
 
 @dataclass(frozen=True, eq=False)
 class AdjustmentSolution:
-    """AdjustmentSolution of a bundle adjustment problem.
+    """Solution of a bundle adjustment problem.
 
     Attributes:
         cameras: (cameras,) batch.
@@ -125,11 +125,36 @@ def players_problem(
     """
     information, free = camera_knowledge(clip, settings)
     information = information / np.reshape(variance_factor, (-1, 1, 1))
+    free = free & ~fixed[:, None]
+    return free_joints_problem(
+        clip.cameras, free, information, observed, noise, settings.loss_scale, clip.names
+    )
+
+
+def free_joints_problem(
+    cameras: Camera,
+    free: Flags,
+    information: Floats,
+    observed: Observations,
+    noise: KeypointNoise,
+    loss_scale: float,
+    names: tuple[str, ...],
+) -> AdjustmentProblem:
+    """Return the adjustment of cameras to joints without a prior of their places.
+
+    Args:
+        cameras: (cameras,) batch.
+        free: (cameras, 12) as in `AdjustmentProblem`.
+        information: (cameras, 12, 12), the prior of a step.
+        observed: joints and their pixels.
+        noise: scale and correlation of the keypoints' errors.
+        loss_scale: scale of Cauchy's loss [standard deviations].
+        names: names of the cameras.
+    """
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
-    scale = settings.loss_scale / np.sqrt(noise.correlation)
     return AdjustmentProblem(
-        cameras=clip.cameras,
-        free=free & ~fixed[:, None],
+        cameras=cameras,
+        free=free,
         camera_information=information,
         points=observed.points,
         point_information=np.zeros(len(observed.points)),
@@ -137,8 +162,8 @@ def players_problem(
         camera_of=observed.camera_of,
         image=observed.image,
         weight=1.0 / variance,
-        scale=np.full(len(variance), scale),
-        names=clip.names,
+        scale=np.full(len(variance), loss_scale / np.sqrt(noise.correlation)),
+        names=names,
     )
 
 

@@ -31,17 +31,15 @@ SIZE_LIMIT: Final = 1 << 16
 
 NUMBER_LIMIT: Final = 1e9
 """Maximum absolute value of any entry, whatever its unit."""
-
 FOCAL_RATIOS: Final = (0.05, 1000.0)
 """Minimum and maximum focal length over the image's longer side [1]: a field of view of 168
 degrees, and a telescope's of 0.06."""
 
 CENTER_SIZES: Final = 10
-"""Maximum distance of the principal point from the image center, in longer sides of the image [1]:
-a small crop of a large sensor has an offset of a few."""
+"""Maximum distance of the principal point from the image center, in longer sides [1]."""
 
 DISTANCE_LIMIT: Final = 1e7
-"""Maximum coordinate of a translation [m]: from the Earth's equator to its pole."""
+"""Maximum coordinate of a translation [m]."""
 
 ROTATION_TOLERANCE: Final = 1e-4
 """Maximum rounding error of R R^T = I [1]; four decimals give less."""
@@ -53,8 +51,7 @@ FARTHEST_M: Final = 1000.0
 """Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m."""
 
 NEAREST_M: Final = 0.1
-"""Minimum of the largest distance from the middle, where the file is in millimetres [m]: cameras
-that see a person from several sides are some metres apart, not some millimetres."""
+"""Minimum distance of the farthest camera from the middle in a file in millimetres [m]."""
 
 FREEMOCAP: Final = (
     "charuco_square_size",
@@ -245,19 +242,16 @@ def read_calibration_toml(
         left_out: receives cameras without a pose; None = all must have one.
 
     Raises:
-        InputError: the file is unreadable or has a missing, misshapen or infinite entry, no
-            rotation, a fisheye camera, no camera, two cameras of one name, or another unit of
-            length; or the world of FreeMoCap's file is not that of the ground. The error names file
-            and key.
+        InputError: an entry is missing or invalid, a camera is a fisheye, the unit is another, or
+            the world of FreeMoCap's file is not that of the ground; it names file and key.
     """
     content = read_toml(path)
     unit_m = MILLIMETRE if _is_freemocap(path, content) else 1.0
     tables = list(camera_tables(path, content))
     posed = [each for each in tables if not _lacks_pose(each[2])]
     if left_out is not None and posed:
-        left_out.update(
-            {camera_id(name): "it has no pose" for _, name, table in tables if _lacks_pose(table)}
-        )
+        lacking = [name for _, name, table in tables if _lacks_pose(table)]
+        left_out.update({camera_id(name): "it has no pose" for name in lacking})
         tables = posed
     cameras = []
     for where, name, table in tables:
@@ -275,8 +269,8 @@ def read_calibration_toml(
 
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
     """Return whether a camera has a lens but neither rotation nor translation, or empty ones."""
-    empty: tuple[object, ...] = (None, "null", "None", "", [])
-    return "matrix" in table and all(table.get(key) in empty for key in ("rotation", "translation"))
+    pose = [table.get(key) for key in ("rotation", "translation")]
+    return "matrix" in table and all(value in (None, "null", "None", "", []) for value in pose)
 
 
 def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:

@@ -44,6 +44,7 @@ BATCH: Final = 4096
 MAX_POINTS: Final = 1000
 """Maximum points of a person."""
 
+_NUMBER: Final = re.compile(r"[A-Za-z]*(\d{1,18})")
 _POINTS: Final = "x, y, confidence of each point"
 _COUNT_TODO: Final = "Export all points, and 0, 0, 0 where one is missing."
 _CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 0 is missing."
@@ -198,8 +199,14 @@ def _listed_frames(path: Path, listed: Sequence[Any]) -> dict[Any, int]:
 
 
 def _last_number(name: str) -> int | None:
-    """Return the last number in the name of a file, without its folders and ending."""
-    numbers = re.findall(r"\d{1,18}", PureWindowsPath(name).stem)
+    """Return the last number in the name of a file, without its folders and ending.
+
+    A part that mixes letters and digits, such as 1080p or a digest, is no number; `frame12` is 12.
+    Roboflow puts a digest after the name: `frame_12_jpg.rf.3fa9`.
+    """
+    stem = PureWindowsPath(name).stem.partition(".rf.")[0]
+    parts = re.split(r"[^A-Za-z0-9]+", stem)
+    numbers = [found[1] for part in parts if (found := _NUMBER.fullmatch(part))]
     return int(numbers[-1]) if numbers else None
 
 

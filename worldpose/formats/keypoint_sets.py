@@ -132,7 +132,7 @@ def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
             + (", ".join(missing) or "none"),
             todo="Export the points of COCO-17, or name them so.",
         )
-    return _order("named points", plain)
+    return _order("COCO-17" if tuple(plain) == COCO17 else "named points", plain)
 
 
 def _plain(name: str) -> str:

@@ -155,6 +155,7 @@ def test_a_data_set_gives_names_of_points_and_numbers_of_images(tmp_path):
     [
         ([{"id": 1, "file_name": "a.jpg"}], COCO17, "images[0]", "file_name with the frame"),
         ([{"id": 1}], COCO17, "images[0]", "found nothing"),
+        ([{"id": 1, "file_name": "3fa9c1.jpg"}], COCO17, "images[0]", "found '3fa9c1.jpg'"),
         (
             [{"id": n, "file_name": f"cam{n}/000000.jpg"} for n in (1, 2)],
             COCO17,
@@ -169,6 +170,14 @@ def test_a_data_set_that_does_not_say_is_refused(tmp_path, images, names, place,
         read_coco_results(data_set(tmp_path / "a.json", images, names))
     assert caught.value.where.endswith(place)
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["12.png", "a/frame000012.PNG", "cam2_0012_1080p.jpg", "f_12_jpg.rf.3fa9b7.jpg"]
+)
+def test_the_frame_is_the_last_number_and_no_part_of_a_word(tmp_path, name):
+    found = read_coco_results(data_set(tmp_path / "a.json", [{"id": 7, "file_name": name}]))
+    assert (found.kind, found.people.frame.tolist()) == ("COCO-17", [12])
 
 
 def test_alphapose_numbers_its_images_by_their_names(tmp_path):
