@@ -9,8 +9,9 @@ from pydantic import TypeAdapter
 
 from data_contracts.ingest import INGEST
 from tasks.unit import UnitInputs, unit_task
-from worldpose.formats.keypoint_files import read_observations
+from worldpose.formats.keypoint_files import read_people, select_ranges
 from worldpose.ingest.footage import UnitFrames, read_footage
+from worldpose.ingest.importing import describe_changes
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.store.writer import ResultWriter
 
@@ -28,7 +29,10 @@ def _write_observations(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the unit's 2D poses on match frames, with people's corrections."""
     sources = inputs.sources
     ranges = [(first + sources["offset_frames"], count) for first, count in sources["ranges"]]
-    observations = read_observations(inputs.file("detections"), ranges)
+    file = inputs.file("detections")
+    read = read_people(file)
+    result.warnings += describe_changes({inputs.unit: read})
+    observations = select_ranges(file, read.people, ranges)
     inputs.require_registered("detections")
     observations = replace(observations, frame=observations.frame - sources["offset_frames"])
     if "edits" in sources:

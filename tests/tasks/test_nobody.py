@@ -1,5 +1,6 @@
 """Clips without tracked people: every stage has an empty result."""
 
+import json
 import shutil
 
 import numpy as np
@@ -57,3 +58,22 @@ def test_a_match_of_nobody_goes_through_two_iterations(empty):
         assert not seen["rejected"].values.any() and not seen["dropped"].values.any()
         assert (seen["fits"].values == -1).all()
         np.testing.assert_array_equal(seen["clock_late"].values, 0.0)
+
+
+def test_a_run_says_what_it_changed_in_the_2d_poses_of_a_camera(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "match")
+    shutil.rmtree(folder / "reference")
+    file = sorted((folder / "detections").glob("cam*.npz"))[0]
+    file.unlink()
+    triples = [[100.0 + 9 * joint, 300.0, 1.2 if joint < 3 else 0.9] for joint in range(17)]
+    points = [number for triple in triples for number in triple]
+    people = [{"image_id": 0, "keypoints": given} for given in (points, [float("nan")] * 51)]
+    file.with_suffix(".json").write_text(json.dumps(people))
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, folder)
+    unit = next(u for u in plan_run(store, match, {}) if u.name == f"ingest/{file.stem}")
+    task_of(METHOD[0]).fn(unit.work(store.url, match, "0001"))
+    assert store.manifest(match.match_id, "ingest", file.stem, unit.key).warnings == (
+        f"confidences above 1, which count as 1: 3 ({file.stem})",
+        f"entries without a known joint, which count as nobody: 1 ({file.stem})",
+    )

@@ -205,7 +205,17 @@ def read_observations(
             the error names file and place.
     """
     path = Path(path)
-    people = read_people(path).people
+    return select_ranges(path, read_people(path).people, ranges)
+
+
+def select_ranges(
+    path: Path, people: KeypointDetections, ranges: Sequence[tuple[int, int]] | None
+) -> KeypointDetections:
+    """Return the people of `path`, dense over ranges as in `read_observations`.
+
+    Raises:
+        InputError: all people are outside the wanted frames.
+    """
     seen = people.frame
     if ranges is None:
         first = int(seen[0]) if len(seen) else 0

@@ -90,9 +90,9 @@ def camera_of(place: Path) -> str:
 
 
 _CHANGES: Final = {
-    "clamped": "confidences above 1 count as 1",
-    "nobody": "entries without a known joint count as nobody",
-    "empty": "empty files count as frames without people",
+    "clamped": "confidences above 1, which count as 1",
+    "nobody": "entries without a known joint, which count as nobody",
+    "empty": "empty files, which count as frames without people",
 }
 
 
@@ -105,10 +105,16 @@ def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
         kept += " and heels and toes" if read[which[0]].people.points else ""
         whose = "" if len(which) == len(read) else f" of {', '.join(which)}"
         notes.append(f"2D poses{whose}: {kind}; kept are {kept}; the others are left out")
+    return notes + describe_changes(read)
+
+
+def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
+    """Return sentences about what was changed in cameras' 2D poses to read them."""
+    notes = []
     for key, what in _CHANGES.items():
         counts = {name: getattr(found.changes, key) for name, found in read.items()}
         if total := sum(counts.values()):
-            notes.append(f"{total} {what} ({', '.join(name for name in counts if counts[name])})")
+            notes.append(f"{what}: {total} ({', '.join(name for name in counts if counts[name])})")
     return notes
 
 
