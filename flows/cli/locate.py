@@ -139,6 +139,7 @@ def _lens(match: Match, camera: str) -> LensCalibration:
             focal_px=focal,
             principal_point_px=given.principal_point_px,
             distortion=given.distortion,
+            lens_model=given.lens_model,
             focal_std_px=GIVEN_FOCAL * focal,
             principal_point_std_px=GIVEN_CENTER_PX,
             distortion_std=0.005,
@@ -175,7 +176,7 @@ def _write(
     calibrations: dict[str, CameraCalibration], folder: Path | None, out: Path | None
 ) -> list[str]:
     """Write the calibration to a file, and into a match folder in place of its lenses."""
-    from worldpose.formats.calibration_files import write_calibration_toml
+    from worldpose.formats.calibration_writer import write_calibration_toml
     from worldpose.formats.files import whole_file
     from worldpose.ingest.match_folder import LENS_FILE
 

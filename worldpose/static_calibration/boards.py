@@ -9,8 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image, Integers
-from data_contracts.cameras import LensCalibration
+from data_contracts.cameras import LensCalibration, LensName
 from worldpose.errors import InputError
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 
 MIN_VIEWS: Final = 4
 """Minimum images with a board [1]: leaving out one must leave three, which determine a lens."""
@@ -155,8 +157,9 @@ def calibrate_lens(
     """Return the lens of a camera from images of one board.
 
     Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV
-    (Zhang, 2000). Images whose corners are not on a plane, or that contradict the others, are left
-    out. The standard deviations are those of leaving out one image at a time (jackknife).
+    (Zhang, 2000); or k1 to k4 of a fisheye, if its residuals are clearly smaller. Images whose
+    corners are not on a plane, or that contradict the others, are left out. The standard deviations
+    are those of leaving out one image at a time (jackknife).
 
     Args:
         camera: its name.
@@ -173,6 +176,7 @@ def calibrate_lens(
         # In squares: a lens bends a board less; corners that were counted wrongly have errors of 1.
         if view is not None and view.bend > 0.25:
             reasons[n] = "its corners are not those of a flat board"
+    model = _choose_model([v for v, no in zip(views, reasons, strict=True) if v and not no], size)
     while True:
         chosen = [n for n, reason in enumerate(reasons) if not reason]
         if len(chosen) < MIN_VIEWS:
@@ -184,17 +188,19 @@ def calibrate_lens(
                 " it is tilted, sharp and near the borders.",
             )
         kept = [view for view in (views[n] for n in chosen) if view is not None]
-        numbers, residuals = _solve(kept, size)
+        numbers, residuals = _solve(kept, size, model)
         error = np.array([_rms(each) for each in residuals])
         worst = int(error.argmax())
         if error[worst] <= 0.3 or len(kept) == MIN_VIEWS:
             break
-        others = _solve(kept[:worst] + kept[worst + 1 :], size)[1]
+        others = _solve(kept[:worst] + kept[worst + 1 :], size, model)[1]
         # The worst image is left out if it doubles the residual.
         if _rms(np.concatenate(residuals)) <= 2.0 * _rms(np.concatenate(others)):
             break
         reasons[chosen[worst]] = f"it contradicts the others, by {error[worst]:.1f} px"
-    left_out = np.array([_solve(kept[:n] + kept[n + 1 :], size)[0] for n in range(len(kept))])
+    left_out = np.array(
+        [_solve(kept[:n] + kept[n + 1 :], size, model)[0] for n in range(len(kept))]
+    )
     count = len(kept)
     spread = (count - 1) / count * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
     std = np.sqrt(spread)
@@ -205,7 +211,7 @@ def calibrate_lens(
             found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
             todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
         )
-    corner = np.array([_corner_factor(each, size) for each in left_out])
+    corner = np.array([_corner_factor(each, size, model) for each in left_out])
     corner_std = np.sqrt((count - 1) / count * ((corner - corner.mean()) ** 2).sum())
     # Three coefficients share the displacement of the corner.
     lens = LensCalibration(
@@ -213,7 +219,8 @@ def calibrate_lens(
         image_size=size,
         focal_px=float(numbers[0]),
         principal_point_px=(float(numbers[1]), float(numbers[2])),
-        distortion=(*(float(one) for one in numbers[3:7]), 0.0),
+        distortion=tuple(numbers[3:].tolist()),
+        lens_model=model,
         focal_std_px=float(max(std[0], min_std_px)),
         principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), min_std_px)),
         distortion_std=float(max(corner_std, 1e-4)),
@@ -235,33 +242,72 @@ def _rms(residuals: Floats) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
-def _solve(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[Floats, list[Floats]]:
-    """Return f, cx, cy, k1, k2, p1, p2, and the residuals (n, 2) of each view [px]."""
+def _choose_model(views: Sequence[BoardView], size: tuple[int, int]) -> LensName:
+    """Return the fisheye if its residuals are clearly smaller than those of Brown's model."""
+    clear = 0.95  # ratio of median residuals; Brown's model has two tangential terms of its own
+    if len(views) < MIN_VIEWS:
+        return "brown"
+    median = {
+        model: float(np.median([_rms(each) for each in _solve(views, size, model)[1]]))
+        for model in ("brown", "fisheye")
+    }
+    return "fisheye" if median["fisheye"] < clear * median["brown"] else "brown"
+
+
+def _solve(
+    views: Sequence[BoardView], size: tuple[int, int], model: LensName
+) -> tuple[Floats, list[Floats]]:
+    """Return f, cx, cy and the coefficients, and the residuals (n, 2) of each view [px].
+
+    Residuals are infinite where OpenCV finds no fisheye.
+    """
     import cv2
 
     places = [np.column_stack([view.places, np.zeros(len(view.places))]) for view in views]
-    objects = [each.astype(np.float32) for each in places]
-    images = [view.pixels.astype(np.float32) for view in views]
+    images = [view.pixels for view in views]
     middle = 0.5 * (np.array(size) - 1.0)
     start = np.array([[max(size), 0.0, middle[0]], [0.0, max(size), middle[1]], [0.0, 0.0, 1.0]])
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
-    distortion_guess = np.zeros(5)
-    _, matrix, distortion, rvecs, tvecs = cv2.calibrateCamera(
-        objects, images, size, start, distortion_guess, flags=flags
+    if model == "fisheye":
+        fisheye: Any = cv2.fisheye  # its stubs lack the flags
+        flags = fisheye.CALIB_RECOMPUTE_EXTRINSIC | fisheye.CALIB_FIX_SKEW
+        objects = [each[None] for each in places]
+        try:
+            _, matrix, found, rvecs, tvecs = fisheye.calibrate(
+                objects, [each[None] for each in images], size, np.eye(3), np.zeros(4), flags=flags
+            )
+        except cv2.error:
+            return np.full(7, np.nan), [np.full_like(each, np.inf) for each in images]
+        matrix[0, 0] = matrix[1, 1] = 0.5 * (matrix[0, 0] + matrix[1, 1])
+        lens = found.ravel()
+    else:
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
+        _, matrix, found, rvecs, tvecs = cv2.calibrateCamera(
+            [each.astype(np.float32) for each in places],
+            [each.astype(np.float32) for each in images],
+            *(size, start, np.zeros(5)),
+            flags=flags,
+        )
+        lens = np.append(found.ravel()[:4], 0.0)
+    camera = Camera.from_matrices(
+        matrix,
+        lens,
+        np.array([cv2.Rodrigues(each)[0] for each in rvecs]),
+        np.array(tvecs).reshape(-1, 3),
+        size,
+        LensModel.named(model),
     )
-    residuals = []
-    for each, view, rvec, tvec in zip(places, views, rvecs, tvecs, strict=True):
-        shown, _ = cv2.projectPoints(each, rvec, tvec, matrix, distortion)
-        residuals.append(view.pixels - shown.reshape(-1, 2))
-    intrinsics = [matrix[0, 0], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:4]]
-    return np.array(intrinsics, dtype=np.float64), residuals
+    shown = [camera[n].project(each) for n, each in enumerate(places)]
+    # A corner beyond the fold of a wrong lens counts as far off.
+    residuals = [np.nan_to_num(a - b, nan=1e3) for a, b in zip(images, shown, strict=True)]
+    return np.array([matrix[0, 0], *matrix[:2, 2], *lens]), residuals
 
 
-def _corner_factor(numbers: Floats, size: tuple[int, int]) -> float:
+def _corner_factor(numbers: Floats, size: tuple[int, int], model: LensName) -> float:
     """Return the relative displacement of the image's farthest corner by the distortion [1]."""
     far = np.maximum(numbers[1:3], np.array(size) - numbers[1:3]) / numbers[0]
-    squared = float((far**2).sum())
-    return float(numbers[3] * squared + numbers[4] * squared**2)
+    powers = float((far**2).sum()) ** np.arange(1, 5)
+    terms = numbers[3:] if model == "fisheye" else numbers[[3, 4]]
+    return float(terms @ powers[: len(terms)])
 
 
 def choose_views(

@@ -59,7 +59,7 @@ def lens(camera, name, focal_std=2.0, focal=None):
         image_size=SIZE,
         focal_px=float(camera.focal[0]) if focal is None else focal,
         principal_point_px=tuple(camera.principal_point.tolist()),
-        distortion=tuple(camera.distortion.tolist()),
+        distortion=tuple(camera.coefficients.tolist()),
         focal_std_px=focal_std,
         principal_point_std_px=2.0,
         distortion_std=0.005,

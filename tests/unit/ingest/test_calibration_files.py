@@ -6,8 +6,8 @@ import pytest
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
 
 ANIPOSE = """
 [cam_0]
@@ -134,10 +134,10 @@ def test_caliscope_camera_is_called_by_its_number_and_may_give_a_matrix(read):
         ("[1032, 776]", "[1032, 0]", "cam_0: size", "whole pixels"),
         ("[1032, 776]", "[1032, 776.5]", "cam_0: size", "whole pixels"),
         ("[1032, 776]", "[1032, 776, 3]", "cam_0.size", "shape (2,)"),
-        ("0.003]", "0.003, 0.1, 0.0, 0.0]", "cam_0.distortions", "zero beyond the fifth"),
-        ("[-0.1, 0.02, 0.001, -0.002, 0.003]", "[0.1, 0.2]", "cam_0.distortions", "4 or 5"),
+        ("0.003]", "0.003, 0.1, 0, 0, 0, 0, 0, 1]", "cam_0.distortions", "more terms"),
+        ("[-0.1, 0.02, 0.001, -0.002, 0.003]", "[0.1, 0.2]", "cam_0.distortions", "k1 k2 p1 p2"),
         ('"left"', '"../left"', "cam_0: name", "letters"),
-        ("[metadata]", "fisheye = true\n[metadata]", "cam_0.fisheye", "standard model"),
+        ("[metadata]", "fisheye = true\n[metadata]", "cam_0.distortions", "k1 k2 k3 k4"),
         ("[cam_0]", "title = 1\n[cam_0]", "title", "a table for each camera"),
         ("1063.5", "6.2", "cam_0: focal length", "in pixels"),
         ("511.7", "1e6", "cam_0: principal point", "in pixels"),
