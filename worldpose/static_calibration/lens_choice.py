@@ -23,6 +23,9 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _CHOICES: Final = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
 """Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's."""
+_FISHEYE_STD: Final = 0.1
+"""Standard deviation of a fisheye's k1, k2 and k3 [1]: projections from orthographic to
+stereographic have k1 from -0.17 to 0.08."""
 _MIN_CLICKS: Final = 10
 """Minimum number of clicked points that choose a lens model [1]: twenty residuals for twelve
 parameters and the noise."""
@@ -45,7 +48,10 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
     lowest = own - CLEAR_GAIN
     for model, coefficients in _CHOICES:
         free = np.arange(STEP) < STEP - 3 + coefficients
-        wider = replace(as_stated, free=free, lens_model=model)
+        prior = as_stated.prior.copy()
+        if model == LensModel.FISHEYE:
+            prior[15:18] = _FISHEYE_STD
+        wider = replace(as_stated, free=free, lens_model=model, prior=prior)
         try:
             other = fit_inliers_at_best_noise(wider, found.fit.row, stated)
         except InputError:
@@ -57,7 +63,7 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
                 f"{model.label} lens, {names}: the log probability of the clicks is "
                 f"{0.5 * (own - score):.0f} higher than with k1 k2 of brown"
             )
-            best, lowest = replace(other, assumptions=(said,)), score - CLEAR_GAIN
+            best, lowest = replace(other, assumptions=(said,)), score
     return best
 
 
