@@ -88,7 +88,7 @@ def describe_misfit(found: Explanation) -> str:
     function of it: odd powers explain more of these residuals than noise allows (F-test). Several
     excluded clicks may be right, and the lens wrong.
     """
-    significance, powers = 1e-4, np.array([1.0, 3.0, 5.0, 7.0])
+    significance, powers = 1e-3, np.array([1.0, 3.0, 5.0, 7.0, 9.0])
     problem, fit = found.problem, found.fit
     offset = problem.evidence.points_image - fit.row[2:4]
     radius = np.linalg.norm(offset, axis=1)

@@ -156,6 +156,11 @@ def build_report(
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
     misfit = describe_misfit(found)
+    if reasons and not misfit and scale >= 3.0:
+        misfit = (
+            f"the errors of clicks are {scale:.1f} times the stated noise with every lens model "
+            "that was tried: check the names, or calibrate the lens (worldpose calibrate)"
+        )
     reasons += [misfit] if misfit else []
     decisions = list(found.assumptions)
     if abs(scale - 1.0) > 0.01:
