@@ -39,7 +39,7 @@ degrees, and a telescope's of 0.06."""
 CENTER_SIZES: Final = 10
 """Maximum distance of the principal point from the image center, in longer sides [1]."""
 
-MAX_TANGENTIAL: Final = 0.02
+MAX_TANGENTIAL: Final = 0.01
 """Maximum p1 and p2 of four numbers that do not say their model [1]; real lenses have 0.005."""
 
 DISTANCE_LIMIT: Final = 1e7

@@ -305,18 +305,22 @@ def _vicon_optics(
     slope = powers @ (np.append(1.0, terms) * [1.0, 3.0, 5.0, 7.0])
     if slope.min() > 0.0:
         from worldpose.geometry.cameras import Camera  # late: few files need the kernels
-        from worldpose.geometry.lens_fit import fit_lens
+        from worldpose.geometry.lens_fit import INTRINSICS, fit_lens
         from worldpose.geometry.lens_models import LensModel
         from worldpose.geometry.rigid import Rigid
 
         at = Rigid.identity()
         lens = Camera(np.full(2, focal), middle, np.zeros(8), at, size.astype(np.int64))
-        for kind in (LensModel.BROWN, LensModel.RATIONAL):
-            names = COEFFICIENTS[kind.label]
+        for kind, names in (
+            (LensModel.BROWN, COEFFICIENTS["brown"]),
+            (LensModel.RATIONAL, COEFFICIENTS["rational"]),
+            (LensModel.RATIONAL, (*INTRINSICS, *COEFFICIENTS["rational"])),
+        ):
             fit = fit_lens(lens, (ideal - middle) / focal, across, kind, names)
             if fit.error_px <= LENS_ERROR_PX:
                 lens = fit.camera
-                return Optics(size, lens.focal, middle, lens.coefficients, kind.label)
+                place = lens.principal_point
+                return Optics(size, lens.focal, place, lens.coefficients, kind.label)
     raise InputError(
         f"{where}.VICON_RADIAL2" if text is not None else f"{where}.VICON_RADIAL",
         expected=f"a lens that k1 to k6, p1 and p2 follow within {LENS_ERROR_PX:g} px",
