@@ -76,6 +76,8 @@ from worldpose.store.runs import pin_run
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
 
+LENS_ERRORS = "lens_errors.json"
+"""Largest differences of the lenses in cameras/ from those of the run [px]."""
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
 
@@ -141,7 +143,7 @@ def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
         write_static_camera(path, camera.to_calibration(name))
         yield path
     if errors:
-        path = out / "lens_errors.json"
+        path = out / LENS_ERRORS
         path.write_text(json.dumps(errors, indent=1), encoding="utf-8")
         yield path
 

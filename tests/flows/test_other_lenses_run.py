@@ -72,7 +72,8 @@ def exported(server, tiny, tmp_path_factory):
     succeed("run", match, "--project", folder / "project")
     formats = ("joints", "worldpose", "coco", "gltf", "viewer")
     asked = [word for form in formats for word in ("--format", form)]
-    succeed("export", "match", *asked, "--out", out, "--project", folder / "project")
+    said = succeed("export", "match", *asked, "--out", out, "--project", folder / "project").out
+    assert "differ from those used by up to" in said
     succeed("report", "match", "--out", folder / "report", "--project", folder / "project")
     return cameras, joints, out
 
