@@ -175,8 +175,8 @@ def calibrate_lens(
     max_focal_std = 0.05  # relative; boards that all face the camera do not determine it
     reasons = ["" if view is not None else "no whole board found" for view in views]
     for n, view in enumerate(views):
-        # In squares: a lens bends a board less; corners that were counted wrongly have errors of 1.
-        if view is not None and view.bend > 0.6:
+        # In squares: a lens bends a board less; corners that were counted wrongly, 0.4 to 1.
+        if view is not None and view.bend > 0.35:
             reasons[n] = "its corners are not those of a flat board"
     model = _choose_model([v for v, no in zip(views, reasons, strict=True) if v and not no], size)
     while True:
