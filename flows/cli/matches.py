@@ -26,8 +26,16 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError, unknown_name
+from worldpose.formats.calibration_forms import form_unit_m
 from worldpose.ingest.clicks import import_clicks
-from worldpose.ingest.importing import import_lenses, import_match, import_videos
+from worldpose.ingest.importing import (
+    Cameras,
+    People,
+    Placing,
+    import_lenses,
+    import_match,
+    import_videos,
+)
 from worldpose.ingest.match_folder import unclicked_clips
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
@@ -187,6 +195,8 @@ def import_command(
     camera: str | None = None,
     lens: list[Path] | None = None,
     left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
+    unit: str | None = None,
+    up: str | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
@@ -214,6 +224,10 @@ def import_command(
         lens: Lens without a pose: OpenCV XML or YAML, ROS YAML, npz, matrix and distortion as
             two .npy files, or TOML.
         left_handed: The survey's x, y and height are left-handed.
+        unit: Unit of the calibration's positions: mm, cm, m, in, ft, yd, km, or its metres, such as
+            0.08. By default people's stature tells it.
+        up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
+            By default people who stand tell it.
     """
     options = {
         "--calibration": calibration,
@@ -228,6 +242,8 @@ def import_command(
         "--camera": camera,
         "--lens": lens,
         "--left-handed": left_handed,
+        "--unit": unit,
+        "--up": up,
     }
     given = {name for name, value in options.items() if value}
     kind = next((name for name in ALONE if name in given), None)
@@ -244,11 +260,19 @@ def import_command(
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
-        spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id)
+        spec, notes = import_pose2sim(
+            pose2sim, out, fps=fps, match_id=match_id, place=_placing(unit, up)
+        )
         _print_match(spec, out, notes, as_json=as_json)
     elif videos is not None and detections is None:
         spec, notes = import_videos(
-            calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes
+            calibration,
+            videos,
+            out,
+            fps=fps,
+            match_id=match_id,
+            boxes=boxes,
+            place=_placing(unit, up),
         )
         _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
@@ -259,13 +283,18 @@ def import_command(
             todo="Read the help: worldpose import --help.",
         )
     else:
-        spec, notes = import_match(calibration, detections, fps, out, match_id=match_id)
+        spec, notes = import_match(
+            calibration, detections, fps, out, match_id=match_id, place=_placing(unit, up)
+        )
         _print_match(spec, out, notes, as_json=as_json)
 
 
 ALONE: Final = {
     "--boxes": ("with --videos, or with --out alone", ()),
-    "--pose2sim": ("with --out, and --fps or --match-id", ("--fps", "--match-id")),
+    "--pose2sim": (
+        "with --out, and --fps, --match-id, --unit or --up",
+        ("--fps", "--match-id", "--unit", "--up"),
+    ),
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
     "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
     "--camera": ("with --clicks or --lens", ()),
@@ -285,6 +314,34 @@ def _require_alone(kind: str, given: set[str]) -> None:
             found=", ".join(others) or f"{kind} alone",
             todo="Import the match first; the rest can be added to its folder then.",
         )
+
+
+def _placing(unit: str | None, up: str | None) -> Placing:
+    """Return what brings cameras to metres with z up, by options and people.
+
+    Raises:
+        UsageError: an option is no unit, or no axis.
+    """
+    from worldpose.triangulation.world import place_cameras, read_stated_world  # late: it is slow
+
+    stated = read_stated_world(unit, up)
+
+    def place(
+        calibration: Path, cameras: Cameras, people: People, fps: float
+    ) -> tuple[Cameras, list[str]]:
+        if not cameras:
+            if unit is not None or up is not None:
+                raise UsageError(
+                    "--unit and --up",
+                    expected="a calibration, whose world they describe",
+                    found="none",
+                    todo="Omit them, or add --calibration.",
+                )
+            return cameras, []
+        read_as_m = form_unit_m(calibration)
+        return place_cameras(str(calibration), cameras, people, fps, stated, read_as_m)
+
+    return place
 
 
 def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:

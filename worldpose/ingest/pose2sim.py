@@ -22,6 +22,7 @@ from worldpose.formats.files import read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.importing import (
+    Placing,
     build_spec,
     camera_of,
     copy_videos,
@@ -29,6 +30,7 @@ from worldpose.ingest.importing import (
     describe_people,
     find_people,
     fit_to_video,
+    keep_world,
     list_videos,
 )
 from worldpose.ingest.writing import write_match
@@ -41,7 +43,11 @@ _SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
 
 
 def import_pose2sim(
-    project: Path, out: Path, fps: float | None = None, match_id: str | None = None
+    project: Path,
+    out: Path,
+    fps: float | None = None,
+    match_id: str | None = None,
+    place: Placing = keep_world,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
 
@@ -59,6 +65,7 @@ def import_pose2sim(
         out: the match folder, absent or empty.
         fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
         match_id: id of the match; None = the name of `out`.
+        place: brings the cameras to metres with z up.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was left out.
@@ -91,7 +98,7 @@ def import_pose2sim(
         source = project / "videos"
     else:
         shown = {camera_of(file): index.size for file, index in known.items()}
-        cameras = read_calibration(calibration, shown, left_out)
+        cameras = read_calibration(calibration, shown, left_out, any_unit=True)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
         places = [each for each in places if camera_of(each) not in left_out]
@@ -116,13 +123,14 @@ def import_pose2sim(
     spec = build_spec(
         out, match_id, rate, {name: sizes[name] for name in names}, (first, stop), videos=videos
     )
-    for name, place in poses.items():
-        people[name] = on_frames(place, people[name], [(first, stop - first)])
+    for name, files in poses.items():
+        people[name] = on_frames(files, people[name], [(first, stop - first)])
 
+    written, placed = place(calibration or project, cameras, people, rate)
     write_match(
-        out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
+        out, spec, calibrations=written, observations=people, further=partial(copy_videos, videos)
     )
-    return spec, notes + _describe_poses(folder, read)
+    return spec, placed + notes + _describe_poses(folder, read)
 
 
 def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:

@@ -1,0 +1,494 @@
+"""The world frame of calibrated cameras by the people in their views: unit, up axis and ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from data_contracts.arrays import Floats, Integers
+from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
+from worldpose.camera_consistency.consistency import select_busiest_frames
+from worldpose.errors import InputError, UsageError
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid, Similarity
+from worldpose.tracking.diagnosis import match_pair, usable_rays
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.tracking.vertical import ALIGNED, SAME_AXIS, Vertical, find_vertical, name_axis
+from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
+
+UNITS: Final = {
+    "mm": (0.001, "millimetres"),
+    "cm": (0.01, "centimetres"),
+    "m": (1.0, "metres"),
+    "in": (0.0254, "inches"),
+    "ft": (0.3048, "feet"),
+    "yd": (0.9144, "yards"),
+    "km": (1000.0, "kilometres"),
+}
+"""Units of length by their sign: metres, and the name."""
+
+
+def _mean_direction(vectors: Floats) -> Floats:
+    """Return the unit vector (3,) of vectors (frames, persons, 3), the median of each axis."""
+    known = vectors[np.isfinite(vectors).all(axis=-1)]
+    middle = np.median(known / np.linalg.norm(known, axis=1, keepdims=True), axis=0)
+    return np.asarray(middle / np.linalg.norm(middle))
+
+
+class Standing(NamedTuple):
+    """The world on whose ground people walk.
+
+    Attributes:
+        similarity: transform to it.
+        std: standard deviation of its vertical [rad].
+        on_feet: whether standing feet determine the vertical; else people are assumed upright.
+    """
+
+    similarity: Similarity
+    std: float
+    on_feet: bool
+
+
+class Walkers(NamedTuple):
+    """People who stand and walk.
+
+    Attributes:
+        joints: (frames, persons, 17, 3) in any unit; NaN where missing.
+        frames: (frames,) rows of the clip.
+        fps: frames per second [1/s].
+    """
+
+    joints: Floats
+    frames: Integers
+    fps: float
+
+    def statures(self) -> Floats:
+        """Return the stature of each person (persons,) by limbs and trunk; NaN where unknown."""
+        return np.array([self._stature(p) for p in range(self.joints.shape[1])])
+
+    def _stature(self, person: int) -> float:
+        found, weight = [], []
+        for each in PROPORTIONS:
+            # Detectors place hips and shoulders at various breadths.
+            if each.spread > 0.06:
+                continue
+            lengths = []
+            for ends in each.ends:
+                first, second = (self.joints[:, person, list(end)].mean(axis=1) for end in ends)
+                lengths.append(np.linalg.norm(first - second, axis=1))
+            known = np.concatenate(lengths)
+            known = known[np.isfinite(known)]
+            if len(known):
+                found.append(float(np.median(known)) / each.share)
+                # A detector's label is not the joint's centre.
+                offset = (0.024 / (each.share * STATURE[0])) ** 2 * each.offsets
+                weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
+        return float(np.average(found, weights=weight)) if found else np.nan
+
+    def orient(self, scale: float) -> Standing:
+        """Return the transform to the world, with the vertical's deviation [rad]."""
+        joints = scale * self.joints
+        shoulders, hips = joints[:, :, [5, 6]].mean(axis=2), joints[:, :, [11, 12]].mean(axis=2)
+        ankles = joints[:, :, [15, 16]]
+        trunk, legs = _mean_direction(shoulders - hips), _mean_direction(hips - ankles.mean(axis=2))
+        lean = (trunk + legs) / np.linalg.norm(trunk + legs)
+        # A person bent at the hips is not upright: trunk and legs then disagree.
+        bent = float(np.arccos(np.clip(trunk @ legs, -1.0, 1.0)))
+        # Mean lean of people who walk [rad].
+        lean_std = float(np.hypot(0.07, 0.5 * bent))
+        up = lean
+        feet = self._standing_feet(ankles)
+        for _ in range(5):
+            spread = feet - (feet.mean(axis=0) if len(feet) else 0.0)
+            off = spread @ up
+            # 3 cm: a foot that rolls off lifts its ankle.
+            weight = 1.0 / (0.03**2 + (off / 3.0) ** 2)
+            level = np.eye(3) - np.outer(up, up)
+            information = level @ (weight * spread.T) @ spread @ level + level / lean_std**2
+            slope = level @ (spread.T @ (weight * off) + (up - lean) / lean_std**2)
+            up = up - np.linalg.lstsq(information, slope, rcond=1e-9)[0]
+            up = up / np.linalg.norm(up)
+        values = np.linalg.eigvalsh(information)[1:]
+        places = hips.reshape(-1, 3)[np.isfinite(hips.reshape(-1, 3)).all(axis=1)]
+        middle = np.median(places, axis=0)
+        lowest = ankles.reshape(-1, 3) @ up
+        ground = np.median(feet @ up) if len(feet) else np.nanquantile(lowest, 0.05)
+        # Height of a standing foot's ankle, by the stature.
+        height = 0.045 * scale * float(np.nanmedian(self.statures()))
+        origin = middle + (ground - height - middle @ up) * up
+        level = (places - middle) @ (np.eye(3) - np.outer(up, up))
+        x = np.linalg.svd(level, full_matrices=False)[2][0]
+        x = x - (x @ up) * up
+        x = x / np.linalg.norm(x)
+        rotation = np.stack([x, np.cross(up, x), up])
+        return Standing(
+            Similarity(np.array(scale), rotation, -rotation @ origin),
+            float(1.0 / np.sqrt(values.min())),
+            bool(values.min() > 2.0 / lean_std**2),
+        )
+
+    def _standing_feet(self, ankles: Floats) -> Floats:
+        """Return the mean ankle (n, 3) [m] of each time that a foot stands."""
+        time = self.frames / self.fps
+        # The speed of an ankle is measured over 0.2 s.
+        half = max(1, round(0.5 * 0.2 / float(np.median(np.diff(time)))))
+        if len(time) <= 2 * half:
+            return np.empty((0, 3))
+        gap = (time[2 * half :] - time[: -2 * half])[:, None, None]
+        moved = np.linalg.norm(ankles[2 * half :] - ankles[: -2 * half], axis=-1)
+        # A foot with a slower ankle stands.
+        still = np.nan_to_num(moved / gap, nan=np.inf) < 0.4
+        found = []
+        for person, side in np.ndindex(still.shape[1:]):
+            rows = np.flatnonzero(still[:, person, side]) + half
+            for part in np.split(rows, np.flatnonzero(np.diff(rows) > half) + 1):
+                there = ankles[part, person, side]
+                there = there[np.isfinite(there[:, 0])]
+                if len(there):
+                    found.append(there.mean(axis=0))
+        return np.array(found).reshape(-1, 3)
+
+
+class People(NamedTuple):
+    """What people tell of the world of calibrated cameras.
+
+    Attributes:
+        statures: (persons,) stature of each [unit of the world].
+        vertical: the axis along which they stand.
+        up: (3,) unit vector that points up from the ground on which they walk.
+        ground: a point (3,) of that ground [unit of the world]; NaN if unknown.
+        on_feet: whether standing feet determine `up`.
+    """
+
+    statures: Floats
+    vertical: Vertical
+    up: Floats
+    ground: Floats
+    on_feet: bool
+
+    @property
+    def stature(self) -> float:
+        """Median stature [unit of the world]."""
+        return float(np.median(self.statures))
+
+    @classmethod
+    def of(cls, joints: NDArray[np.floating], fps: float) -> People | None:
+        """Return what joints (frames, persons, 17, 3) tell; None if no stature or axis is known."""
+        seen = np.isfinite(joints[..., 0]).any(axis=-1).sum(axis=0)
+        walkers = Walkers(
+            joints[:, seen >= max(2, 0.2 * seen.max(initial=0))].astype(np.float64),
+            np.arange(len(joints)),
+            fps,
+        )
+        statures = walkers.statures()
+        vertical = find_vertical(walkers.joints)
+        if vertical is None or not np.isfinite(statures).any():
+            return None
+        statures = statures[np.isfinite(statures)]
+        scale = STATURE[0] / float(np.median(statures))
+        ankles = np.isfinite(walkers.joints[:, :, [15, 16], 0]).any(axis=(0, 1)).all()
+        if not ankles or len(joints) < 2:
+            return cls(statures, vertical, vertical.axis, np.full(3, np.nan), on_feet=False)
+        world = walkers.orient(scale)
+        motion = world.similarity
+        ground = -motion.rotation.T @ motion.translation / scale
+        return cls(statures, vertical, motion.rotation[2], ground, world.on_feet)
+
+
+def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> People | None:
+    """Return what the people in the cameras' images tell of their world, whatever its unit.
+
+    Args:
+        cameras: batch (cameras,).
+        detections: (frames, cameras, detections) in memory.
+        fps: frames per second [1/s].
+
+    Returns:
+        None if no two cameras agree on their people.
+    """
+    longest, settings = 250, TrackingSettings()
+    detections = detections[select_busiest_frames(detections.confidence, longest)]
+    rays = usable_rays(cameras, detections, settings.min_joints)
+    pairs = list(combinations(range(len(cameras.focal)), 2))
+    some = pairs[:: -(-len(pairs) // 15)]
+    matched = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in some]
+    sizes = np.concatenate([np.empty(0)] + [m.matches["size"] for m in matched if m.agrees])
+    sizes = sizes[np.isfinite(sizes)]
+    if not len(sizes):
+        return None
+    size = float(np.median(sizes))
+    motion = Similarity(np.array(1.0 / size), np.eye(3), np.zeros(3))
+    tracks = track_people(move_cameras(motion, cameras), detections, fps, settings)
+    return People.of(size * tracks.joints, fps) if len(tracks.person) else None
+
+
+def doubt_statures(statures: Floats) -> str:
+    """Return a sentence if people's mean stature (persons,) [m] is no adults'; else an empty one.
+
+    A team's mean is known within 7 cm over the root of its number, and limbs tell it within 3 cm.
+    """
+    mean, count = float(np.mean(statures)), len(statures)
+    reach = 2.0 * float(np.hypot(0.03, 0.07 / np.sqrt(count)))
+    if 1.55 - reach <= mean <= 1.82 + reach:
+        return ""
+    yards = UNITS["yd"][0] * mean
+    said = f"the mean stature of {count} people is {mean:.2f} m"
+    if mean > 1.82 and yards < 1.82 + reach:
+        return (
+            f"{said}, and {yards:.2f} m if the calibration is in yards: then import it with "
+            "--unit yd, or multiply its translations by 0.9144"
+        )
+    return (
+        f"{said}: if they are adults, lengths are {mean / STATURE[0]:.2f} times the true ones; "
+        "check the unit of the calibration, or give the metres of its unit with --unit"
+    )
+
+
+def doubt_world(cameras: Camera, joints: NDArray[np.floating]) -> list[str]:
+    """Return sentences about a world in which people do not stand along z, or are no adults.
+
+    Args:
+        cameras: batch (cameras,).
+        joints: (frames, persons, 17, 3) [m], of tracked people; NaN where missing.
+    """
+    most = 1000  # frames; more tell no more
+    people = People.of(joints[:: max(1, len(joints) // most)], 1.0)
+    if people is None:
+        return []
+    vertical, said = people.vertical, []
+    if vertical.is_clear and not vertical.is_z and is_upright(cameras, vertical.axis):
+        said.append(
+            f"{vertical.describe()}. All 3D results lie or stand on their heads; import the "
+            f"calibration again with worldpose import --up {name_axis(vertical.axis)}"
+        )
+    if len(people.statures) and (size := doubt_statures(people.statures)):
+        said.append(size)
+    return said
+
+
+@dataclass(frozen=True)
+class StatedWorld:
+    """What a user states of the world of a calibration.
+
+    Attributes:
+        unit_m: unit of its positions [m]; None = unknown.
+        up: (3,) unit vector that points up; None = unknown.
+    """
+
+    unit_m: float | None = None
+    up: tuple[float, float, float] | None = None
+
+
+def read_stated_world(unit: str | None, up: str | None) -> StatedWorld:
+    """Return what the options `--unit` and `--up` state; None = nothing.
+
+    Raises:
+        UsageError: they are no unit, or no axis.
+    """
+    unit_m = UNITS[unit][0] if unit in UNITS else None
+    if unit is not None and unit_m is None:
+        try:
+            unit_m = float(unit)
+        except ValueError:
+            unit_m = 0.0
+        if not 1e-6 <= unit_m <= 1e6:
+            raise UsageError(
+                f"--unit {unit}",
+                expected=f"{', '.join(UNITS)}, or the metres of the unit, such as 0.08",
+                found=repr(unit),
+                todo="Give one of these.",
+            )
+    axes = {f"{sign}{name}": n for sign in ("", "-") for n, name in enumerate("xyz")}
+    if up is None:
+        return StatedWorld(unit_m)
+    try:
+        vector = [float(word) for word in up.split(",")] if up not in axes else [0.0] * 3
+    except ValueError:
+        vector = []
+    if up in axes:
+        vector[axes[up]] = -1.0 if up.startswith("-") else 1.0
+    if len(vector) != 3 or not 0.0 < np.linalg.norm(vector) < np.inf:
+        raise UsageError(
+            f"--up {up}",
+            expected="x, -x, y, -y, z, -z, or three numbers such as 0.1,-0.9,-0.4",
+            found=repr(up),
+            todo="Give the axis of the calibration's world that points up.",
+        )
+    return StatedWorld(unit_m, (vector[0], vector[1], vector[2]))
+
+
+def place_cameras(
+    where: str,
+    cameras: Mapping[str, CameraCalibration],
+    detections: Mapping[str, KeypointDetections],
+    fps: float,
+    stated: StatedWorld,
+    read_as_m: float = 1.0,
+) -> tuple[dict[str, CameraCalibration], list[str]]:
+    """Return cameras in a world in metres with z up, and sentences about what was changed.
+
+    What the user states holds. The rest follows from the people: their stature tells the unit,
+    and the axis along which they stand, with the ground on which they walk, the vertical. A world
+    that is turned has its ground at z = 0, and keeps its heading.
+
+    Args:
+        where: file of the cameras, for messages.
+        cameras: cameras as read.
+        detections: 2D poses of these cameras on a common clock; none = unknown.
+        fps: frames per second [1/s].
+        stated: what the user states.
+        read_as_m: unit in which positions were read [m].
+
+    Raises:
+        InputError: people have no size of people in any unit, or cameras without people are too
+            far apart for metres.
+    """
+    batch = Camera.stack([Camera.from_calibration(camera) for camera in cameras.values()])
+    people = None
+    if len(cameras) > 1 and detections.keys() >= cameras.keys():
+        stacked = KeypointDetections.stack([detections[name] for name in cameras])
+        people = find_people(batch, stacked, fps)
+    scale, unit = _find_scale(where, batch, people, stated, read_as_m)
+    up, turned, doubt = _find_up(batch, people, stated)
+    notes = [doubt] if doubt else []
+    if people is not None and (size := doubt_statures(scale * people.statures)):
+        notes.append(f"warning: {size}")
+    if not unit and not turned:
+        return dict(cameras), notes
+    height = 0.0
+    if turned and people is not None and np.isfinite(people.ground).all():
+        height = float(scale * people.ground @ up)
+        # The board of a calibration may lie on the ground, and tells it better than ankles.
+        height = height if abs(height) > 0.15 else 0.0
+    if height:
+        turned += f"; people walk {abs(height):.2f} m {'below' if height < 0.0 else 'above'} its "
+        turned += "origin, where z is 0 now"
+    done = "; ".join(each for each in (unit, turned) if each)
+    notes.insert(0, f"{where} is brought to metres with z up: {done}")
+    motion = Similarity(np.array(scale), _turn_to_z(up), np.array([0.0, 0.0, -height]))
+    pose = move_cameras(motion, batch).cam_from_world
+    placed = {
+        name: camera.model_copy(
+            update={
+                "rotation": tuple(map(tuple, pose.rotation[c].tolist())),
+                "translation": tuple(pose.translation[c].tolist()),
+            }
+        )
+        for c, (name, camera) in enumerate(cameras.items())
+    }
+    return placed, notes
+
+
+def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
+    """Return the cameras (cameras,) that see transformed points in the same pixels."""
+    pose = cameras.cam_from_world
+    rotation = pose.rotation @ motion.rotation.T
+    translation = motion.scale * pose.translation - rotation @ motion.translation
+    return replace(cameras, cam_from_world=Rigid(rotation, translation))
+
+
+def _find_scale(
+    where: str, cameras: Camera, people: People | None, stated: StatedWorld, read_as_m: float
+) -> tuple[float, str]:
+    """Return the metres per unit that cameras were read in, and what tells them; empty if one."""
+    farthest_m = 300.0  # of a camera around a stadium from the middle of all: 200 m
+    names = dict(UNITS.values())
+    todo = f"Give the unit: --unit {' or '.join(UNITS)}, or its metres, as --unit 0.08."
+    if stated.unit_m is not None:
+        scale = stated.unit_m / read_as_m
+        name = names.get(stated.unit_m, f"{stated.unit_m:g} m")
+        tall = "" if people is None else f", in which people are {scale * people.stature:.2f} m"
+        return scale, f"its unit is {name}, as stated{tall}" if scale != 1.0 or tall else ""
+    distance = np.linalg.norm(cameras.center - cameras.center.mean(axis=0), axis=1).max()
+    if people is None:
+        if distance > farthest_m:
+            raise InputError(
+                f"{where}: translation",
+                expected=f"positions in {names[read_as_m]}",
+                found=f"a camera {read_as_m**-1 * distance:.3g} {names[read_as_m]} from the middle "
+                "of all cameras, and no people who tell the unit",
+                todo=todo,
+            )
+        return 1.0, ""
+    low, high = (1.75 * size for size in TrackingSettings().size_range)
+    if low <= people.stature <= high:
+        return 1.0, ""
+    fits = [m for m in names if 1.3 <= m / read_as_m * people.stature <= 2.2]
+    if not fits:
+        unit = read_as_m * STATURE[0] / people.stature
+        raise InputError(
+            f"{where}: translation",
+            expected=f"people of 1.3 to 2.2 m in {', '.join(names.values())}",
+            found=f"{len(people.statures)} people of {people.stature / read_as_m:.4g} units",
+            todo=f"{todo} People of {STATURE[0]} m make it {unit:.3g}.",
+        )
+    metres = min(fits, key=lambda m: abs(np.log(m / read_as_m * people.stature / STATURE[0])))
+    scale = metres / read_as_m
+    return scale, (
+        f"its unit is {names[metres]}, by {len(people.statures)} people of "
+        f"{people.stature / read_as_m:.4g} units, {scale * people.stature:.2f} m"
+    )
+
+
+def _find_up(
+    cameras: Camera, people: People | None, stated: StatedWorld
+) -> tuple[Floats, str, str]:
+    """Return the unit vector that points up, what tells it (empty for z), and doubts about it."""
+    z = np.array([0.0, 0.0, 1.0])
+    vertical = None if people is None or not people.vertical.is_clear else people.vertical
+    if stated.up is not None:
+        up = np.array(stated.up) / np.linalg.norm(stated.up)
+        doubt = ""
+        if vertical is not None and vertical.axis @ up < ALIGNED:
+            doubt = f"warning: {vertical.describe(f'{name_axis(up)} as stated')}"
+        return up, "" if up @ z > 1.0 - 1e-12 else f"up is {_describe_turn(up)}, as stated", doubt
+    if people is None or vertical is None or (vertical.is_z and not people.on_feet):
+        return z, "", ""
+    # Bodies lean, and ground slopes: both must tell that z is not up.
+    if max(vertical.axis[2], people.up[2]) > np.cos(np.radians(10.0)):
+        return z, "", ""
+    axis = name_axis(people.up)
+    if not is_upright(cameras, vertical.axis) and not people.on_feet:
+        doubt = f"warning: {vertical.describe()}, but the cameras stand along z: --up {axis} turns"
+        return z, "", f"{doubt} the world if these people do not lie"
+    largest = int(np.abs(people.up).argmax())
+    # The world's own axes are more accurate than people.
+    exact = np.sign(people.up[largest]) * np.eye(3)[largest]
+    up = exact if people.up @ exact >= SAME_AXIS else people.up
+    told = f"{vertical.share:.0%} of {vertical.poses} poses stand along it"
+    return up, f"up is {_describe_turn(up)}, by people: {told}", ""
+
+
+def is_upright(cameras: Camera, axis: Floats) -> bool:
+    """Return whether the images of cameras (cameras,) stand along an axis (3,) more than along z.
+
+    People who lie do so in the images of cameras that stand.
+    """
+    up = -cameras.cam_from_world.rotation[:, 1].mean(axis=0)
+    return bool(up @ axis > up[2])
+
+
+def _describe_turn(up: Floats) -> str:
+    """Return the axis that is turned to z, with the rotation."""
+    turn = Rotation.from_matrix(_turn_to_z(up)).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    return f"{name_axis(up)}, turned by {np.degrees(angle):.1f} degrees about " + (
+        name_axis(turn / angle) if angle > 0.0 else "z"
+    )
+
+
+def _turn_to_z(up: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) that brings a unit vector to z; about x if it is -z."""
+    if up[2] < -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = up
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
