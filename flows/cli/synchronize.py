@@ -15,6 +15,7 @@ from flows.cli.console import (
     JsonOption,
     MatchArgument,
     ProjectOption,
+    errors,
     line,
     print_json,
     print_table,
@@ -49,6 +50,8 @@ class Proposal(NamedTuple):
     """Standard deviation [frame]."""
     reason: str
     """Why it is not known; empty where it is."""
+    relative_to: str | None = None
+    """The camera of its group whose offset stays; None where it is not known."""
 
     @property
     def proposed(self) -> int:
@@ -105,17 +108,19 @@ def synchronize(
     )
     stated = {camera.id: int(camera.offset_frames) for camera in spec.static_cameras}
     known = np.isfinite(found.late)
-    reference = int(np.argmax(known)) if known.any() else 0
+    reference = {camera: group[0] for group in found.groups for camera in group}
     rows = [
         Proposal(
             name,
             stated[name],
-            stated[name] - float(found.late[c] - found.late[reference]) if known[c] else None,
+            stated[name] - float(found.late[c] - found.late[reference[c]]) if known[c] else None,
             float(found.std[c]) if known[c] else None,
             found.reasons[c],
+            names[reference[c]] if known[c] else None,
         )
         for c, name in enumerate(names)
     ]
+    apart = [", ".join(names[c] for c in group) for group in found.groups]
     if plot is not None:
         draw_synchronization(found, names, plot)
     changed = {row.camera: row.proposed for row in rows if row.proposed != row.stated}
@@ -133,7 +138,13 @@ def synchronize(
         )
     else:
         _print(rows, changed, plot, applied=apply)
-    raise typer.Exit(0 if known.all() else 4)
+    if len(apart) > 1:
+        line(
+            f"warning: {len(apart)} groups of cameras share no person: {'; '.join(apart)}. Offsets "
+            "are relative to the first camera of each group; those between groups are unknown.",
+            to=errors,
+        )
+    raise typer.Exit(0 if known.all() and len(apart) == 1 else 4)
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:
@@ -207,7 +218,7 @@ def _print(
             "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
             "-" if row.std is None else f"{row.std:.2f}",
             "-" if row.found is None else str(row.proposed),
-            row.reason,
+            row.reason if row.relative_to is None else f"relative to {row.relative_to}",
         )
         for row in rows
     ]

@@ -117,9 +117,11 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
         ((-1.0, 1.0, 1.0), "its pose is mirrored left to right"),
         ((1.0, -1.0, 1.0), "its pose is mirrored near to far"),
     ):
-        yield Hypothesis(
-            "mirrored", detail, replace_pose(camera, flip @ rotation @ np.diag(axes), flip @ t)
-        )
+        turned = replace_pose(camera, flip @ rotation @ np.diag(axes), flip @ t)
+        yield Hypothesis("mirrored", detail, turned)
+        # Clicks in a mirrored image fit exchanged names, and a camera at the mirrored place.
+        detail = "its images are mirrored, and so are the names of its clicks"
+        yield Hypothesis("mirrored", detail, turned, mirrored=True)
     yield Hypothesis("mirrored", "its images are mirrored", mirrored=True)
     yield Hypothesis("pose", "its images are upside down", upside_down=True)
     yield Hypothesis(

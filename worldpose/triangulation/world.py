@@ -233,22 +233,23 @@ def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> 
 def doubt_statures(statures: Floats) -> str:
     """Return a sentence if people's mean stature (persons,) [m] is no adults'; else an empty one.
 
-    A team's mean is known within 7 cm over the root of its number, and limbs tell it within 3 cm.
+    Means of adults are 1.55 to 1.85 m, within 6 cm over the root of their number; limbs tell
+    stature within 2.5 cm.
     """
     mean, count = float(np.mean(statures)), len(statures)
-    reach = 2.0 * float(np.hypot(0.03, 0.07 / np.sqrt(count)))
-    if 1.55 - reach <= mean <= 1.82 + reach:
+    reach = 2.0 * float(np.hypot(0.025, 0.06 / np.sqrt(count)))
+    if 1.55 - reach <= mean <= 1.85 + reach:
         return ""
     yards = UNITS["yd"][0] * mean
     said = f"the mean stature of {count} people is {mean:.2f} m"
-    if mean > 1.82 and yards < 1.82 + reach:
+    if mean > 1.85 and yards < 1.85 + reach:
         return (
             f"{said}, and {yards:.2f} m if the calibration is in yards: then import it with "
             "--unit yd, or multiply its translations by 0.9144"
         )
     return (
         f"{said}: if they are adults, lengths are {mean / STATURE[0]:.2f} times the true ones; "
-        "check the unit of the calibration, or give the metres of its unit with --unit"
+        "check the unit of the calibration, or state its metres with --unit"
     )
 
 
