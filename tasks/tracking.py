@@ -167,7 +167,9 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             figures |= {name: number for name, number in further.items() if "plane" in name}
     warnings: tuple[str, ...] = (said,) if said else ()
     name = inputs.recipe.name
-    warnings += tuple(f"{name}: {each}" for each in doubt_world(clip.cameras, tracks.joints))
+    warnings += tuple(
+        f"{name}: {each}" for each in doubt_world(clip.cameras, tracks.joints, clip.fps)
+    )
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )

@@ -26,12 +26,8 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError, unknown_name
-from worldpose.formats.calibration_forms import form_unit_m
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import (
-    Cameras,
-    People,
-    Placing,
     import_lenses,
     import_match,
     import_videos,
@@ -229,6 +225,8 @@ def import_command(
         up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
             By default people who stand tell it.
     """
+    from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
+
     options = {
         "--calibration": calibration,
         "--detections": detections,
@@ -260,9 +258,8 @@ def import_command(
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
-        spec, notes = import_pose2sim(
-            pose2sim, out, fps=fps, match_id=match_id, place=_placing(unit, up)
-        )
+        place = place_as_stated(unit, up)
+        spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
         _print_match(spec, out, notes, as_json=as_json)
     elif videos is not None and detections is None:
         spec, notes = import_videos(
@@ -272,7 +269,7 @@ def import_command(
             fps=fps,
             match_id=match_id,
             boxes=boxes,
-            place=_placing(unit, up),
+            place=place_as_stated(unit, up),
         )
         _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
@@ -284,7 +281,7 @@ def import_command(
         )
     else:
         spec, notes = import_match(
-            calibration, detections, fps, out, match_id=match_id, place=_placing(unit, up)
+            calibration, detections, fps, out, match_id=match_id, place=place_as_stated(unit, up)
         )
         _print_match(spec, out, notes, as_json=as_json)
 
@@ -314,34 +311,6 @@ def _require_alone(kind: str, given: set[str]) -> None:
             found=", ".join(others) or f"{kind} alone",
             todo="Import the match first; the rest can be added to its folder then.",
         )
-
-
-def _placing(unit: str | None, up: str | None) -> Placing:
-    """Return what brings cameras to metres with z up, by options and people.
-
-    Raises:
-        UsageError: an option is no unit, or no axis.
-    """
-    from worldpose.triangulation.world import place_cameras, read_stated_world  # late: it is slow
-
-    stated = read_stated_world(unit, up)
-
-    def place(
-        calibration: Path, cameras: Cameras, people: People, fps: float
-    ) -> tuple[Cameras, list[str]]:
-        if not cameras:
-            if unit is not None or up is not None:
-                raise UsageError(
-                    "--unit and --up",
-                    expected="a calibration, whose world they describe",
-                    found="none",
-                    todo="Omit them, or add --calibration.",
-                )
-            return cameras, []
-        read_as_m = form_unit_m(calibration)
-        return place_cameras(str(calibration), cameras, people, fps, stated, read_as_m)
-
-    return place
 
 
 def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:

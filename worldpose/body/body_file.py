@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.conventions import OTHER_UNITS
 from worldpose.body.model import POSE_FEATURES, SMPL_VERTICES, BodyModel
 from worldpose.errors import InputError, UsageError
 from worldpose.parsing import read_npz_members
@@ -242,8 +243,7 @@ def _require_metres(file: Path, span: float) -> None:
     least, most = 0.4, 2.6  # an infant, and an adult with spread arms
     if least <= span <= most:
         return
-    units = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048}
-    fits = [name for name, metres in units.items() if 1.4 <= span * metres <= most]
+    fits = [name for name, metres in OTHER_UNITS.items() if 1.4 <= span * metres <= most]
     raise InputError(
         f"{file}: v_template",
         expected=f"a body in metres, {least:g} to {most:g} in its largest span",

@@ -17,8 +17,8 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import LeftOut, camera_id, require_metres
-from worldpose.formats.calibration_forms import form_unit_m, read_calibration
+from worldpose.formats.calibration_files import LeftOut, camera_id
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
 from worldpose.formats.keypoint_sets import PeopleFile
@@ -36,24 +36,12 @@ MAX_BLACK: Final = 16.0
 """Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
 
-Cameras: TypeAlias = Mapping[str, CameraCalibration]
-People: TypeAlias = Mapping[str, KeypointDetections]
-Placing: TypeAlias = Callable[[Path, Cameras, People, float], tuple[Cameras, list[str]]]
+Placing: TypeAlias = Callable[
+    [Path, Mapping[str, CameraCalibration], Mapping[str, KeypointDetections], float],
+    tuple[dict[str, CameraCalibration], list[str]],
+]
 """Brings the cameras of a calibration to metres with z up, by their 2D poses (none = unknown) and
 the frame rate [1/s]; returns them with sentences about what it changed."""
-
-
-def keep_world(
-    calibration: Path, cameras: Cameras, people: People, fps: float
-) -> tuple[Cameras, list[str]]:
-    """Return the cameras as they are.
-
-    Raises:
-        InputError: they are too far apart for the unit of the file.
-    """
-    if cameras:
-        require_metres(calibration, cameras, form_unit_m(calibration))
-    return cameras, []
 
 
 def import_match(
@@ -63,7 +51,7 @@ def import_match(
     out: Path,
     match_id: str | None = None,
     pitch: Literal["none"] | None = "none",
-    place: Placing = keep_world,
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and their detections.
 
@@ -78,7 +66,7 @@ def import_match(
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
         pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
-        place: brings the cameras to metres with z up.
+        place: brings the cameras to metres with z up; None = they are in such a world.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -88,7 +76,7 @@ def import_match(
             empty; nothing is written then.
     """
     left_out: LeftOut = {}
-    cameras: Cameras = read_calibration(calibration, left_out=left_out, any_unit=True)
+    cameras = read_calibration(calibration, left_out=left_out, any_unit=place is not None)
     files = detections_by_camera(detections, list(cameras), calibration, left_out)
     read = {name: read_people(file) for name, file in files.items()}
     people = {name: found.people for name, found in read.items()}
@@ -97,9 +85,11 @@ def import_match(
     spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
-    cameras, placed = place(calibration, cameras, people, fps)
+    notes: list[str] = []
+    if place is not None:
+        cameras, notes = place(calibration, cameras, people, fps)
     write_match(out, spec, calibrations=cameras, observations=people)
-    return spec, placed + describe_left_out(left_out) + describe_people(read)
+    return spec, notes + describe_left_out(left_out) + describe_people(read)
 
 
 def describe_left_out(left_out: LeftOut) -> list[str]:
@@ -296,7 +286,7 @@ def import_videos(
     fps: float | None = None,
     match_id: str | None = None,
     boxes: Path | None = None,
-    place: Placing = keep_world,
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
@@ -314,7 +304,7 @@ def import_videos(
         match_id: id of the match; None = the name of `out`.
         boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
             estimated, for some of the cameras or all; None = people are detected.
-        place: brings the cameras to metres with z up.
+        place: brings the cameras to metres with z up; None = they are in such a world.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -333,7 +323,7 @@ def import_videos(
         known = {camera_id(file.stem): index_frames(file) for file in filmed}
         left_out: LeftOut = {}
         shown = {name: index.size for name, index in known.items()}
-        cameras = read_calibration(calibration, shown, left_out, any_unit=True)
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes += describe_left_out(left_out)
         files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES, left_out)
         indices = {name: known[name] for name in files}
@@ -343,15 +333,17 @@ def import_videos(
     counts = {name: len(index.on_clock(rate, str(files[name]))) for name, index in indices.items()}
     sizes = {name: index.size for name, index in indices.items()}
     spec = build_spec(out, match_id, rate, sizes, (0, min(counts.values())), videos=files)
-    written, placed = place(calibration or videos, cameras, {}, rate)
+    if place is not None:
+        cameras, placed = place(calibration or videos, cameras, {}, rate)
+        notes = placed + notes
 
     def copy(folder: Path) -> None:
         copy_videos(files, folder)
         if boxes is not None:
             copy_boxes(boxes, indices, folder)
 
-    write_match(out, spec, calibrations=written, observations={}, further=copy)
-    return spec, placed + notes
+    write_match(out, spec, calibrations=cameras, observations={}, further=copy)
+    return spec, notes
 
 
 def list_videos(folder: Path) -> list[Path]:

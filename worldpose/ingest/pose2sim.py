@@ -30,7 +30,6 @@ from worldpose.ingest.importing import (
     describe_people,
     find_people,
     fit_to_video,
-    keep_world,
     list_videos,
 )
 from worldpose.ingest.writing import write_match
@@ -47,7 +46,7 @@ def import_pose2sim(
     out: Path,
     fps: float | None = None,
     match_id: str | None = None,
-    place: Placing = keep_world,
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
 
@@ -65,7 +64,7 @@ def import_pose2sim(
         out: the match folder, absent or empty.
         fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
         match_id: id of the match; None = the name of `out`.
-        place: brings the cameras to metres with z up.
+        place: brings the cameras to metres with z up; None = they are in such a world.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was left out.
@@ -98,7 +97,7 @@ def import_pose2sim(
         source = project / "videos"
     else:
         shown = {camera_of(file): index.size for file, index in known.items()}
-        cameras = read_calibration(calibration, shown, left_out, any_unit=True)
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
         places = [each for each in places if camera_of(each) not in left_out]
@@ -126,11 +125,13 @@ def import_pose2sim(
     for name, files in poses.items():
         people[name] = on_frames(files, people[name], [(first, stop - first)])
 
-    written, placed = place(calibration or project, cameras, people, rate)
+    if place is not None:
+        cameras, placed = place(calibration or project, cameras, people, rate)
+        notes = placed + notes
     write_match(
-        out, spec, calibrations=written, observations=people, further=partial(copy_videos, videos)
+        out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
-    return spec, placed + notes + _describe_poses(folder, read)
+    return spec, notes + _describe_poses(folder, read)
 
 
 def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:

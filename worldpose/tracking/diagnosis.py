@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Flags, Floats, Integers
+from data_contracts.conventions import OTHER_UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import size_ratios
@@ -435,8 +436,7 @@ def _explain_limit(
 
 def _guess_unit(size: float) -> str:
     """Return what translations that make people `size` times as large may be in."""
-    units = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
-    off, unit = min((abs(math.log(size / factor)), name) for factor, name in units.items())
+    off, unit = min((abs(math.log(size * m)), name) for name, m in OTHER_UNITS.items())
     return f"translations seem to be in {unit}" if off < 0.3 else "is the unit the metre?"
 
 

@@ -10,8 +10,8 @@ from data_contracts.arrays import Floats
 
 ALIGNED: Final = float(np.cos(np.radians(30.0)))
 """Cosine from which a person stands along an axis [1]: people who run lean by 15 degrees."""
-SAME_AXIS: Final = float(np.cos(np.radians(8.0)))
-"""Cosine from which people's axis is one of the world's [1]; people tell it within 3 degrees."""
+SAME_AXIS: Final = float(np.cos(np.radians(2.5)))
+"""Cosine from which people's axis is one of the world's [1]; people tell it within 1 degree."""
 
 
 class Vertical(NamedTuple):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from itertools import combinations
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +15,28 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import CameraCalibration
+from data_contracts.conventions import UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import select_busiest_frames
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_forms import form_unit_m
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.tracking.diagnosis import match_pair, usable_rays
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.tracking.vertical import ALIGNED, SAME_AXIS, Vertical, find_vertical, name_axis
+from worldpose.tracking.vertical import (
+    ALIGNED,
+    SAME_AXIS,
+    Vertical,
+    find_vertical,
+    name_axis,
+)
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
 
-UNITS: Final = {
-    "mm": (0.001, "millimetres"),
-    "cm": (0.01, "centimetres"),
-    "m": (1.0, "metres"),
-    "in": (0.0254, "inches"),
-    "ft": (0.3048, "feet"),
-    "yd": (0.9144, "yards"),
-    "km": (1000.0, "kilometres"),
-}
-"""Units of length by their sign: metres, and the name."""
+Placed: TypeAlias = tuple[dict[str, CameraCalibration], list[str]]
+LEVEL: Final = float(np.cos(np.radians(10.0)))
+"""Cosine of the steepest ground, and of the largest mean lean of people who walk [1]."""
 
 
 def _mean_direction(vectors: Floats) -> Floats:
@@ -179,6 +182,14 @@ class People(NamedTuple):
         """Median stature [unit of the world]."""
         return float(np.median(self.statures))
 
+    def stand_along(self, axis: Floats, cameras: Camera) -> bool:
+        """Return whether people stand along an axis (3,), and do not lie in a world with z up.
+
+        People who lie do so in the images of cameras that stand; and they do not walk.
+        """
+        up = -cameras.cam_from_world.rotation[:, 1].mean(axis=0)
+        return bool(up @ axis > up[2] or (self.on_feet and up[2] < 0.5))
+
     @classmethod
     def of(cls, joints: NDArray[np.floating], fps: float) -> People | None:
         """Return what joints (frames, persons, 17, 3) tell; None if no stature or axis is known."""
@@ -199,8 +210,10 @@ class People(NamedTuple):
             return cls(statures, vertical, vertical.axis, np.full(3, np.nan), on_feet=False)
         world = walkers.orient(scale)
         motion = world.similarity
-        ground = -motion.rotation.T @ motion.translation / scale
-        return cls(statures, vertical, motion.rotation[2], ground, world.on_feet)
+        ground, up = -motion.rotation.T @ motion.translation / scale, motion.rotation[2]
+        # Feet of people who lie are on no ground.
+        on_feet = world.on_feet and bool(up @ vertical.axis > LEVEL)
+        return cls(statures, vertical, up if on_feet else vertical.axis, ground, on_feet)
 
 
 def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> People | None:
@@ -253,87 +266,93 @@ def doubt_statures(statures: Floats) -> str:
     )
 
 
-def doubt_world(cameras: Camera, joints: NDArray[np.floating]) -> list[str]:
+def doubt_world(cameras: Camera, joints: NDArray[np.floating], fps: float) -> list[str]:
     """Return sentences about a world in which people do not stand along z, or are no adults.
 
     Args:
         cameras: batch (cameras,).
         joints: (frames, persons, 17, 3) [m], of tracked people; NaN where missing.
+        fps: frames per second [1/s].
     """
     most = 1000  # frames; more tell no more
-    people = People.of(joints[:: max(1, len(joints) // most)], 1.0)
+    people = People.of(joints[:most], fps)
     if people is None:
         return []
-    vertical, said = people.vertical, []
-    if vertical.is_clear and not vertical.is_z and is_upright(cameras, vertical.axis):
-        said.append(
+    vertical, size = people.vertical, doubt_statures(people.statures)
+    said = [size] if size else []
+    if vertical.is_clear and not vertical.is_z and people.stand_along(vertical.axis, cameras):
+        said.insert(
+            0,
             f"{vertical.describe()}. All 3D results lie or stand on their heads; import the "
-            f"calibration again with worldpose import --up {name_axis(vertical.axis)}"
+            f"calibration again with worldpose import --up {name_axis(people.up)}",
         )
-    if len(people.statures) and (size := doubt_statures(people.statures)):
-        said.append(size)
     return said
 
 
-@dataclass(frozen=True)
-class StatedWorld:
-    """What a user states of the world of a calibration.
-
-    Attributes:
-        unit_m: unit of its positions [m]; None = unknown.
-        up: (3,) unit vector that points up; None = unknown.
-    """
+class StatedWorld(NamedTuple):
+    """What a user states of the world of a calibration; None = nothing."""
 
     unit_m: float | None = None
-    up: tuple[float, float, float] | None = None
+    """Unit of its positions [m]."""
+    up: Floats | None = None
+    """(3,) unit vector that points up."""
 
 
 def read_stated_world(unit: str | None, up: str | None) -> StatedWorld:
-    """Return what the options `--unit` and `--up` state; None = nothing.
+    """Return what the options `--unit` and `--up` state.
 
     Raises:
         UsageError: they are no unit, or no axis.
     """
-    unit_m = UNITS[unit][0] if unit in UNITS else None
-    if unit is not None and unit_m is None:
+    axes = {
+        f"{sign}{'xyz'[n]}": float(f"{sign}1") * np.eye(3)[n]
+        for sign in ("", "-")
+        for n in range(3)
+    }
+    numbers = []
+    for text in (unit, up):
         try:
-            unit_m = float(unit)
+            numbers.append([float(word) for word in (text or "").split(",")])
         except ValueError:
-            unit_m = 0.0
-        if not 1e-6 <= unit_m <= 1e6:
-            raise UsageError(
-                f"--unit {unit}",
-                expected=f"{', '.join(UNITS)}, or the metres of the unit, such as 0.08",
-                found=repr(unit),
-                todo="Give one of these.",
-            )
-    axes = {f"{sign}{name}": n for sign in ("", "-") for n, name in enumerate("xyz")}
-    if up is None:
-        return StatedWorld(unit_m)
-    try:
-        vector = [float(word) for word in up.split(",")] if up not in axes else [0.0] * 3
-    except ValueError:
-        vector = []
-    if up in axes:
-        vector[axes[up]] = -1.0 if up.startswith("-") else 1.0
-    if len(vector) != 3 or not 0.0 < np.linalg.norm(vector) < np.inf:
+            numbers.append([])
+    unit_m = (
+        UNITS[unit][0] if unit in UNITS else float(numbers[0][0]) if len(numbers[0]) == 1 else 0.0
+    )
+    vector = axes.get(up or "z", np.array(numbers[1]))
+    if unit is not None and not 1e-6 <= unit_m <= 1e6:
+        raise UsageError(
+            f"--unit {unit}",
+            expected=f"{', '.join(UNITS)}, or the metres of the unit, such as 0.08",
+            found=repr(unit),
+            todo="Give the unit of the calibration's positions.",
+        )
+    length = float(np.linalg.norm(vector))
+    if len(vector) != 3 or not 0.0 < length < np.inf:
         raise UsageError(
             f"--up {up}",
             expected="x, -x, y, -y, z, -z, or three numbers such as 0.1,-0.9,-0.4",
             found=repr(up),
             todo="Give the axis of the calibration's world that points up.",
         )
-    return StatedWorld(unit_m, (vector[0], vector[1], vector[2]))
+    return StatedWorld(unit_m if unit else None, vector / length if up else None)
+
+
+def place_as_stated(unit: str | None, up: str | None) -> partial[Placed]:
+    """Return `place_cameras` with what the options `--unit` and `--up` state.
+
+    Raises:
+        UsageError: they are no unit, or no axis.
+    """
+    return partial(place_cameras, stated=read_stated_world(unit, up))
 
 
 def place_cameras(
-    where: str,
+    calibration: Path,
     cameras: Mapping[str, CameraCalibration],
     detections: Mapping[str, KeypointDetections],
     fps: float,
     stated: StatedWorld,
-    read_as_m: float = 1.0,
-) -> tuple[dict[str, CameraCalibration], list[str]]:
+) -> Placed:
     """Return cameras in a world in metres with z up, and sentences about what was changed.
 
     What the user states holds. The rest follows from the people: their stature tells the unit,
@@ -341,51 +360,55 @@ def place_cameras(
     that is turned has its ground at z = 0, and keeps its heading.
 
     Args:
-        where: file of the cameras, for messages.
+        calibration: the calibration, whose form tells the unit in which it was read.
         cameras: cameras as read.
         detections: 2D poses of these cameras on a common clock; none = unknown.
         fps: frames per second [1/s].
         stated: what the user states.
-        read_as_m: unit in which positions were read [m].
 
     Raises:
+        UsageError: there is no camera that has the stated world.
         InputError: people have no size of people in any unit, or cameras without people are too
             far apart for metres.
     """
+    if not cameras:
+        if stated != StatedWorld():
+            raise UsageError(
+                "--unit and --up",
+                expected="a calibration, whose world they describe",
+                found="none",
+                todo="Omit them, or add --calibration.",
+            )
+        return {}, []
     batch = Camera.stack([Camera.from_calibration(camera) for camera in cameras.values()])
     people = None
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
         people = find_people(batch, stacked, fps)
-    scale, unit = _find_scale(where, batch, people, stated, read_as_m)
-    up, turned, doubt = _find_up(batch, people, stated)
+    scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
+    up, turned, doubt = _find_up(batch, people, stated.up)
     notes = [doubt] if doubt else []
     if people is not None and (size := doubt_statures(scale * people.statures)):
         notes.append(f"warning: {size}")
     if not unit and not turned:
         return dict(cameras), notes
-    height = 0.0
-    if turned and people is not None and np.isfinite(people.ground).all():
-        height = float(scale * people.ground @ up)
-        # The board of a calibration may lie on the ground, and tells it better than ankles.
-        height = height if abs(height) > 0.15 else 0.0
-    if height:
-        turned += f"; people walk {abs(height):.2f} m {'below' if height < 0.0 else 'above'} its "
-        turned += "origin, where z is 0 now"
+    height = float(scale * people.ground @ up) if turned and people is not None else 0.0
+    # The board of a calibration may lie on the ground, and tells it better than ankles.
+    if not abs(height) > 0.15:  # also NaN
+        height = 0.0
+    else:
+        turned += f"; people walk at {height:+.2f} m, which is z = 0 now"
     done = "; ".join(each for each in (unit, turned) if each)
-    notes.insert(0, f"{where} is brought to metres with z up: {done}")
     motion = Similarity(np.array(scale), _turn_to_z(up), np.array([0.0, 0.0, -height]))
     pose = move_cameras(motion, batch).cam_from_world
+    poses = zip(pose.rotation.tolist(), pose.translation.tolist(), strict=True)
     placed = {
         name: camera.model_copy(
-            update={
-                "rotation": tuple(map(tuple, pose.rotation[c].tolist())),
-                "translation": tuple(pose.translation[c].tolist()),
-            }
+            update={"rotation": tuple(map(tuple, rotation)), "translation": tuple(translation)}
         )
-        for c, (name, camera) in enumerate(cameras.items())
+        for (name, camera), (rotation, translation) in zip(cameras.items(), poses, strict=True)
     }
-    return placed, notes
+    return placed, [f"{calibration} is brought to metres with z up: {done}", *notes]
 
 
 def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
@@ -397,84 +420,64 @@ def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
 
 
 def _find_scale(
-    where: str, cameras: Camera, people: People | None, stated: StatedWorld, read_as_m: float
+    calibration: Path, cameras: Camera, people: People | None, unit_m: float | None
 ) -> tuple[float, str]:
     """Return the metres per unit that cameras were read in, and what tells them; empty if one."""
     farthest_m = 300.0  # of a camera around a stadium from the middle of all: 200 m
-    names = dict(UNITS.values())
-    todo = f"Give the unit: --unit {' or '.join(UNITS)}, or its metres, as --unit 0.08."
-    if stated.unit_m is not None:
-        scale = stated.unit_m / read_as_m
-        name = names.get(stated.unit_m, f"{stated.unit_m:g} m")
-        tall = "" if people is None else f", in which people are {scale * people.stature:.2f} m"
-        return scale, f"its unit is {name}, as stated{tall}" if scale != 1.0 or tall else ""
-    distance = np.linalg.norm(cameras.center - cameras.center.mean(axis=0), axis=1).max()
-    if people is None:
-        if distance > farthest_m:
-            raise InputError(
-                f"{where}: translation",
-                expected=f"positions in {names[read_as_m]}",
-                found=f"a camera {read_as_m**-1 * distance:.3g} {names[read_as_m]} from the middle "
-                "of all cameras, and no people who tell the unit",
-                todo=todo,
-            )
+    names, read_as_m = dict(UNITS.values()), form_unit_m(calibration)
+    tall, count = (0.0, 0) if people is None else (people.stature, len(people.statures))
+    seen, stated = f"{count} people of {tall / read_as_m:.4g} units", unit_m is not None
+    distance = float(np.linalg.norm(cameras.center - cameras.center.mean(axis=0), axis=1).max())
+    low, high = 0.9, 2.6  # children, and measured badly
+    if unit_m is not None:
+        metres, fits = unit_m, not tall or 0.3 <= unit_m / read_as_m * tall <= 4.0
+    elif low <= tall <= high or (not tall and distance <= farthest_m):
         return 1.0, ""
-    low, high = (1.75 * size for size in TrackingSettings().size_range)
-    if low <= people.stature <= high:
-        return 1.0, ""
-    fits = [m for m in names if 1.3 <= m / read_as_m * people.stature <= 2.2]
+    else:
+        metres = min(names, key=lambda m: abs(np.log(m / read_as_m * (tall or 1e6) / STATURE[0])))
+        fits = low <= metres / read_as_m * tall <= high
+    name = names.get(metres, f"{metres:g} m")
     if not fits:
-        unit = read_as_m * STATURE[0] / people.stature
+        far = f"a camera {distance / read_as_m:.3g} units from the middle of all, and no people"
+        makes = f" People of {STATURE[0]} m make it {read_as_m * STATURE[0] / (tall or 1.0):.3g}."
         raise InputError(
-            f"{where}: translation",
-            expected=f"people of 1.3 to 2.2 m in {', '.join(names.values())}",
-            found=f"{len(people.statures)} people of {people.stature / read_as_m:.4g} units",
-            todo=f"{todo} People of {STATURE[0]} m make it {unit:.3g}.",
+            f"{calibration}: translation",
+            expected=f"positions in {name if stated else names[read_as_m]}, and people of "
+            f"{low:g} to {high:g} m",
+            found=seen if tall else far,
+            todo=f"Give the unit: --unit {' or '.join(UNITS)}, or its metres, as --unit 0.08."
+            + (makes if tall else ""),
         )
-    metres = min(fits, key=lambda m: abs(np.log(m / read_as_m * people.stature / STATURE[0])))
-    scale = metres / read_as_m
-    return scale, (
-        f"its unit is {names[metres]}, by {len(people.statures)} people of "
-        f"{people.stature / read_as_m:.4g} units, {scale * people.stature:.2f} m"
-    )
+    scale, by = metres / read_as_m, ", as stated" if stated else ""
+    by += f", by {seen}, {metres / read_as_m * tall:.2f} m" if tall else ""
+    return scale, f"its unit is {name}{by}" if scale != 1.0 else ""
 
 
 def _find_up(
-    cameras: Camera, people: People | None, stated: StatedWorld
+    cameras: Camera, people: People | None, stated: Floats | None
 ) -> tuple[Floats, str, str]:
     """Return the unit vector that points up, what tells it (empty for z), and doubts about it."""
-    z = np.array([0.0, 0.0, 1.0])
+    z, doubt = np.array([0.0, 0.0, 1.0]), ""
     vertical = None if people is None or not people.vertical.is_clear else people.vertical
-    if stated.up is not None:
-        up = np.array(stated.up) / np.linalg.norm(stated.up)
-        doubt = ""
-        if vertical is not None and vertical.axis @ up < ALIGNED:
-            doubt = f"warning: {vertical.describe(f'{name_axis(up)} as stated')}"
-        return up, "" if up @ z > 1.0 - 1e-12 else f"up is {_describe_turn(up)}, as stated", doubt
-    if people is None or vertical is None or (vertical.is_z and not people.on_feet):
-        return z, "", ""
+    if stated is not None:
+        if vertical is not None and vertical.axis @ stated < ALIGNED:
+            doubt = f"warning: {vertical.describe(f'{name_axis(stated)} as stated')}"
+        same = stated @ z > 1.0 - 1e-12
+        return stated, "" if same else f"up is {_describe_turn(stated)}, as stated", doubt
     # Bodies lean, and ground slopes: both must tell that z is not up.
-    if max(vertical.axis[2], people.up[2]) > np.cos(np.radians(10.0)):
+    if people is None or vertical is None or max(vertical.axis[2], people.up[2]) > LEVEL:
         return z, "", ""
-    axis = name_axis(people.up)
-    if not is_upright(cameras, vertical.axis) and not people.on_feet:
-        doubt = f"warning: {vertical.describe()}, but the cameras stand along z: --up {axis} turns"
-        return z, "", f"{doubt} the world if these people do not lie"
+    if not people.stand_along(vertical.axis, cameras) or (vertical.is_z and not people.on_feet):
+        if not vertical.is_z:
+            doubt = f"warning: {vertical.describe()}, but the cameras stand along z: if these "
+            doubt += f"people do not lie, --up {name_axis(people.up)} turns the world"
+        return z, "", doubt
     largest = int(np.abs(people.up).argmax())
     # The world's own axes are more accurate than people.
     exact = np.sign(people.up[largest]) * np.eye(3)[largest]
     up = exact if people.up @ exact >= SAME_AXIS else people.up
     told = f"{vertical.share:.0%} of {vertical.poses} poses stand along it"
     return up, f"up is {_describe_turn(up)}, by people: {told}", ""
-
-
-def is_upright(cameras: Camera, axis: Floats) -> bool:
-    """Return whether the images of cameras (cameras,) stand along an axis (3,) more than along z.
-
-    People who lie do so in the images of cameras that stand.
-    """
-    up = -cameras.cam_from_world.rotation[:, 1].mean(axis=0)
-    return bool(up @ axis > up[2])
 
 
 def _describe_turn(up: Floats) -> str:

@@ -1,5 +1,7 @@
 """A calibration's unit and up axis follow from the people, or from what the user states."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,8 +21,16 @@ from worldpose.triangulation.world import (
 
 FPS = 25.0
 NOTHING = StatedWorld()
+CALIBRATION = Path("cal.mcal")
 LYING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation from people who stand along z to ones who lie along y."""
+
+
+@pytest.fixture(autouse=True)
+def calibration(tmp_path, monkeypatch):
+    """A file whose ending tells that its cameras are in metres."""
+    monkeypatch.chdir(tmp_path)
+    CALIBRATION.touch()
 
 
 def walk(people, frames=40):
@@ -43,7 +53,7 @@ def poses(keypoints, confidence):
 
 def placed(true, given, keypoints, stated=NOTHING):
     """Errors of the placed cameras: tilt [degree], height [m], scale [1]; and the sentences."""
-    found, notes = place_cameras("cal.toml", records(given), keypoints, FPS, stated)
+    found, notes = place_cameras(CALIBRATION, records(given), keypoints, FPS, stated)
     cameras = Camera.stack([Camera.from_calibration(each) for each in found.values()])
     turn = np.swapaxes(cameras.cam_from_world.rotation, -1, -2) @ true.cam_from_world.rotation
     tilt = float(np.degrees(np.arccos(np.clip(turn[:, 2, 2], -1.0, 1.0))).max())
@@ -95,9 +105,11 @@ def test_what_the_user_states_holds(ring, people, seen):
     assert (tilt, height, scale) == pytest.approx((0.0, 0.0, 1.0), abs=1e-5)
     assert "0.08 m, as stated; up is y" in notes[0]
     with pytest.raises(InputError, match=r"3 people of 2[0-9.]+ units.*make it 0.079"):
-        place_cameras("cal.toml", records(given), keypoints, FPS, NOTHING)
+        place_cameras(CALIBRATION, records(given), keypoints, FPS, NOTHING)
+    with pytest.raises(InputError, match=r"in millimetres, .* found 3 people of 1[.][0-9]+ units"):
+        placed(true, true, keypoints, StatedWorld(0.001))
     # People who contradict the stated axis are told.
-    notes = placed(true, true, keypoints, StatedWorld(up=(0.0, 1.0, 0.0)))[3]
+    notes = placed(true, true, keypoints, read_stated_world(None, "y"))[3]
     assert "the upright axis of people is z, not y as stated" in notes[1]
 
 
@@ -105,15 +117,15 @@ def test_people_who_lie_before_cameras_that_stand_turn_no_world(ring, people, se
     true = ring(4)
     joints = walk(people) @ LYING.T + [0.0, 0.0, 1.0]
     given = records(true)
-    found, notes = place_cameras("cal.toml", given, poses(*seen(true, joints)), FPS, NOTHING)
+    found, notes = place_cameras(CALIBRATION, given, poses(*seen(true, joints)), FPS, NOTHING)
     assert found == given
     assert "the cameras stand along z" in notes[0]
-    assert doubt_world(true, joints) == []
+    assert doubt_world(true, joints, FPS) == []
 
 
 def test_a_run_names_the_axis_of_a_turned_world(ring, people):
     turned = move_cameras(Similarity(np.array(1.0), LYING, np.zeros(3)), ring(4))
-    (said,) = doubt_world(turned, walk(people) @ LYING.T)
+    (said,) = doubt_world(turned, walk(people) @ LYING.T, FPS)
     assert "the upright axis of people is y, not z: 100% of 120 poses" in said
     assert "--up y" in said
 
@@ -123,10 +135,10 @@ def test_without_people_cameras_alone_decide(ring):
         records(move_cameras(Similarity(np.array(scale), np.eye(3), np.zeros(3)), ring(4)))
         for scale in (1.0, 20.0)
     )
-    assert place_cameras("cal.toml", near, {}, FPS, NOTHING) == (near, [])
-    with pytest.raises(InputError, match=r"601 metres from the middle.*--unit mm"):
-        place_cameras("cal.toml", far, {}, FPS, NOTHING)
-    assert place_cameras("cal.toml", far, {}, FPS, StatedWorld(1.0)) == (far, [])
+    assert place_cameras(CALIBRATION, near, {}, FPS, NOTHING) == (near, [])
+    with pytest.raises(InputError, match=r"601 units from the middle.*--unit mm"):
+        place_cameras(CALIBRATION, far, {}, FPS, NOTHING)
+    assert place_cameras(CALIBRATION, far, {}, FPS, StatedWorld(1.0)) == (far, [])
 
 
 @pytest.mark.parametrize(
@@ -135,7 +147,7 @@ def test_without_people_cameras_alone_decide(ring):
         ([1.85] * 11, ""),
         ([1.6, 1.9], ""),
         ([1.9], ""),
-        ([1.76 / 0.9144] * 3, "1.76 m if the calibration is in yards"),
+        ([1.76 / 0.9144] * 6, "1.76 m if the calibration is in yards"),
         ([1.82 / 0.9144] * 11, "1.82 m if the calibration is in yards"),
         ([1.3] * 5, "0.76 times the true ones"),
     ],
