@@ -36,8 +36,8 @@ def camera_consistency(inputs: UnitInputs, result: ResultWriter) -> None:
         settings,
         ground=sources["ground"],
     )
-    if found.strangers:
-        result.warnings.append(_describe_strangers(inputs, clip, found))
+    if doubt := _doubt_calibration(inputs, clip, found):
+        result.warnings.append(doubt)
     faults = describe_faults(found, names, sources["offset_frames"], clip.fps)
     wrong = faulty_cameras(found) if settings.leave_out else set()
     result.write(
@@ -65,37 +65,42 @@ def camera_consistency(inputs: UnitInputs, result: ResultWriter) -> None:
     )
 
 
-def _describe_strangers(inputs: UnitInputs, clip: ClipInputs, found: Consistency) -> str:
-    """Return a warning of cameras whose people fit those of no other camera.
+def _doubt_calibration(inputs: UnitInputs, clip: ClipInputs, found: Consistency) -> str:
+    """Return a warning of a calibration that people of most cameras, or stills, contradict.
 
     Raises:
-        InputError: most stills contradict the calibration, too.
+        InputError: both contradict it.
     """
     names, folder = clip.camera_ids, Path(inputs.work.folder)
-    alone = (
-        f"the people of {len(found.strangers)} of {len(names)} cameras "
-        f"({', '.join(names[c] for c in found.strangers)}) fit those of no other camera"
-    )
-    shares = {}
-    for name, still in inputs.sources.get("stills", {}).items():
-        camera = clip.cameras[names.index(name)]
+    alone, shares = "", {}
+    if found.strangers:
+        alone = (
+            f"the people of {len(found.strangers)} of {len(names)} cameras "
+            f"({', '.join(names[c] for c in found.strangers)}) fit those of no other camera"
+        )
+    stills = inputs.sources.get("stills", {})
+    for name in (name for name in names if name in stills):
+        camera, file = clip.cameras[names.index(name)], folder / stills[name]["still"]
         width, height = camera.image_size.tolist()
-        picture = read_still(folder / still["still"], (width, height))
-        require_registered(folder / still["still"], still["still_sha256"])
+        picture = read_still(file, (width, height))
+        require_registered(file, stills[name]["still_sha256"])
         assert inputs.pitch is not None  # stills are listed on a pitch alone
         if (share := paint_share(picture, camera, inputs.pitch)) is not None:
             shares[name] = share
     off = [name for name, share in shares.items() if share < 0.45]
-    if 2 * len(off) > len(shares):
+    unpainted = 2 * len(off) > len(shares)
+    fits = f"{np.mean([shares[n] for n in off] or [0.0]):.0%} of the markings lie on paint in the "
+    fits += f"stills of {', '.join(off)}, as by chance"
+    if alone and unpainted:
         raise InputError(
             "calibration.toml",
             expected="the cameras of this match",
-            found=f"others: they show {np.mean([shares[n] for n in off]):.0%} of the markings on "
-            f"paint in the stills of {', '.join(off)}, as by chance, and {alone}",
+            found=f"others: {fits}, and {alone}",
             todo="Is it the calibration of another match? Give that of this one, or click the "
             "markings.",
         )
-    return (
-        f"{alone}: calibration.toml is that of other cameras, or the clocks differ by more than "
-        "some frames (worldpose synchronize)"
-    )
+    if off and not alone:
+        whole = "has another world or pitch than the stills" if unpainted else "contradicts stills"
+        return f"calibration.toml {whole}: {fits}"
+    clocks = "calibration.toml is that of other cameras, or the clocks differ by more than some"
+    return f"{alone}: {clocks} frames (worldpose synchronize)" if alone else ""

@@ -166,10 +166,10 @@ def _track_people(inputs: UnitInputs) -> Tracked:
         elif found.on_plane.any():
             figures |= {name: number for name, number in further.items() if "plane" in name}
     warnings: tuple[str, ...] = (said,) if said else ()
-    name = inputs.recipe.name
-    warnings += tuple(
-        f"{name}: {each}" for each in doubt_world(clip.cameras, tracks.joints, clip.fps)
-    )
+    name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
+    # With many detections left over, people are rays that meet by chance.
+    world = doubt_world(clip.cameras, tracks.joints, clip.fps, sizes=unmatched < 0.3)
+    warnings += tuple(f"{name}: {each}" for each in world)
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )

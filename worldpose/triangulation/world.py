@@ -266,19 +266,22 @@ def doubt_statures(statures: Floats) -> str:
     )
 
 
-def doubt_world(cameras: Camera, joints: NDArray[np.floating], fps: float) -> list[str]:
+def doubt_world(
+    cameras: Camera, joints: NDArray[np.floating], fps: float, *, sizes: bool = True
+) -> list[str]:
     """Return sentences about a world in which people do not stand along z, or are no adults.
 
     Args:
         cameras: batch (cameras,).
         joints: (frames, persons, 17, 3) [m], of tracked people; NaN where missing.
         fps: frames per second [1/s].
+        sizes: whether lengths can be judged.
     """
     most = 1000  # frames; more tell no more
     people = People.of(joints[:most], fps)
     if people is None:
         return []
-    vertical, size = people.vertical, doubt_statures(people.statures)
+    vertical, size = people.vertical, doubt_statures(people.statures) if sizes else ""
     said = [size] if size else []
     if vertical.is_clear and not vertical.is_z and people.stand_along(vertical.axis, cameras):
         said.insert(
