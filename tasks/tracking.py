@@ -116,8 +116,7 @@ def _open_uncorrected(inputs: UnitInputs) -> Tracked:
 
 
 def _track_people(inputs: UnitInputs) -> Tracked:
-    clip = open_clip(inputs)
-    pitch = _pitch(inputs)
+    clip, pitch = open_clip(inputs), _pitch(inputs)
     settings = inputs.settings(TrackingSettings)
     pitch_size = None if pitch is None else (pitch.length, pitch.width)
     tracks = track_people(
@@ -168,8 +167,8 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     warnings: tuple[str, ...] = (said,) if said else ()
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
     # With many detections left over, people are rays that meet by chance.
-    world = doubt_world(clip.cameras, tracks.joints, clip.fps, sizes=unmatched < 0.3)
-    warnings += tuple(f"{name}: {each}" for each in world)
+    doubted = doubt_world(clip.cameras, tracks.joints, clip.fps, sizes=unmatched < 0.3)
+    warnings += tuple(f"{name}: {each}" for each in doubted)
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )

@@ -27,11 +27,7 @@ from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError, unknown_name
 from worldpose.ingest.clicks import import_clicks
-from worldpose.ingest.importing import (
-    import_lenses,
-    import_match,
-    import_videos,
-)
+from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import unclicked_clips
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
@@ -225,8 +221,6 @@ def import_command(
         up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
             By default people who stand tell it.
     """
-    from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
-
     options = {
         "--calibration": calibration,
         "--detections": detections,
@@ -247,6 +241,11 @@ def import_command(
     kind = next((name for name in ALONE if name in given), None)
     if kind is not None:
         _require_alone(kind, given)
+    place = None
+    if kind in (None, "--pose2sim"):
+        from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
+
+        place = place_as_stated(unit, up)
     if kind == "--boxes" and boxes is not None:
         counts = import_boxes(boxes, out)
         lines = (f"wrote {out / 'boxes' / name}.txt: {n} boxes" for name, n in counts.items())
@@ -258,7 +257,6 @@ def import_command(
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
-        place = place_as_stated(unit, up)
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
         _print_match(spec, out, notes, as_json=as_json)
     elif videos is not None and detections is None:
@@ -269,7 +267,7 @@ def import_command(
             fps=fps,
             match_id=match_id,
             boxes=boxes,
-            place=place_as_stated(unit, up),
+            place=place,
         )
         _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
@@ -281,7 +279,7 @@ def import_command(
         )
     else:
         spec, notes = import_match(
-            calibration, detections, fps, out, match_id=match_id, place=place_as_stated(unit, up)
+            calibration, detections, fps, out, match_id=match_id, place=place
         )
         _print_match(spec, out, notes, as_json=as_json)
 

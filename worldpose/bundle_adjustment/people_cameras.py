@@ -131,17 +131,17 @@ def locate_cameras(
             )
     people = _walkers(observed, detections.frame if len(detections.frame) else None, fps)
     scale, scale_std = _scale(people, adjusted.cameras, known)
-    world = people.orient(scale)
+    world, vertical_std, on_feet = people.orient(scale)
     shown = [observed.image[observed.camera_of == c] for c in range(len(names))]
     std = relative * [scale, 1.0, 1.0]
     off = np.linalg.norm(player_residuals(adjusted.cameras, observed.points, observed), axis=1)
     return CamerasFromPeople(
-        cameras=move_cameras(world.similarity, adjusted.cameras),
+        cameras=move_cameras(world, adjusted.cameras),
         std=std,
         scale_std=scale_std,
         # A rig that is bent tilts the vertical, too.
-        up_std=float(np.hypot(world.std, np.median(std[:, 1]))),
-        on_feet=world.on_feet,
+        up_std=float(np.hypot(vertical_std, np.median(std[:, 1]))),
+        on_feet=on_feet,
         stature_m=scale * float(np.median(people.statures())),
         people=len(np.unique(observed.person_of)),
         keypoints=np.bincount(observed.camera_of, minlength=len(names)),

@@ -66,7 +66,7 @@ def import_match(
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
         pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
-        place: brings the cameras to metres with z up; None = they are in such a world.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -293,8 +293,7 @@ def import_videos(
     Without a calibration each video is a camera, to be located by clicks or by people. A camera
     that was calibrated in larger or smaller images of the same shape is scaled to its video.
 
-    The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
-    in match.yaml can shift them afterwards.
+    The only clip, `clip`, is as long as the shortest video; `offset_frames` can shift videos later.
 
     Args:
         calibration: a file or folder that `read_calibration` reads; None = not known.
@@ -304,7 +303,7 @@ def import_videos(
         match_id: id of the match; None = the name of `out`.
         boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
             estimated, for some of the cameras or all; None = people are detected.
-        place: brings the cameras to metres with z up; None = they are in such a world.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -322,7 +321,7 @@ def import_videos(
         filmed = [file for file in sorted(videos.glob("[!.]*")) if is_video(file)]
         known = {camera_id(file.stem): index_frames(file) for file in filmed}
         left_out: LeftOut = {}
-        shown = {name: index.size for name, index in known.items()}
+        shown = {n: one.size for n, one in known.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes += describe_left_out(left_out)
         files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES, left_out)
@@ -334,8 +333,7 @@ def import_videos(
     sizes = {name: index.size for name, index in indices.items()}
     spec = build_spec(out, match_id, rate, sizes, (0, min(counts.values())), videos=files)
     if place is not None:
-        cameras, placed = place(calibration or videos, cameras, {}, rate)
-        notes = placed + notes
+        cameras, notes[:0] = place(calibration or videos, cameras, {}, rate)
 
     def copy(folder: Path) -> None:
         copy_videos(files, folder)

@@ -64,7 +64,7 @@ def import_pose2sim(
         out: the match folder, absent or empty.
         fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
         match_id: id of the match; None = the name of `out`.
-        place: brings the cameras to metres with z up; None = they are in such a world.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was left out.
@@ -126,8 +126,7 @@ def import_pose2sim(
         people[name] = on_frames(files, people[name], [(first, stop - first)])
 
     if place is not None:
-        cameras, placed = place(calibration or project, cameras, people, rate)
-        notes = placed + notes
+        cameras, notes[:0] = place(calibration or project, cameras, people, rate)
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )

@@ -15,13 +15,7 @@ SAME_AXIS: Final = float(np.cos(np.radians(2.5)))
 
 
 class Vertical(NamedTuple):
-    """The axis along which people stand.
-
-    Attributes:
-        axis: (3,) unit vector from feet to head.
-        share: share of the poses that stand along it [1].
-        poses: number of poses whose axis is known [1].
-    """
+    """Unit vector (3,) from feet to head, and the share of the poses that stand along it [1]."""
 
     axis: Floats
     share: float

@@ -46,20 +46,6 @@ def _mean_direction(vectors: Floats) -> Floats:
     return np.asarray(middle / np.linalg.norm(middle))
 
 
-class Standing(NamedTuple):
-    """The world on whose ground people walk.
-
-    Attributes:
-        similarity: transform to it.
-        std: standard deviation of its vertical [rad].
-        on_feet: whether standing feet determine the vertical; else people are assumed upright.
-    """
-
-    similarity: Similarity
-    std: float
-    on_feet: bool
-
-
 class Walkers(NamedTuple):
     """People who stand and walk.
 
@@ -96,8 +82,12 @@ class Walkers(NamedTuple):
                 weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
         return float(np.average(found, weights=weight)) if found else np.nan
 
-    def orient(self, scale: float) -> Standing:
-        """Return the transform to the world, with the vertical's deviation [rad]."""
+    def orient(self, scale: float) -> tuple[Similarity, float, bool]:
+        """Return the transform to the world on whose ground people walk.
+
+        The second result is the deviation of its vertical [rad], the third whether standing feet
+        determine it; else people are assumed upright.
+        """
         joints = scale * self.joints
         shoulders, hips = joints[:, :, [5, 6]].mean(axis=2), joints[:, :, [11, 12]].mean(axis=2)
         ankles = joints[:, :, [15, 16]]
@@ -132,7 +122,7 @@ class Walkers(NamedTuple):
         x = x - (x @ up) * up
         x = x / np.linalg.norm(x)
         rotation = np.stack([x, np.cross(up, x), up])
-        return Standing(
+        return (
             Similarity(np.array(scale), rotation, -rotation @ origin),
             float(1.0 / np.sqrt(values.min())),
             bool(values.min() > 2.0 / lean_std**2),
@@ -205,14 +195,13 @@ class People(NamedTuple):
             return None
         statures = statures[np.isfinite(statures)]
         scale = STATURE[0] / float(np.median(statures))
-        ankles = np.isfinite(walkers.joints[:, :, [15, 16], 0]).any(axis=(0, 1)).all()
-        if not ankles or len(joints) < 2:
+        legs = np.isfinite(walkers.joints[:, :, [11, 12, 15, 16], 0]).all(axis=-1)
+        if not legs.any() or len(joints) < 2:
             return cls(statures, vertical, vertical.axis, np.full(3, np.nan), on_feet=False)
-        world = walkers.orient(scale)
-        motion = world.similarity
+        motion, _, on_feet = walkers.orient(scale)
         ground, up = -motion.rotation.T @ motion.translation / scale, motion.rotation[2]
         # Feet of people who lie are on no ground.
-        on_feet = world.on_feet and bool(up @ vertical.axis > LEVEL)
+        on_feet = on_feet and bool(up @ vertical.axis > LEVEL)
         return cls(statures, vertical, up if on_feet else vertical.axis, ground, on_feet)
 
 
@@ -254,16 +243,11 @@ def doubt_statures(statures: Floats) -> str:
     if 1.55 - reach <= mean <= 1.85 + reach:
         return ""
     yards = UNITS["yd"][0] * mean
-    said = f"the mean stature of {count} people is {mean:.2f} m"
+    said = f"if they are adults, lengths are {mean / STATURE[0]:.2f} times the true ones: check "
+    said += "the unit of the calibration, or state its metres with --unit"
     if mean > 1.85 and yards < 1.85 + reach:
-        return (
-            f"{said}, and {yards:.2f} m if the calibration is in yards: then import it with "
-            "--unit yd, or multiply its translations by 0.9144"
-        )
-    return (
-        f"{said}: if they are adults, lengths are {mean / STATURE[0]:.2f} times the true ones; "
-        "check the unit of the calibration, or state its metres with --unit"
-    )
+        said = f"it is {yards:.2f} m if the calibration is in yards: import it with --unit yd"
+    return f"the mean stature of {count} people is {mean:.2f} m; {said}"
 
 
 def doubt_world(
@@ -293,12 +277,10 @@ def doubt_world(
 
 
 class StatedWorld(NamedTuple):
-    """What a user states of the world of a calibration; None = nothing."""
+    """Unit [m] and unit vector (3,) up of a calibration's world by the user; None = unknown."""
 
     unit_m: float | None = None
-    """Unit of its positions [m]."""
     up: Floats | None = None
-    """(3,) unit vector that points up."""
 
 
 def read_stated_world(unit: str | None, up: str | None) -> StatedWorld:
@@ -307,45 +289,32 @@ def read_stated_world(unit: str | None, up: str | None) -> StatedWorld:
     Raises:
         UsageError: they are no unit, or no axis.
     """
-    axes = {
-        f"{sign}{'xyz'[n]}": float(f"{sign}1") * np.eye(3)[n]
-        for sign in ("", "-")
-        for n in range(3)
-    }
-    numbers = []
-    for text in (unit, up):
-        try:
-            numbers.append([float(word) for word in (text or "").split(",")])
-        except ValueError:
-            numbers.append([])
-    unit_m = (
-        UNITS[unit][0] if unit in UNITS else float(numbers[0][0]) if len(numbers[0]) == 1 else 0.0
-    )
-    vector = axes.get(up or "z", np.array(numbers[1]))
-    if unit is not None and not 1e-6 <= unit_m <= 1e6:
+    axes = {f"{sign}{'xyz'[n]}": f"{sign}1" for sign in ("", "-") for n in range(3)}
+    unit_m, axis = None, None
+    try:
+        if unit is not None:
+            unit_m = UNITS[unit][0] if unit in UNITS else float(unit)
+        if up in axes:
+            axis = float(axes[up]) * np.eye(3)["xyz".index(up[-1])]
+        elif up is not None:
+            axis = np.array([float(word) for word in up.split(",")])
+        length = 1.0 if axis is None else float(np.linalg.norm(axis))
+        fits = (unit_m is None or 1e-6 <= unit_m <= 1e6) and 0.0 < length < np.inf
+        if not fits or (axis is not None and len(axis) != 3):
+            raise ValueError
+    except ValueError:
         raise UsageError(
-            f"--unit {unit}",
-            expected=f"{', '.join(UNITS)}, or the metres of the unit, such as 0.08",
-            found=repr(unit),
-            todo="Give the unit of the calibration's positions.",
-        )
-    length = float(np.linalg.norm(vector))
-    if len(vector) != 3 or not 0.0 < length < np.inf:
-        raise UsageError(
-            f"--up {up}",
-            expected="x, -x, y, -y, z, -z, or three numbers such as 0.1,-0.9,-0.4",
-            found=repr(up),
-            todo="Give the axis of the calibration's world that points up.",
-        )
-    return StatedWorld(unit_m if unit else None, vector / length if up else None)
+            "--unit and --up",
+            expected=f"{', '.join(UNITS)}, or the metres of the unit, such as 0.08; and x, -x, y, "
+            "-y, z, -z, or three numbers such as 0.1,-0.9,-0.4",
+            found=f"{unit} and {up}",
+            todo="State the unit of the calibration's positions, and the axis that points up.",
+        ) from None
+    return StatedWorld(unit_m, None if axis is None else axis / length)
 
 
 def place_as_stated(unit: str | None, up: str | None) -> partial[Placed]:
-    """Return `place_cameras` with what the options `--unit` and `--up` state.
-
-    Raises:
-        UsageError: they are no unit, or no axis.
-    """
+    """Return `place_cameras` with what the options `--unit` and `--up` state (UsageError)."""
     return partial(place_cameras, stated=read_stated_world(unit, up))
 
 
@@ -363,7 +332,7 @@ def place_cameras(
     that is turned has its ground at z = 0, and keeps its heading.
 
     Args:
-        calibration: the calibration, whose form tells the unit in which it was read.
+        calibration: the calibration, whose form tells its unit.
         cameras: cameras as read.
         detections: 2D poses of these cameras on a common clock; none = unknown.
         fps: frames per second [1/s].
@@ -376,12 +345,8 @@ def place_cameras(
     """
     if not cameras:
         if stated != StatedWorld():
-            raise UsageError(
-                "--unit and --up",
-                expected="a calibration, whose world they describe",
-                found="none",
-                todo="Omit them, or add --calibration.",
-            )
+            of_what, todo = "a calibration, whose world they describe", "Add --calibration."
+            raise UsageError("--unit and --up", expected=of_what, found="none", todo=todo)
         return {}, []
     batch = Camera.stack([Camera.from_calibration(camera) for camera in cameras.values()])
     people = None
