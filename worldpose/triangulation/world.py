@@ -344,7 +344,7 @@ def place_cameras(
             far apart for metres.
     """
     if not cameras:
-        if stated != StatedWorld():
+        if stated.unit_m is not None or stated.up is not None:
             of_what, todo = "a calibration, whose world they describe", "Add --calibration."
             raise UsageError("--unit and --up", expected=of_what, found="none", todo=todo)
         return {}, []
