@@ -281,9 +281,10 @@ def read_calibration_toml(
 
 
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
-    """Return whether a camera has a lens but neither rotation nor translation, or empty ones."""
+    """Return whether a camera has a lens but no pose, an empty one, or one with NaN."""
     pose = [table.get(key) for key in ("rotation", "translation")]
-    return "matrix" in table and all(value in (None, "null", "None", "", []) for value in pose)
+    empty = all(value in (None, "null", "None", "", []) for value in pose)
+    return "matrix" in table and (empty or "nan" in repr(pose))
 
 
 def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
