@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import typer
 
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import MatchSpec
+from data_contracts.match import ClipSpec, ClockOffset, MatchSpec
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -31,8 +32,14 @@ from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, unknown_name
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import exact_frames, simplest_offset
+from worldpose.ingest.footage import unit_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Run, Store
+
+if TYPE_CHECKING:
+    from worldpose.triangulation.camera_changes import Course
+    from worldpose.triangulation.synchronization import Synchronization
 
 MIN_OFFSET_FRAMES = 0.1
 """Remaining offset that is worth a correction [frame]."""
@@ -42,21 +49,19 @@ class Proposal(NamedTuple):
     """The clock offset of a camera, as stated and as found."""
 
     camera: str
-    stated: int
+    stated: ClockOffset
     """`offset_frames` in match.yaml [frame]."""
     found: float | None
-    """The same with its fraction, by the people [frame]; None where they do not tell it."""
+    """The same with its fraction at the clip's start, by the people [frame]; None where they do not
+    tell it."""
     std: float | None
     """Standard deviation [frame]."""
+    proposed: ClockOffset
+    """The offset for match.yaml [frame]: whole, or pairs where it changes within the clip."""
     reason: str
     """Why it is not known; empty where it is."""
     relative_to: str | None = None
     """The camera of its group whose offset stays; None where it is not known."""
-
-    @property
-    def proposed(self) -> int:
-        """The whole offset for match.yaml [frame]."""
-        return self.stated if self.found is None else round(self.found)
 
 
 def synchronize(
@@ -73,7 +78,7 @@ def synchronize(
 
     The cameras must be calibrated, and nothing must be known of their clocks. The command computes
     the match up to the 2D poses first. The offset of the first camera that it can tell stays, and
-    --apply writes the others.
+    --apply writes the others. A clock that drifts or steps has pairs [match frame, offset].
 
     Example: worldpose synchronize matches/lab --plot clocks.svg --apply
 
@@ -84,6 +89,7 @@ def synchronize(
         apply: Write the proposed offset_frames into match.yaml.
     """
     from worldpose.reports.drawing import draw_synchronization, require_plot
+    from worldpose.triangulation.camera_changes import trace_clocks
     from worldpose.triangulation.synchronization import synchronize as estimate
 
     if plot is not None:
@@ -92,12 +98,12 @@ def synchronize(
     with progress(verbose=False):
         opened = find_match(store, match)
         spec = opened.folder.spec
-        chosen = choose_clip(spec, clip)
+        chosen_clip = choose_clip(spec, clip)
         claim_file(plot, opened.match_id)
         require_no_other_run(store, opened.match_id)
         request = RunRequest({}, until_stage="detection", workers=workers, gates="never")
         record = run_match(store, opened, request)
-    cameras, names, detections = load_clip(Run(store, record), opened, chosen)
+    cameras, names, detections = load_clip(Run(store, record), opened, chosen_clip)
     pitch = opened.folder.pitch
     found = estimate(
         cameras,
@@ -106,20 +112,18 @@ def synchronize(
         max_offset_s=max_offset,
         pitch=None if pitch is None else PitchTemplate.from_spec(pitch),
     )
-    stated = {camera.id: int(camera.offset_frames) for camera in spec.static_cameras}
     known = np.isfinite(found.late)
-    reference = {camera: group[0] for group in found.groups for camera in group}
-    rows = [
-        Proposal(
-            name,
-            stated[name],
-            stated[name] - float(found.late[c] - found.late[reference[c]]) if known[c] else None,
-            float(found.std[c]) if known[c] else None,
-            found.reasons[c],
-            names[reference[c]] if known[c] else None,
-        )
-        for c, name in enumerate(names)
-    ]
+    courses: list[Course] = [[(0, float(late))] for late in found.late]
+    size = None if pitch is None else (pitch.length, pitch.width)
+    for group in (np.array(each) for each in found.groups if len(each) > 2):
+        arrays = {name: array[:, group] for name, array in detections.arrays().items()}
+        some = detections.with_arrays(arrays, detections.frame)
+        late = found.late[group]
+        traced = trace_clocks(cameras[group], some, spec.fps, late, pitch_size=size)
+        for c, course in zip(group.tolist(), traced, strict=True):
+            courses[c] = course
+    clip_spec = spec.clip(chosen_clip)
+    rows = [_propose(spec, clip_spec, names, courses, c, found) for c in range(len(names))]
     apart = [", ".join(names[c] for c in group) for group in found.groups]
     if plot is not None:
         draw_synchronization(found, names, plot)
@@ -131,8 +135,8 @@ def synchronize(
     if as_json:
         print_json(
             {
-                "clip": chosen,
-                "cameras": [row._asdict() | {"proposed": row.proposed} for row in rows],
+                "clip": chosen_clip,
+                "cameras": [row._asdict() for row in rows],
                 "applied": changed if apply else {},
             }
         )
@@ -145,6 +149,35 @@ def synchronize(
             to=errors,
         )
     raise typer.Exit(0 if known.all() and len(apart) == 1 else 4)
+
+
+def _propose(
+    spec: MatchSpec,
+    clip: ClipSpec,
+    names: list[str],
+    courses: list[Course],
+    c: int,
+    found: Synchronization,
+) -> Proposal:
+    """Return the proposal of a camera: the first one of its group keeps its offset."""
+    name = names[c]
+    unit, stated = unit_frames(spec, name), spec.camera(name).offset_frames
+    if not isinstance(stated, tuple):
+        stated = int(stated)
+    if not np.isfinite(found.late[c]):
+        return Proposal(name, stated, None, None, stated, found.reasons[c])
+    first = next(group[0] for group in found.groups if c in group)
+    reference = courses[first]
+    pairs = unit.offset if isinstance(unit.offset, tuple) else ()
+    inside = [frame - clip.first_frame for frame, _ in pairs]
+    inside = [row for row in inside if 0 <= row < clip.frame_count]
+    row = np.unique([row for row, _ in (*courses[c], *reference)] + inside)
+    late = np.interp(row, *np.array(courses[c]).T) - np.interp(row, *np.array(reference).T)
+    frame = (row + clip.first_frame).astype(np.int64)
+    exact = exact_frames(frame, unit.offset) - frame - late
+    is_known = isinstance(stated, tuple) and np.abs(late).max() < MIN_OFFSET_FRAMES
+    proposed = stated if is_known else simplest_offset(frame, exact)
+    return Proposal(name, stated, float(exact[0]), float(found.std[c]), proposed, "", names[first])
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:
@@ -207,17 +240,23 @@ def load_detections(run: Run, match: Match, clip: str, names: list[str]) -> Keyp
     return KeypointDetections.stack(parts)
 
 
+def _offset_text(offset: ClockOffset) -> str:
+    """Return an offset as in match.yaml."""
+    pairs = [list(pair) for pair in offset] if isinstance(offset, tuple) else offset
+    return str(pairs)
+
+
 def _print(
-    rows: list[Proposal], changed: dict[str, int], plot: Path | None, *, applied: bool
+    rows: list[Proposal], changed: Mapping[str, ClockOffset], plot: Path | None, *, applied: bool
 ) -> None:
     """Print a table of the offsets, and what to do with them."""
     shown = [
         (
             row.camera,
-            str(row.stated),
+            _offset_text(row.stated),
             "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
             "-" if row.std is None else f"{row.std:.2f}",
-            "-" if row.found is None else str(row.proposed),
+            "-" if row.found is None else _offset_text(row.proposed),
             row.reason if row.relative_to is None else f"relative to {row.relative_to}",
         )
         for row in rows
@@ -235,6 +274,7 @@ def _print(
     if any(
         row.found is not None
         and row.std is not None
+        and not isinstance(row.proposed, tuple)
         and abs(row.found - row.proposed) > max(MIN_OFFSET_FRAMES, 3.0 * row.std)
         for row in rows
     ):

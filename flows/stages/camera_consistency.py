@@ -21,7 +21,10 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         **tracking.clip_sources(match, unit),
         **({"stills": stills, "pitch": match.pitch_source} if stills else {}),
         "ground": match.folder.pitch is not None,
-        "offset_frames": [camera.offset_frames for camera in spec.static_cameras],
+        "offset_frames": [
+            None if isinstance(camera.offset_frames, tuple) else camera.offset_frames
+            for camera in spec.static_cameras
+        ],
     }
 
 
