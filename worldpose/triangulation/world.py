@@ -222,7 +222,9 @@ def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> 
     pairs = list(combinations(range(len(cameras.focal)), 2))
     some = pairs[:: -(-len(pairs) // 15)]
     matched = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in some]
-    sizes = np.concatenate([np.empty(0)] + [m.matches["size"] for m in matched if m.agrees])
+    # Rays that are nearly parallel tell no size.
+    wide = [m.matches["size"] for m in matched if m.agrees and m.angle >= settings.min_angle_rad]
+    sizes = np.concatenate([np.empty(0), *wide])
     sizes = sizes[np.isfinite(sizes)]
     if not len(sizes):
         return None
