@@ -169,18 +169,16 @@ def camera_id(name: str) -> str:
 
 
 def index_by_name(
-    path: Path, cameras: list[tuple[str, CameraCalibration]], unit_m: float = 1.0
+    path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
     """Return the cameras by id, in file order.
 
     Args:
         path: the file, for messages.
         cameras: pairs of place in the file and camera.
-        unit_m: unit of length in the file [m].
 
     Raises:
-        InputError: there is no camera, two cameras have one name, or the cameras are so near each
-            other, or so far apart, that the file has another unit.
+        InputError: there is no camera, two cameras have one name, or no camera has a pose.
     """
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
@@ -189,18 +187,16 @@ def index_by_name(
         by_name[camera.id] = camera
     if not by_name:
         raise calibration_error(str(path), "at least one camera", "none")
-    _require_unit(path, list(by_name.values()), unit_m)
+    require_poses(path, by_name)
     return by_name
 
 
-def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -> None:
-    """Raise InputError if the cameras' distances contradict the unit of the file."""
-    if len(cameras) < 2:
-        return
-    rotations = np.array([camera.rotation for camera in cameras])
-    centers = -np.einsum("cij,ci->cj", rotations, [camera.translation for camera in cameras])
-    distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
-    if not centers.any() and (rotations == np.eye(3)).all():
+def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
+    """Raise InputError if the poses of several cameras are all zero."""
+    if len(cameras) > 1 and all(
+        not any(camera.translation) and (np.array(camera.rotation) == np.eye(3)).all()
+        for camera in cameras.values()
+    ):
         raise InputError(
             f"{path}: translation",
             expected="the poses of the cameras",
@@ -208,16 +204,33 @@ def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -
             todo="Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
             "cameras by clicks or by worldpose locate-cameras.",
         )
+
+
+def require_metres(
+    path: Path, cameras: Mapping[str, CameraCalibration], unit_m: float = 1.0
+) -> None:
+    """Raise InputError if the cameras' distances contradict the unit of the file.
+
+    Args:
+        path: the file, for messages.
+        cameras: cameras in metres, if the file has that unit.
+        unit_m: unit of length in the file [m].
+    """
+    centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
+    distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
     in_millimetres = unit_m == MILLIMETRE
-    if distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M):
+    if len(centers) < 2 or (
+        distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M)
+    ):
         return
     raise InputError(
         f"{path}: translation",
         expected=f"positions in {'millimetres' if in_millimetres else 'metres'}",
         found=f"a camera {distance:.3g} m from the middle of all cameras",
-        todo="Multiply the positions by 1000 if they are in metres."
+        todo="Multiply the positions by 1000 if they are in metres (worldpose import --unit m)."
         if distance < NEAREST_M
-        else "Divide the positions by 1000 if they are in millimetres.",
+        else "Divide the positions by 1000 if they are in millimetres (worldpose import --unit "
+        "mm).",
     )
 
 
@@ -246,7 +259,7 @@ def read_calibration_toml(
             the world of FreeMoCap's file is not that of the ground; it names file and key.
     """
     content = read_toml(path)
-    unit_m = MILLIMETRE if _is_freemocap(path, content) else 1.0
+    unit_m = toml_unit_m(path, content)
     tables = list(camera_tables(path, content))
     posed = [each for each in tables if not _lacks_pose(each[2])]
     if left_out is not None and posed:
@@ -264,20 +277,26 @@ def read_calibration_toml(
                 "pose.",
             )
         cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
-    return index_by_name(path, cameras, unit_m)
+    return index_by_name(path, cameras)
 
 
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
-    """Return whether a camera has a lens but neither rotation nor translation, or empty ones."""
+    """Return whether a camera has a lens but no pose, an empty one, or one with NaN."""
     pose = [table.get(key) for key in ("rotation", "translation")]
-    return "matrix" in table and all(value in (None, "null", "None", "", []) for value in pose)
+    empty = all(value in (None, "null", "None", "", []) for value in pose)
+    return "matrix" in table and (empty or "nan" in repr(pose))
 
 
-def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:
-    """Return whether a TOML file is FreeMoCap's, whose world must have the ground as z = 0."""
+def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
+    """Return the unit of a TOML file [m]: FreeMoCap's has millimetres, and the ground as z = 0.
+
+    Raises:
+        InputError: FreeMoCap's file has no ground plane.
+    """
+    content = read_toml(path) if content is None else content
     metadata = content.get("metadata")
     if not isinstance(metadata, dict) or not any(key in metadata for key in FREEMOCAP):
-        return False
+        return 1.0
     if not (metadata.get("groundplane_calibration") or metadata.get("groundplane_applied")):
         raise InputError(
             f"{path}: metadata.groundplane_calibration",
@@ -287,7 +306,7 @@ def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:
             "Charuco as groundplane'), or import the lenses (worldpose import --lens) and locate "
             "the cameras from people (worldpose locate-cameras).",
         )
-    return True
+    return MILLIMETRE
 
 
 def camera_tables(

@@ -27,6 +27,8 @@ from worldpose.formats.calibration_files import (
     index_by_name,
     read_calibration_toml,
     read_camera_table,
+    require_metres,
+    toml_unit_m,
 )
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.files import SETTINGS_BYTES, require_file
@@ -91,7 +93,11 @@ def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
 
 
 def read_calibration(
-    path: Path, sizes: Sizes = MappingProxyType({}), left_out: LeftOut | None = None
+    path: Path,
+    sizes: Sizes = MappingProxyType({}),
+    left_out: LeftOut | None = None,
+    *,
+    any_unit: bool = False,
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a calibration by name, in file order.
 
@@ -99,13 +105,25 @@ def read_calibration(
         path: a file of one of `FORMS`, or a folder that has one calibration.
         sizes: image sizes that the file may lack, such as those of the videos.
         left_out: receives cameras without a pose, with the reason; None = all must have one.
+        any_unit: whether cameras may be as far apart as in another unit than the form's.
 
     Raises:
         InputError: an unknown form, a folder with no calibration or several, or an invalid entry,
             with file and key.
     """
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
-    return form.read(files, sizes, left_out)
+    cameras = form.read(files, sizes, left_out)
+    if not any_unit:
+        require_metres(path, cameras, form_unit_m(path))
+    return cameras
+
+
+def form_unit_m(path: Path) -> float:
+    """Return the unit of a calibration by its form [m]; arguments and errors as above."""
+    form, files = find_calibration(path) if path.is_dir() else _form_of(path)
+    if form is TOML:
+        return toml_unit_m(files[0])
+    return MILLIMETRE if form.unit.startswith("mm") else 1.0
 
 
 def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
@@ -227,7 +245,6 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
             )
             for file, table in tables.items()
         ],
-        MILLIMETRE,
     )
 
 
@@ -392,7 +409,7 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
         name = Path(file.stem).stem if is_video(file.stem) else file.stem
         camera = read_camera_table(where, name, table, keys=keys, unit_m=MILLIMETRE)
         cameras.append((where, camera))
-    return index_by_name(files[0].parent if len(files) > 1 else files[0], cameras, MILLIMETRE)
+    return index_by_name(files[0].parent if len(files) > 1 else files[0], cameras)
 
 
 TOML: Final = Form(

@@ -122,7 +122,7 @@ def _read_qualisys(
                 left_out[element.get("serial", where)] = why
         active = [each for each, why in zip(active, lacks, strict=True) if not why]
     cameras = [(where, _read_qualisys_camera(where, element)) for where, element in active]
-    return index_by_name(path, cameras, MILLIMETRE)
+    return index_by_name(path, cameras)
 
 
 def _qualisys_lack(element: ET.Element, has_video: bool) -> str:
@@ -206,7 +206,7 @@ def _read_vicon(
             todo="Calibrate the video cameras with the others, and export again.",
         )
     cameras = [(where, _read_vicon_camera(where, element)) for where, element in elements]
-    return index_by_name(path, cameras, MILLIMETRE)
+    return index_by_name(path, cameras)
 
 
 def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,14 @@ MAX_BLACK: Final = 16.0
 """Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
 
+Placing: TypeAlias = Callable[
+    [Path, Mapping[str, CameraCalibration], Mapping[str, KeypointDetections], float],
+    tuple[dict[str, CameraCalibration], list[str]],
+]
+"""Brings the cameras of a calibration to metres with z up, by their 2D poses (none = unknown) and
+the frame rate [1/s]; returns them with sentences about what it changed."""
+
+
 def import_match(
     calibration: Path,
     detections: Path,
@@ -43,6 +51,7 @@ def import_match(
     out: Path,
     match_id: str | None = None,
     pitch: Literal["none"] | None = "none",
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and their detections.
 
@@ -57,6 +66,7 @@ def import_match(
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
         pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -66,7 +76,7 @@ def import_match(
             empty; nothing is written then.
     """
     left_out: LeftOut = {}
-    cameras = read_calibration(calibration, left_out=left_out)
+    cameras = read_calibration(calibration, left_out=left_out, any_unit=place is not None)
     files = detections_by_camera(detections, list(cameras), calibration, left_out)
     read = {name: read_people(file) for name, file in files.items()}
     people = {name: found.people for name, found in read.items()}
@@ -75,8 +85,11 @@ def import_match(
     spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
+    notes: list[str] = []
+    if place is not None:
+        cameras, notes = place(calibration, cameras, people, fps)
     write_match(out, spec, calibrations=cameras, observations=people)
-    return spec, describe_left_out(left_out) + describe_people(read)
+    return spec, notes + describe_left_out(left_out) + describe_people(read)
 
 
 def describe_left_out(left_out: LeftOut) -> list[str]:
@@ -273,14 +286,14 @@ def import_videos(
     fps: float | None = None,
     match_id: str | None = None,
     boxes: Path | None = None,
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
     Without a calibration each video is a camera, to be located by clicks or by people. A camera
     that was calibrated in larger or smaller images of the same shape is scaled to its video.
 
-    The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
-    in match.yaml can shift them afterwards.
+    The only clip, `clip`, is as long as the shortest video; `offset_frames` can shift videos later.
 
     Args:
         calibration: a file or folder that `read_calibration` reads; None = not known.
@@ -290,6 +303,7 @@ def import_videos(
         match_id: id of the match; None = the name of `out`.
         boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
             estimated, for some of the cameras or all; None = people are detected.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -307,7 +321,8 @@ def import_videos(
         filmed = [file for file in sorted(videos.glob("[!.]*")) if is_video(file)]
         known = {camera_id(file.stem): index_frames(file) for file in filmed}
         left_out: LeftOut = {}
-        cameras = read_calibration(calibration, {n: one.size for n, one in known.items()}, left_out)
+        shown = {n: one.size for n, one in known.items()}
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes += describe_left_out(left_out)
         files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES, left_out)
         indices = {name: known[name] for name in files}
@@ -317,6 +332,8 @@ def import_videos(
     counts = {name: len(index.on_clock(rate, str(files[name]))) for name, index in indices.items()}
     sizes = {name: index.size for name, index in indices.items()}
     spec = build_spec(out, match_id, rate, sizes, (0, min(counts.values())), videos=files)
+    if place is not None:
+        cameras, notes[:0] = place(calibration or videos, cameras, {}, rate)
 
     def copy(folder: Path) -> None:
         copy_videos(files, folder)

@@ -22,6 +22,7 @@ from worldpose.formats.files import read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.importing import (
+    Placing,
     build_spec,
     camera_of,
     copy_videos,
@@ -41,7 +42,11 @@ _SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
 
 
 def import_pose2sim(
-    project: Path, out: Path, fps: float | None = None, match_id: str | None = None
+    project: Path,
+    out: Path,
+    fps: float | None = None,
+    match_id: str | None = None,
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
 
@@ -59,6 +64,7 @@ def import_pose2sim(
         out: the match folder, absent or empty.
         fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
         match_id: id of the match; None = the name of `out`.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was left out.
@@ -91,7 +97,7 @@ def import_pose2sim(
         source = project / "videos"
     else:
         shown = {camera_of(file): index.size for file, index in known.items()}
-        cameras = read_calibration(calibration, shown, left_out)
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
         places = [each for each in places if camera_of(each) not in left_out]
@@ -116,9 +122,11 @@ def import_pose2sim(
     spec = build_spec(
         out, match_id, rate, {name: sizes[name] for name in names}, (first, stop), videos=videos
     )
-    for name, place in poses.items():
-        people[name] = on_frames(place, people[name], [(first, stop - first)])
+    for name, files in poses.items():
+        people[name] = on_frames(files, people[name], [(first, stop - first)])
 
+    if place is not None:
+        cameras, notes[:0] = place(calibration or project, cameras, people, rate)
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
