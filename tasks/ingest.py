@@ -10,10 +10,12 @@ from pydantic import TypeAdapter
 from data_contracts.ingest import INGEST
 from tasks.unit import UnitInputs, unit_task
 from worldpose.formats.keypoint_files import read_people, select_ranges
+from worldpose.ingest.camera_videos import describe_gaps
 from worldpose.ingest.footage import UnitFrames, read_footage
 from worldpose.ingest.importing import describe_changes
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.store.writer import ResultWriter
+from worldpose.video.recordings import describe_video
 
 
 @unit_task
@@ -61,6 +63,9 @@ def _write_footage(inputs: UnitInputs, result: ResultWriter) -> None:
         UnitFrames(sources["first_frame"], sources["frame_count"], sources["offset_frames"]),
         [(clip, first, count) for clip, (first, count) in sources["clips"].items()],
     )
+    result.warnings += describe_video(inputs.file("video"), footage.index)
+    if gaps := describe_gaps(footage.picture):
+        result.warnings.append(f"{inputs.unit}: {gaps}")
     inputs.require_registered("video")
     base = footage.index.time_base
     result.write(

@@ -28,6 +28,12 @@ from worldpose.formats.calibration_files import (
     read_calibration_toml,
     read_camera_table,
 )
+from worldpose.formats.calibration_programs import (
+    is_openpose,
+    read_camera_json,
+    read_kalibr,
+    read_openpose_cameras,
+)
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.files import SETTINGS_BYTES, require_file
 from worldpose.formats.lens_files import read_file_storage
@@ -147,12 +153,19 @@ def calibrations_in(folder: Path) -> list[tuple[Form, tuple[Path, ...]]]:
         or tuple(nested),
         EASYMOCAP.name: tuple(f for f in files if _is_easymocap(f)),
         BIOCV.name: tuple(f for f in files if f.suffix.lower() in BIOCV.endings),
+        OPENPOSE.name: tuple(f for f in files if is_openpose(f)),
     }
     found: list[tuple[Form, tuple[Path, ...]]] = [
         (form, (file,))
         for form in (TOML, QUALISYS, VICON, OPTITRACK)
         for file in files
         if file.name.lower().endswith(form.endings[0])
+    ]
+    found += [
+        (form, (file,))
+        for form, name in ((JSON, "calib"), (KALIBR, "camchain"))
+        for file in files
+        if file.suffix.lower() in form.endings and name in file.stem.lower()
     ]
     return found + [(form, sets[form.name]) for form in FORMS if sets.get(form.name)]
 
@@ -175,6 +188,8 @@ def _form_of(path: Path) -> tuple[Form, tuple[Path, ...]]:
     suffix = path.suffix.lower()
     if _is_easymocap(path):
         return EASYMOCAP, tuple(f for f in sorted(path.parent.iterdir()) if _is_easymocap(f))
+    if is_openpose(path):
+        return OPENPOSE, tuple(f for f in sorted(path.parent.iterdir()) if is_openpose(f))
     for form in FORMS:
         if suffix in form.endings:
             return form, (path,)
@@ -218,7 +233,7 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
                 str(file),
                 read_camera_table(
                     str(file),
-                    file.parent.name if file.stem == OPENCAP_NAME else file.stem,
+                    file.resolve().parent.name if file.stem == OPENCAP_NAME else file.stem,
                     table,
                     keys=OPENCAP_KEYS,
                     unit_m=MILLIMETRE,
@@ -399,7 +414,7 @@ TOML: Final = Form(
     "Anipose, Pose2Sim, caliscope, FreeMoCap",
     (".toml",),
     "m (FreeMoCap: mm), z up",
-    lambda files, _, left_out: read_calibration_toml(files[0], left_out),
+    lambda files, sizes, left_out: read_calibration_toml(files[0], left_out, sizes),
 )
 QUALISYS: Final = Form(
     "Qualisys",
@@ -414,5 +429,26 @@ OPENCAP: Final = Form(
 )
 EASYMOCAP: Final = Form("EasyMocap", ("intri.yml", "extri.yml"), "m, z up", _read_easymocap)
 BIOCV: Final = Form("bioCV", (".calib",), "mm, z up", lambda files, *_: _read_biocv(files))
-FORMS: Final = (TOML, QUALISYS, VICON, OPTITRACK, OPENCAP, EASYMOCAP, BIOCV)
+JSON: Final = Form(
+    "Panoptic Studio, multical",
+    (".json",),
+    "cm, y down; multical: m, first camera",
+    lambda files, _, left_out: read_camera_json(files[0], left_out),
+)
+KALIBR: Final = Form(
+    "Kalibr",
+    (".yaml", ".yml"),
+    "m, first camera",
+    lambda files, _, left_out: read_kalibr(files[0], left_out),
+)
+OPENPOSE: Final = Form(
+    "OpenPose",
+    ("<camera>.xml",),
+    "m, first camera",
+    lambda files, sizes, _: read_openpose_cameras(files, sizes),
+)
+FORMS: Final = (
+    *(TOML, QUALISYS, VICON, OPTITRACK, OPENCAP, EASYMOCAP, BIOCV),
+    *(JSON, KALIBR, OPENPOSE),
+)
 """All forms; docs/reference/formats.md describes them."""

@@ -261,7 +261,9 @@ class JsonItems:
         kept: values of the other keys to keep; filled while iterating.
     """
 
-    def __init__(self, path: Path, key: str, limit: int, keep: Collection[str] = ()) -> None:
+    def __init__(
+        self, path: Path, key: str, limit: int, keep: Collection[str] = (), other_key: str = ""
+    ) -> None:
         """Prepare reading.
 
         Args:
@@ -269,12 +271,13 @@ class JsonItems:
             key: key of the list if the file is a mapping.
             limit: maximum size of the file [byte].
             keep: further keys of the mapping whose values are kept.
+            other_key: another name of the key.
 
         Raises:
             InputError: no such file, or too large.
         """
         require_file(path, limit)
-        self.path, self.key = path, key
+        self.path, self.keys = path, (key, other_key)
         self.is_mapping = False
         self.has_list = False
         self.other: Any = None
@@ -325,10 +328,10 @@ class JsonItems:
             if name in self.keep:
                 is_list = text.ahead() == "["
                 self.kept[name] = list(_read_list(text)) if is_list else text.value()
-            elif name != self.key:
+            elif name not in self.keys:
                 _skip(text)
             elif self.has_list or self.other is not None:
-                raise text.error(f"{self.key!r} is given twice")
+                raise text.error(f"{name!r} is given twice")
             elif text.ahead() == "[":
                 self.has_list = True
                 yield from _read_list(text)
