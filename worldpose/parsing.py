@@ -22,7 +22,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 
 Result = TypeVar("Result")
 
@@ -152,9 +152,8 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
         lines = csv.reader(text.splitlines(), delimiter=separator)
         rows = [(number, row) for number, row in enumerate(lines, 1) if any(map(str.strip, row))]
     except (OSError, ValueError, csv.Error) as error:
-        found = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            str(path), expected="text in rows and columns", found=found, todo=todo
+            str(path), expected="text in rows and columns", found=say_failure(error), todo=todo
         ) from error
     numbers = [cell.strip() for _, row in rows for cell in row]
     has_commas = separator != "," and any(DECIMAL_COMMA.fullmatch(cell) for cell in numbers)
@@ -172,6 +171,8 @@ def _decode_table(content: bytes) -> str:
     """Return the text of a table."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16")
+    if b"\0" in content:
+        raise ValueError("bytes that are no text")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:

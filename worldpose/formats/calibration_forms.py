@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     Keys,
@@ -257,7 +257,7 @@ def _read_pickle(file: Path) -> dict[str, Any]:
         raise InputError(
             str(file),
             expected="OpenCap's pickle of one camera: arrays alone",
-            found=f"{error}",
+            found=say_failure(error),
             todo="Give cameraIntrinsicsExtrinsics.pickle, as OpenCap wrote it. Nothing in this "
             "file was run.",
         ) from error
@@ -388,7 +388,7 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
         try:
             numbers = [float(word) for word in file.read_text(encoding="utf-8").split()]
         except (OSError, ValueError) as error:
-            raise calibration_error(where, "32 numbers", f"{error}"[:80]) from error
+            raise calibration_error(where, "32 numbers", say_failure(error)[:80]) from error
         if len(numbers) != 32:
             raise calibration_error(
                 where, "32 numbers: width, height, K, L and five of the lens", str(len(numbers))

@@ -40,7 +40,7 @@ def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCa
     content = read_json(path, 16 * SETTINGS_BYTES)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(cameras, list) and all(isinstance(one, dict) for one in cameras):
-        return _read_panoptic(path, cameras)
+        return _read_panoptic(path, cameras, left_out)
     if isinstance(cameras, dict) and all(isinstance(one, dict) for one in cameras.values()):
         return _read_multical(path, cameras, content.get("camera_poses"), left_out)
     raise calibration_error(
@@ -50,18 +50,34 @@ def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCa
     )
 
 
-def _read_panoptic(path: Path, cameras: list[dict[str, Any]]) -> dict[str, CameraCalibration]:
-    """Return cameras with `resolution`, `K`, `distCoef`, `R`, `t` [cm], in a world with y down."""
+def _read_panoptic(
+    path: Path, cameras: list[dict[str, Any]], left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
+    """Return cameras with `resolution`, `K`, `distCoef`, `R`, `t` [cm], in a world with y down.
+
+    The many cameras of low resolution have a skew, and are left out.
+    """
     keys = Keys("resolution", "K", "distCoef", "R", "t")
+    skewed = [_has_skew(table.get("K")) for table in cameras]
     found = []
     for index, table in enumerate(cameras):
         where = f"{path}: cameras[{index}]"
         name = str(table.get("name", ""))
+        if left_out is not None and skewed[index] and not all(skewed):
+            left_out[camera_id(name)] = "its pixels are skew (K[0][1]), which no lens model has"
+            continue
         camera = read_camera_table(
             where, name, table, keys=keys, unit_m=CENTIMETRE, axes=Y_DOWN, where_pose=where
         )
         found.append((where, camera))
     return index_by_name(path, found, CENTIMETRE)
+
+
+def _has_skew(matrix: object) -> bool:
+    try:
+        return abs(float(matrix[0][1])) > 1e-9  # type: ignore[index] # the reader names a fault
+    except (TypeError, ValueError, IndexError, KeyError):
+        return False
 
 
 def _read_multical(

@@ -110,7 +110,8 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
     if not file.stat().st_size:
         return None
     content = read_json(file)
-    keys = [key for key in ("people", "bodies") if isinstance(content, dict) and key in content]
+    known = ("people", "bodies", "instance_info")
+    keys = [key for key in known if isinstance(content, dict) and key in content]
     people = content[keys[0]] if keys else content
     if content == []:
         return None

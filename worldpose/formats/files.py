@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 
 
 @contextmanager
@@ -131,7 +131,7 @@ def require_file(path: Path, limit: int | None = None) -> int:
         raise InputError(
             str(path),
             expected="a readable file",
-            found=str(error),
+            found=say_failure(error),
             todo="Check its name and rights.",
         ) from error
     if limit is not None and size > limit:
@@ -150,7 +150,10 @@ def _read_text(path: Path, limit: int) -> str:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(
-            str(path), expected="readable UTF-8 text", found=str(error), todo="Save it as UTF-8."
+            str(path),
+            expected="readable UTF-8 text",
+            found=say_failure(error),
+            todo="Save it as UTF-8.",
         ) from error
 
 
@@ -299,12 +302,15 @@ class JsonItems:
             raise self._wrong(f"{error.msg} (character {error.pos})") from error
         except UnicodeDecodeError as error:
             raise InputError(
-                str(self.path), expected="UTF-8 text", found=str(error), todo="Save it as UTF-8."
+                str(self.path),
+                expected="UTF-8 text",
+                found=say_failure(error),
+                todo="Save it as UTF-8.",
             ) from error
         except ValueError as error:  # a number with more digits than Python converts
-            raise self._wrong(str(error)) from error
+            raise self._wrong(say_failure(error)) from error
         except OSError as error:
-            raise self._wrong(str(error)) from error
+            raise self._wrong(say_failure(error)) from error
 
     def _entries(self, text: _Text) -> Iterator[Any]:
         if text.ahead() == "[":

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from data_contracts.arrays import Floats
 from data_contracts.cameras import LensCalibration
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.archives import read_npz
 from worldpose.formats.calibration_files import (
     calibration_error,
@@ -93,7 +93,7 @@ def read_lenses(
     try:
         matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
     except (ValueError, TypeError) as error:
-        raise calibration_error(where, "matrices of numbers", str(error)) from error
+        raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
     size = _image_size(given, sizes[camera])
     is_fisheye = "fisheye_model" in given and np.any(np.asarray(given["fisheye_model"]) != 0)
     table = {
@@ -170,7 +170,7 @@ def _read_file(file: Path) -> dict[str, Any]:
                 array = read_npy(stream)
             return {"K" if array.shape == (3, 3) else "dist": array}
     except (OSError, ValueError, EOFError) as error:
-        raise calibration_error(str(file), "arrays of numbers", str(error)) from error
+        raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
     if suffix in (".yml", ".yaml"):
@@ -194,7 +194,7 @@ def _read_pickled_lens(file: Path) -> dict[str, Any]:
     try:
         content = read_pickle(file)
     except (OSError, ValueError) as error:
-        found = f"{error}"
+        found = say_failure(error)
         raise calibration_error(str(file), "OpenCap's pickle, arrays alone", found) from error
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a dictionary", type(content).__name__)
@@ -299,7 +299,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
                 found[str(name)] = np.reshape(value["data"], (value["rows"], value["cols"]))
             except (ValueError, TypeError) as error:
                 raise calibration_error(
-                    f"{file}: {name}", "rows x cols numbers", str(error)
+                    f"{file}: {name}", "rows x cols numbers", say_failure(error)
                 ) from error
         elif isinstance(value, list | int | float):
             found[str(name)] = value

@@ -56,10 +56,10 @@ def find_videos(folder: Path, workshop: Path | None = None) -> dict[str, Path]:
                 found=f"{found[name].name} and {place.name}",
                 todo="Name each video after its camera.",
             )
-        if len(group) > 1 and workshop is None:
-            raise _chapters_error(folder, group)
         found[name] = place
-        if len(group) > 1 and workshop is not None:
+        if len(group) > 1:
+            if workshop is None or not _is_whole(group):
+                raise _chapters_error(folder, group)
             found[name] = workshop / f"{name}{group[0].suffix.lower()}"
             join_videos(group, found[name])
     return found
@@ -83,13 +83,23 @@ def _recordings(files: Sequence[Path]) -> list[list[Path]]:
     return [[file for _, file in sorted(group)] for group in found.values()]
 
 
+def _is_whole(group: Sequence[Path]) -> bool:
+    """Return whether no chapter is missing between others."""
+    chapters = [_CHAPTER.fullmatch(file.stem) for file in group]
+    numbers = [int(each[3] or 0) for each in chapters if each is not None]
+    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
 def _chapters_error(folder: Path, group: Sequence[Path]) -> InputError:
+    is_whole = _is_whole(group)
     return InputError(
         str(folder),
-        expected="one video of each camera",
+        expected="one video of each camera" if is_whole else "all chapters of a recording",
         found=f"chapters of one recording: {', '.join(file.name for file in group)}",
         todo="Add --join, which joins them, or join them with ffmpeg: -f concat -safe 0 -i LIST -c "
-        "copy OUT.mp4, with a line file 'NAME' for each chapter in LIST.",
+        "copy OUT.mp4, with a line file 'NAME' for each chapter in LIST."
+        if is_whole
+        else "Add the missing chapter.",
     )
 
 

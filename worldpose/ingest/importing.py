@@ -87,8 +87,16 @@ def import_match(
 
 
 def describe_left_out(left_out: LeftOut) -> list[str]:
-    """Return a sentence about each camera that is left out."""
-    return [f"camera {name} is left out: {why}" for name, why in left_out.items()]
+    """Return a sentence about the cameras that are left out for each reason."""
+    notes = []
+    for why in dict.fromkeys(left_out.values()):
+        names = [name for name, reason in left_out.items() if reason == why]
+        if len(names) == 1:
+            notes.append(f"camera {names[0]} is left out: {why}")
+        else:
+            more = f" and {len(names) - 20} more" if len(names) > 20 else ""
+            notes.append(f"cameras {', '.join(names[:20])}{more} are left out: {why}")
+    return notes
 
 
 def camera_of(place: Path) -> str:
@@ -108,8 +116,10 @@ def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
     notes = []
     for kind in sorted({found.kind for found in read.values() if found.kind} - {"COCO-17"}):
         which = [name for name, found in read.items() if found.kind == kind]
-        kept = "the 17 keypoints of COCO"
-        kept += " and heels and toes" if read[which[0]].people.points else ""
+        people = read[which[0]].people
+        has_face = np.isfinite(people.confidence[..., :5]).any()
+        kept = "the 17 keypoints of COCO" if has_face else "COCO's 12 of the body, not of the face"
+        kept += " and heels and toes" if people.points else ""
         whose = "" if len(which) == len(read) else f" of {', '.join(which)}"
         notes.append(f"2D poses{whose}: {kind}; kept are {kept}; the others are left out")
     return notes + describe_changes(read)

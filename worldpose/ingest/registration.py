@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from data_contracts.match import Registration, SourceFile
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.ingest.match_folder import LENS_FILE, MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
 from worldpose.ingest.validation import reachable
@@ -126,7 +126,7 @@ def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]
         raise InputError(
             str(folder / path),
             expected="a readable file",
-            found=str(error),
+            found=say_failure(error),
             todo="Check its rights, or wait until it is written.",
         ) from error
     return SourceFile(path=path, size=before.st_size, modified_ns=before.st_mtime_ns, sha256=sha256)

@@ -18,7 +18,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.video.pictures import FrameIndex, Pictures, convert_pixels
 
 MAX_STRETCH: Final = 0.01
@@ -61,7 +61,7 @@ def index_frames(path: Path) -> FrameIndex:
         if not is_told:
             return _count_frames(path, given, len(packets), base, size)
     except (av.error.FFmpegError, OSError) as error:
-        raise _no_video(path, f"{error}") from error
+        raise _no_video(path, say_failure(error)) from error
     stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     key = np.array([key for _, key in packets], dtype=np.bool_)[order]

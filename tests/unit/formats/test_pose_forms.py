@@ -62,7 +62,8 @@ def test_a_file_of_all_frames(tmp_path, content):
 
 @pytest.mark.parametrize("person", [mmpose(), ultralytics()])
 def test_a_file_of_each_frame(tmp_path, person):
-    for number, people in ((7, [person]), (8, []), (9, [person, person])):
+    info = {"meta_info": {}, "instance_info": [person]}
+    for number, people in ((7, info), (8, []), (9, [person, person])):
         (tmp_path / f"cam_{number:06d}.json").write_text(json.dumps(people))
     people = read_people(tmp_path).people
     assert people.frame.tolist() == [7, 8, 9]

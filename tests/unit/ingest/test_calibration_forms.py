@@ -1,5 +1,6 @@
 """Calibrations of other programs: known cameras written in each form, and bad files of each."""
 
+import json
 import os
 import pickle
 import re
@@ -74,6 +75,16 @@ def test_a_camchain_counts_from_its_first_camera(tmp_path):
     path.write_text(path.read_text().replace("pinhole", "omni"))
     with pytest.raises(InputError, match="found omni with radtan"):
         read_calibration(path)
+
+
+def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):
+    path = WRITERS["Panoptic"](tmp_path, rig())
+    content = json.loads(path.read_text())
+    content["cameras"][1]["K"][0][1] = 0.403304
+    path.write_text(json.dumps(content))
+    left_out = {}
+    assert list(read_calibration(path, left_out=left_out)) == ["a1", "c3"]
+    assert "skew" in left_out["b2"]
 
 
 def test_openposes_cameras_take_the_size_of_the_videos(tmp_path):

@@ -69,6 +69,10 @@ def test_chapters_are_joined_on_request(tmp_path, names):
             assert [number_of(shown) for _, shown in video.frames()] == list(range(10))
             assert number_of(video.frame(7)) == 7
             np.testing.assert_allclose(video.index.times, np.arange(10) / 25.0, atol=1e-3)
+    last = tmp_path / "videos" / f"{names[1]}.MP4"
+    last.rename(last.with_name(f"{names[1][:2]}050017.MP4"))
+    with pytest.raises(InputError, match="Add the missing chapter"):
+        find_videos(tmp_path / "videos", tmp_path / "x")
 
 
 def test_folders_of_images_are_videos_of_cameras(tmp_path):

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.review import Origin
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 
 Content = TypeVar("Content")
 
@@ -56,7 +56,7 @@ def decode_file(
         place = ".".join(map(str, first["loc"]))
         found = f"{place}: {first['msg']}" if place else first["msg"]
     except (OSError, ContentError) as error:
-        found = str(error)
+        found = say_failure(error)
     raise InputError(str(path), expected=expected, found=found[:300], todo=todo)
 
 
