@@ -150,3 +150,42 @@ def test_the_array_example_of_the_library_guide_runs():
     given["confidence"] = np.ones((3, 3, 2, 17))
     exec(code, given)
     np.testing.assert_allclose(given["result"].joints, joints, atol=1e-3)
+
+
+def test_a_cost_term_of_ones_own_moves_the_camera_to_the_surveyed_height(script, tiny):
+    truth = np.ravel(read_camera(tiny / "reference/cameras/cam00.npz").center)[:3]
+    clicks = tiny / "annotations/static_calibration/cam00.json"
+    out = script("add_cost_term.py", clicks, 1920, 1080, truth[2])
+    by_clicks, with_mast = (
+        np.array(part.split("]")[0].split(), dtype=float) for part in out.split("[")[1:]
+    )
+    assert abs(with_mast[2] - truth[2]) < 0.03 < abs(by_clicks[2] - truth[2])
+    assert np.linalg.norm(with_mast - truth) < np.linalg.norm(by_clicks - truth)
+
+
+def test_an_export_of_ones_own_holds_the_ways_of_all_people(script, tiny_run, bodies, tmp_path):
+    assert "clip.geojson" in script("add_export.py", tiny_run, TINY, tmp_path)
+    ways = json.loads((tmp_path / "clip.geojson").read_text())["features"]
+    hips = bodies.joints.values[:, :, 11:13, :2].mean(axis=2)
+    assert [way["properties"]["person"] for way in ways] == bodies.person.values.tolist()
+    for person, way in enumerate(ways):
+        np.testing.assert_allclose(way["geometry"]["coordinates"], hips[:, person], atol=6e-4)
+
+
+def test_a_detector_of_ones_own_gives_poses_that_an_import_takes(script, tmp_path):
+    match, poses = tmp_path / "match", tmp_path / "poses"
+    scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.2, "--cameras", 2)
+    succeed("simulate", *scenario, "--render", "--out", match)
+    for camera in ("cam00", "cam01"):
+        script("add_detector.py", match / f"videos/{camera}.mp4", poses / f"{camera}.npz")
+    truth = np.load(match / "reference/boxes/cam00.npz")["boxes"][0]
+    found = np.load(poses / "cam00.npz")["boxes"][0]
+    inside = np.minimum(truth[:, None, 2:], found[:, 2:]) - np.maximum(
+        truth[:, None, :2], found[:, :2]
+    )
+    common = np.clip(inside, 0.0, None).prod(axis=-1)
+    areas = [np.prod(each[:, 2:] - each[:, :2], axis=-1) for each in (truth, found)]
+    overlap = np.nan_to_num(common / (areas[0][:, None] + areas[1] - common))
+    assert (overlap.max(axis=1) > 0.5).sum() >= 3  # of five: green and white kits look like pitch
+    given = ("--calibration", match / "reference/calibration.toml", "--detections", poses)
+    succeed("import", *given, "--fps", 25, "--out", tmp_path / "imported")

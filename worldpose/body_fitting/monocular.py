@@ -225,8 +225,6 @@ PRIOR_SPREAD: Final = 0.25
 
 CORRELATION_S: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
-INDEPENDENT_SHARE: Final = 0.3
-"""Share of an estimate's variance that is independent from frame to frame [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,6 +312,8 @@ def carry_errors(
     Returns:
         The first two arguments, corrected, and the share (frames,) of the variance that is left.
     """
+    # Share of an estimate's variance that is independent from frame to frame [1].
+    independent_share = 0.3
     turn, angles, left = known.copy(), known_angles.copy(), np.ones(len(off))
     there = np.flatnonzero(np.isfinite(off).all(axis=-1))
     asked = np.flatnonzero(used)
@@ -326,8 +326,8 @@ def carry_errors(
         if not len(near):
             continue
         apart = [np.abs(rows[:, None] - near) / lasting for rows in (near, at)]
-        alike = [(1.0 - INDEPENDENT_SHARE) * np.exp(-away) for away in apart]
-        share = np.linalg.solve(alike[0] + INDEPENDENT_SHARE * np.eye(len(near)), alike[1].T).T
+        alike = [(1.0 - independent_share) * np.exp(-away) for away in apart]
+        share = np.linalg.solve(alike[0] + independent_share * np.eye(len(near)), alike[1].T).T
         expected = share @ off[near]
         turn[at] = Rigid.from_rotvec(expected[:, :3], np.zeros(3)).rotation @ turn[at]
         angles[at] += expected[:, 3:]

@@ -58,9 +58,6 @@ MAX_MISFIT: Final = 0.85
 position and size [root mean square, relative to that of the keypoints about their middle]. In two
 simulated worlds 0.2 to 0.6 with angles off by 8 degrees, up to 0.8 with 15 degrees, 0.9 to 1 for
 bodies that lie or stand on their heads."""
-MAX_FITTED_MISFIT: Final = 2.0
-"""Maximum misfit of a fitted body, median over frames, relative to the keypoints' noise [1]. In the
-two worlds 0.7 to 1.1, also for poor estimates, and 1.6 to 5 for bodies the wrong way round."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,14 +444,18 @@ def _find_contradiction(misfit: Floats) -> str | None:
 
 def _judge_fit(misfit: Floats, turned: Floats) -> str | None:
     """Return why a person's fitted body is refused; None if it is accepted."""
+    # Maximum misfit of a fitted body, median over frames, relative to the keypoints' noise
+    # [1]. In the two worlds 0.7 to 1.1, also for poor estimates, and 1.6 to 5 for bodies the
+    # wrong way round.
+    max_fitted_misfit = 2.0
     compared = np.isfinite(misfit) & np.isfinite(turned)
     if not compared.any():
         return f"no frame has a body and {MIN_KEYPOINTS} keypoints"
     middle, other = float(np.median(misfit[compared])), float(np.median(turned[compared]))
-    if middle > MAX_FITTED_MISFIT:
+    if middle > max_fitted_misfit:
         return (
             f"the body fitted to the monocular estimates misses the keypoints by {middle:.1f} "
-            f"times their noise (at most {MAX_FITTED_MISFIT:g})"
+            f"times their noise (at most {max_fitted_misfit:g})"
         )
     # A body turned half round contradicts the estimates if it misses the keypoints by less than
     # this share of what the body as estimated does [1].

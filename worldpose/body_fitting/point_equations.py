@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.compiled import compile_kernel
-
-VECTOR: Final = 16
-"""Numbers that an unrolled loop of vector instructions takes at once [1]: the rest takes longer."""
 
 
 @compile_kernel
@@ -101,7 +96,10 @@ def accumulate_points(
 @compile_kernel
 def _round_up(count: int, most: int) -> int:
     """Return a length that vector instructions fill, at most `most`."""
-    return min((count + VECTOR - 1) // VECTOR * VECTOR, most)
+    # Numbers that an unrolled loop of vector instructions takes at once [1]: the rest takes
+    # longer.
+    vector = 16
+    return min((count + vector - 1) // vector * vector, most)
 
 
 @compile_kernel

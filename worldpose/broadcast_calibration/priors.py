@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-
-REFERENCE: Final = 2.19
-"""Reference focal length of the prior's distortion, in image widths [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +41,10 @@ def build_prior(settings: BroadcastPrior, focal: Floats, image_size: Integers) -
     All frames have one lens: its departure from the prior lasts for the whole clip, so that the
     frames count as one together, however many there are.
     """
+    reference = 2.19  # reference focal length of the prior's distortion, in image widths [1]
     width = float(image_size[0])
     middle = 0.5 * (image_size - 1.0)
-    zoom = focal / (REFERENCE * width)
+    zoom = focal / (reference * width)
     growth = np.stack([zoom**1.6, zoom, zoom], axis=-1)
     spread = np.array([settings.k1_std, settings.k2_std, settings.k3_std])
     return Prior(

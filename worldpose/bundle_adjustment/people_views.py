@@ -41,8 +41,6 @@ SAMPLE: Final = 400
 """Most joints of a person in the random search for a pose [1]."""
 DRAWS: Final = 300
 """Draws of this search [1]; half of the joints being right, 150 of 5 have none wrong in 99 %."""
-GROSS: Final = 20.0
-"""Standard deviations from which a keypoint is another person's [1]."""
 LOSS_SCALE: Final = 3.0
 """Standard deviations beyond which a keypoint counts less (Cauchy's loss) [1]."""
 
@@ -397,6 +395,7 @@ class Views:
         poses: dict[int, Rigid],
     ) -> Observations:
         """Return the keypoints of all joints that two cameras show, without gross errors."""
+        gross = 20.0  # standard deviations from which a keypoint is another person's [1]
         noise_of = (1.5, 0.02)
         joints = np.stack([self._joints(person, poses) for person in shown], axis=1)
         image = np.full((*joints.shape[:-1], len(order), 2), np.nan)
@@ -409,7 +408,7 @@ class Views:
                 track = self.pixels[camera][person[camera]]
                 noise[:, p, :, k] = np.hypot(noise_of[0], noise_of[1] * _height(track) / STATURE[0])
                 off = np.linalg.norm(places[:, p] - track, axis=-1)
-                near = off < GROSS * noise[:, p, :, k]
+                near = off < gross * noise[:, p, :, k]
                 image[:, p, :, k] = np.where(near[..., None], track, np.nan)
         seen = np.isfinite(image[..., 0])
         seen &= (seen.sum(axis=-1) >= 2)[..., None]

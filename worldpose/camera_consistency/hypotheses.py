@@ -31,9 +31,6 @@ LENS_ORDERS: Final = (
     (4, 0, 1, 2, 3),
 )
 """Possible positions of k1 k2 p1 p2 k3 among the five stated numbers."""
-MAX_TANGENTIAL: Final = 0.01
-"""Largest shift of an image corner by p1 and p2 of a real lens, relative to the image width [1].
-The four cameras of Pose2Sim's demo have 0.0007 to 0.002."""
 OFF_AXIS: Final = "its principal point or orientation is off"
 """What an order of coefficients with larger shifts stands for: no such lens exists."""
 LENGTH_UNITS: Final = {
@@ -159,6 +156,9 @@ def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     Orders with large tangential coefficients move the image nearly as a whole: they show an error
     of the principal point or the orientation.
     """
+    # Largest shift of an image corner by p1 and p2 of a real lens, relative to the image
+    # width [1]. The four cameras of Pose2Sim's demo have 0.0007 to 0.002.
+    max_tangential = 0.01
     stated = camera.distortion
     tried = [stated]
     orders = [(stated[list(order)], order) for order in LENS_ORDERS]
@@ -172,7 +172,7 @@ def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     for values, detail in choices:
         if not any(np.array_equal(values, other) for other in tried):
             tried.append(values)
-            if tangential_shift(camera, values) > MAX_TANGENTIAL:
+            if tangential_shift(camera, values) > max_tangential:
                 detail = OFF_AXIS
             yield Hypothesis("lens", detail, replace(camera, distortion=values))
 

@@ -40,9 +40,6 @@ from worldpose.geometry.boxes import box_iou
 
 _BODIES: Final = 400
 """Maximum number of sampled bodies."""
-_OVERLAP: Final = 0.35
-"""Minimum median intersection over union of valid boxes and those around 2D skeletons [1]:
-bodies extend beyond joints, so 0.5 to 0.7 is normal."""
 _AS_SHIPPED: Final = "the camera's x, y, z"
 
 
@@ -51,8 +48,11 @@ def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]
 
     Boxes are (frames, persons, 4) as in the file, skeletons (frames, persons, points, 2) [px].
     """
+    # Minimum median intersection over union of valid boxes and those around 2D skeletons [1]:
+    # bodies extend beyond joints, so 0.5 to 0.7 is normal.
+    overlap = 0.35
     shipped = _overlap(boxes, skel_2d)
-    if shipped >= _OVERLAP:
+    if shipped >= overlap:
         return
     start, rest = boxes[..., :2], boxes[..., 2:]
     others = {
@@ -64,7 +64,7 @@ def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]
     }
     overlaps = {name: _overlap(other, skel_2d) for name, other in others.items()}
     best = max(overlaps, key=lambda name: overlaps[name])
-    known = overlaps[best] >= _OVERLAP
+    known = overlaps[best] >= overlap
     yield Finding(
         fault="box_format" if known else "boxes",
         kind="convention" if known else "damage",

@@ -220,10 +220,6 @@ STAND: Final = (0.5, 150.0)
 """Minimum and maximum height of a camera above the ground [m]."""
 FAR: Final = 500.0
 """Maximum distance of a camera from the centre spot [m]."""
-TRAVEL: Final = 2.0
-"""Distance of a camera's centre from its median beyond which its pose is invalid [m]."""
-_PEOPLE: Final = 4000
-"""Maximum number of sampled bodies."""
 
 
 def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
@@ -234,10 +230,13 @@ def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> floa
         points: (frames, persons, points, 3) [m], world.
         rows: the camera; with an implausible or varying position its share is zero.
     """
+    people = 4000  # maximum number of sampled bodies
+    # Distance of a camera's centre from its median beyond which its pose is invalid [m].
+    travel = 2.0
     center = camera_center(rows)
     if not STAND[0] < center[2] < STAND[1] or np.linalg.norm(center) > FAR:
         return 0.0
-    if np.linalg.norm(centers(rows) - center, axis=-1).max() > TRAVEL:
+    if np.linalg.norm(centers(rows) - center, axis=-1).max() > travel:
         return 0.0
     ends = points[:, :, [source.skeleton.index(n) for n in ("nose", "left_ankle", "right_ankle")]]
     known = np.all(np.isfinite(ends), axis=(-1, -2))
@@ -249,7 +248,7 @@ def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> floa
     frame, person = np.nonzero(known)
     if not len(frame):
         return 0.0
-    picked = sample_evenly(len(frame), _PEOPLE)
+    picked = sample_evenly(len(frame), people)
     camera = rows.camera()
     camera = camera[frame[picked]] if moving else camera[0]
     pixels = camera.project(ends[frame[picked], person[picked]])

@@ -21,8 +21,6 @@ KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")
 
 _TURN: Final = 1e-3
 """Maximum rotation of a static camera [rad]: a pixel in a broadcast image."""
-_ZOOM: Final = 1e-2
-"""Maximum relative change of focal length without zoom."""
 
 
 def read_places(folder: Path, clip: str) -> Floats:
@@ -113,8 +111,9 @@ def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
 
     Rotations are (frames, 3, 3), or (1, 3, 3) if only the first one is known.
     """
+    zoom = 1e-2  # maximum relative change of focal length without zoom
     known = np.isfinite(focal)
-    if known.any() and np.ptp(focal[known]) > _ZOOM * focal[known].mean():
+    if known.any() and np.ptp(focal[known]) > zoom * focal[known].mean():
         return "M+Z"
     turns = rotation[np.isfinite(rotation).all((-1, -2))]
     if len(turns) < 2 <= len(focal):

@@ -325,6 +325,7 @@ def detect_people(
     images: Iterable[Image],
     settings: DetectionSettings = DetectionSettings(),  # noqa: B008
     *,
+    detectors: Sequence[Detector] | None = None,
     camera: Camera | None = None,
     pitch: PitchTemplate | None = None,
 ) -> KeypointDetections:
@@ -333,6 +334,7 @@ def detect_people(
     Args:
         images: (height, width, 3) RGB, in order; read once.
         settings: detectors, pose net and thresholds. The defaults are the bundled nets.
+        detectors: own detectors in place of those that the settings name; scores stay theirs.
         camera: calibrated camera; with `pitch`, people beside the pitch are left out.
         pitch: pitch in the camera's view.
 
@@ -343,10 +345,10 @@ def detect_people(
         InputError: a net or its file is missing or invalid.
     """
     finder = PeopleFinder(
-        load_detectors(settings),
+        load_detectors(settings) if detectors is None else detectors,
         load_pose(settings),
         settings,
-        load_score_map(settings),
+        load_score_map(settings) if detectors is None else None,
         load_landmarks(settings),
     )
     place = None if camera is None or pitch is None else Place(camera, pitch)

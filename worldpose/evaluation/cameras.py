@@ -149,6 +149,7 @@ def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
         rays: (...) rays.
         pitch: the surface, extended beyond the touch lines.
     """
+    newton_steps = 8  # each step squares the error; the surface is within 0.2 m of the start plane
     origins, directions = rays.origins, rays.directions
 
     def height(along: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -160,15 +161,11 @@ def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # The surface lies below z = 0 and curves away, so Newton's steps never pass it.
         along = np.where(down, -origins[..., 2] / directions[..., 2], np.nan)
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(newton_steps):
             along = along - height(along) / (height(along + 0.5) - height(along - 0.5))
         # A tenth of a millimetre: points that have not converged by now never will.
         met = (along > 0.0) & (np.abs(height(along)) < 1e-4)
         return np.where(met[..., None], origins + along[..., None] * directions, np.nan)
-
-
-_NEWTON_STEPS = 8
-"""Each step squares the error; the surface is within 0.2 m of the start plane."""
 
 
 def _capped_lengths(vectors: NDArray[np.float64], most: float) -> NDArray[np.float64]:

@@ -38,12 +38,6 @@ UNIT_NAMES: Final = {
 """Units as words."""
 SUFFIXES: Final = (".c3d", ".trc")
 """Suffixes of marker files."""
-_MAX_OFFSET_S: Final = 2.0
-"""Maximum clock offset of the search, either way [s]."""
-_STEP_S: Final = 0.2
-"""Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate."""
-_MATCH_GATE_M: Final = 1.0
-"""Maximum mean joint distance of matched persons after alignment [m], as in the evaluation."""
 People = Mapping[str, Mapping[str, tuple[str, ...]]]
 """Markers by person and joint; their mean is the joint."""
 
@@ -247,9 +241,12 @@ def align_reference(
     Raises:
         DegenerateError: prediction and reference match at no offset.
     """
+    # Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate.
+    step_s = 0.2
+    max_offset_s = 2.0  # maximum clock offset of the search, either way [s]
     times = prediction.frames / fps
-    count = int(np.ceil(_MAX_OFFSET_S / _STEP_S))
-    grid = np.arange(-count, count + 1) * _STEP_S
+    count = int(np.ceil(max_offset_s / step_s))
+    grid = np.arange(-count, count + 1) * step_s
     tried = [
         (_match_cost(prediction.joints, sample_joints(joints, rate, times + o)), o) for o in grid
     ]
@@ -258,7 +255,7 @@ def align_reference(
     if match is None:
         raise DegenerateError(
             "the reference matches the prediction nowhere within "
-            f"{_MAX_OFFSET_S:g} s of difference between their clocks"
+            f"{max_offset_s:g} s of difference between their clocks"
         )
 
     def error(shift: float) -> float:
@@ -267,7 +264,7 @@ def align_reference(
     # Tenths of a millisecond: a millimetre of a runner's path.
     found = minimize_scalar(
         error,
-        bounds=(offset - _STEP_S, offset + _STEP_S),
+        bounds=(offset - step_s, offset + step_s),
         method="bounded",
         options={"xatol": 1e-4},
     )
@@ -298,18 +295,21 @@ def sample_joints(joints: Floats, rate: float, times: Floats) -> Floats:
 
 def _match_cost(people: Floats, reference: Floats) -> tuple[float, NDArray[np.int64] | None]:
     """Return the sum of joint distances, clipped at the gate, and the match after registration."""
-    motion = register_world(reference, people, _MATCH_GATE_M)
+    # Maximum mean joint distance of matched persons after alignment [m], as in the
+    # evaluation.
+    match_gate_m = 1.0
+    motion = register_world(reference, people, match_gate_m)
     if motion is None:
         return np.inf, None
     distances = joint_distances(people, move_people(motion, reference))
-    match = match_people(distances, _MATCH_GATE_M)
+    match = match_people(distances, match_gate_m)
     there = int(np.isfinite(reference[..., 0]).any(-1).sum())
     if not (match >= 0).any():
         return np.inf, None
     chosen = np.take_along_axis(distances, np.maximum(match, 0)[..., None], axis=2)[..., 0]
-    total = np.where(match >= 0, chosen, 0.0).sum() + _MATCH_GATE_M * (there - (match >= 0).sum())
+    total = np.where(match >= 0, chosen, 0.0).sum() + match_gate_m * (there - (match >= 0).sum())
     # Missing people cost the gate, so that a short overlap that fits by chance does not win.
-    missing = _MATCH_GATE_M * (len(reference) * reference.shape[1] - there)
+    missing = match_gate_m * (len(reference) * reference.shape[1] - there)
     return float(total + missing), match
 
 

@@ -298,8 +298,6 @@ _FRAMES: Final = 48
 """Sample frames, evenly spread: enough to distinguish paths."""
 _PAIRS: Final = 400
 """Maximum pairs of people to try, by falling number of common joints: all of 20 against 20."""
-_ROUNDS: Final = 3
-"""Iterations of matching and alignment, enough to converge."""
 
 
 def register_world(
@@ -316,6 +314,7 @@ def register_world(
         true: (frames, true persons, joints, 3) [m]; NaN where missing.
         gate: maximum distance between matched persons after the motion [m].
     """
+    rounds = 3  # iterations of matching and alignment, enough to converge
     shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
     if not len(shared):
         return None
@@ -336,7 +335,7 @@ def register_world(
         for index in range(len(rows))
     ]
     motion = _one(motions, int(np.argmin(left)))
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         distances = joint_distances(move_people(motion, predicted), true)
         found = take_matched(predicted, match_people(distances, gate))
         if not np.isfinite(found).any():

@@ -28,12 +28,6 @@ from worldpose.filtering.judging import BodyViews, Spread, TriangulatedDetection
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.geometry.boxes import box_areas, box_iou
 
-BOX_MARGINS: Final = (0.12, 0.20, 0.12, 0.10)
-"""Margins of a person beyond the joints: left, up to the top of the head, right, and down to the
-soles [m]."""
-OCCLUSION_M: Final = 0.2
-"""A body occludes joints that are farther away than it by more than this [m]."""
-
 
 def _capsules() -> tuple[NDArray[np.int64], Floats]:
     """Return pairs of joints at the ends of a body's solid parts, and their radii [m]."""
@@ -85,7 +79,10 @@ class Expected:
     @property
     def boxes(self) -> Floats:
         """Return bodies' boxes (frames, persons, 4) [px]: x0, y0, x1, y1; NaN if incomplete."""
-        left, up, right, down = (side * self.scale for side in BOX_MARGINS)
+        # Margins of a person beyond the joints: left, up to the top of the head, right,
+        # and down to the soles [m].
+        box_margins = (0.12, 0.20, 0.12, 0.10)
+        left, up, right, down = (side * self.scale for side in box_margins)
         x, y = self.image[..., 0], self.image[..., 1]
         sides = [(x - left).min(-1), (y - up).min(-1), (x + right).max(-1), (y + down).max(-1)]
         return np.stack(sides, axis=-1)
@@ -98,6 +95,8 @@ class Expected:
 
     def hidden_joints(self, frame: int) -> NDArray[np.bool_]:
         """Return which joints (persons, 17) of a frame another person's body occludes."""
+        # A body occludes joints that are farther away than it by more than this [m].
+        occlusion_m = 0.2
         image, scale, depth = self.image[frame], self.scale[frame], self.depth[frame]
         begin, end = image[:, _ENDS[:, 0]], image[:, _ENDS[:, 1]]
         along = end - begin
@@ -108,7 +107,7 @@ class Expected:
             part = (off * along).sum(-1) / np.square(along).sum(-1)
             away = off - np.clip(np.nan_to_num(part), 0.0, 1.0)[..., None] * along
             covered = np.square(away).sum(-1) < radius**2
-            covered &= near + OCCLUSION_M < depth[:, :, None, None]
+            covered &= near + occlusion_m < depth[:, :, None, None]
         persons = np.arange(len(image))
         covered[persons, :, persons] = False
         return np.asarray(covered.any(axis=(2, 3)))

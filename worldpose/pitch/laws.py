@@ -8,8 +8,6 @@ from data_contracts.pitch import ArcSpec, LineSpec
 
 PENALTY_AREA = (16.5, 40.32)
 """Depth from the goal line, width along it [m]: 16.5 m to either side of the goal of 7.32 m."""
-GOAL = (2.44, 7.32)
-"""Height of the crossbar's lower edge, width between the posts [m]."""
 PENALTY_MARK_DISTANCE = 11.0
 """Distance from the goal line [m]."""
 CIRCLE_RADIUS = 9.15
@@ -31,6 +29,7 @@ def law_points(length: float, width: float) -> dict[str, Place]:
         length: length of the pitch [m].
         width: width of the pitch [m].
     """
+    goal = (2.44, 7.32)  # height of the crossbar's lower edge, width between the posts [m]
     x_goal, y_touch = 0.5 * length, 0.5 * width
     points: dict[str, Place] = {"center_mark": (0.0, 0.0, 0.0)}
     for end, toward in ENDS.items():
@@ -49,9 +48,9 @@ def law_points(length: float, width: float) -> dict[str, Place]:
                 toward * CIRCLE_RADIUS * math.sin(_ARC_HALF_ANGLE),
                 0.0,
             )
-            y = toward * 0.5 * GOAL[1]
+            y = toward * 0.5 * goal[1]
             points[f"goal_post_{side}_{end}_bottom"] = (out * x_goal, y, 0.0)
-            points[f"goal_post_{side}_{end}_top"] = (out * x_goal, y, GOAL[0])
+            points[f"goal_post_{side}_{end}_top"] = (out * x_goal, y, goal[0])
     return points
 
 

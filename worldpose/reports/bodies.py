@@ -35,8 +35,6 @@ from worldpose.reports.drawing import (
 
 _SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
 """Direction to the light, world: high, from the main camera's side."""
-_AMBIENT: Final = 0.45
-_SUNLIT: Final = 0.3
 _FACING: Final = 0.25
 """Shares of ambient light, sunlight and light from the camera."""
 
@@ -138,11 +136,13 @@ def _light(
     surface: Singles, faces: NDArray[np.int32], corners: scipy.sparse.csr_array, eye: Singles
 ) -> Singles:
     """Return the light at each vertex (vertices,); 1 = unchanged colour."""
+    sunlit = 0.3
+    ambient = 0.45
     a, b, c = (surface[faces[:, k]] for k in range(3))
     normals = _unit(corners @ np.cross(b - a, c - a))
     facing = np.einsum("vc,vc->v", normals, _unit(eye - surface))
     sun = normals @ _unit(_SUN)
-    light = _AMBIENT + _SUNLIT * np.maximum(sun, 0.0) + _FACING * np.maximum(facing, 0.0)
+    light = ambient + sunlit * np.maximum(sun, 0.0) + _FACING * np.maximum(facing, 0.0)
     return np.asarray(light, dtype=np.float32)
 
 
@@ -152,13 +152,7 @@ def _unit(vectors: Singles) -> Singles:
     return np.asarray(vectors / np.maximum(lengths, np.float32(1e-12)), dtype=np.float32)
 
 
-IMAGE_SHARE: Final = 0.3
-"""Share of the camera's image to show: players of 80 px are then 210 px tall."""
 _GROUND: Final = (206, 217, 202)
-_PALE: Final = 0.35
-"""Share of white in the colours of large bodies, to make shading visible [1]."""
-_SUBPIXEL: Final = 4
-"""Fractional bits of pixel coordinates."""
 
 
 def plot_bodies(
@@ -176,6 +170,7 @@ def plot_bodies(
     Surfaces are (persons, vertices, 3) [m], world, NaN for missing people; faces (triangles, 3),
     counter-clockwise seen from outside. Without a still, RGB, the markings of the pitch are drawn.
     """
+    pale = 0.35  # share of white in the colours of large bodies, to make shading visible [1]
     present = np.isfinite(surfaces[:, 0, 0])
     ids = np.asarray(person_ids)[present]
     bodies = surfaces[present]
@@ -184,7 +179,7 @@ def plot_bodies(
     near = zoom_camera(camera, corner, scale, (WIDTH, round(side[1] * scale)))
     canvas = _background(near, corner, scale, still, pitch)
     colors = np.array([to_rgb(person_color(int(person))) for person in ids]).reshape(-1, 3)
-    paint_bodies(canvas, near, bodies, faces, _PALE + (1.0 - _PALE) * colors)
+    paint_bodies(canvas, near, bodies, faces, pale + (1.0 - pale) * colors)
 
     height, width = canvas.shape[:2]
     figure, (axes,) = picture_panels([title], (-0.5, -0.5), (width, height), still=canvas)
@@ -200,8 +195,9 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
 
     The camera is single; bodies are (persons, points, 3) [m], world.
     """
+    image_share = 0.3  # share of the camera's image to show: players of 80 px are then 210 px tall
     size = np.asarray(camera.image_size, dtype=np.float64)
-    side = IMAGE_SHARE * size
+    side = image_share * size
     middles = camera.project(bodies.mean(axis=1))
     inside: NDArray[np.bool_] = np.all((middles >= 0.0) & (middles < size), axis=-1)
     if not inside.any():
@@ -216,6 +212,7 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
 def _background(
     camera: Camera, corner: Floats, scale: float, still: Image | None, pitch: PitchSpec | None
 ) -> Image:
+    subpixel = 4  # fractional bits of pixel coordinates
     width, height = (int(n) for n in camera.image_size)
     if still is not None:
         # Pixel (x, y) of the part shows place (x + 0.5) / scale + corner of the still.
@@ -232,6 +229,6 @@ def _background(
         # Points far outside do not fit into 32 bits, and are not visible.
         near: NDArray[np.bool_] = np.all(np.abs(pixels) < 1e4, axis=-1)
         for start in np.flatnonzero(near[:-1] & near[1:]):
-            a, b = np.rint(pixels[start : start + 2] * 2**_SUBPIXEL).astype(int).tolist()
-            cv2.line(canvas, a, b, (255, 255, 255), 3, cv2.LINE_AA, _SUBPIXEL)
+            a, b = np.rint(pixels[start : start + 2] * 2**subpixel).astype(int).tolist()
+            cv2.line(canvas, a, b, (255, 255, 255), 3, cv2.LINE_AA, subpixel)
     return canvas

@@ -198,8 +198,6 @@ def plot_flow(
     return png(figure)
 
 
-_SHOWN: Final = 5
-"""Frames per clip, in order and evenly spaced."""
 _BAR: Final = 24
 """Height of the title line above them [px]."""
 
@@ -216,7 +214,8 @@ def programme_sheet(shots: Sequence[Shot]) -> bytes:
 
 
 def _row(shot: Shot) -> NDArray[np.uint8]:
-    places = np.linspace(0, len(shot.pictures) - 1, _SHOWN).round().astype(int)
+    shown = 5  # frames per clip, in order and evenly spaced
+    places = np.linspace(0, len(shot.pictures) - 1, shown).round().astype(int)
     pictures = np.hstack([shot.pictures[place] for place in places])
     bar = np.zeros((_BAR, pictures.shape[1], 3), np.uint8)
     said = f"{shot.first}:{shot.first + shot.count}   {shot.seconds:.1f} s, pan {shot.pan:.2f}"

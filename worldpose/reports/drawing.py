@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 PLOTS: Final = (".svg", ".pdf", ".png")
 """Forms of a plot."""
-RESIDUAL_SHARE: Final = 0.02
-"""Length at which the root mean square residual is drawn, as a share of the image's side [1]."""
 PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
 """One colour per person, after Okabe and Ito: distinguishable with any colour vision."""
 
@@ -55,8 +53,6 @@ TEMPLATE: Final = "#ffd54a"
 HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 WIDTH: Final = 1540
 """Width of a figure [px]."""
-DPI: Final = 110
-"""Resolution of a figure [px/in]."""
 _TITLE: Final = 32
 """Height of the titles above panels [px]."""
 _GAP: Final = 14
@@ -140,11 +136,12 @@ def picture_panels(
         ground: colour of plain ground.
         below: free height below the panels [px].
     """
+    dpi = 110  # resolution of a figure [px/in]
     (left, top), (across, down) = np.asarray(corner, float), np.asarray(side, float)
     width = (WIDTH - _GAP * (len(titles) - 1)) / len(titles)
     height = round(width * down / across)
     whole = _TITLE + height + below
-    figure = Figure(figsize=(WIDTH / DPI, whole / DPI), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(WIDTH / dpi, whole / dpi), dpi=dpi, facecolor="white")
     panels = []
     for number, title in enumerate(titles):
         start = number * (width + _GAP)
@@ -401,12 +398,15 @@ def draw_synchronization(found: Synchronization, names: Sequence[str], path: Pat
 
 def draw_lens_fits(fits: Mapping[str, LensFit], path: Path) -> None:
     """Write a plot of board corners, their residuals, and residuals by radius, by camera."""
+    # Length at which the root mean square residual is drawn, as a share of the image's side
+    # [1].
+    residual_share = 0.02
     figure = Figure(figsize=(8.0, 3.2 * len(fits)), layout="constrained")
     rows = figure.subplots(len(fits), 2, squeeze=False)
     for (seen, radial), (name, fit) in zip(rows, fits.items(), strict=True):
         width, height = fit.lens.image_size
         x, y = fit.pixels.T
-        longer = RESIDUAL_SHARE * max(width, height) / max(fit.rms_px, 1e-6)
+        longer = residual_share * max(width, height) / max(fit.rms_px, 1e-6)
         seen.quiver(x, y, *(longer * fit.residuals.T), angles="xy", scale_units="xy", scale=1.0)
         seen.scatter(x, y, s=4, c=fit.image, cmap="tab20")
         seen.set(xlim=(0, width), ylim=(height, 0), aspect="equal")

@@ -231,10 +231,6 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 LARGE: Final = 200_000
 """Size of a PNG [byte] from which it counts as a photograph, not a plot."""
-QUALITY: Final = 88
-"""WebP quality that keeps lines of one pixel sharp."""
-EFFORT: Final = 2
-"""Effort to find a small WebP, of 6: the usual 4 takes twice as long, for 2 to 4 % of the size."""
 
 SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 """Kind, content, and size (width, height) [px] of an image."""
@@ -242,6 +238,10 @@ SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 
 def compress_image(png: bytes) -> SmallImage:
     """Return kind, content and size (width, height) [px] of a PNG: as WebP if it is smaller."""
+    # Effort to find a small WebP, of 6: the usual 4 takes twice as long, for 2 to 4 % of the
+    # size.
+    effort = 2
+    quality = 88  # webP quality that keeps lines of one pixel sharp
     size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
     if len(png) < LARGE:
         return "png", png, size
@@ -249,6 +249,6 @@ def compress_image(png: bytes) -> SmallImage:
 
     webp = io.BytesIO()
     with Image.open(io.BytesIO(png)) as picture:
-        picture.save(webp, "webp", quality=QUALITY, method=EFFORT)
+        picture.save(webp, "webp", quality=quality, method=effort)
     small = webp.getvalue()
     return ("webp", small, size) if len(small) < len(png) else ("png", png, size)

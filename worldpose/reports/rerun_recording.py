@@ -17,9 +17,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import markings, person_color, rgb
 
 NAME: Final = "worldpose"
-_WHITE: Final = (235, 235, 235)
-_BONE: Final = 0.025
-"""Radius of a bone [m]."""
 
 
 def write_recording(
@@ -44,6 +41,7 @@ def write_recording(
     Raises:
         UsageError: rerun-sdk is not installed.
     """
+    white = (235, 235, 235)
     try:
         import rerun as rr
     except ImportError:
@@ -60,7 +58,7 @@ def write_recording(
         if pitch is not None:
             lines = [line.tolist() for line in markings(pitch)]
             stream.log(
-                "world/pitch", rr.LineStrips3D(lines, colors=[_WHITE], radii=[0.06]), static=True
+                "world/pitch", rr.LineStrips3D(lines, colors=[white], radii=[0.06]), static=True
             )
         for name, camera in (cameras or {}).items():
             _log_camera(rr, stream, f"world/cameras/{name}", camera, static=True)
@@ -76,13 +74,14 @@ def write_recording(
 
 def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
     """Return the bones of all people in one frame."""
+    bone = 0.025  # radius of a bone [m]
     ends = tracks.joints[row][:, np.array(COCO17_BONES)]
     people, bones = np.nonzero(np.isfinite(ends).all((-1, -2)))
     shades = [rgb(person_color(int(number))) for number in tracks.person_ids]
     return rr.LineStrips3D(
         ends[people, bones],
         colors=[shades[person] for person in people.tolist()],
-        radii=[_BONE] * len(people),
+        radii=[bone] * len(people),
     )
 
 

@@ -33,8 +33,6 @@ REFUSED: Final = "#d55e00"
 
 MAP_HEIGHT: Final = 790
 """Height of the map of expected errors in its figure [px]."""
-ERROR_RANGE: Final = (0.005, 1.0)
-"""Range of expected ground errors of the colour scale [m]."""
 
 
 class Click(NamedTuple):
@@ -98,6 +96,7 @@ def plot_calibration(
 
 def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> None:
     """Draw the map in the lowest `MAP_HEIGHT` pixels of a figure."""
+    error_range = (0.005, 1.0)  # range of expected ground errors of the colour scale [m]
     high = MAP_HEIGHT / (figure.dpi * figure.get_size_inches()[1])
     axes = figure.add_axes((0.05, 0.08 * high, 0.75, 0.84 * high))
     axes.set(aspect="equal", anchor="E", facecolor="#ececec")
@@ -105,7 +104,7 @@ def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> No
         error_map.x,
         error_map.y,
         np.ma.masked_invalid(error_map.expected),
-        norm=LogNorm(ERROR_RANGE[0], ERROR_RANGE[1]),
+        norm=LogNorm(error_range[0], error_range[1]),
         cmap="viridis_r",
         shading="nearest",
         zorder=0,
@@ -120,14 +119,6 @@ def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> No
     axes.set_title("Grey: outside the image", color=INK, loc="left", fontsize=11)
 
 
-CONTRAST: Final = 18
-"""Minimum brightness of paint above both sides [levels of 255]."""
-MAX_WIDTH_PX: Final = 15
-"""Maximum width of lines [px]."""
-MAX_DISTANCE_PX: Final = 300.0
-"""Distance from which the map is white [px]."""
-ON_PAINT_PX: Final = 1.5
-"""Maximum distance to paint of a marking sample on paint [px]."""
 NEAR_PAINT_PX: Final = 12.0
 """Maximum distance of samples to paint [px]; beyond, they are occluded, or their paint is faint."""
 
@@ -137,15 +128,17 @@ def detect_paint(still: Image) -> NDArray[np.bool_]:
 
     They are colourless, bright, brighter than both sides, and part of a long region.
     """
+    max_width_px = 15  # maximum width of lines [px]
+    contrast = 18  # minimum brightness of paint above both sides [levels of 255]
     grey = cv2.GaussianBlur(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), (3, 3), 0)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (MAX_WIDTH_PX, MAX_WIDTH_PX))
-    bright = np.asarray(cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, disc)) > CONTRAST
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (max_width_px, max_width_px))
+    bright = np.asarray(cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, disc)) > contrast
     # Paint is colourless; shirts and boards mostly are not.
     spread = still.max(-1).astype(np.int16) - still.min(-1)
     found: NDArray[np.bool_] = bright & (spread < 70) & (grey > 90)
     # Remove specks.
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
-    long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * MAX_WIDTH_PX
+    long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * max_width_px
     long[0] = False
     return np.asarray(long[labels])
 
@@ -180,6 +173,8 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
 
     The single camera projects the markings over the distances; its still is RGB.
     """
+    on_paint_px = 1.5  # maximum distance to paint of a marking sample on paint [px]
+    max_distance_px = 300.0  # distance from which the map is white [px]
     paint = detect_paint(still)
     distance = distance_to(paint)
     off = marking_distances(camera, pitch, distance)
@@ -191,7 +186,7 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
     )
     show_image(left, np.where(paint, 255, 18).astype(np.uint8))
     # The square root makes distances of a few pixels visible.
-    grey = np.sqrt(np.minimum(distance, MAX_DISTANCE_PX))
+    grey = np.sqrt(np.minimum(distance, max_distance_px))
     show_image(right, np.rint(255.0 * grey / max(float(grey.max()), 1.0)).astype(np.uint8))
     draw_markings(right, camera, pitch, TEMPLATE, 0.8, zorder=2)
-    return png(figure), float((off < ON_PAINT_PX).mean()) if len(off) else float("nan")
+    return png(figure), float((off < on_paint_px).mean()) if len(off) else float("nan")

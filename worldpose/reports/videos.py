@@ -20,18 +20,12 @@ from worldpose.reports.drawing import GRASS, INK, LINE, TEMPLATE, markings, pers
 
 _PARTS: Final = 16
 """Subpixel steps of line coordinates per pixel."""
-_FAR: Final = 4.0
-"""Maximum absolute coordinate of drawn points, in image widths [1]."""
-_OPACITY: Final = 0.6
-"""Opacity of bodies [1]: the player in the image stays visible for comparison."""
 _MARGIN: Final = 0.1
 """Margin around the image within which joints count as visible, in image widths [1]."""
 PIXELS_PER_M: Final = 10.0
 """Scale of the pitch from above [px/m]."""
 MARGIN_M: Final = 5.0
 """Ground around the pitch [m]."""
-RADIUS_PX: Final = 8
-"""Radius of a person's disc on the pitch from above [px]."""
 
 
 def overlay_frames(
@@ -77,6 +71,7 @@ def _paint(
     bodies: BodyTracks | None,
 ) -> set[int]:
     """Draw the bodies in the image, and return the ids of all people with bodies."""
+    opacity = 0.6  # opacity of bodies [1]: the player in the image stays visible for comparison
     if bodies is None or frame not in bodies.frames:
         return set()
     poses = bodies.poses[int(np.searchsorted(bodies.frames, frame))]
@@ -90,14 +85,15 @@ def _paint(
     if len(who):
         colors = np.array([rgb(person_color(int(n))) for n in bodies.person_ids[who]]) / 255.0
         surfaces = bodies.model.vertices(poses[who])
-        paint_bodies(canvas, camera, surfaces, bodies.model.faces, colors, opacity=_OPACITY)
+        paint_bodies(canvas, camera, surfaces, bodies.model.faces, colors, opacity=opacity)
     return embodied
 
 
 def _draw(canvas: Image, pixels: Floats, color: tuple[int, int, int]) -> None:
     """Draw the finite parts of a polyline (n, 2) [px]."""
+    far = 4.0  # maximum absolute coordinate of drawn points, in image widths [1]
     with np.errstate(invalid="ignore"):
-        near = (np.abs(pixels) < _FAR * canvas.shape[1]).all(axis=-1)
+        near = (np.abs(pixels) < far * canvas.shape[1]).all(axis=-1)
     begins = np.flatnonzero(near & ~np.append(False, near[:-1]))
     ends = np.flatnonzero(near & ~np.append(near[1:], False)) + 1
     for begin, end in zip(begins, ends, strict=True):
@@ -112,6 +108,7 @@ def minimap_frames(positions: Positions, pitch: PitchSpec) -> Iterator[Image]:
     A disc is a triangulated person, a ring one placed by the feet alone; the label is the roster
     id, or else the person's number. Images have even sides.
     """
+    radius_px = 8  # radius of a person's disc on the pitch from above [px]
     half = 0.5 * np.array([pitch.length, pitch.width]) + MARGIN_M
     width, height = (2.0 * np.rint(half * PIXELS_PER_M)).astype(int).tolist()
 
@@ -131,7 +128,7 @@ def minimap_frames(positions: Positions, pitch: PitchSpec) -> Iterator[Image]:
             x, y = locate(positions.xy[row, p]).tolist()
             thickness = 2 if positions.on_plane[row, p] else cv2.FILLED
             color = person_color(person)
-            cv2.circle(canvas, (x, y), RADIUS_PX, rgb(color), thickness, cv2.LINE_AA)
+            cv2.circle(canvas, (x, y), radius_px, rgb(color), thickness, cv2.LINE_AA)
             _write(canvas, positions.names[p] or str(person), (x + 10, y - 6), color)
         yield canvas
 

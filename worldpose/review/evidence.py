@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,22 +135,6 @@ def _medians(values: Floats) -> Floats:
     return found
 
 
-JOINT_HEIGHTS_M: Final = (-0.3, 3.2)
-"""Range of joint heights above the ground [m]: the ground may be lower at its edges, and arms are
-raised in a jump."""
-CAMERA_DISTANCES_M: Final = (0.5, 300.0)
-"""Range of distances between people and cameras [m]: across the largest stadium."""
-INITIAL_SAMPLES: Final = 33
-"""Initial samples along a ray."""
-MAX_SPACING_PX: Final = 12.0
-"""Maximum spacing of a curve's points [px]: arc and chord differ by less than a hundredth of a
-pixel in a lens that bends a line by 10 px over 400."""
-HALVINGS: Final = 8
-"""Maximum number of subdivisions."""
-EDGE_HALVINGS: Final = 12
-"""Bisections to the border of the image: 12 px become 0.003 px."""
-
-
 @dataclass(frozen=True, eq=False)
 class ViewCheck:
     """Multi-view consistency of one person's keypoints.
@@ -179,6 +162,12 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     Returns:
         Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
     """
+    edge_halvings = 12  # bisections to the border of the image: 12 px become 0.003 px
+    halvings = 8  # maximum number of subdivisions
+    # Maximum spacing of a curve's points [px]: arc and chord differ by less than a hundredth
+    # of a pixel in a lens that bends a line by 10 px over 400.
+    max_spacing_px = 12.0
+    initial_samples = 33  # initial samples along a ray
     rays = source.unproject(np.asarray(pixel, dtype=np.float64)[None])
     span = _span(rays)
     if span is None:
@@ -191,12 +180,12 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     def is_inside(places: Floats) -> NDArray[np.bool_]:
         return _is_in_or_near(places, target.image_size, 0.0)
 
-    along = np.linspace(span[0], span[1], INITIAL_SAMPLES)
+    along = np.linspace(span[0], span[1], initial_samples)
     places = project_along(along)
-    for _ in range(HALVINGS):
+    for _ in range(halvings):
         gap = np.linalg.norm(np.diff(places, axis=0), axis=1)
         inside = is_inside(places)
-        wide = np.flatnonzero((gap > MAX_SPACING_PX) & (inside[1:] | inside[:-1]))
+        wide = np.flatnonzero((gap > max_spacing_px) & (inside[1:] | inside[:-1]))
         # One end may be behind the camera, or outside the valid range of its lens model.
         cut = np.flatnonzero(np.isfinite(places[1:, 0]) != np.isfinite(places[:-1, 0]))
         halved = np.union1d(wide, cut)
@@ -210,7 +199,7 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     edges = np.flatnonzero(inside[1:] != inside[:-1])
     inner = np.where(inside[edges], along[edges], along[edges + 1])
     outer = np.where(inside[edges], along[edges + 1], along[edges])
-    for _ in range(EDGE_HALVINGS):
+    for _ in range(edge_halvings):
         middle = (inner + outer) / 2
         is_seen = is_inside(project_along(middle))
         inner, outer = np.where(is_seen, middle, inner), np.where(is_seen, outer, middle)
@@ -260,20 +249,22 @@ def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
 
 def _span(rays: Rays) -> tuple[float, float] | None:
     """Return the interval of possible joints along the ray [m]; None if empty."""
+    # Range of distances between people and cameras [m]: across the largest stadium.
+    camera_distances_m = (0.5, 300.0)
+    # Range of joint heights above the ground [m]: the ground may be lower at its edges, and
+    # arms are raised in a jump.
+    joint_heights_m = (-0.3, 3.2)
     if not rays.valid[0]:
         return None
     height, slope = float(rays.origins[0, 2]), float(rays.directions[0, 2])
-    low, high = JOINT_HEIGHTS_M
+    low, high = joint_heights_m
     if abs(slope) < 1e-9:
-        return CAMERA_DISTANCES_M if low <= height <= high else None
+        return camera_distances_m if low <= height <= high else None
     ends = sorted(((low - height) / slope, (high - height) / slope))
-    span = max(ends[0], CAMERA_DISTANCES_M[0]), min(ends[1], CAMERA_DISTANCES_M[1])
+    span = max(ends[0], camera_distances_m[0]), min(ends[1], camera_distances_m[1])
     return span if span[0] < span[1] else None
 
 
-MARKING_SPACING_M = 0.5
-"""Spacing of points along a drawn marking [m]: the chords of a curved marking are only a few pixels
-long."""
 MARGIN = 0.25
 """Margin beyond the image for drawn markings, relative to its size [1]: far outside, unconstrained
 distortion may fold them back."""
@@ -292,8 +283,11 @@ class PitchDrawing:
     @cached_property
     def markings(self) -> dict[str, NDArray[np.float64]]:
         """Points (n, 3) [m], world, along every marking, by name."""
+        # Spacing of points along a drawn marking [m]: the chords of a curved marking are
+        # only a few pixels long.
+        marking_spacing_m = 0.5
         names = self.template.marking_names
-        return {name: self.template.marking_points(name, MARKING_SPACING_M) for name in names}
+        return {name: self.template.marking_points(name, marking_spacing_m) for name in names}
 
     @cached_property
     def points(self) -> NDArray[np.float64]:

@@ -18,8 +18,6 @@ from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.settings import CalibrationErrors, ClickSettings
 
-SPACING: Final = 0.25
-"""Distance between samples along a marking [m]."""
 BORDER: Final = 4.0
 """Minimum distance of clicks from the image border [px]."""
 SHORT: Final = 60.0
@@ -27,8 +25,6 @@ SHORT: Final = 60.0
 FLAT: Final = 2.0
 """Points that spread less than this across their common direction [m] are collinear. If all but one
 are, calibration is impossible, so the user must add others."""
-TRIES: Final = 50
-"""Draws of points before collinear ones are accepted."""
 CONFUSED: Final = (
     ("near", "far"),
     ("front", "back"),
@@ -137,6 +133,7 @@ def _choose_points(
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Return indices of the points to click, in random order."""
+    tries = 50  # draws of points before collinear ones are accepted
     low, high = settings.clustered_points if clustered else settings.points
     count = int(rng.integers(low, high + 1))
     if clustered:
@@ -148,7 +145,7 @@ def _choose_points(
         there = rich[rng.integers(len(rich))]
     count = min(count, len(there))
     chosen = rng.permutation(there)[:count]
-    for _ in range(TRIES if _is_spread_out(places[there]) else 0):
+    for _ in range(tries if _is_spread_out(places[there]) else 0):
         if _is_spread_out(places[chosen]):
             break
         chosen = rng.permutation(there)[:count]
@@ -202,7 +199,8 @@ def _draw_markings(
     rng: np.random.Generator,
 ) -> tuple[DrawnMarking, ...]:
     """Return drawn markings: points along their visible parts, from one end to the other."""
-    samples = pitch.sample_lines(SPACING)
+    spacing = 0.25  # distance between samples along a marking [m]
+    samples = pitch.sample_lines(spacing)
     pixels = camera.project(samples.points_world)
     visible = _are_visible(camera, samples.points_world, pixels, _person_boxes(camera, people))
     drawn = []
@@ -224,8 +222,6 @@ def _place_click(camera: Camera, xy: Floats) -> tuple[float, float]:
     return round(float(x), 2), round(float(y), 2)
 
 
-SEARCH_RANGE: Final = 0.1
-"""Search range for a key frame around its even place, as a share of the clip's length [1]."""
 COMPARED_FRAMES: Final = 5
 """Frames that a person compares for one key frame [1]."""
 
@@ -248,11 +244,13 @@ def click_key_frames(
         count: number of key frames.
         rng: random generator of the clicks.
     """
+    # Search range for a key frame around its even place, as a share of the clip's length [1].
+    search_range = 0.1
     frames = len(people)
     drawing = settings.model_copy(update={"enough": len(pitch.points) + 1})
     picked: dict[int, Clicks] = {}
     for middle in np.linspace(0.0, frames - 1.0, count):
-        around = middle + SEARCH_RANGE * frames * np.linspace(-1.0, 1.0, COMPARED_FRAMES)
+        around = middle + search_range * frames * np.linspace(-1.0, 1.0, COMPARED_FRAMES)
         looks = {
             int(frame): click(
                 cameras[int(frame)],
@@ -295,10 +293,6 @@ def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchS
     return painted.model_copy(update={"points": points})
 
 
-PIVOT: Final = 60.0
-"""Distance of the point whose projection an error of the center leaves unchanged [m]."""
-
-
 def add_calibration_errors(
     cameras: dict[str, Camera], errors: CalibrationErrors, rng: np.random.Generator
 ) -> dict[str, Camera]:
@@ -325,9 +319,11 @@ def add_calibration_errors(
 def _move_camera(
     camera: Camera, turn: NDArray[np.float64], shift: NDArray[np.float64], scale: float
 ) -> Camera:
+    # Distance of the point whose projection an error of the center leaves unchanged [m].
+    pivot = 60.0
     pose = camera.cam_from_world
     # Seen from the new center, the pivot straight ahead must again be straight ahead.
-    seen = np.array([0.0, 0.0, PIVOT]) - pose.rotation @ shift
+    seen = np.array([0.0, 0.0, pivot]) - pose.rotation @ shift
     axis = np.cross(seen, [0.0, 0.0, 1.0])
     length = float(np.linalg.norm(axis))
     keep = axis / max(length, 1e-12) * np.arctan2(length, seen[2])

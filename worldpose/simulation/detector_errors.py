@@ -97,10 +97,6 @@ MIRRORED: Final = np.array(
     ]
 )
 """The same joint on the other side."""
-MOSTLY_HIDDEN: Final = 0.7
-"""Share of hidden joints above which a person is mostly hidden."""
-DISPLACED: Final = (4.0, 10.0)
-"""Offset of displaced joints, in standard deviations of their error."""
 _SIDE: Final = np.array([("left" in name) - ("right" in name) for name in COCO17], dtype=float)
 
 
@@ -162,6 +158,8 @@ def detect(
         fps: [1/s].
         rng: this camera's own.
     """
+    displaced = (4.0, 10.0)  # offset of displaced joints, in standard deviations of their error
+    mostly_hidden = 0.7  # share of hidden joints above which a person is mostly hidden
     pixels, size, hider = projections.keypoints, projections.size, projections.hider
     hidden, shape = hider >= 0, hider.shape
     spread = size[..., None] * DIFFICULTY
@@ -179,7 +177,7 @@ def detect(
     thrown = rng.random(shape) < noise.displaced
     angle = 2.0 * np.pi * rng.random(shape)
     sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, noise.floor_px)
-    throw = rng.uniform(*DISPLACED, shape) * sigma * thrown
+    throw = rng.uniform(*displaced, shape) * sigma * thrown
     error = error + throw[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     keypoints = pixels + error
     stolen = bursts(noise.stolen, noise.stolen_time_s, shape, fps, rng) & hidden
@@ -192,7 +190,7 @@ def detect(
     lost = rng.random(shape) < np.where(hidden, noise.hidden_joint_missed, noise.joint_missed)
     small = size < noise.small_px
     missed = _draw_bursts_by_size(noise.person_missed, noise.person_missed_time_s, small, fps, rng)
-    overlapped = hidden.mean(axis=-1) >= MOSTLY_HIDDEN
+    overlapped = hidden.mean(axis=-1) >= mostly_hidden
     overlapped &= rng.random(small.shape) < noise.hidden_person_missed
     merges = overlapped & (rng.random(small.shape) < noise.merged)
     outside = np.isnan(pixels[..., 0])
@@ -232,8 +230,6 @@ def _draw_bursts_by_size(
 
 ROOM: Final = 0.06
 """Margin of a box around the keypoints, for head, hands and feet [person height]."""
-MAX_FALSE_POSITIVES: Final = 2
-"""Maximum number of false positives at a time in one camera."""
 
 
 def report(
@@ -301,9 +297,10 @@ def draw_false_positives(
         frames: number of frames.
         rng: generator of this camera alone, so that false positives of cameras are independent.
     """
+    max_false_positives = 2  # maximum number of false positives at a time in one camera
     noise, crowd = scenario.noise, scenario.crowd
-    share = noise.false_people / MAX_FALSE_POSITIVES
-    shape = (frames, MAX_FALSE_POSITIVES)
+    share = noise.false_people / max_false_positives
+    shape = (frames, max_false_positives)
     on = bursts(share, noise.false_people_time_s, shape, scenario.fps, rng)
     body = draw_body(crowd.height_m, rng)
     # Any moment of a walk serves as a posture; every appearance draws another.
@@ -322,7 +319,7 @@ def draw_false_positives(
     since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
     joints = np.take_along_axis(joints, since[..., None, None], axis=0)
     joints[~on] = np.nan
-    return joints, np.full(MAX_FALSE_POSITIVES, body.height)
+    return joints, np.full(max_false_positives, body.height)
 
 
 def _walk_in_circle(rng: np.random.Generator) -> GroundPath:

@@ -22,11 +22,6 @@ STRIDES: Final = (
 """Speeds [m/s] and strides per second at them: walkers up to 2 m/s, runners beyond."""
 STANDING_SPEED: Final = 0.25
 """Slower people stand [m/s]."""
-STANDING_TIME: Final = 0.3
-"""A person who is slower than `STANDING_SPEED` for this time stands [s]."""
-TURNING_ARM: Final = 0.5
-"""Turning by 1 rad/s needs as many steps as walking at this many metres per second [m]; a turn of
-less than half of that uses the hips alone."""
 
 
 def walk(
@@ -98,7 +93,10 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
         path: one person's path.
         phase: stride at the start of the path [1], for a person who never stands.
     """
-    turning = TURNING_ARM * np.abs(np.gradient(path.heading, path.time))
+    # Turning by 1 rad/s needs as many steps as walking at this many metres per second [m]; a
+    # turn of less than half of that uses the hips alone.
+    turning_arm = 0.5
+    turning = turning_arm * np.abs(np.gradient(path.heading, path.time))
     pace = np.maximum(path.speed, np.minimum(turning, 1.0))
     rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), np.interp(pace, STRIDES[0], STRIDES[1]))
     cycle = phase + np.concatenate(
@@ -126,9 +124,10 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
 
 def _rest_samples(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
     """Return the intervals of samples, first and behind the last, in which a person stands."""
+    standing_time = 0.3  # A person who is slower than `STANDING_SPEED` for this time stands [s]
     slow = np.concatenate([[False], pace < STANDING_SPEED, [False]])
     begins, ends = np.flatnonzero(~slow[:-1] & slow[1:]), np.flatnonzero(slow[:-1] & ~slow[1:])
-    long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= STANDING_TIME
+    long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= standing_time
     return [(int(a), int(b)) for a, b in zip(begins[long], ends[long], strict=True)]
 
 

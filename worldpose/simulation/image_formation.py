@@ -56,8 +56,6 @@ Faces = NDArray[np.int32]
 
 SKY: Final = np.array([0.0, 0.0, -1.0, 0.2])
 """Ambient light, as a light straight from above: dims the grass at the feet."""
-SOFT: Final = 0.9
-"""Standard deviation of a shadow's rim [px]: some centimetres."""
 
 
 def shade_ground(
@@ -72,6 +70,7 @@ def shade_ground(
         things: faces (triangles, 3) and vertices (things, vertices, 3) [m], world, of objects that
             cast shadows.
     """
+    soft = 0.9  # standard deviation of a shadow's rim [px]: some centimetres
     height, width = image.shape[:2]
     mask = np.zeros((height, width), dtype=np.uint8)
     # Levels of 255 that each combination of lights takes.
@@ -84,14 +83,10 @@ def shade_ground(
             for number in range(len(vertices)):
                 if shadows.box(number, 0, width, height) is not None:
                     cover_triangles(shadows.pixels[number], faces, bit, mask)
-    left = 255 - cv2.GaussianBlur(cv2.LUT(mask, taken), (0, 0), SOFT)
+    left = 255 - cv2.GaussianBlur(cv2.LUT(mask, taken), (0, 0), soft)
     cv2.multiply(image, cv2.merge([left] * 3), dst=image, scale=1.0 / 255.0)
 
 
-AMBIENT: Final = 0.58
-"""Ambient light on an upright surface [1]."""
-FROM_ABOVE: Final = 0.12
-"""Additional ambient light on a surface that faces up [1]."""
 DIRECT: Final = 1.3
 """Light on a surface that faces a light source, per share of light that its shadow takes [1]."""
 _SPARE: Final = 64
@@ -218,8 +213,10 @@ def _exposed_box(
 
 def _shade_surfaces(venue: Venue, surfaces: Surfaces) -> Singles:
     """Return the light (persons, vertices) on surfaces, 1 = their own colour."""
+    from_above = 0.12  # additional ambient light on a surface that faces up [1]
+    ambient = 0.58  # ambient light on an upright surface [1]
     normals, vertices = surfaces.normals, surfaces.vertices
-    light = np.float32(AMBIENT) + np.float32(FROM_ABOVE) * normals[..., 2]
+    light = np.float32(ambient) + np.float32(from_above) * normals[..., 2]
     for way in venue.lights:
         toward = (-way[:3] / np.linalg.norm(way[:3])).astype(np.float32)
         direct = np.float32(DIRECT * way[3]) * np.maximum(normals @ toward, np.float32(0.0))

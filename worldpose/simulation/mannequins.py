@@ -17,8 +17,6 @@ from worldpose.simulation.settings import PATTERNS, Pattern
 
 CELL: Final = 0.03
 """Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px."""
-HAND: Final = 0.76
-"""Fingers are beyond that x of the T-pose; they become one mitten [m]."""
 TEXEL: Final = 0.0125
 """Texel of a kit's textures [m]: a pixel of a person of 150 px."""
 LEFT, TOP, SIZE = -0.96, 0.68, 154
@@ -144,7 +142,8 @@ def _cluster_vertices(
 
     No cell crosses the middle of the body, so legs stay apart.
     """
-    size = np.where(np.abs(vertices[:, :1]) > HAND, 2.0 * CELL, CELL)
+    hand = 0.76  # fingers are beyond that x of the T-pose; they become one mitten [m]
+    size = np.where(np.abs(vertices[:, :1]) > hand, 2.0 * CELL, CELL)
     key = np.concatenate([np.floor(vertices / size), size], axis=1)
     _, cell = np.unique(key, axis=0, return_inverse=True)
     cell = cell.ravel()

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
 
 import cv2
 import numpy as np
@@ -41,9 +40,6 @@ from worldpose.video.files import write_video
 
 Advance = Callable[[str, int, int], None]
 
-AT_ONCE: Final = 4
-"""Maximum number of cameras filmed at a time: each holds its empty stadium and encoder frames."""
-
 
 def _film_scene(
     stage: _FilmSet, folder: Path, options: MatchOptions, advance: Advance | None
@@ -52,6 +48,9 @@ def _film_scene(
 
     docs/explanation/simulation.md describes the files.
     """
+    # Maximum number of cameras filmed at a time: each holds its empty stadium and encoder
+    # frames.
+    at_once = 4
 
     def film(name: str) -> None:
         part = "broadcast" if name == CLIP_ID else "videos"
@@ -61,7 +60,7 @@ def _film_scene(
         write_video(file, labelled, stage.scenario.fps)
 
     names = [*stage.scene.cameras, *([] if stage.scene.broadcast is None else [CLIP_ID])]
-    with ThreadPoolExecutor(min(AT_ONCE, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(at_once, os.cpu_count() or 1)) as pool:
         for _ in pool.map(film, names):
             pass
 

@@ -18,34 +18,10 @@ from data_contracts.arrays import Flags, Floats
 from worldpose.simulation.paths import STEP, GroundPath, drift, sample_times
 from worldpose.simulation.settings import CrowdSettings
 
-TOUCH: Final = 0.48
-"""Distance between the middles of people whose bodies begin to touch [m]: chests and shoulders are
-0.25 to 0.5 m thick, and arms are spread."""
-PUSH: Final = 60.0
-"""Acceleration that separates two coincident bodies [m/s^2]; less overlap pushes less."""
-FORESIGHT: Final = 0.6
-"""Time ahead at which people see a collision [s]."""
-CLOSING: Final = 1.5
-"""Closing speed below which people lean in instead of passing [m/s]."""
-DODGE: Final = 15.0
-"""Lateral acceleration on an exact collision course [m/s^2]; a pass in contact needs none."""
-BRAKE: Final = 6.0
-"""Rate at which bodies in contact lose speed relative to each other [1/s]: they hold and lean on
-one another."""
-MAKE_WAY: Final = 5.0
-"""Speed wished away from a person in the same place [m/s]; more distance needs less."""
-ACCELERATION: Final = 5.0
-"""Maximum by a person's own legs [m/s^2]; forward it falls to zero at `TOP_SPEED`."""
-SHOVED: Final = 20.0
-"""Maximum in all, pushed by others [m/s^2]: a body check takes 2 m/s in 0.1 s."""
 REACTION: Final = 0.25
 """Time constant of a wished change of velocity [s]."""
 KEEN: Final = 2.5
 """Maximum speed per metre to the target [1/s]."""
-TURN_RATE: Final = 6.0
-"""Maximum turn rate of a body [rad/s]."""
-TURN_TIME: Final = 0.15
-"""Time constant of a body's turn to its direction of movement or gaze [s]."""
 FACING_SPEED: Final = 0.8
 """Slower people face the ball and step aside or back [m/s]."""
 TOP_SPEED: Final = 9.2
@@ -70,6 +46,8 @@ def _steer(
         space: distance below which people make way for each other [m].
         yields: (n, n), whether a person heeds another one; None = everyone heeds everyone.
     """
+    turn_time = 0.15  # time constant of a body's turn to its direction of movement or gaze [s]
+    turn_rate = 6.0  # maximum turn rate of a body [rad/s]
     count = len(start)
     heeds = ~np.eye(count, dtype=bool) if yields is None else yields
     position, velocity = start.copy(), np.zeros((count, 2))
@@ -83,7 +61,7 @@ def _steer(
         facing = np.where(fast, velocity, look - position)
         turn = np.arctan2(facing[:, 1], facing[:, 0]) - heading
         turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-        rate = np.clip(turn / TURN_TIME, -TURN_RATE, TURN_RATE)
+        rate = np.clip(turn / turn_time, -turn_rate, turn_rate)
         heading = heading + (turn if i == 0 else rate * STEP)
         places[i], headings[i] = position, heading
         position = position + velocity * STEP
@@ -96,33 +74,50 @@ def _accelerate(
     position: Floats, velocity: Floats, way: Floats, top: Floats, space: float, heeds: Flags
 ) -> Floats:
     """Return accelerations (people, 2) [m/s^2] by legs and by contact."""
+    shoved = 20.0  # maximum in all, pushed by others [m/s^2]: a body check takes 2 m/s in 0.1 s
+    # Maximum by a person's own legs [m/s^2]; forward it falls to zero at `TOP_SPEED`.
+    acceleration = 5.0
+    # Speed wished away from a person in the same place [m/s]; more distance needs less.
+    make_way = 5.0
+    # Rate at which bodies in contact lose speed relative to each other [1/s]: they hold and
+    # lean on one another.
+    brake = 6.0
+    # Lateral acceleration on an exact collision course [m/s^2]; a pass in contact needs none.
+    dodge = 15.0
+    closing = 1.5  # closing speed below which people lean in instead of passing [m/s]
+    foresight = 0.6  # time ahead at which people see a collision [s]
+    # Acceleration that separates two coincident bodies [m/s^2]; less overlap pushes less.
+    push = 60.0
+    # Distance between the middles of people whose bodies begin to touch [m]: chests and
+    # shoulders are 0.25 to 0.5 m thick, and arms are spread.
+    touch = 0.48
     apart, passing = position[:, None] - position, velocity[:, None] - velocity
     gap = np.linalg.norm(apart, axis=-1) + 1e-9
     far = np.linalg.norm(way, axis=-1, keepdims=True)
     wished = way * np.minimum(KEEN, top[:, None] / np.maximum(far, 1e-9))
     if space > 0.0:
         near = heeds * np.clip(1.0 - gap / space, 0.0, 1.0)
-        wished = wished + MAKE_WAY * (apart * (near / gap)[..., None]).sum(axis=1)
+        wished = wished + make_way * (apart * (near / gap)[..., None]).sum(axis=1)
     drive = (wished - velocity) / REACTION
     # The limit of driving forces falls with speed, the limit of braking and turning does not.
     speed = np.linalg.norm(velocity, axis=-1)
     ahead = velocity / np.maximum(speed, 1e-9)[:, None]
     forward = (drive * ahead).sum(-1)
-    limit = ACCELERATION * np.maximum(1.0 - speed / TOP_SPEED, 0.0)
+    limit = acceleration * np.maximum(1.0 - speed / TOP_SPEED, 0.0)
     drive = drive + (np.minimum(forward, limit) - forward)[:, None] * ahead
-    drive = _limit(drive, ACCELERATION)
+    drive = _limit(drive, acceleration)
 
-    close = heeds * np.clip(1.0 - gap / TOUCH, 0.0, 1.0)
-    pushed = PUSH * (apart * (close / gap)[..., None]).sum(axis=1)
+    close = heeds * np.clip(1.0 - gap / touch, 0.0, 1.0)
+    pushed = push * (apart * (close / gap)[..., None]).sum(axis=1)
     touching = np.minimum(4.0 * close, 1.0)[..., None]
-    held = -BRAKE * (touching * passing).sum(axis=1)
+    held = -brake * (touching * passing).sum(axis=1)
     meet = -(apart * passing).sum(axis=-1) / np.maximum((passing**2).sum(axis=-1), 1e-9)
-    nearest = apart + passing * np.clip(meet, 0.0, FORESIGHT)[..., None]
+    nearest = apart + passing * np.clip(meet, 0.0, foresight)[..., None]
     miss = np.linalg.norm(nearest, axis=-1) + 1e-9
-    urgent = heeds * np.clip(1.0 - miss / TOUCH, 0.0, 1.0)
-    urgent[(meet <= 0.0) | ((passing**2).sum(axis=-1) < CLOSING**2)] = 0.0
-    dodged = DODGE * (nearest * (urgent / miss)[..., None]).sum(axis=1)
-    return _limit(drive + pushed + held + dodged, SHOVED)
+    urgent = heeds * np.clip(1.0 - miss / touch, 0.0, 1.0)
+    urgent[(meet <= 0.0) | ((passing**2).sum(axis=-1) < closing**2)] = 0.0
+    dodged = dodge * (nearest * (urgent / miss)[..., None]).sum(axis=1)
+    return _limit(drive + pushed + held + dodged, shoved)
 
 
 def _limit(vectors: Floats, most: float) -> Floats:
@@ -134,10 +129,6 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 
 
-START_SPACE: Final = 2.5
-"""Minimum distance between people at the start of their paths [m], where there is room."""
-ARRIVED: Final = 1.5
-"""A wandering person that near a goal goes for the next one [m]."""
 GOALS: Final = 1.25
 """Size of the area of goals [the people's area]: people come as far as its border."""
 
@@ -153,6 +144,9 @@ def wander(
         rngs: one per person. People heed earlier ones alone, so that an additional person changes
             no earlier path.
     """
+    arrived = 1.5  # A wandering person that near a goal goes for the next one [m]
+    # Minimum distance between people at the start of their paths [m], where there is room.
+    start_space = 2.5
     time, count = sample_times(duration), len(rngs)
     center, half = np.array(crowd.area_center_m), 0.5 * np.array(crowd.area_size_m)
     low, high = crowd.speed_m_s
@@ -163,7 +157,7 @@ def wander(
         drawn = center + half * rng.uniform(-1.0, 1.0, (50, 2))
         clear = np.linalg.norm(drawn[:, None] - starts, axis=-1).min(axis=1, initial=np.inf)
         # The first with room, else the best.
-        start = drawn[[int(np.argmax(np.minimum(clear, START_SPACE)))]]
+        start = drawn[[int(np.argmax(np.minimum(clear, start_space)))]]
         starts = np.concatenate([starts, start])
         goals[person] = center + GOALS * half * rng.uniform(-1.0, 1.0, (most, 2))
         period = rng.uniform(4.0, 9.0)
@@ -174,26 +168,16 @@ def wander(
 
     def wish(sample: int, position: Floats, velocity: Floats) -> tuple[Floats, Floats, Floats]:
         target = goals[np.arange(count), number % most]
-        number[np.linalg.norm(target - position, axis=-1) < ARRIVED] += 1
+        number[np.linalg.norm(target - position, axis=-1) < arrived] += 1
         return target, pace[:, sample], target
 
     return _steer(time, starts, wish, 1.5 * crowd.personal_space_m, np.tri(count, k=-1, dtype=bool))
 
 
-FIRST_BALL: Final = 1.8
-"""Time at which the first ball comes down [s]."""
-BALL_EVERY: Final = 5.0
-"""Interval between balls in longer clips [s]."""
 PACKS: Final = 3
 """Groups of attackers who wait for the ball, an arm's length apart."""
-FEINT_TIME: Final = (0.5, 1.3)
-"""Time between an attacker's feints [s]."""
-FEINT: Final = 0.6
-"""Length of a feint along each axis [m], standard deviation."""
 MARKED: Final = 0.35
 """Distance at which a defender marks an attacker, towards the goal [m]: in contact."""
-BESIDE: Final = 0.1
-"""Desired lateral distance of pairs of runners [m]; shoulders keep them farther apart."""
 
 
 def take_corner(
@@ -209,6 +193,9 @@ def take_corner(
         duration: time covered besides the margins [s].
         rng: draws everything.
     """
+    feint = 0.6  # length of a feint along each axis [m], standard deviation
+    ball_every = 5.0  # interval between balls in longer clips [s]
+    first_ball = 1.8  # time at which the first ball comes down [s]
     time = sample_times(duration)
     count, center = crowd.people, np.array(crowd.area_center_m)
     half = 0.5 * np.array(crowd.area_size_m)
@@ -220,8 +207,8 @@ def take_corner(
     packs = center + half * rng.uniform([-0.5, -0.6], [0.3, 0.6], (PACKS, 2)) * [out, 1.0]
     homes = packs[rng.integers(PACKS, size=len(attackers))]
     homes = homes + 1.0 * rng.standard_normal(homes.shape)
-    feints = FEINT * _draw_steps(time, len(attackers), rng)
-    balls = np.arange(FIRST_BALL, time[-1], BALL_EVERY)
+    feints = feint * _draw_steps(time, len(attackers), rng)
+    balls = np.arange(first_ball, time[-1], ball_every)
     drops = goal + rng.uniform([3.5, -5.0], [8.0, 5.0], (len(balls), 2)) * [-out, 1.0]
     around = rng.standard_normal((len(balls), len(attackers), 2))
     # Half of them go for the ball, others for a post and the edge of the area.
@@ -254,10 +241,11 @@ def take_corner(
 
 def _draw_steps(time: Floats, count: int, rng: np.random.Generator) -> Floats:
     """Return standard normal steps (samples, count, 2), constant for a random feint time each."""
+    feint_time = (0.5, 1.3)  # time between an attacker's feints [s]
     steps = np.empty((len(time), count, 2))
     for person in range(count):
-        intervals = int((time[-1] - time[0]) / FEINT_TIME[0]) + 2
-        ends = time[0] + np.cumsum(rng.uniform(FEINT_TIME[0], FEINT_TIME[1], intervals))
+        intervals = int((time[-1] - time[0]) / feint_time[0]) + 2
+        ends = time[0] + np.cumsum(rng.uniform(feint_time[0], feint_time[1], intervals))
         steps[:, person] = rng.standard_normal((len(ends) + 1, 2))[np.searchsorted(ends, time)]
     return steps
 
@@ -272,6 +260,8 @@ def run_through(
         duration: time covered besides the margins [s].
         rng: draws everything.
     """
+    # Desired lateral distance of pairs of runners [m]; shoulders keep them farther apart.
+    beside = 0.1
     count, center = crowd.people, np.array(crowd.area_center_m)
     reach = 0.5 * float(min(crowd.area_size_m))
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1) + rng.uniform(-0.3, 0.3, count)
@@ -289,7 +279,7 @@ def run_through(
         there = np.linalg.norm(ahead - position, axis=-1) < 1.5
         state[there] += np.pi + 0.5 * np.sin(7.0 * state[there])
         aside = _unit(np.stack([-velocity[:, 1], velocity[:, 0]], axis=-1))
-        ahead[partners] = position[partners - 1] + BESIDE * aside[partners - 1]
+        ahead[partners] = position[partners - 1] + beside * aside[partners - 1]
         ahead[partners] += velocity[partners - 1] / KEEN  # the follower aims ahead to keep up
         return ahead, speed, center
 
@@ -297,10 +287,6 @@ def run_through(
     return _steer(sample_times(duration), start, wish)
 
 
-PASS_EVERY: Final = (2.0, 4.5)
-"""Time between passes [s]."""
-PASS_LENGTH: Final = 12.0
-"""Standard deviation of a pass per axis [m]."""
 FORMATION: Final = np.array(
     # goalkeeper, four defenders, three midfielders, three forwards
     [
@@ -317,20 +303,6 @@ KEEPER_FOLLOW: Final = np.array([0.12, 0.12])
 """The same for goalkeepers, who stay near their goal [1]."""
 ROAM: Final = 8.0
 """Drift of players from their place in the formation [m], standard deviation per axis."""
-ROAM_TIME: Final = 10.0
-"""Correlation time of that drift [s]."""
-PRESSING: Final = 2
-"""Players of each team who go for the ball: one on it, one in support."""
-SPRINT_EVERY: Final = 45.0
-"""Mean time between a player's sprints [s]."""
-SPRINT_TIME: Final = 2.5
-"""Planned duration of a sprint [s]."""
-EAGERNESS: Final = 0.38
-"""Speed wished per metre to the target [1/s]: 10 m away they jog, 20 m away they run hard."""
-STANDS: Final = (2.0, 5.0)
-"""A player that near the target stands [m], until the target is that far away [m]."""
-BODY_SPACE: Final = 1.3
-"""Distance below which players make way for each other [m]."""
 
 
 def play(
@@ -347,6 +319,12 @@ def play(
         duration: time covered besides the margins [s].
         rng: draws play.
     """
+    body_space = 1.3  # distance below which players make way for each other [m]
+    # A player that near the target stands [m], until the target is that far away [m].
+    stands = (2.0, 5.0)
+    # Speed wished per metre to the target [1/s]: 10 m away they jog, 20 m away they run hard.
+    eagerness = 0.38
+    pressing = 2  # players of each team who go for the ball: one on it, one in support
     time = sample_times(duration)
     players = max(crowd.people - crowd.officials, 0)
     team = np.arange(crowd.people) % 2
@@ -361,23 +339,25 @@ def play(
             # Goalkeepers are the first two.
             mates = np.flatnonzero((team[:players] == which) & (np.arange(players) >= 2))
             far = np.linalg.norm(position[mates] - ball[sample], axis=-1)
-            for rank, mate in enumerate(mates[np.argsort(far, kind="stable")[:PRESSING]]):
+            for rank, mate in enumerate(mates[np.argsort(far, kind="stable")[:pressing]]):
                 target[mate] = ball[sample] - side[mate] * np.array([0.8 + 4.0 * rank, 0.5 * rank])
         far = np.linalg.norm(target - position, axis=-1)
-        moving[:] = far > np.where(moving, *STANDS)
-        pace = np.where(moving, EAGERNESS * hurry[sample] * far, 0.0)
+        moving[:] = far > np.where(moving, *stands)
+        pace = np.where(moving, eagerness * hurry[sample] * far, 0.0)
         return target, np.minimum(pace, TOP_SPEED), ball[sample]
 
-    return _steer(time, targets[0], wish, BODY_SPACE), ball
+    return _steer(time, targets[0], wish, body_space), ball
 
 
 def _roll_ball(time: Floats, rng: np.random.Generator) -> Floats:
     """Return the places (samples, 2) [m] of a ball that goes from pass to pass in play."""
+    pass_length = 12.0  # standard deviation of a pass per axis [m]
+    pass_every = (2.0, 4.5)  # time between passes [s]
     when, places = [float(time[0])], [rng.uniform(-1.0, 1.0, 2) * [30.0, 18.0]]
     while when[-1] < time[-1]:
-        when.append(when[-1] + rng.uniform(*PASS_EVERY))
+        when.append(when[-1] + rng.uniform(*pass_every))
         # Play drifts back to the middle third instead of staying in a corner.
-        place = 0.9 * places[-1] + PASS_LENGTH * rng.standard_normal(2)
+        place = 0.9 * places[-1] + pass_length * rng.standard_normal(2)
         places.append(np.clip(place, [-46.0, -29.0], [46.0, 29.0]))
     straight = np.stack([np.interp(time, when, axis) for axis in np.array(places).T], axis=-1)
     # The target of people's gaze must not jump.
@@ -388,15 +368,18 @@ def _draw_targets(
     time: Floats, ball: Floats, players: int, side: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Return targets (samples, people, 2) [m], and by person a factor on the usual speed there."""
+    sprint_time = 2.5  # planned duration of a sprint [s]
+    sprint_every = 45.0  # mean time between a player's sprints [s]
+    roam_time = 10.0  # correlation time of that drift [s]
     shape = (len(time), len(side))
     # One knot per second, without the jitter of a random walk in between.
     knots = np.arange(time[0], time[-1] + 2.0)
-    roam = ROAM * drift((len(knots), shape[1], 2), ROAM_TIME, 1.0, rng)
+    roam = ROAM * drift((len(knots), shape[1], 2), roam_time, 1.0, rng)
     roam = interp1d(knots, roam, axis=0)(time)
     aims = rng.uniform([12.0, -10.0], [26.0, 10.0], (shape[1], 2))
     sprinting = np.zeros(shape, dtype=bool)
-    for sample, person in np.argwhere(rng.random(shape) < STEP / SPRINT_EVERY):
-        sprinting[sample : sample + round(SPRINT_TIME / STEP), person] = True
+    for sample, person in np.argwhere(rng.random(shape) < STEP / sprint_every):
+        sprinting[sample : sample + round(sprint_time / STEP), person] = True
     targets = np.empty((*shape, 2))
     for person in range(shape[1]):
         role, own = (person // 2) % len(FORMATION), roam[:, person]

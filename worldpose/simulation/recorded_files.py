@@ -126,10 +126,6 @@ def read_tracking(path: Path, content: Mapping[str, NDArray[Any]]) -> list[Track
     return [Tracking(path.stem, time[rows] - time[rows[0]], xy[rows]) for rows in chunks]
 
 
-COAST: Final = 0.5
-"""Time in which people come to a stop before and after the data [s]."""
-FASTEST: Final = 9.0
-"""[m/s]"""
 FACING_SPEED: Final = 0.45
 """Slower people keep their heading [m/s]."""
 
@@ -146,6 +142,8 @@ def follow_track(
         smoothing_s: standard deviation of the smoothing in time [s].
         scale: (2,) scale of this pitch to the pitch of the data [1].
     """
+    fastest = 9.0  # [m/s]
+    coast = 0.5  # time in which people come to a stop before and after the data [s]
     step = times[1] - times[0]
     place = np.stack([np.interp(times, clock, column) for column in xy.T], -1) * scale
     for part, edge in ((times < clock[0], 0), (times > clock[-1], -1)):
@@ -153,12 +151,12 @@ def follow_track(
             near = np.abs(clock - clock[edge]) <= 0.6
             speed = np.array([np.polyfit(clock[near], c[near], 1)[0] for c in xy.T]) * scale
             beyond = times[part] - clock[edge]
-            coasted = -np.expm1(-np.abs(beyond)[:, None] / COAST)
-            place[part] += np.sign(beyond)[:, None] * COAST * speed * coasted
+            coasted = -np.expm1(-np.abs(beyond)[:, None] / coast)
+            place[part] += np.sign(beyond)[:, None] * coast * speed * coasted
     place = gaussian_filter1d(place, smoothing_s / step, axis=0, mode="nearest")
     velocity = np.gradient(place, step, axis=0)
     speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
-    velocity *= np.minimum(1.0, FASTEST / np.maximum(speed, 1e-9))
+    velocity *= np.minimum(1.0, fastest / np.maximum(speed, 1e-9))
     middle = len(times) // 2
     moved = np.cumsum(velocity, axis=0) * step
     going = np.linalg.norm(velocity, axis=-1) > FACING_SPEED

@@ -65,18 +65,13 @@ def _smooth_path(clock: Floats, xy: Floats) -> GroundPath:
 
 NAMES: Final = {**LIMBS, "head": ("head_end", "head")}
 """Points of a clip by their names."""
-USUAL_LEG: Final = 0.82
-"""Length of thigh and shank together, which identifies the unit of a file [m]."""
 UNITS: Final = (1.0, 0.01, 0.0254, 0.001, 0.056444)
 """Units of files [m]; the last is that of the CMU database."""
 ANKLE: Final = 0.08
 """Height of the ankles above the floor in their lowest frames [m]."""
-EASE: Final = 0.5
-"""Time at the end of a clip in which it blends into standing [s]."""
 
 _BONES: Final = ((6, 5), (12, 11), (5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14))
 """Pairs of joints: shoulders and hips from right to left, limbs outward ..."""
-_LAST: Final = (14, 16)
 
 
 def read_clip(path: Path) -> Clip:
@@ -91,6 +86,7 @@ def read_clip(path: Path) -> Clip:
     Raises:
         InputError: unreadable, or joints are missing.
     """
+    usual_leg = 0.82  # length of thigh and shank together, which identifies the unit of a file [m]
     npz = path.suffix == ".npz"
     capture = read_capture(path, read_archive(path)) if npz else read_bvh(path)
     points = capture.select(path, NAMES)
@@ -106,7 +102,7 @@ def read_clip(path: Path) -> Clip:
     if np.argmax(np.abs(rise)) == 1:
         points = points[..., [2, 0, 1]]
     length = _leg_length(points)
-    points = points * min(UNITS, key=lambda metres: abs(np.log(length * metres / USUAL_LEG)))
+    points = points * min(UNITS, key=lambda metres: abs(np.log(length * metres / usual_leg)))
     across = points[0, 6] - points[0, 7]
     points = points @ _about_z(np.arctan2(-across[0], across[1]))
     start = points[0, 6:8].mean(axis=0)
@@ -149,13 +145,15 @@ def play_clip(body: Body, clip: Clip, times: Floats, ground: Ground, gait: Float
         ground: height of the ground [m] at x and y [m].
         gait: (frames, 17, 3) joints of a person on the clip's path, used before and after it.
     """
+    last = (14, 16)
+    ease = 0.5  # time at the end of a clip in which it blends into standing [s]
     inside = np.clip(times, 0.0, clip.time[-1])
     flat = clip.points.reshape(len(clip.time), -1)
     points = np.stack([np.interp(inside, clip.time, each) for each in flat.T], axis=-1)
     points = points.reshape(len(times), -1, 3)
     played = np.concatenate([np.zeros((len(times), 5, 3)), points[:, :12]], axis=1)
     played[:, 5:, 2] += ground(*played[:, 11:13, :2].mean(axis=1).T)[:, None]
-    done = np.clip(np.minimum(times, clip.time[-1] - times) / EASE, 0.0, 1.0)
+    done = np.clip(np.minimum(times, clip.time[-1] - times) / ease, 0.0, 1.0)
     share = np.where(times < 0.5 * clip.time[-1], times >= 0.0, done**2 * (3.0 - 2.0 * done))
     share = share[:, None]
 
@@ -163,7 +161,7 @@ def play_clip(body: Body, clip: Clip, times: Floats, ground: Ground, gait: Float
         weight = share.reshape(-1, *(1 for _ in own.shape[1:]))
         return weight * own + (1.0 - weight) * walked
 
-    pairs = np.array([*_BONES, _LAST])
+    pairs = np.array([*_BONES, last])
     own, walked = (unit(each[:, pairs[:, 1]] - each[:, pairs[:, 0]]) for each in (played, gait))
     bones = unit(between(own, walked))
     shoulders, walked_shoulders = played[:, 5:7].mean(axis=1), gait[:, 5:7].mean(axis=1)

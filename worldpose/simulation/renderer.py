@@ -136,8 +136,6 @@ def _dress(betas: Floats, seed: int) -> Cast:
     return dress_people(betas, [("first", "second")[n % 2] for n in range(len(betas))], seed)
 
 
-_STRIP: Final = 512
-"""Width of the strips that are painted one after the other, to save memory [px]."""
 _GRID: Final = 8
 """Grid spacing of a frame's lens inversion [px]: between the nodes its error is 0.005 px."""
 _MARGIN: Final = 0.01
@@ -175,6 +173,7 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
     Raises:
         InputError: the cameras have different centers.
     """
+    strip = 512  # width of the strips that are painted one after the other, to save memory [px]
     center = cameras.center[0]
     if not np.allclose(cameras.center, center, rtol=0.0, atol=1e-6):
         raise InputError(
@@ -194,11 +193,11 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
     strips = [
         paint_venue(
             venue,
-            np.ascontiguousarray(grid[:, begin // CELL : (begin + _STRIP) // CELL + 3]),
+            np.ascontiguousarray(grid[:, begin // CELL : (begin + strip) // CELL + 3]),
             center,
-            (min(_STRIP, width - begin), height),
+            (min(strip, width - begin), height),
         )
-        for begin in range(0, width, _STRIP)
+        for begin in range(0, width, strip)
     ]
     whole = np.concatenate(strips, axis=1)
     levels = [whole]

@@ -32,9 +32,6 @@ from worldpose.simulation.reference import CLIP_ID, Report
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
 from worldpose.simulation.visibility import facing_axes
 
-STANDARD_PERSON: Final = 1.8
-"""Body height for `RigSettings.person_height_px` [m]."""
-
 GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
 """Steps of this share of a turn spread any number of cameras, and an additional one moves none."""
 
@@ -87,16 +84,17 @@ def _place_in_ring(
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Return center and aim (3,) [m], world, and focal length [px]."""
+    standard_person = 1.8  # body height for `RigSettings.person_height_px` [m]
     azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
     way = np.array([np.cos(azimuth), np.sin(azimuth)])
     border = 0.5 * np.array([pitch.length, pitch.width])
     to_border = float(np.min((border - np.sign(way) * target[:2]) / np.abs(way)))
     distance = to_border + rng.uniform(*rig.distance_m)
     center = target + np.array([*(distance * way), rng.uniform(*rig.height_m)])
-    aim = target + np.array([*rng.uniform(-1.5, 1.5, 2), 0.5 * STANDARD_PERSON])
+    aim = target + np.array([*rng.uniform(-1.5, 1.5, 2), 0.5 * standard_person])
     # An upright person far below the camera is foreshortened by the cosine of the tilt.
     far = float(np.linalg.norm(aim - center))
-    return center, aim, rig.person_height_px * far / (STANDARD_PERSON * distance / far)
+    return center, aim, rig.person_height_px * far / (standard_person * distance / far)
 
 
 def look_at(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:

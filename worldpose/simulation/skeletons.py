@@ -132,11 +132,6 @@ BIAS: Final = 0.1
 straight limbs keep their twist."""
 POINTED: Final = np.radians(10.0)
 """Angle by which toes of a foot in the air point down from square with the shank [rad]."""
-TREADING: Final = (0.25, 0.6)
-"""Upward part of the shank's direction [1]: below the first a foot ignores the ground, as of a
-lying person; above the second the foot is flat on it."""
-LEVELLED: Final = 0.15
-"""An ankle higher than a standing one by this much no longer levels the foot's roll [m]."""
 
 _X, _Z = np.eye(3)[[0, 2]]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -283,16 +278,21 @@ def _rotate_foot(
         clear: (frames,) [m], height of the ankle above that of a flat foot.
         course: (frames,) [rad], direction of the foot when it treads.
     """
+    # An ankle higher than a standing one by this much no longer levels the foot's roll [m].
+    levelled = 0.15
+    # Upward part of the shank's direction [1]: below the first a foot ignores the ground, as
+    # of a lying person; above the second the foot is flat on it.
+    treading = (0.25, 0.6)
     down = unit(shank)
     hanging = np.cos(POINTED) * (turned @ _Z) + np.sin(POINTED) * down
-    treads = _smooth((-down[:, 2] - TREADING[0]) / (TREADING[1] - TREADING[0]))
+    treads = _smooth((-down[:, 2] - treading[0]) / (treading[1] - treading[0]))
     free, clear = 4.0 * (1.0 - treads), np.maximum(clear, 0.0)
     ball = float(body.joints[10, 2] - body.joints[7, 2])
     rise = _soft_limit(hanging[:, 2], clear / ball + free, clear / body.heel + free)
     # Toes stay down while the heel rises.
     under = np.maximum(clear + ball * np.minimum(rise, 0.0), 0.0)
     toe_rise = _soft_limit(rise, under / body.toe + free, np.inf)
-    level = (treads * (1.0 - _smooth(clear / LEVELLED)))[:, None]
+    level = (treads * (1.0 - _smooth(clear / levelled)))[:, None]
     ahead = _turn_towards(unit(hanging * [1.0, 1.0, 0.0]), course, treads)
     turns = []
     for slope in (rise, toe_rise):

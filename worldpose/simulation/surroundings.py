@@ -19,11 +19,7 @@ from worldpose.pitch.template import PitchTemplate
 
 LINE_WIDTH: Final = 0.12
 """Width of the painted markings, centred on the template's line [m] (Law 1)."""
-SPOT_RADIUS: Final = 0.11
-"""Radius of the painted centre and penalty marks [m]."""
 _SPOTS: Final = ("center_mark", "penalty_mark_left", "penalty_mark_right")
-_STRIPE: Final = 5.5
-"""Width of a mown stripe: a third of the penalty area's depth [m]."""
 
 _LINE, _ARC, _SPOT = 0.0, 1.0, 2.0
 _HALF = 0.5 * LINE_WIDTH
@@ -38,6 +34,7 @@ def paint_rows(pitch: PitchTemplate) -> Floats:
     - for an arc: x and y of its center, radius, start angle, span, height, 0;
     - for a spot: x and y of its center, radius, 0, 0, height, 0.
     """
+    spot_radius = 0.11  # radius of the painted centre and penalty marks [m]
 
     def above(name: str) -> tuple[float, float, float]:
         x, y, z = (float(value) for value in pitch.points[name])
@@ -51,7 +48,7 @@ def paint_rows(pitch: PitchTemplate) -> Floats:
     rows += [_arc_row(arc, above(arc.center)) for arc in pitch.arcs.values()]
     for name in _SPOTS:
         x, y, h = above(name)
-        rows.append((_SPOT, x, y, SPOT_RADIUS, 0.0, 0.0, h, 0.0))
+        rows.append((_SPOT, x, y, spot_radius, 0.0, 0.0, h, 0.0))
     return np.array(rows, dtype=np.float64)
 
 
@@ -183,11 +180,12 @@ def grass(
         width: width of the pitch [m].
         stripes: brightness of a stripe against its neighbour [1].
     """
+    stripe = 5.5  # width of a mown stripe: a third of the penalty area's depth [m]
     x, y = place[0], place[1]
     size = abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5])
     # A steep triangle wave: 0.15 m of half-turned grass between stripes, or a pixel.
-    phase = ((x + 0.5 * length) / _STRIPE + 0.5) % 2.0
-    ramp = (0.5 - abs(phase - 1.0)) * 2.0 * _STRIPE / max(0.3, size)
+    phase = ((x + 0.5 * length) / stripe + 0.5) % 2.0
+    ramp = (0.5 - abs(phase - 1.0)) * 2.0 * stripe / max(0.3, size)
     bright = 1.0 + 0.5 * stripes * min(max(ramp, -1.0), 1.0)
     broad = texture(table, x / 6.3, y / 6.3)
     bright += 0.022 * broad + 0.02 * texture(table, x / 1.1 + 17.0, y / 1.1)
@@ -213,9 +211,6 @@ BOARD_HEIGHT: Final = 0.95
 """[m]"""
 _PANEL = 7.0
 _LETTER = 0.42
-_STAND_SETBACK = 4.0
-_STAND_SLOPE = 0.55
-_STAND_TOP = 24.0
 _ROW = 0.45
 _SEAT = 0.52
 
@@ -307,6 +302,9 @@ def scenery(
         bend: (2,) bend of the surface, see `surface_hit`.
         look: seed of the stadium's look.
     """
+    stand_top = 24.0
+    stand_slope = 0.55
+    stand_setback = 4.0
     nearest = surface_hit(o, dx, dy, dz, bend)
     x, y = o[0] + nearest * dx, o[1] + nearest * dy
     red, green, blue = -1.0, 0.0, 0.0
@@ -335,8 +333,8 @@ def scenery(
                     red, green, blue = 0.13, 0.13, 0.14
         # A stand is a plane that rises outwards from behind the track. A camera below it is built
         # into it and looks out.
-        rise = dz - _STAND_SLOPE * toward * step
-        below = _STAND_SLOPE * (toward * start - half[axis] - _STAND_SETBACK) - o[2]
+        rise = dz - stand_slope * toward * step
+        below = stand_slope * (toward * start - half[axis] - stand_setback) - o[2]
         if rise == 0.0 or below >= 0.0:
             continue
         steps = below / rise
@@ -344,8 +342,8 @@ def scenery(
             z = o[2] + steps * dz
             along = o[1] + steps * dy if axis == 0 else o[0] + steps * dx
             # Where two stands meet, the higher one is visible.
-            other = abs(along) - half[1 - axis] - _STAND_SETBACK
-            if 0.0 < z < _STAND_TOP and z >= _STAND_SLOPE * other:
+            other = abs(along) - half[1 - axis] - stand_setback
+            if 0.0 < z < stand_top and z >= stand_slope * other:
                 nearest = steps
                 if z < 1.2:
                     red, green, blue = 0.36, 0.36, 0.37

@@ -47,8 +47,6 @@ xr.Variable((), 0).chunksizes  # noqa: B018
 
 CODEC: Final[dict[str, Any]] = {"cname": "lz4", "clevel": 5}
 """Compression of chunks by Blosc."""
-NO_CHUNK: Final = (1 << 64) - 1
-"""Place and size of a chunk beyond the end of an array in the index of a file."""
 
 
 def checked_arrays(
@@ -416,6 +414,8 @@ def _write_shard(
         values: this file's part of the array.
         shape: shape of the array.
     """
+    # Place and size of a chunk beyond the end of an array in the index of a file.
+    no_chunk = (1 << 64) - 1
     assert array.chunk_dim is not None
     axis = array.dims.index(array.chunk_dim)
     length = array.chunks(shape)[axis]
@@ -431,7 +431,7 @@ def _write_shard(
         coded = bytes(codec.encode(np.ascontiguousarray(chunk)))
         return coded + _crc32c(coded)
 
-    index = np.full((array.shards(shape)[axis] // length, 2), NO_CHUNK, dtype="<u8")
+    index = np.full((array.shards(shape)[axis] // length, 2), no_chunk, dtype="<u8")
     file.parent.mkdir(parents=True, exist_ok=True)
     # Not in the main thread: there Blosc uses threads of its own, which change the bytes.
     with file.open("xb") as out, ThreadPoolExecutor(os.cpu_count()) as threads:

@@ -32,12 +32,10 @@ def libraries() -> dict[str, str]:
     return versions
 
 
-KEY_LENGTH = 32
-
-
 def recipe_key(recipe: Recipe) -> str:
     """Return the key of the result of `recipe`: the first 128 bits of the recipe's SHA-256."""
-    return digest(canonical_json(dict(recipe)))[:KEY_LENGTH]
+    key_length = 32
+    return digest(canonical_json(dict(recipe)))[:key_length]
 
 
 DifferenceKind = Literal[

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.records import CONTRACT_VERSION
@@ -20,9 +20,6 @@ from worldpose.store.documents import canonical_json, digest, record_checksum
 
 if TYPE_CHECKING:
     from worldpose.store.groups import Arrays
-
-DIGEST_THREADS: Final = 2
-"""Threads that hash the files of one result; the units of other workers do so, too."""
 
 
 class ResultWriter:
@@ -127,6 +124,8 @@ class ResultWriter:
 
 def stored_files(folder: Path) -> tuple[StoredFile, ...]:
     """Return size and checksum of every file below `folder`, sorted by path."""
+    # Threads that hash the files of one result; the units of other workers do so, too.
+    digest_threads = 2
 
     def describe(path: Path) -> StoredFile:
         data = path.read_bytes()
@@ -134,7 +133,7 @@ def stored_files(folder: Path) -> tuple[StoredFile, ...]:
         return StoredFile(path=name, size=len(data), sha256=digest(data))
 
     # Hashing leaves the interpreter to other threads.
-    with ThreadPoolExecutor(DIGEST_THREADS) as threads:
+    with ThreadPoolExecutor(digest_threads) as threads:
         found = list(threads.map(describe, filter(Path.is_file, folder.rglob("*"))))
     return tuple(sorted(found, key=lambda file: file.path))
 

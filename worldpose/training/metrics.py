@@ -16,8 +16,6 @@ from worldpose.detection.suppression import suppress_poses
 from worldpose.geometry.boxes import box_iou
 from worldpose.training.labels import LabelledPicture, PictureCache
 
-MIN_TRUE_IOU: Final = 0.5
-"""Least intersection over union of a true positive [1]."""
 MAX_ERROR_SHARE: Final = 0.05
 """A keypoint is correct within this share of the box's longer side [1], a fifth of a torso."""
 
@@ -154,6 +152,7 @@ def average_precision(
 
 def _match_boxes(boxes: Floats, true: Floats, wanted: Flags) -> Integers:
     """Return per box, best first: 1 true positive, 0 false positive, -1 on an ignored person."""
+    min_true_iou = 0.5  # least intersection over union of a true positive [1]
     verdict = np.zeros(len(boxes), dtype=np.int64)
     if not len(true):
         return verdict
@@ -161,9 +160,9 @@ def _match_boxes(boxes: Floats, true: Floats, wanted: Flags) -> Integers:
     free = wanted.copy()
     for index, row in enumerate(overlap):
         best = int(np.where(free, row, -1.0).argmax())
-        if free[best] and row[best] >= MIN_TRUE_IOU:
+        if free[best] and row[best] >= min_true_iou:
             verdict[index], free[best] = 1, False
-        elif np.any(row[~wanted] >= MIN_TRUE_IOU):
+        elif np.any(row[~wanted] >= min_true_iou):
             verdict[index] = -1
     return verdict
 

@@ -31,10 +31,6 @@ GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
 apart."""
 SETTLED: Final = 0.005
 """Change that ends the passes [frame]."""
-ALIKE: Final = 0.025
-"""Share of a detector's error along the motion that all people in a camera have in common [1]: the
-detector shifts bodies seen from one side, and no number of people averages that out. Simulated
-matches and penalty boxes showed 0.027 and 0.021."""
 
 
 class ClockReport(Record):
@@ -172,9 +168,14 @@ class PersonSums:
 
     def common_score(self) -> Floats:
         """Return the score (cameras,) of an error that all people in a camera have in common."""
+        # Share of a detector's error along the motion that all people in a camera have in
+        # common [1]: the detector shifts bodies seen from one side, and no number of
+        # people averages that out. Simulated matches and penalty boxes showed 0.027 and
+        # 0.021.
+        alike = 0.025
         along, misses, scale = self.shared
         usual = np.divide(misses, 2.0 * scale, out=np.zeros_like(scale), where=scale > 0.0)
-        return np.asarray(ALIKE * along * np.sqrt(usual))
+        return np.asarray(alike * along * np.sqrt(usual))
 
 
 @dataclass(frozen=True, eq=False)

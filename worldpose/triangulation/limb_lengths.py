@@ -200,8 +200,6 @@ def _find_swaps(
 
 SURE: Final = 3
 """Inlier views that both ends of a measured limb need; an end with no more may be accidental."""
-FEWEST: Final = 5
-"""Minimum frames to measure the length of a limb."""
 SLACK: Final = 0.03
 """Standard deviation of a limb's length from frame to frame [m]: the label of a hip means another
 point from behind than from the side."""
@@ -215,6 +213,7 @@ def limb_lengths(found: SolvedJoints) -> Floats:
     A length is the median over the frames with three inlier views of both ends, or over all frames
     if those are too few. The length is unknown if it varies too much.
     """
+    fewest = 5  # minimum frames to measure the length of a limb
     persons, joints = found.joints.shape[1:3]
     lengths = np.full((persons, len(COCO17_LIMBS)), np.nan)
     if joints != len(COCO17):
@@ -224,9 +223,9 @@ def limb_lengths(found: SolvedJoints) -> Floats:
         sure = np.minimum(found.views[:, :, upper], found.views[:, :, lower]) >= SURE
         for person in range(persons):
             known = there[:, person][sure[:, person]]
-            if len(known) < FEWEST:
+            if len(known) < fewest:
                 known = there[:, person][np.isfinite(there[:, person])]
-            if len(known) < FEWEST:
+            if len(known) < fewest:
                 continue
             usual = np.median(known)
             if np.median(np.abs(known - usual)) <= SLACK:

@@ -35,18 +35,8 @@ _RUN: Final = np.array(
     dtype=np.float64,
 ).T
 """Running: share of the cycle from the foot's strike [%], hip flexion, knee flexion [deg]."""
-_NEUTRAL: Final = (4.0, 6.0)
-"""Hip and knee flexion of a standing person [deg]."""
-_RUNNING_FROM: Final = (1.9, 2.6)
-"""Speeds between which a walk becomes a run [m/s]."""
 _HOLD: Final = (0.04, 0.42, 0.24)
 """Rest of the ankle: from this share of the cycle to these, walking and running [1]."""
-_FLIGHT: Final = 0.05
-"""Rise and fall of a runner's pelvis, peak to peak [share of the leg]."""
-_ROLL: Final = 0.5
-"""Maximum distance of the hips past a resting ankle; then the heel rises [share of the leg]."""
-_STILL: Final = 0.05
-"""A slower person keeps both feet down [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -150,12 +140,18 @@ def walk_posture(
         gestures: the person's gestures.
         rng: draws the first step and the gaze.
     """
+    still = 0.05  # A slower person keeps both feet down [m/s]
+    # Maximum distance of the hips past a resting ankle; then the heel rises [share of the
+    # leg].
+    roll = 0.5
+    flight = 0.05  # rise and fall of a runner's pelvis, peak to peak [share of the leg]
+    running_from = (1.9, 2.6)  # speeds between which a walk becomes a run [m/s]
     step = times[1] - times[0]
     velocity = np.gradient(root, step, axis=0)
     pace = np.linalg.norm(velocity, axis=-1)
     pace = np.hypot(pace, 0.2 * np.gradient(heading, step))  # turning on the spot takes steps
     ahead = (velocity * np.stack([np.cos(heading), np.sin(heading)], axis=-1)).sum(-1)
-    run = np.clip((pace - _RUNNING_FROM[0]) / np.diff(_RUNNING_FROM), 0.0, 1.0)
+    run = np.clip((pace - running_from[0]) / np.diff(running_from), 0.0, 1.0)
     run = run**2 * (3.0 - 2.0 * run)
     rate = _stride_rate(pace, leg, run) / manner.stride
     cycle = rng.random() + np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
@@ -172,7 +168,7 @@ def walk_posture(
     shank = _sagittal(angles[..., 0] - angles[..., 1], outward)
     tall = -0.5 * (thigh[..., 2] + shank[..., 2]).min(axis=1)
     height = gaussian_filter1d(tall, 0.12 / step, mode="nearest")
-    height = np.minimum(height + 0.03 * run, 0.995) + run * 0.5 * _FLIGHT * np.cos(
+    height = np.minimum(height + 0.03 * run, 0.995) + run * 0.5 * flight * np.cos(
         4.0 * np.pi * (cycle - 0.42)
     )
 
@@ -192,11 +188,11 @@ def walk_posture(
         arm[:, side, 1] = np.clip(bend + 0.35 * arm[:, side, 0], 0.03, 2.4)
     splay = np.array([1.0, -1.0]) * manner.splay
     hold = _HOLD[1] + (_HOLD[2] - _HOLD[1]) * run - _HOLD[0]
-    hold = np.minimum(hold, _ROLL * leg * rate / np.maximum(pace, 1e-9))
+    hold = np.minimum(hold, roll * leg * rate / np.maximum(pace, 1e-9))
     part = np.stack([cycle % 1.0, (cycle + 0.5) % 1.0], axis=1)
     middle = 0.5 * (_HOLD[0] + _HOLD[1] + (_HOLD[2] - _HOLD[1]) * run)[:, None]
     planted = np.abs(part - middle) <= 0.5 * hold[:, None]
-    planted |= (pace < _STILL)[:, None]
+    planted |= (pace < still)[:, None]
     posture = Posture(
         hips=_unit(hips),
         trunk=_unit(np.stack([np.sin(lean), 0.02 * swing, np.cos(lean)], axis=-1)),
@@ -237,10 +233,11 @@ def _stride_size(pace: Floats, rate: Floats, leg: float, run: Floats) -> Floats:
 
 def _angles(part: Floats, size: Floats, bend: Floats, run: Floats) -> Floats:
     """Return hip and knee flexion (frames, 2) [rad]; walking backwards mirrors the hips' swing."""
+    neutral = (4.0, 6.0)  # hip and knee flexion of a standing person [deg]
     both = (1.0 - run)[:, None] * _curve(_WALK, part) + run[:, None] * _curve(_RUN, part)
     mean = (1.0 - run)[:, None] * _WALK[:, 1:].mean(0) + run[:, None] * _RUN[:, 1:].mean(0)
     share = np.minimum(bend, 1.0)[:, None]
-    middle = (1.0 - share) * np.array(_NEUTRAL) + share * mean
+    middle = (1.0 - share) * np.array(neutral) + share * mean
     swung = middle + np.stack([size, np.minimum(bend, 1.1)], axis=-1) * (both - mean)
     swung[:, 1] = np.maximum(swung[:, 1], 2.0)
     return np.asarray(np.radians(swung))

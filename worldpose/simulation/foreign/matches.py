@@ -56,16 +56,10 @@ from worldpose.simulation.foreign.trajectories import (
 from worldpose.simulation.recorded_files import follow_track
 from worldpose.simulation.reference import CLIP_ID, Report, write_reference
 
-MOTION_RATE: Final = 100.0
-"""Minimum rate of the motion's computation [1/s], a multiple of the frame rate."""
 REPLAYED: Final = 0.3
 """Share of people who replay motion capture if there is any [1]."""
-TRACKED: Final = 0.75
-"""Share of matches on a pitch whose people follow tracking data if there is any [1]."""
 _OFFSETS: Final = ((0, 1), (0, 1), (-40, 41), (0, 90000))
 """Ranges of a camera's frame number at the match's first frame, one of which is drawn [frame]."""
-ENOUGH_POINTS: Final = 6
-"""Minimum number of named points in the image of a camera to be calibrated from clicks [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +232,9 @@ def simulate_foreign_scene(
 
 def _motion_times(frames: int, fps: float) -> tuple[Floats, NDArray[np.int64]]:
     """Return the times of the motion [s], and which of them are frames."""
-    multiple = int(np.ceil(MOTION_RATE / fps))
+    # Minimum rate of the motion's computation [1/s], a multiple of the frame rate.
+    motion_rate = 100.0
+    multiple = int(np.ceil(motion_rate / fps))
     step = 1.0 / (fps * multiple)
     lead = round(LEAD / step)
     ticks = np.arange((frames - 1) * multiple + 1 + 2 * lead) - lead
@@ -308,8 +304,10 @@ def _follow_tracking(
     recordings: Recordings, count: int, times: Floats, pitch: Pitch, rng: np.random.Generator
 ) -> dict[int, Trajectory]:
     """Return the trajectories of tracked people, in most matches if the data are long enough."""
+    # Share of matches on a pitch whose people follow tracking data if there is any [1].
+    tracked = 0.75
     long = [track for track in recordings.tracks if track.clock[-1] >= times[-1] - LEAD]
-    if not long or rng.random() >= TRACKED:
+    if not long or rng.random() >= tracked:
         return {}
     tracking = long[rng.integers(len(long))]
     there = np.flatnonzero(np.isfinite(tracking.xy).all(axis=(0, 2)))
@@ -334,12 +332,15 @@ def _mount_cameras(
     rng: np.random.Generator,
 ) -> dict[str, RigCamera]:
     """Return cameras by id; if they are to be clicked, others for those that see few markings."""
+    # Minimum number of named points in the image of a camera to be calibrated from clicks
+    # [1].
+    enough_points = 6
     # Heads, hips and feet at intervals.
     action = joints[:: max(1, len(joints) // 15)][:, :, [0, 11, 15]].reshape(-1, 3)
     mounted = draw_rig(count, layout, space, action, rng)
     for index in range(count):
         for _ in range(12):
-            if clickable is None or len(visible_points(mounted[index], clickable)) >= ENOUGH_POINTS:
+            if clickable is None or len(visible_points(mounted[index], clickable)) >= enough_points:
                 break
             mounted[index] = draw_rig(1, layout, space, action, rng)[0]
     return {f"view{index:02d}": camera for index, camera in enumerate(mounted)}

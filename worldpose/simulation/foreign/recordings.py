@@ -32,8 +32,6 @@ PLANTED: Final = (0.55, 0.06)
 """An ankle slower than this [m/s] and at most this far above its lowest place [m] is planted."""
 TEMPO: Final = (0.8, 1.15)
 """Playback speed relative to the recording [1]."""
-_JUMP: Final = 15.0
-"""A joint this fast at the beginning [m/s] comes from a calibration pose, which is dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +68,9 @@ def read_recordings(folder: Path) -> Recordings:
     Raises:
         InputError: there is no such folder, a file cannot be read, or none has recordings.
     """
+    # A joint this fast at the beginning [m/s] comes from a calibration pose, which is
+    # dropped.
+    jump = 15.0
     expected = "a folder with npz files of motion capture or tracking data"
     if not folder.is_dir():
         raise refuse(
@@ -85,7 +86,7 @@ def read_recordings(folder: Path) -> Recordings:
             if len(points) < 10:
                 raise refuse(path, "10 frames or more", f"{len(points)} frames")
             speed = np.linalg.norm(np.diff(capture.positions, axis=0), axis=-1).max(axis=1)
-            early = np.flatnonzero(speed[: len(speed) // 4] > _JUMP / capture.fps)
+            early = np.flatnonzero(speed[: len(speed) // 4] > jump / capture.fps)
             points = points[early[-1] + 2 :] if len(early) else points
             joints = dict(zip(JOINTS, np.moveaxis(points, 1, 0), strict=True))
             motions.append(Motion(path.stem, capture.fps, joints))

@@ -295,18 +295,8 @@ def _is_behind_trunk(
     return np.asarray(covered & (own > depth[..., None] + 0.09))
 
 
-PAINTING: Final = 0.015
-"""Error of painted points against the Laws of the Game, standard deviation along each axis [m]."""
-SURVEY: Final = 0.005
-"""Error of a surveyed point, along each axis [m]."""
-TAPE: Final = 0.02
-"""Error of a length measured by tape [m]."""
 CLICK: Final = (0.3, 1.1)
 """Spread of one person's clicks in an image of 1920 px, minimum and maximum [px]."""
-CLICK_TAIL: Final = 4.0
-"""Degrees of freedom of clicks (Student's t) [1]."""
-MISNAMED: Final = 0.04
-"""Share of cameras with a click under a wrong name [1]."""
 FEW: Final = 9
 """If an image shows fewer points, lines and arcs are drawn, too [1]."""
 _CONFUSED: Final = (("left", "right"), ("near", "far"), ("front", "back"))
@@ -330,6 +320,11 @@ class Pitch:
 
 def draw_pitch(rng: np.random.Generator) -> Pitch:
     """Return a pitch of 90 to 120 by 45 to 90 m with a crown of up to 0.4 m."""
+    tape = 0.02  # error of a length measured by tape [m]
+    survey = 0.005  # error of a surveyed point, along each axis [m]
+    # Error of painted points against the Laws of the Game, standard deviation along each axis
+    # [m].
+    painting = 0.015
     length, width = float(rng.uniform(90.0, 120.0)), float(rng.uniform(45.0, 90.0))
     if rng.random() < 0.4:
         length, width = 105.0, 68.0
@@ -337,7 +332,7 @@ def draw_pitch(rng: np.random.Generator) -> Pitch:
     law = PitchTemplate.from_spec(PitchSpec(length=length, width=width, crown=crown)).points
     painted = {}
     for name, place in law.items():
-        off = PAINTING * rng.standard_normal(3) * [1.0, 1.0, 0.2]
+        off = painting * rng.standard_normal(3) * [1.0, 1.0, 0.2]
         painted[name] = place + (0.0 if name == "center_mark" else off)
     for name in [name for name in painted if name.endswith("_top")]:
         foot = painted[name.replace("_top", "_bottom")]
@@ -346,12 +341,12 @@ def draw_pitch(rng: np.random.Generator) -> Pitch:
         )
     true = PitchSpec(length=length, width=width, crown=crown, points=_to_tuples(painted))
     if rng.random() < 0.5:
-        surveyed = {n: p + SURVEY * rng.standard_normal(3) for n, p in painted.items()}
+        surveyed = {n: p + survey * rng.standard_normal(3) for n, p in painted.items()}
         stated = true.model_copy(update={"points": _to_tuples(surveyed)})
         return Pitch(true, stated, "survey of all points")
     taped = PitchSpec(
-        length=round(length + TAPE * rng.standard_normal(), 2),
-        width=round(width + TAPE * rng.standard_normal(), 2),
+        length=round(length + tape * rng.standard_normal(), 2),
+        width=round(width + tape * rng.standard_normal(), 2),
         crown=max(0.0, round(crown + 0.03 * rng.standard_normal(), 2)),
     )
     return Pitch(true, taped, "length, width and crown by tape")
@@ -379,14 +374,16 @@ def click_points(
         pitch: the painted pitch.
         rng: this camera's own.
     """
+    misnamed = 0.04  # share of cameras with a click under a wrong name [1]
+    click_tail = 4.0  # degrees of freedom of clicks (Student's t) [1]
     spread = rng.uniform(CLICK[0], CLICK[1]) * np.sqrt(camera.camera.image_size[0] / 1920.0)
-    unit = np.sqrt(CLICK_TAIL / (CLICK_TAIL - 2.0))
+    unit = np.sqrt(click_tail / (click_tail - 2.0))
     there = visible_points(camera, pitch)
     chosen = list(rng.permutation(there)[: int(rng.integers(8, 18))])
     pixels = camera.project(pitch.positions(chosen)).reshape(-1, 2)
-    pixels = pixels + spread / unit * rng.standard_t(CLICK_TAIL, pixels.shape)
+    pixels = pixels + spread / unit * rng.standard_t(click_tail, pixels.shape)
     names = {name: name for name in chosen}
-    if chosen and rng.random() < MISNAMED:
+    if chosen and rng.random() < misnamed:
         victim = str(rng.choice(chosen))
         pairs = [*_CONFUSED, *((two, one) for one, two in _CONFUSED)]
         other = [victim.replace(one, two) for one, two in pairs if one in victim]
@@ -407,7 +404,7 @@ def click_points(
             rows = np.sort(
                 rng.choice(len(course), min(len(course), int(rng.integers(4, 11))), False)
             )
-            line = course[rows] + 1.3 * spread / unit * rng.standard_t(CLICK_TAIL, (len(rows), 2))
+            line = course[rows] + 1.3 * spread / unit * rng.standard_t(click_tail, (len(rows), 2))
             drawn.append(DrawnMarking(name=name, xy=tuple(_round_click(camera, xy) for xy in line)))
     markings = ClickedMarkings(points=points, drawn=tuple(drawn))
     return markings, {new: name for name, new in names.items() if new != name}

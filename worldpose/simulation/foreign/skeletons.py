@@ -56,10 +56,6 @@ FACE: Final = np.array(
     ]
 ).T
 """Nose, eyes and ears [m] forward, left and up of the middle between the ears."""
-NECK_FORWARD: Final = 0.6
-"""Ratio of the ears' distance before the neck's base to their height above it [1]."""
-SETTLING: Final = 0.08
-"""Standard deviation of the smoothing in time of the pelvis' drop into the legs' reach [s]."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +172,8 @@ def place_joints(
         fps: frame rate [1/s].
         ground: height of the ground under the feet.
     """
+    # Ratio of the ears' distance before the neck's base to their height above it [1].
+    neck_forward = 0.6
     frames = len(root)
     turn = _heading_rotations(heading)
     world = {
@@ -216,7 +214,7 @@ def place_joints(
     up = world["head_up"]
     gaze = _unit(world["gaze"] - (world["gaze"] * up).sum(-1, keepdims=True) * up)
     axes = np.stack([gaze, np.cross(up, gaze), up], axis=1)
-    ears = neck + skeleton.neck * (world["trunk"] + NECK_FORWARD * gaze)
+    ears = neck + skeleton.neck * (world["trunk"] + neck_forward * gaze)
     face = ears[:, None] + skeleton.head * FACE @ axes
     return np.concatenate([face, shoulders, elbows, wrists, hips, knees, ankles], axis=1)
 
@@ -262,14 +260,17 @@ def _pelvis_drop(
     hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps: float
 ) -> Floats:
     """Return the pelvis' drop (frames,) [m] that puts planted ankles within reach."""
+    # Standard deviation of the smoothing in time of the pelvis' drop into the legs' reach
+    # [s].
+    settling = 0.08
     reach = 0.998 * lengths.sum(axis=0)
     away = np.linalg.norm((ankles - hips)[..., :2], axis=-1)
     highest = ankles[..., 2] + np.sqrt(np.maximum(reach**2 - away**2, 0.0))
     slack = np.where(planted, highest - hips[..., 2], np.inf).min(axis=1)
     slack = np.minimum(slack, 0.0)
-    half = max(1, round(3.0 * SETTLING * fps))
+    half = max(1, round(3.0 * settling * fps))
     lowest = minimum_filter1d(slack, 2 * half + 1, mode="nearest")
-    return np.asarray(-gaussian_filter1d(lowest, SETTLING * fps, mode="nearest", truncate=3.0))
+    return np.asarray(-gaussian_filter1d(lowest, settling * fps, mode="nearest", truncate=3.0))
 
 
 def _solve_knees(

@@ -23,14 +23,6 @@ LEAD: Final = 2.0
 """Time before the first frame and after the last in which people already move [s]."""
 TRACK_SMOOTHING: Final = 0.3
 """Standard deviation in time of the smoothing of tracking data [s]."""
-_RELAXATION: Final = 0.45
-"""Time constant of a person's velocity [s]."""
-_PUSH: Final = (12.0, 0.25)
-"""Repulsion by a person in contact: acceleration [m/s^2], and its decay distance [m]."""
-_HARDEST: Final = (6.0, 25.0)
-"""Maximum acceleration by legs, and by others [m/s^2]."""
-_BODY: Final = 0.42
-"""Distance between the middles of two people in contact [m]."""
 _SPEEDS: Final[dict[Role, tuple[float, float]]] = {
     "roam": (0.6, 4.5),
     "duel": (0.8, 5.0),
@@ -76,6 +68,8 @@ def wander(
         obstacles: people with fixed trajectories; the others avoid them.
         rng: draws places, goals and speeds.
     """
+    hardest = (6.0, 25.0)  # maximum acceleration by legs, and by others [m/s^2]
+    relaxation = 0.45  # time constant of a person's velocity [s]
     if not roles:
         return []
     count, step = len(roles), float(times[1] - times[0])
@@ -115,8 +109,8 @@ def wander(
             rest = np.maximum(rest - h, 0.0)
             pace = np.where(rest > 0.0, 0.0, np.minimum(want, 1.6 * far))
             wanted = away / np.maximum(far, 1e-6)[:, None] * pace[:, None]
-            drive = _limit_length((wanted - velocity) / _RELAXATION, _HARDEST[0])
-            push = _limit_length(_repulsion(place, others), _HARDEST[1])
+            drive = _limit_length((wanted - velocity) / relaxation, hardest[0])
+            push = _limit_length(_repulsion(place, others), hardest[1])
             velocity = velocity + h * (drive + push)
             place = place + h * velocity
     root = gaussian_filter1d(root, 0.06 / step, axis=0, mode="nearest")
@@ -158,11 +152,14 @@ def _draw_goal(
 
 def _repulsion(place: Floats, others: Floats) -> Floats:
     """Return accelerations (persons, 2) [m/s^2] by which people repel each other."""
+    body = 0.42  # distance between the middles of two people in contact [m]
+    # Repulsion by a person in contact: acceleration [m/s^2], and its decay distance [m].
+    push = (12.0, 0.25)
     everyone = np.concatenate([place, others])
     apart = place[:, None] - everyone
     far = np.linalg.norm(apart, axis=-1)
     far[np.arange(len(place)), np.arange(len(place))] = np.inf
-    strength = _PUSH[0] * np.exp(np.clip((_BODY - far) / _PUSH[1], -30.0, 2.0))
+    strength = push[0] * np.exp(np.clip((body - far) / push[1], -30.0, 2.0))
     return np.asarray(((strength / np.maximum(far, 1e-3))[..., None] * apart).sum(axis=1))
 
 
