@@ -110,7 +110,7 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
     if not file.stat().st_size:
         return None
     content = read_json(file)
-    known = ("people", "bodies", "instance_info")
+    known = ("people", "bodies", "instance_info", "results")
     keys = [key for key in known if isinstance(content, dict) and key in content]
     people = content[keys[0]] if keys else content
     if content == []:

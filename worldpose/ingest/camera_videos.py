@@ -84,10 +84,11 @@ def _recordings(files: Sequence[Path]) -> list[list[Path]]:
 
 
 def _is_whole(group: Sequence[Path]) -> bool:
-    """Return whether no chapter is missing between others."""
+    """Return whether a recording has its first chapter, and those up to its last."""
     chapters = [_CHAPTER.fullmatch(file.stem) for file in group]
     numbers = [int(each[3] or 0) for each in chapters if each is not None]
-    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    first = 0 if (chapters[0] and (chapters[0][2] or "GP").upper() == "GP") else 1
+    return numbers == list(range(first, first + len(numbers)))
 
 
 def _chapters_error(folder: Path, group: Sequence[Path]) -> InputError:
@@ -150,7 +151,7 @@ def describe_gaps(clock: Integers) -> str:
     longest = sorted(gaps, key=lambda gap: gap[0] - gap[1])[:5]
     listed = ", ".join(f"{a} to {b}" if a < b else f"{a}" for a, b in sorted(longest))
     count = sum(last - first + 1 for first, last in gaps)
-    more = f" and {len(gaps) - len(longest)} shorter gaps" if len(gaps) > len(longest) else ""
+    more = f" and {len(gaps) - len(longest)} more gaps" if len(gaps) > len(longest) else ""
     return f"the video lacks {count} of {len(clock)} frames: {listed}{more}" if gaps else ""
 
 

@@ -154,12 +154,12 @@ def detections_by_camera(
     if sorted(folders) == sorted(cameras):
         return {name: folders[name] for name in cameras}
     suffixes = (".json", ".npz")
-    there = sorted(folder.glob("[!.]*"))
-    found = [file for file in there if file.suffix.lower() in suffixes]
-    if len({camera_id(file.stem) for file in found}) < len(found):
-        raise _camera_files_error(folder, cameras, calibration, suffixes, found)
-    named = {camera_id(file.stem): file for file in found}
-    return files_by_camera(folder, cameras, calibration, suffixes, named, left_out)
+    files: dict[str, Path] = {}
+    for file in sorted(folder.glob("[!.]*")):
+        name = camera_id(file.stem)
+        if file.suffix.lower() in suffixes:
+            files[file.name if name in files else name] = file  # a second one fits no camera
+    return pick_cameras(folder, files, cameras, calibration, suffixes, left_out)
 
 
 def import_lenses(
@@ -200,48 +200,38 @@ def import_lenses(
     return lenses
 
 
-def files_by_camera(
+def pick_cameras(
     folder: Path,
+    found: Mapping[str, Path],
     cameras: Sequence[str],
     calibration: Path,
     suffixes: Collection[str],
-    named: Mapping[str, Path],
     left_out: Collection[str] = (),
 ) -> dict[str, Path]:
-    """Return the file of each camera in a folder.
+    """Return the file of each camera.
 
     Args:
         folder: holds them, for messages.
+        found: its files, by name of a camera.
         cameras: the cameras.
         calibration: file of the cameras, for messages.
         suffixes: endings of such files, for messages.
-        named: files of the folder by name of a camera.
         left_out: further cameras, whose files are ignored.
 
     Raises:
         InputError: a camera lacks its file, or a file its camera.
     """
-    files = {name: file for name, file in named.items() if name not in left_out}
+    files = {name: file for name, file in found.items() if name not in left_out}
     if sorted(files) != sorted(cameras):
-        raise _camera_files_error(folder, cameras, calibration, suffixes, list(files.values()))
+        there = files.values() or sorted(folder.glob("[!.]*"))
+        raise InputError(
+            str(folder),
+            expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
+            + ", ".join(cameras),
+            found=", ".join(file.name for file in there) or "no such file",
+            todo="Rename the files as the cameras, and leave neither over.",
+        )
     return {name: files[name] for name in cameras}
-
-
-def _camera_files_error(
-    folder: Path,
-    cameras: Sequence[str],
-    calibration: Path,
-    suffixes: Collection[str],
-    files: Sequence[Path],
-) -> InputError:
-    found = files or sorted(folder.glob("[!.]*"))
-    return InputError(
-        str(folder),
-        expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
-        + ", ".join(cameras),
-        found=", ".join(file.name for file in found) or "no such file",
-        todo="Rename the files as the cameras, and leave neither over.",
-    )
 
 
 def build_spec(
@@ -361,7 +351,7 @@ def _import_found(
         cameras = read_calibration(calibration, shown, left_out)
         notes += describe_left_out(left_out)
         endings = VIDEO_SUFFIXES
-        files = files_by_camera(folder, list(cameras), calibration, endings, found, left_out)
+        files = pick_cameras(folder, found, list(cameras), calibration, endings, left_out)
         indices = {name: indices[name] for name in files}
         for name, file in files.items():
             cameras[name] = fit_to_video(file, cameras[name], indices[name], notes)

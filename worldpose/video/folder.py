@@ -98,7 +98,15 @@ class ImageFolder(Pictures):
         """Yield images as `frames` does, with None for each unreadable one; see `VideoReader`."""
         for number in range(start, len(self) if stop is None else stop):
             if only is None or number in only:
-                yield number, _read(self._files[number], grey=grey)
+                picture = _read(self._files[number], grey=grey)
+                if picture is not None and picture.shape[1::-1] != self.index.size:
+                    raise InputError(
+                        str(self._files[number]),
+                        expected="images of {} x {} px, as the first one".format(*self.index.size),
+                        found=f"{picture.shape[1]} x {picture.shape[0]}",
+                        todo="Keep the images of one camera and one mode in a folder.",
+                    )
+                yield number, picture
 
     def damage_error(self, number: int) -> InputError:
         """Return the error of a file that is no image."""

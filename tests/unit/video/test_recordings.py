@@ -3,6 +3,7 @@
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -93,6 +94,9 @@ def test_folders_of_images_are_videos_of_cameras(tmp_path):
         with open_video(file) as video:
             assert [number_of(shown) for _, shown in video.frames()] == list(range(6))
             assert number_of(video.frame(4)) == 4
+    cv2.imwrite(str(file / "f_0086403.tiff"), np.zeros((20, 30, 3), np.uint8))
+    with open_video(file) as video, pytest.raises(InputError, match="as the first one, found 30"):
+        list(video.frames())
 
 
 def encode(path, count=30, options=None, name="libx264"):

@@ -265,7 +265,7 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     if isinstance(given, dict) and isinstance(given.get("annotations"), list):
         marked = [each for each in given["annotations"] if isinstance(each, dict)]
         if any(isinstance(each.get("lines"), dict) for each in marked):
-            yield from _read_game_state(given)
+            yield from _read_game_state({**given, "annotations": marked})
             return
     dataset = _Dataset.model_validate(given)
     names = {category.id: category.keypoints for category in dataset.categories}
@@ -292,36 +292,22 @@ class _Share(Given):
     y: float
 
 
-class _GameImage(Given):
-    image_id: str
-    file_name: str
-
-
-class _GameLines(Given):
-    image_id: str
-    lines: dict[str, Any] = {}
-
-
-class _GameState(Given):
-    images: tuple[_GameImage, ...]
-    annotations: tuple[_GameLines, ...]
-
-
 def _read_game_state(given: dict[str, Any]) -> Iterator[MarkedImage]:
     """Yield the images of SoccerNet's Labels-GameState.json; its first image is frame 0."""
-    state = _GameState.model_validate(given)
+    listed = TypeAdapter(tuple[dict[str, Any], ...]).validate_python(given.get("images"))
     numbers = {}
-    for image in state.images:
-        digits = re.search(r"(\d{1,9})\.\w+$", image.file_name)
+    for image in listed:
+        digits = re.search(r"(\d{1,9})\.\w+$", str(image.get("file_name")))
         if digits is None:
-            raise ContentError(f"file_name {image.file_name[:40]!r} without a number")
-        numbers[image.image_id] = int(digits[1])
-    for each in state.annotations:
-        if each.lines and each.image_id not in numbers:
-            raise ContentError(f"lines of image {each.image_id}, which is not there")
-        if each.lines:
-            number = numbers[each.image_id] - min(numbers.values())
-            yield _read_soccernet(f"frame_{number:06d}", each.lines)
+            raise ContentError(f"an image without a number: {image.get('file_name')!r:.40}")
+        numbers[str(image.get("image_id"))] = int(digits[1])
+    for each in given["annotations"]:
+        lines, image_id = each.get("lines"), str(each.get("image_id"))
+        if lines and image_id not in numbers:
+            raise ContentError(f"lines of image {image_id:.40}, which is not there")
+        if lines:
+            number = numbers[image_id] - min(numbers.values())
+            yield _read_soccernet(f"frame_{number:06d}", lines)
 
 
 def _read_soccernet(image: str, given: dict[str, Any]) -> MarkedImage:
