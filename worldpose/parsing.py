@@ -128,7 +128,7 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
     """Return the rows of a table as spreadsheets save it, and whether it has decimal commas.
 
     Text is UTF-8, UTF-16 with its mark, or Windows-1252; cells are separated by commas, semicolons
-    or tabs. Rows are numbered from 1, and empty ones are left out.
+    or tabs. Rows are numbered from 1; empty ones, and empty columns at the end, are left out.
 
     Args:
         path: the file.
@@ -147,10 +147,18 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
         if content.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
             raise ValueError("a workbook, not text: save it as CSV")
         text = _decode_table(content)
-        first = text.partition("\n")[0]
-        separator = max(",;\t", key=first.count)
-        lines = csv.reader(text.splitlines(), delimiter=separator)
-        rows = [(number, row) for number, row in enumerate(lines, 1) if any(map(str.strip, row))]
+        lines = text.splitlines()
+        hint = re.fullmatch(r"sep=(.)\W*", lines[0]) if lines else None  # of Excel
+        if hint is not None:
+            lines[0] = ""
+        first = next((each for each in lines if each.strip()), "")
+        separator = hint[1] if hint is not None else max(",;\t", key=first.count)
+        cells = enumerate(csv.reader(lines, delimiter=separator), 1)
+        rows = [(number, row) for number, row in cells if any(map(str.strip, row))]
+        width = max(
+            (n for _, row in rows for n, cell in enumerate(row, 1) if cell.strip()), default=0
+        )
+        rows = [(number, row[:width]) for number, row in rows]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(
             str(path), expected="text in rows and columns", found=say_failure(error), todo=todo

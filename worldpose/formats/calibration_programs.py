@@ -117,7 +117,8 @@ def _read_tables(
             f"{path}: {lacking}",
             expected="the pose of the camera",
             found="a lens alone",
-            todo="Import lenses with worldpose import --lens FILE --out MATCH, and click the pose.",
+            todo="Calibrate the poses too; or write the lenses as TOML, import them (worldpose "
+            "import --lens), and click the poses.",
         )
     cameras = []
     for name in posed:

@@ -130,8 +130,10 @@ def test_a_file_is_read_as_spreadsheets_save_it(tmp_path, encoding, separator):
     rows = [["Point", "X (m)", "y", "Elevation [m]"], ["center_mark", "1.5", "-2", "0.25"]]
     text = "\r\n".join(separator.join(row) for row in rows).replace(".", sign)
     path = tmp_path / "survey.csv"
-    path.write_bytes((text + "\r\n").encode(encoding))
-    np.testing.assert_array_equal(read_survey(path).places, [[1.5, -2.0, 0.25]])
+    hinted = f"sep={separator}\r\n" + text.replace("\r\n", 2 * separator + "\r\n")
+    for content in (text, hinted):  # Excel's hint, and its empty columns
+        path.write_bytes((content + "\r\n").encode(encoding))
+        np.testing.assert_array_equal(read_survey(path).places, [[1.5, -2.0, 0.25]])
 
 
 @pytest.mark.parametrize(
