@@ -1,6 +1,6 @@
 """Cameras of a calibration file: checks that all forms share, and Anipose's TOML.
 
-Reader and writer of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
+Reader of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
 other forms are in `calibration_systems` and `calibration_forms`.
 
 One table per camera with `size`, `matrix`, `distortions` (k1 k2 p1 p2 k3, as OpenCV), `rotation`
@@ -97,12 +97,8 @@ def build_camera(
             rotation, or the name is unfit for a file.
     """
     if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
-        raise InputError(
-            f"{where}: size",
-            expected=f"whole pixels from 1 to {SIZE_LIMIT}",
-            found=str(size.tolist()),
-            todo="Write the size of the calibrated images; an import with --videos takes theirs.",
-        )
+        expected = f"whole pixels from 1 to {SIZE_LIMIT}; an import with --videos takes theirs"
+        raise calibration_error(f"{where}: size", expected, str(size.tolist()))
     require_optics(where, size, focal, principal_point)
     far = float(np.max(np.abs(translation)))
     if far > DISTANCE_LIMIT:
@@ -492,30 +488,3 @@ def _plain_numbers(value: object) -> NDArray[np.float64] | None:
         return np.array(value, dtype=np.float64)
     except (ValueError, OverflowError):
         return None
-
-
-def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibration]) -> None:
-    """Write cameras in the form that Anipose, Pose2Sim and `read_calibration` read.
-
-    Numbers keep all digits. A rotation becomes a Rodrigues vector, the only form that all of them
-    read, with rounding errors of 1e-15 on reading.
-    """
-    from scipy.spatial.transform import Rotation  # late: as above
-
-    lines = []
-    for index, (name, camera) in enumerate(calibrations.items()):
-        (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
-        rotvec = Rotation.from_matrix(np.array(camera.rotation)).as_rotvec()
-        lines += [
-            f"[cam_{index}]",
-            f'name = "{name}"',
-            f"size = {list(camera.image_size)}",
-            f"matrix = {[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]}",
-            f"distortions = {list(camera.distortion)}",
-            f"rotation = {rotvec.tolist()}",
-            f"translation = {list(camera.translation)}",
-            "fisheye = false",
-            "",
-        ]
-    lines += ["[metadata]", "adjusted = false", "error = 0.0", ""]
-    path.write_text("\n".join(lines), encoding="utf-8")

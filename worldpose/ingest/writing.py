@@ -21,7 +21,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError, say_failure
-from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
 from worldpose.formats.files import FULL, sync_path, whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays

@@ -7,8 +7,8 @@ import pytest
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
 
 ANIPOSE = """
 [cam_0]
