@@ -38,6 +38,7 @@ from flows.stage import Stage
 from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks, read_joints
+from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import read_match
 from worldpose.simulation.foreign.matches import simulate_foreign_match
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
@@ -221,9 +222,10 @@ def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
 def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
     """Return the number of static cameras that detect each true person (frames, persons)."""
     count = np.zeros(truth.joints.shape[:2], np.int64)
-    for camera in read_match(folder).spec.static_cameras:
+    spec = read_match(folder).spec
+    for camera in spec.static_cameras:
         known = np.load(folder / "reference" / "identities" / f"{camera.id}.npz")
-        rows = known["frame"] - int(camera.offset_frames) - truth.frames[0]
+        rows = known["frame"] - unit_frames(spec, camera.id).number(0) - truth.frames[0]
         for row, people in zip(rows, known["person"], strict=True):
             count[row, np.unique(people[people >= 0])] += 1
     return count

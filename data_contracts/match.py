@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections import Counter
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
@@ -27,6 +28,10 @@ TEAM_SIZE: Final = 11
 """Players of a team on the pitch (Laws of the Game, 3)."""
 
 
+ClockOffset = FrameOffset | tuple[tuple[Frame, FrameOffset], ...]
+"""A camera's frame minus the match frame; a number, or rising pairs of a match frame and a number,
+with linear change between them."""
+
 Side = Literal["near", "far", "left", "right"]
 """Side of the pitch, seen from the main camera, which is near."""
 
@@ -42,8 +47,9 @@ class CameraSpec(Record):
     """[px]"""
     fps: FramesPerSecond | None = None
     """[1/s]; absent = the match's."""
-    offset_frames: FrameOffset = 0.0
-    """This camera's own frame number at match frame 0: camera frame = match frame + offset."""
+    offset_frames: ClockOffset = 0.0
+    """This camera's own frame number at match frame 0: camera frame = match frame + offset. Pairs
+    [match frame, offset] describe a clock that runs fast, or frames that a recorder lost."""
     video: str | None = None
     """Video file or folder of images, relative to the match folder."""
     still: str | None = None
@@ -52,6 +58,20 @@ class CameraSpec(Record):
     """Side of the pitch on which the camera stands. A camera without clicks is calibrated from its
     image. The pitch looks the same after half a turn: the side of one camera, and people whom
     cameras share, decide."""
+
+    @model_validator(mode="after")
+    def _readable_clock(self) -> Self:
+        offset, todo = self.offset_frames, "a broadcast clip has broadcast_offset_frames"
+        if not isinstance(offset, tuple):
+            if self.kind == "broadcast" or offset == int(offset):
+                return self
+            todo = f"a static camera's must be whole, or in pairs as [[0, {offset:g}]]"
+        elif self.kind == "static":
+            frames = [frame for frame, _ in offset]
+            if frames and all(a < b for a, b in pairwise(frames)):
+                return self
+            todo = "give pairs [match frame, offset] with rising match frames"
+        raise ValueError(f"camera {self.id} has offset_frames {offset}; {todo}")
 
 
 class ClipSpec(Record):
@@ -117,15 +137,10 @@ class MatchSpec(Record):
                     f"clip {clip.id} names {wrong}, who are not in the roster or there twice"
                 )
         for camera in self.cameras:
-            if camera.fps is not None and camera.fps != self.fps:
+            if camera.kind == "broadcast" and camera.fps not in (None, self.fps):
                 raise ValueError(
-                    f"camera {camera.id} has fps {camera.fps:g}, the match {self.fps:g}; "
-                    "resample it first"
-                )
-            if camera.kind == "static" and camera.offset_frames != int(camera.offset_frames):
-                raise ValueError(
-                    f"camera {camera.id} has offset_frames {camera.offset_frames:g}; "
-                    "a static camera's offset must be whole"
+                    f"broadcast camera {camera.id} has fps {camera.fps:g}, the match "
+                    f"{self.fps:g}; resample it first"
                 )
         return self
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from data_contracts.arrays import GroupLayout, array_layouts
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
+from data_contracts.records import Count, Frame, Name, Record
 from data_contracts.tracking import PERSON
 
 EXCHANGED_PARTS = {
@@ -13,6 +16,36 @@ EXCHANGED_PARTS = {
     "legs": ("hip", "knee", "ankle"),
 }
 """Parts of a body whose left and right sides a detector swaps together, and their joints."""
+
+
+CLOCK_CHANGE = "clock_change_frames."
+"""Metric of a camera whose clock changes within the clip."""
+
+
+class CameraChange(Record):
+    """A camera whose clock or view changes within a clip."""
+
+    camera: Name
+    kind: Literal["clock", "view"]
+    frame: Frame | None
+    """First match frame after a sudden change; None = gradual over the clip."""
+    first_frame: Frame
+    frame_count: Count
+    """Of the clip."""
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    """Displacement of the image [px]."""
+    zoom: float = 0.0
+    """Growth of the image about the principal point [1]."""
+    roll_rad: float = 0.0
+    center_px: tuple[float, float] = (0.0, 0.0)
+    """Principal point."""
+    late_frames: float = 0.0
+    """How much later its images are than before [frame]."""
+    std: float | None
+    """Standard deviation of the displacement [px] or of the lateness [frame]; None if unknown."""
+    is_explained: bool = True
+    """Whether this change explains its images; else its views are left out."""
+
 
 EXTRA_JOINTS = array_layouts(
     """
@@ -88,7 +121,11 @@ TRIANGULATION = GroupLayout(
         "coordinate": ("x", "y", "z"),
         "coordinate_": ("x", "y", "z"),
     },
-    attributes={"camera": "camera ids in the order of the camera dimension", **POINT_ATTRIBUTE},
+    attributes={
+        "camera": "camera ids in the order of the camera dimension",
+        "changes": "cameras that change within the clip, each a CameraChange",
+        **POINT_ATTRIBUTE,
+    },
     optional=(*(array.name for array in EXTRA_TRIANGULATION), *POINT_ATTRIBUTE),
 )
 

@@ -68,7 +68,8 @@ class Match:
         return {
             "first_frame": frames.first,
             "frame_count": frames.count,
-            "offset_frames": frames.offset,
+            "offset_frames": frames.clock[0],
+            "rate": frames.clock[1],
         }
 
     def without(self, cameras: Container[str]) -> Match:

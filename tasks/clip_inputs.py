@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 from data_contracts.arrays import ClipArray, Flags, Integers, Singles
 from data_contracts.detection import redetection_name
 from data_contracts.keypoints import EXTRA_ARRAYS, KEYPOINT_ARRAYS, KeypointDetections
+from data_contracts.triangulation import CameraChange
 from tasks.unit import UnitInputs
 from worldpose.filtering.feedback import Feedback, align_results, apply_feedback
 from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.ingest.clock import lateness
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.store import Store
+from worldpose.triangulation.camera_changes import correct_views
+from worldpose.triangulation.clocks import move_to_match_time
 from worldpose.triangulation.settings import TriangulationSettings
 
 PAGE = 256
@@ -165,9 +169,16 @@ def _fill_cameras(out: NDArray[Any], arrays: Sequence[xr.DataArray | None], rows
 
 
 def open_detections(
-    cameras: Sequence[xr.Dataset], frame: Integers, feedback: StoredFeedback
+    cameras: Sequence[xr.Dataset],
+    frame: Integers,
+    feedback: StoredFeedback,
+    camera_ids: Sequence[str] = (),
+    changes: Sequence[CameraChange] = (),
 ) -> KeypointDetections[ClipArray]:
-    """Return the detections of all cameras, read in pages; NaN beyond a camera's number of them."""
+    """Return the detections of all cameras, read in pages; NaN beyond a camera's number of them.
+
+    Views of the cameras (`camera_ids`) that change within the clip are corrected.
+    """
     aligned, points = align_points(cameras)
     most = max(1, *(camera.sizes["detection"] for camera in cameras))
 
@@ -181,7 +192,10 @@ def open_detections(
             for camera, array in enumerate(stored):
                 part = array[rows]
                 page[:, camera, : part.shape[1]] = part
-            return feedback.apply(name, page, rows)
+            page = feedback.apply(name, page, rows)
+            if not changes or name not in ("keypoints", "extra_keypoints"):
+                return page
+            return correct_views(page, frame[rows], camera_ids, changes).astype(np.float32)
 
         return PagedArray(shape, read)
 
@@ -252,7 +266,18 @@ def open_clip(
     feedback = StoredFeedback(
         seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
     )
-    return _open_inputs(inputs, open_detections(seen, inputs.frames, feedback))
+    names, changes = inputs.sources["cameras"], known_changes(inputs, inputs.unit, "view")
+    detections = open_detections(seen, inputs.frames, feedback, names, changes)
+    return _open_inputs(inputs, detections)
+
+
+def known_changes(inputs: UnitInputs, clip: str, kind: str | None = None) -> list[CameraChange]:
+    """Return the changes of cameras within a clip that a triangulation before this unit found."""
+    for name in (f"triangulation/{clip}", f"retriangulation/{clip}"):
+        if name in inputs:
+            found = map(CameraChange.model_validate, inputs.open(name).attrs["changes"])
+            return [change for change in found if kind in (None, change.kind)]
+    return []
 
 
 def open_tracked_clip(
@@ -262,7 +287,31 @@ def open_tracked_clip(
     clip = open_clip(inputs, filtered=filtered, shifted=shifted)
     tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
     people = clip.detections.assign_people(tracks["detection_index"].values)
+    if "clocks" in inputs.sources:
+        clocks = [lateness(inputs.frames, *clock) for clock in inputs.sources["clocks"]]
+        people = _on_match_clock(people, np.stack(clocks, axis=1))
     return replace(clip, detections=people, person=tracks["person"].values)
+
+
+def _on_match_clock(
+    people: KeypointDetections[ClipArray], late: NDArray[np.float64]
+) -> KeypointDetections[ClipArray]:
+    """Return tracked people at match time, read on access; `late` is (frames, cameras)."""
+
+    def correct(array: ClipArray) -> PagedArray:
+        def read(rows: slice) -> NDArray[np.float64]:
+            wide = slice(max(0, rows.start - 1), min(len(late), rows.stop + 1))
+            moved = move_to_match_time(array[wide], people.detection_index[wide], late[wide])
+            return moved[rows.start - wide.start : rows.stop - wide.start]
+
+        return PagedArray(array.shape, read)
+
+    extra = people.extra_keypoints
+    return replace(
+        people,
+        keypoints=correct(people.keypoints),
+        extra_keypoints=None if extra is None else correct(extra),
+    )
 
 
 def triangulation_settings(inputs: UnitInputs, clip: str) -> TriangulationSettings:
@@ -313,7 +362,10 @@ def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> 
     ]
     feedback = StoredFeedback(seen, _concatenate_clips(filtering) if filtering else None)
     frame = np.concatenate(list(frames.values()))
-    return _open_inputs(inputs, open_detections(seen, frame, feedback)[: len(frame)])
+    changes = [each for clip in frames for each in known_changes(inputs, clip, "view")]
+    cameras = inputs.sources["cameras"]
+    detections = open_detections(seen, frame, feedback, cameras, changes)
+    return _open_inputs(inputs, detections[: len(frame)])
 
 
 def _open_cameras(inputs: UnitInputs, where: slice) -> list[xr.Dataset]:

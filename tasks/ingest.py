@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from pydantic import TypeAdapter
 
 from data_contracts.ingest import INGEST
 from tasks.unit import UnitInputs, unit_task
-from worldpose.formats.keypoint_files import read_people, select_ranges
+from worldpose.formats.keypoint_files import read_people
 from worldpose.ingest.camera_videos import describe_gaps
 from worldpose.ingest.footage import UnitFrames, read_footage
 from worldpose.ingest.importing import describe_changes
@@ -30,13 +28,11 @@ def ingest(inputs: UnitInputs, result: ResultWriter) -> None:
 def _write_observations(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the unit's 2D poses on match frames, with people's corrections."""
     sources = inputs.sources
-    ranges = [(first + sources["offset_frames"], count) for first, count in sources["ranges"]]
     file = inputs.file("detections")
     read = read_people(file)
     result.warnings += describe_changes({inputs.unit: read})
-    observations = select_ranges(file, read.people, ranges)
+    observations = _unit_frames(inputs).place(file, read.people)
     inputs.require_registered("detections")
-    observations = replace(observations, frame=observations.frame - sources["offset_frames"])
     if "edits" in sources:
         edits = TypeAdapter(list[DetectionEdit]).validate_python(sources["edits"])
         replay = replay_detections(observations, edits)
@@ -60,11 +56,11 @@ def _write_footage(inputs: UnitInputs, result: ResultWriter) -> None:
         inputs.file("video"),
         float(sources["fps"]),
         (width, height),
-        UnitFrames(sources["first_frame"], sources["frame_count"], sources["offset_frames"]),
+        _unit_frames(inputs),
         [(clip, first, count) for clip, (first, count) in sources["clips"].items()],
     )
     result.warnings += describe_video(inputs.file("video"), footage.index)
-    if gaps := describe_gaps(footage.picture):
+    if gaps := describe_gaps(footage.picture, footage.frame):
         result.warnings.append(f"{inputs.unit}: {gaps}")
     inputs.require_registered("video")
     base = footage.index.time_base
@@ -89,3 +85,11 @@ def _write_footage(inputs: UnitInputs, result: ResultWriter) -> None:
     result.figures["frames"] = footage.frame.size
     result.figures["pictures"] = len(footage.index)
     result.figures["frames_missing"] = int(np.count_nonzero(footage.picture < 0))
+
+
+def _unit_frames(inputs: UnitInputs) -> UnitFrames:
+    """Return the unit's frames in the match."""
+    stated = inputs.sources
+    first, count = stated["first_frame"], stated["frame_count"]
+    ranges = stated.get("ranges", ())
+    return UnitFrames(first, count, stated["offset_frames"], ranges, stated["rate"])

@@ -20,6 +20,7 @@ from data_contracts.static_calibration import (
 from tasks.unit import UnitInputs, require_registered, unit_task
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
+from worldpose.ingest.clock import camera_frames
 from worldpose.ingest.footage import read_still
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
@@ -196,7 +197,7 @@ def _filmed_still(folder: Path, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
     chosen = every[np.linspace(0, len(every) - 1, min(STILL_FRAMES, len(every))).astype(int)]
     index = index_video(path)
     clock = index.on_clock(float(filmed["fps"]), str(path))
-    numbers = chosen + filmed["offset_frames"]
+    numbers = camera_frames(chosen, filmed["offset_frames"], filmed["rate"])
     shown = clock[numbers[(numbers >= 0) & (numbers < len(clock))]]
 
     with open_video(path, index) as video:

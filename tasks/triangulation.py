@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import reduce
 from operator import add
 from typing import Any
@@ -10,10 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import GroupLayout
-from data_contracts.triangulation import RETRIANGULATION, TRIANGULATION
-from tasks.clip_inputs import ClipInputs, open_tracked_clip, triangulation_settings
+from data_contracts.triangulation import (
+    CLOCK_CHANGE,
+    RETRIANGULATION,
+    TRIANGULATION,
+    CameraChange,
+)
+from tasks.clip_inputs import (
+    ClipInputs,
+    known_changes,
+    open_tracked_clip,
+    triangulation_settings,
+)
 from tasks.unit import UnitInputs, figures_of, unit_task
+from worldpose.camera_consistency.changes import Kind, find_changes
+from worldpose.camera_consistency.health import CameraHealth
 from worldpose.store.writer import ResultWriter
+from worldpose.triangulation.camera_changes import (
+    change_record,
+    describe_change,
+    explain_changes,
+)
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
@@ -24,14 +42,17 @@ def triangulation(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write joints with covariance."""
     settings = inputs.settings(TriangulationSettings)
     stride = settings.stride(inputs.sources["match_frames"])
-    _write_joints(inputs, settings, result, TRIANGULATION, stride)
+    kinds: tuple[Kind, ...] = ("clock", "view") if stride == 1 else ("view",)
+    _write_joints(inputs, settings, result, TRIANGULATION, kinds, stride)
 
 
 @unit_task
 def retriangulation(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the joints by adjusted cameras, with covariance."""
     settings = triangulation_settings(inputs, inputs.unit)
-    _write_joints(inputs, settings, result, RETRIANGULATION)
+    first = inputs.open(f"triangulation/{inputs.unit}")
+    kinds: tuple[Kind, ...] = () if first.sizes["frame"] == len(inputs.frames) else ("clock",)
+    _write_joints(inputs, settings, result, RETRIANGULATION, kinds)
 
 
 def _write_joints(
@@ -39,29 +60,57 @@ def _write_joints(
     settings: TriangulationSettings,
     result: ResultWriter,
     layout: GroupLayout,
+    kinds: tuple[Kind, ...],
     stride: int = 1,
 ) -> None:
-    """Triangulate every `stride`-th frame of the unit's clip in chunks, and write the joints."""
+    """Triangulate every `stride`-th frame of the unit's clip in chunks, and write the joints.
+
+    Changes of cameras of these kinds are looked for; those that are known stay recorded.
+    """
     clip = open_tracked_clip(inputs)
     detections, covariance = clip.detections, camera_errors(inputs, clip)
     index = detections.detection_index
     model = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
+    rows = np.arange(0, len(index), stride)
+    _, cameras, persons = index.shape
+    health = CameraHealth.empty(len(rows), cameras, persons, clip.fps / stride)
     with inputs.open_spool() as spool:
         chunks = reconstruct_chunks(
             clip.cameras, detections, model, clip.fps, settings, covariance, stride=stride
         )
         for part in chunks:
             spool.add(_part_arrays(part.triangulation, part.smoothing))
+            if kinds:
+                seen = detections[rows[part.frames]]
+                health.add(clip.cameras, seen, part.triangulation.joints, part.frames.start)
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
+        known = known_changes(inputs, inputs.unit)
+        found = _find_changes(clip, health, kinds, settings, rows)
+        if len(clip.camera_ids) > 2:
+            result.warnings += [f"{describe_change(change)}." for change in found]
+            for change in found:
+                if change.kind == "clock":
+                    result.figures[CLOCK_CHANGE + change.camera] = change.late_frames
+        elif found:
+            result.warnings.append(
+                f"cameras {' and '.join(clip.camera_ids)} cease to agree at frame "
+                f"{found[0].frame or found[0].first_frame}: one of them moved, or its clock "
+                "changed. Two cameras cannot tell which."
+            )
+            found = []
         result.write(
             layout,
             arrays=spool.arrays()
             | {"clock_late": model.clocks.late, "clock_error": model.clocks.standard_error}
             | _bias_arrays(model.detector, clip.detections.points, settings),
             coordinates={"frame": detections.frame[::stride], "person": clip.person},
-            attributes={"camera": list(clip.camera_ids), **clip.detections.labels()},
+            attributes={
+                "camera": list(clip.camera_ids),
+                "changes": [change.model_dump(mode="json") for change in (*known, *found)],
+                **clip.detections.labels(),
+            },
         )
     agreement = reduce(add, agreements).report(model.detector.last_noise.factor)
     if agreement.joints == 0 and index.shape[2]:
@@ -82,6 +131,28 @@ def _write_joints(
         model.clocks.report,
     ):
         result.figures.update(figures_of(report, clip.camera_ids))
+
+
+def _find_changes(
+    clip: ClipInputs,
+    health: CameraHealth,
+    kinds: tuple[Kind, ...],
+    settings: TriangulationSettings,
+    rows: NDArray[np.int64],
+) -> list[CameraChange]:
+    """Return the clearest change of a camera within the clip, if there is one."""
+    fps = clip.fps * len(rows) / max(1, len(clip.detections.frame))
+    found = [
+        replace(change, row=int(rows[change.row])) for change in find_changes(health, fps, kinds)
+    ]
+    if not found:
+        return []
+    measured = explain_changes(clip.cameras, clip.detections, clip.fps, settings, found)
+    if measured is None:
+        return []
+    center = clip.cameras[measured.found.camera].principal_point
+    camera = clip.camera_ids[measured.found.camera]
+    return [change_record(measured, camera, center, clip.detections.frame)]
 
 
 def camera_errors(inputs: UnitInputs, clip: ClipInputs) -> NDArray[np.float64] | None:

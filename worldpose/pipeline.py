@@ -116,10 +116,11 @@ def find_people(match: MatchFolder, clip_id: str) -> KeypointDetections:
             after = given.frame - clip.first_frame
             cameras.append(given[np.flatnonzero((after >= 0) & (after < clip.frame_count))])
         else:
-            start = clip.first_frame + unit_frames(match.spec, camera.id).offset
+            frame = np.arange(clip.first_frame, clip.first_frame + clip.frame_count)
+            number = unit_frames(match.spec, camera.id).numbers(frame)
             with open_video(match.videos[camera.id]) as video:
-                pictures = (each for _, each in video.frames(start, start + clip.frame_count))
-                cameras.append(detect_people(pictures))
+                pictures = (each for _, each in video.frames(number[0], number[-1] + 1))
+                cameras.append(detect_people(pictures)[number - number[0]])
     return KeypointDetections.stack(cameras)
 
 
@@ -130,7 +131,7 @@ def calibrate_moving_camera(
     if clip_id not in match.key_frames:
         return None
     frames = unit_frames(match.spec, clip_id)
-    start = frames.first + frames.offset
+    start = frames.number(frames.first)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         with open_video(match.videos[clip_id]) as video:

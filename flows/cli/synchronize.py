@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import typer
 
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import MatchSpec
+from data_contracts.match import ClipSpec, ClockOffset, MatchSpec
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -30,8 +31,14 @@ from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, unknown_name
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import exact_frames, simplest_offset
+from worldpose.ingest.footage import unit_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Run, Store
+
+if TYPE_CHECKING:
+    from worldpose.triangulation.camera_changes import Course
+    from worldpose.triangulation.synchronization import Synchronization
 
 MIN_OFFSET_FRAMES = 0.1
 """Remaining offset that is worth a correction [frame]."""
@@ -41,19 +48,17 @@ class Proposal(NamedTuple):
     """The clock offset of a camera, as stated and as found."""
 
     camera: str
-    stated: int
+    stated: ClockOffset
     """`offset_frames` in match.yaml [frame]."""
     found: float | None
-    """The same with its fraction, by the people [frame]; None where they do not tell it."""
+    """The same with its fraction at the clip's start, by the people [frame]; None where they do not
+    tell it."""
     std: float | None
     """Standard deviation [frame]."""
+    proposed: ClockOffset
+    """The offset for match.yaml [frame]: whole, or pairs where it changes within the clip."""
     reason: str
     """Why it is not known; empty where it is."""
-
-    @property
-    def proposed(self) -> int:
-        """The whole offset for match.yaml [frame]."""
-        return self.stated if self.found is None else round(self.found)
 
 
 def synchronize(
@@ -70,7 +75,7 @@ def synchronize(
 
     The cameras must be calibrated, and nothing must be known of their clocks. The command computes
     the match up to the 2D poses first. The offset of the first camera that it can tell stays, and
-    --apply writes the others.
+    --apply writes the others. A clock that drifts or steps has pairs [match frame, offset].
 
     Example: worldpose synchronize matches/lab --plot clocks.svg --apply
 
@@ -81,6 +86,7 @@ def synchronize(
         apply: Write the proposed offset_frames into match.yaml.
     """
     from worldpose.reports.drawing import draw_synchronization, require_plot
+    from worldpose.triangulation.camera_changes import trace_clocks
     from worldpose.triangulation.synchronization import synchronize as estimate
 
     if plot is not None:
@@ -89,12 +95,12 @@ def synchronize(
     with progress(verbose=False):
         opened = find_match(store, match)
         spec = opened.folder.spec
-        chosen = choose_clip(spec, clip)
+        chosen_clip = choose_clip(spec, clip)
         claim_file(plot, opened.match_id)
         require_no_other_run(store, opened.match_id)
         request = RunRequest({}, until_stage="detection", workers=workers, gates="never")
         record = run_match(store, opened, request)
-    cameras, names, detections = load_clip(Run(store, record), opened, chosen)
+    cameras, names, detections = load_clip(Run(store, record), opened, chosen_clip)
     pitch = opened.folder.pitch
     found = estimate(
         cameras,
@@ -103,19 +109,19 @@ def synchronize(
         max_offset_s=max_offset,
         pitch=None if pitch is None else PitchTemplate.from_spec(pitch),
     )
-    stated = {camera.id: int(camera.offset_frames) for camera in spec.static_cameras}
     known = np.isfinite(found.late)
-    reference = int(np.argmax(known)) if known.any() else 0
-    rows = [
-        Proposal(
-            name,
-            stated[name],
-            stated[name] - float(found.late[c] - found.late[reference]) if known[c] else None,
-            float(found.std[c]) if known[c] else None,
-            found.reasons[c],
-        )
-        for c, name in enumerate(names)
-    ]
+    courses: list[Course] = [[(0, float(late))] for late in found.late]
+    if np.count_nonzero(known) > 2:
+        chosen = np.flatnonzero(known)
+        arrays = {name: array[:, chosen] for name, array in detections.arrays().items()}
+        some = detections.with_arrays(arrays, detections.frame)
+        size = None if pitch is None else (pitch.length, pitch.width)
+        late = found.late[chosen]
+        traced = trace_clocks(cameras[chosen], some, spec.fps, late, pitch_size=size)
+        for c, course in zip(chosen, traced, strict=True):
+            courses[c] = course
+    clip_spec = spec.clip(chosen_clip)
+    rows = [_propose(spec, clip_spec, name, courses, c, found) for c, name in enumerate(names)]
     if plot is not None:
         draw_synchronization(found, names, plot)
     changed = {row.camera: row.proposed for row in rows if row.proposed != row.stated}
@@ -126,14 +132,42 @@ def synchronize(
     if as_json:
         print_json(
             {
-                "clip": chosen,
-                "cameras": [row._asdict() | {"proposed": row.proposed} for row in rows],
+                "clip": chosen_clip,
+                "cameras": [row._asdict() for row in rows],
                 "applied": changed if apply else {},
             }
         )
     else:
         _print(rows, changed, plot, applied=apply)
     raise typer.Exit(0 if known.all() else 4)
+
+
+def _propose(
+    spec: MatchSpec,
+    clip: ClipSpec,
+    name: str,
+    courses: list[Course],
+    c: int,
+    found: Synchronization,
+) -> Proposal:
+    """Return the proposal of a camera: the first one that is known keeps its offset."""
+    unit, stated = unit_frames(spec, name), spec.camera(name).offset_frames
+    if not isinstance(stated, tuple):
+        stated = int(stated)
+    known = np.isfinite(found.late)
+    if not known[c]:
+        return Proposal(name, stated, None, None, stated, found.reasons[c])
+    reference = courses[int(np.argmax(known))]
+    pairs = unit.offset if isinstance(unit.offset, tuple) else ()
+    inside = [frame - clip.first_frame for frame, _ in pairs]
+    inside = [row for row in inside if 0 <= row < clip.frame_count]
+    row = np.unique([row for row, _ in (*courses[c], *reference)] + inside)
+    late = np.interp(row, *np.array(courses[c]).T) - np.interp(row, *np.array(reference).T)
+    frame = (row + clip.first_frame).astype(np.int64)
+    exact = exact_frames(frame, unit.offset) - frame - late
+    is_known = isinstance(stated, tuple) and np.abs(late).max() < MIN_OFFSET_FRAMES
+    proposed = stated if is_known else simplest_offset(frame, exact)
+    return Proposal(name, stated, float(exact[0]), float(found.std[c]), proposed, "")
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:
@@ -196,17 +230,23 @@ def load_detections(run: Run, match: Match, clip: str, names: list[str]) -> Keyp
     return KeypointDetections.stack(parts)
 
 
+def _offset_text(offset: ClockOffset) -> str:
+    """Return an offset as in match.yaml."""
+    pairs = [list(pair) for pair in offset] if isinstance(offset, tuple) else offset
+    return str(pairs)
+
+
 def _print(
-    rows: list[Proposal], changed: dict[str, int], plot: Path | None, *, applied: bool
+    rows: list[Proposal], changed: Mapping[str, ClockOffset], plot: Path | None, *, applied: bool
 ) -> None:
     """Print a table of the offsets, and what to do with them."""
     shown = [
         (
             row.camera,
-            str(row.stated),
+            _offset_text(row.stated),
             "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
             "-" if row.std is None else f"{row.std:.2f}",
-            "-" if row.found is None else str(row.proposed),
+            "-" if row.found is None else _offset_text(row.proposed),
             row.reason,
         )
         for row in rows
@@ -224,6 +264,7 @@ def _print(
     if any(
         row.found is not None
         and row.std is not None
+        and not isinstance(row.proposed, tuple)
         and abs(row.found - row.proposed) > max(MIN_OFFSET_FRAMES, 3.0 * row.std)
         for row in rows
     ):

@@ -72,7 +72,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
         tracks = joint_tracks(run, clip)
         pictures += _before_and_after(run, match, clip, tracks)
         pictures += flow_pictures(run, match, clip, camera)
-        offset = unit_frames(match.folder.spec, clip).offset
+        offset = unit_frames(match.folder.spec, clip).number(0)
         for video_number in result.attrs["pick_next"][:WORST_FRAMES]:
             number = video_number - offset
             place = int(np.searchsorted(frame, number))
@@ -115,7 +115,7 @@ def _before_and_after(
     number = int(both[place])
     (detected,) = seen_in_broadcast(match, clip)
     with open_video(match.folder.videos[clip]) as video:
-        still = video.frame(number + unit_frames(match.folder.spec, clip).offset)
+        still = video.frame(unit_frames(match.folder.spec, clip).number(number))
     markings, players = (
         "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
     )
@@ -147,7 +147,7 @@ def write_broadcast_video(run: Run, match: Match, clip: str, file: Path) -> None
     every = video_step(match)
     chosen = broadcast_video_frames(run, match, clip)
     frames = run[f"broadcast_calibration/{clip}"]["frame"].values[chosen]
-    start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
+    start = unit_frames(match.folder.spec, clip).number(int(frames[0]))
     stop = start + int(chosen[-1] - chosen[0]) + 1
     with open_video(match.folder.videos[clip]) as video, whole_file(file) as draft:
         pictures = (
@@ -253,9 +253,9 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Cap
         return []
     pair = int(np.argmin(np.where(known, traces, np.inf)))
     number = int(frames[pair])
-    offset = unit_frames(match.folder.spec, clip).offset
+    first = unit_frames(match.folder.spec, clip).number(number)
     with open_video(match.folder.videos[clip]) as video:
-        stills = [video.frame(number + offset + k) for k in (0, 1)]
+        stills = [video.frame(first + k) for k in (0, 1)]
     boxes = None
     for unit in seen_in_broadcast(match, clip):
         boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)

@@ -87,4 +87,4 @@ def _numbers(
         if "picture_of_frame" in footage:
             known = footage["picture_of_frame"].reindex(frame=frames, fill_value=-1)
             return known.values.astype(np.int64)
-    return np.maximum(-1, frames + unit_frames(match.folder.spec, owner).offset)
+    return np.maximum(-1, unit_frames(match.folder.spec, owner).numbers(frames))

@@ -67,6 +67,7 @@ from worldpose.formats.challenge import (
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
 from worldpose.formats.tables import write_positions
+from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run
@@ -107,7 +108,7 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
                 camera,
                 tracks,
                 inliers.sel(camera=camera_id).values,
-                offset_frames=int(origin.spec.camera(camera_id).offset_frames),
+                number=unit_frames(origin.spec, camera_id).numbers(tracks.frames.astype(np.int64)),
             )
             path = (out if len(origin.clips) == 1 else out / clip) / f"{camera_id}.json"
             write_coco(path, dataset)

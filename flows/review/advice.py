@@ -10,6 +10,7 @@ from typing import Final
 from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
+from data_contracts.triangulation import CLOCK_CHANGE
 
 MIN_FREEDOM: Final = 10.0
 """Minimum degrees of freedom of all cameras for advice [1]."""
@@ -66,18 +67,20 @@ def clock_advice(metrics: Mapping[str, Mapping[str, float]], spec: MatchSpec) ->
     for camera in spec.static_cameras:
         found = [_difference(metrics, clip.id, camera.id) for clip in spec.clips]
         known = [each for each in found if each is not None]
-        if not known:
-            continue
+        if not known or any(CLOCK_CHANGE + camera.id in each for each in metrics.values()):
+            continue  # one offset cannot correct a clock that changes
         late, error = min(known, key=lambda each: each[1])
-        offset = round(camera.offset_frames - late)
-        if (
-            abs(late) > max(MIN_OFFSET, MIN_STANDARD_ERRORS * error)
-            and offset != camera.offset_frames
-        ):
+        change = -round(late)
+        if abs(late) > max(MIN_OFFSET, MIN_STANDARD_ERRORS * error) and change:
+            offset = camera.offset_frames
             said.append(
                 f"camera {camera.id} shows {abs(late):.1f} frames "
-                f"{'later' if late > 0 else 'earlier'} than the others: set its offset_frames to "
-                f"{offset} in match.yaml"
+                f"{'later' if late > 0 else 'earlier'} than the others: "
+                + (
+                    f"add {change} to every offset of its offset_frames in match.yaml"
+                    if isinstance(offset, tuple)
+                    else f"set its offset_frames to {int(offset) + change} in match.yaml"
+                )
             )
     return said
 

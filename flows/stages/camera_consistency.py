@@ -15,7 +15,10 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     return {
         **tracking.clip_sources(match, unit),
         "ground": match.folder.pitch is not None,
-        "offset_frames": [camera.offset_frames for camera in spec.static_cameras],
+        "offset_frames": [
+            None if isinstance(camera.offset_frames, tuple) else camera.offset_frames
+            for camera in spec.static_cameras
+        ],
     }
 
 

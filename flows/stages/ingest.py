@@ -76,7 +76,7 @@ def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     folder = match.folder
     return {
         **match.file_sources("video", folder.videos[unit]),
-        "fps": folder.spec.fps,
+        "fps": folder.spec.fps * unit_frames(folder.spec, unit).rate,
         "image_size": list(footage_size(folder.spec, unit)),
         "clips": {clip: [first, count] for clip, first, count in footage_clips(folder.spec, unit)},
     }

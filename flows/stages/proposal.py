@@ -100,8 +100,9 @@ def _video_for_still(match: Match, unit: str) -> dict[str, JsonValue] | None:
     """Return the camera's video, for a still without people if none is given."""
     if unit not in match.folder.videos:
         return None
-    offset = match.frame_sources(unit)["offset_frames"]
-    return {**video_sources(match, unit), "offset_frames": offset}
+    frames = match.frame_sources(unit)
+    clock = {name: frames[name] for name in ("offset_frames", "rate")}
+    return {**video_sources(match, unit), **clock}
 
 
 STAGE = Stage(

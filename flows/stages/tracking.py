@@ -8,6 +8,7 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage
 from flows.stages import detection
+from worldpose.ingest.footage import unit_frames
 from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.tracking.settings import TrackingSettings
 
@@ -60,10 +61,16 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def clip_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip's frames, the clock, the cameras in order, and their detections."""
+    """Return the clip's frames, the clock, the cameras in order, and their detections.
+
+    `clocks` has the offset and the rate of each camera, unless all show whole match frames.
+    """
     spec = match.folder.spec
     clip = spec.clip(unit)
+    clocks = [unit_frames(spec, camera.id) for camera in spec.static_cameras]
+    is_whole = all(isinstance(each.offset, int) and each.rate == 1.0 for each in clocks)
     return {
+        **({} if is_whole else {"clocks": [each.clock for each in clocks]}),
         "cameras": [camera.id for camera in spec.static_cameras],
         "seen": list(detection.seen_by_cameras(match, unit)),
         "first_frame": clip.first_frame,

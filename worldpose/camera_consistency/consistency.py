@@ -117,14 +117,14 @@ def faulty_cameras(found: Consistency) -> set[int]:
 
 
 def describe_faults(
-    found: Consistency, cameras: Sequence[str], offset_frames: Sequence[int], fps: float
+    found: Consistency, cameras: Sequence[str], offset_frames: Sequence[int | None], fps: float
 ) -> tuple[CameraFault, ...]:
     """Return the faults with the cameras' names and a reason that says what to do.
 
     Args:
         found: result of the consistency check.
         cameras: ids in the order of the cameras.
-        offset_frames: stated offset of each camera's video [frame].
+        offset_frames: stated offset of each camera's video [frame]; None if it changes.
         fps: frames per second of the match [1/s].
     """
     return tuple(
@@ -141,7 +141,7 @@ def describe_faults(
     )
 
 
-def _reason(fault: Fault, cameras: Sequence[str], offset: int, fps: float) -> str:
+def _reason(fault: Fault, cameras: Sequence[str], offset: int | None, fps: float) -> str:
     """Return one sentence: the fault, the correction, and the share of detections in support."""
     other = "" if fault.other is None else cameras[fault.other]
     if fault.kind == "contradiction":
@@ -159,17 +159,19 @@ def _reason(fault: Fault, cameras: Sequence[str], offset: int, fps: float) -> st
     return said
 
 
-def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int, fps: float) -> str:
+def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int | None, fps: float) -> str:
     """Return the fault and its correction in words."""
     value = fault.value or 1.0
     if detail == OFF_AXIS:
         return f"{OFF_AXIS}: calibrate it again"
     if kind == "clock":
         late = "later" if value < 0 else "earlier"
-        return (
-            f"it shows {abs(value):.0f} frames {late} than the others: set its offset_frames to "
-            f"{offset + round(value)} in match.yaml"
+        todo = (
+            f"add {round(value)} to its offset_frames"
+            if offset is None
+            else f"set its offset_frames to {offset + round(value)}"
         )
+        return f"it shows {abs(value):.0f} frames {late} than the others: {todo} in match.yaml"
     if kind == "frame_rate":
         return (
             f"its video has about {value * fps:.3g} frames per second, not {fps:g}: convert it, or "

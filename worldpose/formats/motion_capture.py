@@ -32,7 +32,7 @@ def coco_dataset(
     tracks: JointTracks,
     observed: NDArray[np.bool_],
     *,
-    offset_frames: int = 0,
+    number: NDArray[np.int64] | None = None,
 ) -> dict[str, Any]:
     """Return the people of one static camera as a COCO keypoints data set.
 
@@ -47,15 +47,17 @@ def coco_dataset(
         camera: a single camera.
         tracks: frames are match frames.
         observed: (frames, persons, 17), the camera's observation of the joint was an inlier.
-        offset_frames: the camera's own frame number at match frame 0.
+        number: (frames,) the camera's own frame at each frame, not falling; of frames that it shows
+            twice the first one counts. None = the match frames.
     """
     width, height = (int(n) for n in camera.image_size)
     frames, persons = tracks.joints.shape[:2]
     pixels = camera.project(tracks.joints.reshape(-1, 3)).reshape(frames, persons, 17, 2)
     pixels = np.round(pixels, PIXEL_DECIMALS)
     within = (pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5)
-    visible = np.all(within, axis=-1) * np.where(observed, 2, 1)
-    own_frames = [int(frame) + offset_frames for frame in tracks.frames]
+    own_frames = (tracks.frames if number is None else number).tolist()
+    is_first = np.diff(own_frames, prepend=-np.inf) > 0
+    visible = np.all(within, axis=-1) * np.where(observed, 2, 1) * is_first[:, None, None]
     annotations = [
         {
             "id": number,
@@ -82,7 +84,7 @@ def coco_dataset(
                 "width": width,
                 "height": height,
             }
-            for frame in own_frames
+            for frame in dict.fromkeys(own_frames)
         ],
         "annotations": annotations,
         "categories": [

@@ -142,12 +142,19 @@ def describe_videos(
     return notes
 
 
-def describe_gaps(clock: Integers) -> str:
-    """Return a sentence about the frames that a video lacks between others; empty if none."""
+def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
+    """Return a sentence about the frames that a video lacks between others; empty if none.
+
+    Args:
+        clock: (frames,) number of the video frame; -1 = missing.
+        frame: (frames,) rising numbers to name them by; None = from 0.
+    """
     shown = np.flatnonzero(clock >= 0)
     if not len(shown):
         return ""
-    gaps = stretches(shown[0] + np.flatnonzero(clock[shown[0] : shown[-1]] < 0))
+    numbers = np.arange(len(clock)) if frame is None else frame
+    between = slice(int(shown[0]), int(shown[-1]))
+    gaps = stretches(numbers[between][clock[between] < 0])
     longest = sorted(gaps, key=lambda gap: gap[0] - gap[1])[:5]
     listed = ", ".join(f"{a} to {b}" if a < b else f"{a}" for a, b in sorted(longest))
     count = sum(last - first + 1 for first, last in gaps)

@@ -6,17 +6,18 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import MatchSpec
+from data_contracts.match import ClockOffset, MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.files import require_file
-from worldpose.formats.keypoint_files import read_observations
+from worldpose.formats.keypoint_files import read_people, select_ranges
+from worldpose.ingest.clock import camera_frames
 from worldpose.ingest.match_folder import MatchFolder
 
 if TYPE_CHECKING:
@@ -30,15 +31,48 @@ class UnitFrames:
     Attributes:
         first: first match frame.
         count: number of frames, including those between clips.
-        offset: match frame = camera frame - offset.
+        offset: camera frame minus match frame, see `worldpose.ingest.clock`.
         ranges: first match frame and number of frames of every interval covered by clips, rising
             and disjoint: only these contain people.
+        rate: frames of the camera per match frame.
     """
 
     first: int
     count: int
-    offset: int
+    offset: ClockOffset
     ranges: tuple[tuple[int, int], ...] = ()
+    rate: float = 1.0
+
+    @property
+    def frame(self) -> NDArray[np.int64]:
+        """Match frames (n,) of the ranges."""
+        return np.concatenate([np.arange(first, first + count) for first, count in self.ranges])
+
+    @property
+    def clock(self) -> list[Any]:
+        """Offset and rate, as recipes list them."""
+        offset = self.offset
+        pairs = [list(pair) for pair in offset] if isinstance(offset, tuple) else offset
+        return [pairs, self.rate]
+
+    def numbers(self, frame: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the camera frame (n,) that is nearest to each match frame (n,)."""
+        return camera_frames(frame, self.offset, self.rate)
+
+    def number(self, frame: int) -> int:
+        """Return the camera frame that is nearest to a match frame."""
+        return int(self.numbers(np.array([frame]))[0])
+
+    def place(self, path: Path, people: KeypointDetections) -> KeypointDetections:
+        """Return a file's people, whose frames are the camera's, on the match frames of the ranges.
+
+        Raises:
+            InputError: all people are outside these frames.
+        """
+        frame = self.frame
+        number, row = np.unique(self.numbers(frame), return_inverse=True)
+        ranges = [(first, last - first + 1) for first, last in stretches(number)]
+        return replace(select_ranges(path, people, ranges)[row], frame=frame)
 
 
 def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
@@ -47,13 +81,17 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
     The function rounds a broadcast offset to the nearest frame; the rest stays in the clip's
     `broadcast_offset_frames`.
     """
-    clips = spec.clips
+    clips, rate = spec.clips, 1.0
+    offset: ClockOffset
     if unit_id in {clip.id for clip in clips}:
         clip = spec.clip(unit_id)
         clips = (clip,)
         offset = round(clip.broadcast_offset_frames) - clip.first_frame
     else:
-        offset = int(spec.camera(unit_id).offset_frames)
+        camera = spec.camera(unit_id)
+        rate = (camera.fps or spec.fps) / spec.fps
+        offset = camera.offset_frames
+        offset = offset if isinstance(offset, tuple) else int(offset)
     ranges: list[tuple[int, int]] = []
     for first, stop in sorted((c.first_frame, c.first_frame + c.frame_count) for c in clips):
         if ranges and first <= sum(ranges[-1]):
@@ -62,7 +100,7 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
         else:
             ranges.append((first, stop - first))
     first = ranges[0][0]
-    return UnitFrames(first, sum(ranges[-1]) - first, offset, tuple(ranges))
+    return UnitFrames(first, sum(ranges[-1]) - first, offset, tuple(ranges), rate)
 
 
 def read_unit(
@@ -87,10 +125,9 @@ def read_unit(
             found=f"those of {', '.join(match.detections) or 'none'}",
             todo="Add the file, or correct the name.",
         )
-    frames = unit_frames(match.spec, unit_id)
-    ranges = [(first + frames.offset, count) for first, count in frames.ranges]
-    people = read_observations(match.detections[unit_id], ranges)
-    return replace(people, frame=people.frame - frames.offset), match.calibrations.get(unit_id)
+    path = match.detections[unit_id]
+    people = unit_frames(match.spec, unit_id).place(path, read_people(path).people)
+    return people, match.calibrations.get(unit_id)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +162,7 @@ def read_footage(
 
     Args:
         path: a video file or a folder of images.
-        fps: frames per second of match time.
+        fps: frames per second of the camera.
         image_size: width, height from match.yaml [px].
         frames: the unit's frames in the match.
         clips: id, first match frame and number of frames of each clip.
@@ -147,17 +184,17 @@ def read_footage(
     clock = index.on_clock(fps, str(path))
     wanted = [np.arange(first, first + count, dtype=np.int64) for _, first, count in clips]
     frame = np.unique(np.concatenate(wanted))
-    number = frame + frames.offset
+    number = frames.numbers(frame)
     inside = (number >= 0) & (number < len(clock))
     picture = np.full(len(frame), -1, dtype=np.int64)
     picture[inside] = clock[number[inside]]
     for clip, first, count in clips:
         row = int(np.searchsorted(frame, first))
         if (picture[row : row + count] < 0).all():
-            begin = first + frames.offset
+            begin, end = frames.numbers(np.array([first, first + count - 1]))
             raise InputError(
                 f"{path}: clip {clip}",
-                expected=f"frames {begin} to {begin + count - 1} of this video",
+                expected=f"frames {begin} to {end} of this video",
                 found=f"frames 0 to {len(clock) - 1}",
                 todo="Check the clip's first_frame and the camera's offset_frames.",
             )
@@ -184,7 +221,8 @@ def require_footage(
 ) -> None:
     """Raise InputError as `read_footage` if a video contradicts match.yaml."""
     frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
-    read_footage(path, spec.fps, footage_size(spec, unit_id), frames, clips, index)
+    fps = spec.fps * frames.rate
+    read_footage(path, fps, footage_size(spec, unit_id), frames, clips, index)
 
 
 def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:

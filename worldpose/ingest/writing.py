@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import MatchSpec
+from data_contracts.match import ClockOffset, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.compiled import map_in_threads
@@ -200,7 +200,7 @@ def _write_pitch(folder: Path, spec: MatchSpec, pitch: PitchSpec) -> None:
     path.write_text(pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
-def write_offsets(folder: Path, offsets: Mapping[str, int]) -> None:
+def write_offsets(folder: Path, offsets: Mapping[str, ClockOffset]) -> None:
     """Write clock offsets of static cameras into match.yaml; everything else in it stays.
 
     Args:
@@ -222,7 +222,8 @@ def write_offsets(folder: Path, offsets: Mapping[str, int]) -> None:
         name = keys["id"].value
         if name not in missing:
             continue
-        number = str(missing.pop(name))
+        offset = missing.pop(name)
+        number = str([list(each) for each in offset] if isinstance(offset, tuple) else offset)
         if "offset_frames" in keys:
             old = keys["offset_frames"]
             edits.append((old.start_mark.index, old.end_mark.index, number))

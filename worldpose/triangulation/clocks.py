@@ -364,3 +364,37 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
     if not detections.points:
         return found
     return found.add_points(detections.points, pixels[..., joints:, :], weights[..., joints:])
+
+
+def move_to_match_time(pixels: Floats, index: NDArray[np.integer], late: Floats) -> Floats:
+    """Return keypoints of tracked people as they are at the match frames.
+
+    A keypoint moves along the line to the same person's in a neighbouring frame: x(f) = x + share
+    (x' - x), where the camera's frames show the match times f + late and f' + late'. The neighbour
+    on the other side of f counts, or else the one on the same side; without any, x stays.
+
+    Args:
+        pixels: (frames, cameras, detections, points, 2) [px].
+        index: (frames, cameras, persons), each person's detection; -1 = not seen.
+        late: (frames, cameras), how much later than its match frame each frame is [frame].
+    """
+    moved, frames = pixels.copy(), len(index)
+    frame = np.arange(frames)[:, None]
+    for c in np.flatnonzero((late != 0.0).any(axis=0)):
+        slot, off = index[:, c], late[:, c, None]
+        own = np.where((slot >= 0)[..., None, None], pixels[frame, c, np.maximum(slot, 0)], np.nan)
+        found, shares = [], []
+        for side in (-1, 1):
+            there = np.clip(frame + side, 0, frames - 1)[:, 0]
+            step = (there - frame[:, 0])[:, None] + off[there] - off
+            # The same image again tells no motion.
+            share = np.where(np.abs(step) > 1e-6, -off / np.where(step == 0.0, 1.0, step), np.nan)
+            found.append(own + share[..., None, None] * (own[there] - own))
+            shares.append(share)
+        is_before = (shares[0] >= 0.0)[..., None, None]
+        best = np.where(is_before, found[0], found[1])
+        best = np.where(np.isfinite(best), best, np.where(is_before, found[1], found[0]))
+        row, column = np.nonzero(slot >= 0)
+        known = np.where(np.isfinite(best), best, own)
+        moved[row, c, slot[row, column]] = known[row, column]
+    return moved

@@ -2,7 +2,7 @@ import numpy as np
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation.clocks import estimate_clocks
+from worldpose.triangulation.clocks import estimate_clocks, move_to_match_time
 from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import smooth_joints
@@ -83,3 +83,16 @@ def test_late_clocks_are_found(ring):
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
     )
+
+
+def test_keypoints_move_along_the_persons_path_to_the_match_frame():
+    # A person at x = 10 t px; the frames show the times 0, 1.25, 2 and 2.75, the last one alone.
+    late = np.array([[0.0], [0.25], [0.0], [-0.25]])
+    pixels = np.zeros((4, 1, 2, 1, 2))
+    pixels[:, 0, 1, 0, 0] = 10.0 * (np.arange(4) + late[:, 0])
+    index = np.array([1, 1, 1, 1]).reshape(4, 1, 1)
+    moved = move_to_match_time(pixels, index, late)
+    np.testing.assert_allclose(moved[:, 0, 1, 0, 0], [0.0, 10.0, 20.0, 30.0])
+    assert not moved[:, 0, 0].any()
+    alone = move_to_match_time(pixels, np.array([-1, 1, -1, -1]).reshape(4, 1, 1), late)
+    np.testing.assert_array_equal(alone, pixels)

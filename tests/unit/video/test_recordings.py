@@ -38,6 +38,8 @@ def test_a_pause_leaves_its_frames_empty_and_is_named(late):
     clock = index([40 * n + late * (n > 200) for n in kept]).on_clock(25.0, "cam.mp4")
     assert describe_gaps(clock) == "the video lacks 75 of 500 frames: 200 to 274"
     assert clock[275] == 200
+    frame = np.r_[900 + np.arange(250), 2000 + np.arange(250)]  # of two clips
+    assert "75 of 500 frames: 1100 to 1149, 2000 to 2024" in describe_gaps(clock, frame)
 
 
 def test_dropped_frames_shift_none_and_another_rate_is_refused():

@@ -1,0 +1,124 @@
+"""Health of each camera over time: how its images depart from the people whom all cameras place.
+
+A keypoint x of camera c at time t departs from the projection p of the triangulated joint, whose
+image moves by v per frame, as
+
+    x - p = s + z q + r q' + l v + noise,
+
+with q = p less the principal point, and q' = q turned by 90 degrees: a shift s [px] and a roll r
+[rad] of a camera that was knocked, a zoom z [1], and a clock that is l frames late. Each bin of
+frames has the normal equations of (s, z, r, l); `changes` finds where the solution changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats, Integers
+from data_contracts.keypoints import KeypointDetections
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
+
+UNKNOWNS: Final = 5
+"""Shift along x and y [px], zoom [1], roll [rad], lateness [frame]."""
+LIMBS: Final = slice(5, 17)
+"""Joints that are compared: those of the face move little and are often hidden."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraHealth:
+    """Departures of each camera, in bins of frames.
+
+    Attributes:
+        length: frames of a bin.
+        every: of this many frames, one is compared.
+        matrix: (bins, cameras, 5, 5) normal matrices.
+        right: (bins, cameras, 5) right-hand sides.
+        matched: (bins, cameras) detections of tracked people.
+        seen: (bins, cameras) all detections.
+        scale: (cameras, 2) sum of the image scale at people [px/m], and number of terms.
+        cost: (cameras,) sum of the robust loss of departures [1].
+    """
+
+    length: int
+    every: int
+    matrix: Floats
+    right: Floats
+    matched: Floats
+    seen: Floats
+    scale: Floats
+    cost: Floats
+
+    @classmethod
+    def empty(cls, frames: int, cameras: int, persons: int, fps: float) -> CameraHealth:
+        """Return bins of 0.2 s without departures."""
+        length = max(1, round(0.2 * fps))
+        # More frames cost time and tell little more.
+        every = length if frames * cameras * persons > 50_000 else 1
+        shape = (-(-frames // length), cameras)
+        matrix, right = np.zeros((*shape, UNKNOWNS, UNKNOWNS)), np.zeros((*shape, UNKNOWNS))
+        zeros = np.zeros(shape), np.zeros(shape), np.zeros((cameras, 2)), np.zeros(cameras)
+        return cls(length, every, matrix, right, *zeros)
+
+    def add(self, cameras: Camera, people: KeypointDetections, joints: Floats, start: int) -> None:
+        """Add a chunk of a clip; its first and last frame give velocities only.
+
+        Args:
+            cameras: batch (cameras,).
+            people: detections of tracked people, (frames, cameras, detections).
+            joints: (frames, persons, 17, 3) triangulated [m], world.
+            start: row of the first of these frames in the clip.
+        """
+        rows = np.arange(1, len(joints) - 1)
+        rows = rows[(start + rows) % self.every == self.every // 2]
+        bins = (start + rows) // self.length
+        if not len(rows):
+            return
+        points = np.stack([joints[rows + step][:, :, LIMBS] for step in (-1, 0, 1)])
+        index = people.detection_index[rows]
+        for c in range(index.shape[1]):
+            slot, found = index[:, c], people.keypoints[rows, c]
+            there = slot >= 0
+            seen = np.isfinite(found[..., 0]).any(axis=-1).sum(axis=1)
+            np.add.at(self.seen[:, c], bins, seen)
+            np.add.at(self.matched[:, c], bins, there.sum(axis=1))
+            frame, person = np.nonzero(there)
+            if len(frame):
+                pixels = found[frame, slot[frame, person]][:, LIMBS]
+                self._add_departures(c, cameras[c], bins[frame], pixels, points[:, frame, person])
+
+    def _add_departures(
+        self, c: int, camera: Camera, bins: Integers, pixels: Floats, points: Floats
+    ) -> None:
+        """Add people (n,) of one camera, in rising bins, at points (3, n, 12, 3) over time."""
+        joint_noise, pixel_noise = 0.03, 2.0  # of a detector [m], [px]
+        before, image, after = camera.project(points.reshape(-1, 3)).reshape(*points.shape[:-1], 2)
+        speed, off = 0.5 * (after - before), pixels - image
+        depth = camera.cam_from_world.apply(points[1].reshape(-1, 3))[:, 2].reshape(off.shape[:-1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = camera.focal.mean() / depth
+            variance = pixel_noise**2 + (joint_noise * scale) ** 2
+            squared = (off**2).sum(axis=-1) / variance
+            weight = cauchy_weight(squared, 5.0) / variance
+        use = np.isfinite(weight) & np.isfinite(speed).all(axis=-1) & (depth > 0.0)
+        self.scale[c] += scale[use].sum(), use.sum()
+        self.cost[c] += cauchy_loss(squared[use], 5.0).sum()
+        around = image - camera.principal_point
+        columns = np.zeros((*off.shape, UNKNOWNS))
+        columns[..., 0, 0] = columns[..., 1, 1] = 1.0
+        columns[..., 2] = around
+        columns[..., 0, 3], columns[..., 1, 3] = -around[..., 1], around[..., 0]
+        columns[..., 4] = speed
+        weight = np.where(use, weight, 0.0)[..., None, None]
+        columns = np.where(use[..., None, None], columns, 0.0).reshape(len(bins), -1, UNKNOWNS)
+        off = np.where(use[..., None], off, 0.0).reshape(len(bins), -1, 1)
+        weight = np.broadcast_to(weight[..., 0], (*use.shape, 2)).reshape(off.shape)
+        held = (weight * columns).swapaxes(1, 2)
+        each = np.concatenate([held @ columns, held @ off], axis=2)
+        first = np.flatnonzero(np.diff(bins, prepend=-1))
+        sums = np.add.reduceat(each, first, axis=0)
+        self.matrix[bins[first], c] += sums[..., :UNKNOWNS]
+        self.right[bins[first], c] += sums[..., UNKNOWNS]

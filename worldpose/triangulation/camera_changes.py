@@ -1,0 +1,363 @@
+"""Cameras that change within a clip, and how much: clocks that step or drift, views that move.
+
+`camera_consistency.changes` finds a change from joints that the changed camera has displaced. Here
+the change is corrected in the detections, people are triangulated again, and the rest is added,
+until there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.triangulation import CameraChange
+from worldpose.camera_consistency.changes import Change, find_changes, measure_step
+from worldpose.camera_consistency.health import LIMBS, UNKNOWNS, CameraHealth
+from worldpose.geometry.cameras import Camera
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.clocks import move_to_match_time, read_frames
+from worldpose.triangulation.noise_model import NoiseModel
+from worldpose.triangulation.residuals import Observations, Rig
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.solve import solve_joints
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredChange:
+    """A change of a camera with its size.
+
+    Attributes:
+        found: camera, kind and moment.
+        amount: (5,) shift along x and y [px], zoom [1], roll [rad], lateness [frame] of the images
+            after a sudden change, or at the end of the clip.
+        std: standard deviation of its size [frame] or [px].
+        is_explained: whether all cameras agree with the change corrected.
+        before: lateness of a changed clock before the change [frame].
+    """
+
+    found: Change
+    amount: Floats
+    std: float
+    is_explained: bool = True
+    before: float = 0.0
+
+    def at(self, rows: Floats, frames: int) -> Floats:
+        """Return the share (n,) of the change at rows of a clip of some frames."""
+        if self.found.is_sudden:
+            return np.asarray((rows >= self.found.row) * 1.0)
+        return np.asarray(rows / max(1.0, frames - 1.0))
+
+
+def explain_changes(
+    cameras: Camera,
+    people: KeypointDetections[ClipArray],
+    fps: float,
+    settings: TriangulationSettings,
+    found: Sequence[Change],
+) -> MeasuredChange | None:
+    """Return the change of the camera without which the others agree; None if there is none.
+
+    Args:
+        cameras: batch (cameras,), at least three.
+        people: detections of the tracked people of a clip.
+        fps: frames per second [1/s].
+        settings: noise of the keypoints.
+        found: changes as `find_changes` finds them, at least one.
+    """
+    loose = settings.model_copy(update={"max_deviation": 30.0})
+    trial = _Trial(cameras, people, fps, loose)
+    windows = trial.choose_windows(found[0])
+    before = trial.misfit(windows)
+    without = [trial.misfit(windows, without=c) for c in range(len(cameras.focal))]
+    culprit = int(np.argmin(without))
+    # Less data always fits a little better. One camera of many hardly counts in the mean.
+    usual = float(np.median(np.delete(without, culprit)))
+    if usual - without[culprit] < 0.25 * usual / (len(without) - 1):
+        return None
+    own = [trial.measure(each) for each in found if each.camera == culprit]
+    if not own:
+        swaying = replace(found[0], camera=culprit, is_sudden=False)
+        return MeasuredChange(swaying, np.zeros(UNKNOWNS), np.inf, is_explained=False)
+    after = [trial.misfit(windows, each) for each in own]
+    best = int(np.argmin(after))
+    # A camera that sways is not explained by one change.
+    is_explained = before - after[best] > 0.7 * (before - without[culprit])
+    return replace(own[best], is_explained=is_explained)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Windows of a clip, triangulated with a change corrected or without a camera."""
+
+    cameras: Camera
+    people: KeypointDetections[ClipArray]
+    fps: float
+    settings: TriangulationSettings
+
+    def choose_windows(self, found: Change) -> list[slice]:
+        """Return intervals of a second that a change leaves whole, on both sides of it."""
+        frames, length = len(self.people.detection_index), max(3, round(self.fps))
+        starts = np.arange(0, max(1, frames - length + 1), length)
+        if not found.is_sudden:
+            chosen = starts[np.unique(np.linspace(0, len(starts) - 1, 16).astype(int))]
+            return [slice(int(start), int(start) + length) for start in chosen]
+        # Not at the step: its place is known to some frames, and a clock's correction reads there.
+        gap = length // 2
+        before = starts[starts + length + gap <= found.row][-6:]
+        after = np.arange(found.row + gap, frames - length + 1, length)[:6]
+        return [slice(int(start), int(start) + length) for start in (*before, *after)]
+
+    def measure(self, found: Change) -> MeasuredChange:
+        """Return a change with its size."""
+        measured = MeasuredChange(found, np.zeros(UNKNOWNS), np.inf)
+        frames = len(self.people.detection_index)
+        windows = self.choose_windows(found)
+        middles = np.array([0.5 * (window.start + window.stop - 1) for window in windows])
+        for _ in range(20):
+            each = [self._look(window, measured)[0] for window in windows]
+            sums = CameraHealth.empty(len(each), len(self.cameras.focal), 1, 5.0)
+            for number, one in enumerate(each):
+                sums.matrix[number] = one.matrix.sum(axis=0)
+                sums.right[number] = one.right.sum(axis=0)
+            change, std, rest = measure_step(sums, found, measured.at(middles, frames))
+            amount, before = measured.amount + change, measured.before + rest
+            measured = replace(measured, amount=amount, std=std, before=before)
+            if max(np.abs(change).max(), abs(rest)) < 0.01:
+                break
+        return measured
+
+    def misfit(
+        self,
+        windows: Sequence[slice],
+        change: MeasuredChange | None = None,
+        without: int | None = None,
+    ) -> float:
+        """Return the mean loss of the departures of all cameras, per degree of freedom [1]."""
+        cost = freedom = 0.0
+        for window in windows:
+            one, joints = self._look(window, change, without)
+            cost += float(one.cost.sum())
+            freedom += 2.0 * float(one.scale[:, 1].sum()) - 3.0 * joints
+        return cost / max(1.0, freedom)
+
+    def _look(
+        self, window: slice, change: MeasuredChange | None, without: int | None = None
+    ) -> tuple[CameraHealth, int]:
+        """Return the departures in a window, and the number of joints."""
+        cameras, seen = self.cameras, self.people[window]
+        if change is not None:
+            seen = correct_window(cameras, self.people, window, change)
+        if without is not None:
+            index = seen.detection_index.copy()
+            index[:, without] = -1
+            seen = seen.assign_people(index)
+        joints = triangulate_views(cameras, seen, self.settings)
+        one = CameraHealth.empty(len(joints), len(cameras.focal), joints.shape[1], self.fps)
+        one.add(cameras, seen, joints, 0)
+        return one, int(np.isfinite(joints[1:-1, :, LIMBS, 0]).sum())
+
+
+def triangulate_views(
+    cameras: Camera, seen: KeypointDetections, settings: TriangulationSettings
+) -> Floats:
+    """Return joints (frames, persons, 17, 3) [m] by the stated noise."""
+    precision = NoiseModel.nominal(seen.confidence.shape[-1]).precision(seen.confidence)
+    rig, index = Rig.from_cameras(cameras), seen.detection_index
+    return solve_joints(Observations.of(rig, seen.keypoints, precision, index), settings).joints
+
+
+def correct_window(
+    cameras: Camera, people: KeypointDetections[ClipArray], window: slice, change: MeasuredChange
+) -> KeypointDetections:
+    """Return the people of some frames with a change corrected."""
+    middle = 0.5 * (window.start + window.stop - 1)
+    amount = change.amount * change.at(np.array([middle]), len(people.detection_index))
+    c, late = change.found.camera, np.zeros(len(cameras.focal))
+    late[c] = change.before + amount[4]
+    seen = read_frames(people, window, late) if late[c] else people[window]
+    keypoints = np.array(seen.keypoints, dtype=np.float64)
+    keypoints[:, c] = move_back(keypoints[:, c], cameras[c].principal_point, amount)
+    return replace(seen, keypoints=keypoints)
+
+
+def move_back(pixels: Floats, center: Floats, amount: Floats) -> Floats:
+    """Return the pixels (..., 2) that a camera had shown before its view changed."""
+    x, y, zoom, roll = amount[:4]
+    turn = np.array([[1.0 + zoom, -roll], [roll, 1.0 + zoom]])
+    return np.asarray((pixels - center - (x, y)) @ np.linalg.inv(turn).T + center)
+
+
+def correct_views(
+    pixels: AnyFloats, frame: Integers, cameras: Sequence[str], changes: Sequence[CameraChange]
+) -> Floats:
+    """Return keypoints (frames, cameras, detections, points, 2) as unchanged cameras show them."""
+    moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
+    for change in changes:
+        c = list(cameras).index(change.camera)
+        after = frame - change.first_frame
+        inside = (after >= 0) & (after < change.frame_count)
+        if not change.is_explained:
+            moved[inside, c] = np.nan
+            continue
+        gradual: Floats = np.asarray(after / max(1.0, change.frame_count - 1.0))
+        sudden = (frame >= (change.frame or 0)).astype(np.float64)
+        share = np.where(inside, gradual if change.frame is None else sudden, 0.0)
+        amount = np.array([*change.shift_px, change.zoom, change.roll_rad])
+        for part in np.unique(share[share > 0.0]):
+            rows = share == part
+            center = np.array(change.center_px)
+            moved[rows, c] = move_back(np.asarray(moved[rows, c]), center, part * amount)
+    return moved
+
+
+def describe_change(change: CameraChange) -> str:
+    """Return a sentence about a change."""
+    camera, late = change.camera, change.late_frames
+    todo = "worldpose synchronize proposes offsets that change with it"
+    if not change.is_explained:
+        what = "its clock changes" if change.kind == "clock" else "it moves"
+        left = "" if change.kind == "clock" else "; its views are left out"
+        return (
+            f"camera {camera}: {what} within the clip in a way that no single step or drift "
+            f"explains{left}"
+        )
+    if change.kind == "clock" and change.frame is not None:
+        number = max(1, round(abs(late)))
+        plural = "s" if number > 1 else ""
+        did = "lost" if late > 0.0 else "repeated"
+        return (
+            f"camera {camera}: its offset changes by {-late:+.1f} frames at frame {change.frame}: "
+            f"its recorder {did} {number} frame{plural} there. {todo}"
+        )
+    if change.kind == "clock":
+        rate = late / max(1.0, change.frame_count - 1.0)
+        return (
+            f"camera {camera}: its offset changes by {-late:+.1f} frames within the clip: its "
+            f"clock runs {abs(rate):.2%} {'fast' if rate > 0.0 else 'slow'}. {todo}"
+        )
+    parts = [f"{math.hypot(*change.shift_px):.0f} px"]
+    if abs(change.zoom) > 0.003:
+        parts.append(f"{change.zoom:+.1%} of zoom")
+    if abs(change.roll_rad) > 0.003:
+        parts.append(f"{math.degrees(change.roll_rad):+.1f} degrees of roll")
+    when = "moves slowly within the clip"
+    if change.frame is not None:
+        when = f"moves at frame {change.frame}"
+    return (
+        f"camera {camera} {when}, by {', '.join(parts)}: its views are corrected by that from the "
+        "people. Calibrate it anew for the rest, or cut the clip there"
+    )
+
+
+def change_record(
+    change: MeasuredChange, camera: str, center: Floats, frame: Integers
+) -> CameraChange:
+    """Return a change as results store it; match frames (n,) of a clip."""
+    x, y, zoom, roll, late = change.amount.tolist()
+    found = change.found
+    return CameraChange(
+        camera=camera,
+        kind=found.kind,
+        frame=int(frame[found.row]) if found.is_sudden else None,
+        first_frame=int(frame[0]),
+        frame_count=len(frame),
+        shift_px=(x, y),
+        zoom=zoom,
+        roll_rad=roll,
+        center_px=(float(center[0]), float(center[1])),
+        late_frames=late,
+        std=change.std if np.isfinite(change.std) else None,
+        is_explained=change.is_explained,
+    )
+
+
+Course = list[tuple[int, float]]
+"""Lateness of a camera: rising rows of a clip with values [frame], linear between them."""
+
+
+def trace_clocks(
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    late: Floats,
+    *,
+    pitch_size: tuple[float, float] | None = None,
+) -> list[Course]:
+    """Return the lateness of each camera over a clip, with steps and drifts.
+
+    People are tracked and triangulated with the clocks so far; the clearest change is added, until
+    there is none.
+
+    Args:
+        cameras: batch (cameras,), at least three.
+        detections: (frames, cameras, detections) in memory, before tracking.
+        fps: frames per second [1/s].
+        late: (cameras,) constant lateness to start from [frame].
+        pitch_size: length and width of the pitch that people stand on [m]; None = not known.
+    """
+    frames, count = detections.score.shape[:2]
+    courses: list[Course] = [[(0, float(value))] for value in late]
+    settings = TriangulationSettings()
+    for _ in range(2 * count + 4):
+        people = _track_on_time(cameras, detections, fps, courses, pitch_size)
+        health = CameraHealth.empty(frames, count, people.detection_index.shape[2], fps)
+        for start in range(0, frames, 512):
+            rows = slice(max(0, start - 1), min(frames, start + 513))
+            seen = people[rows]
+            health.add(cameras, seen, triangulate_views(cameras, seen, settings), rows.start)
+        found = find_changes(health, fps, ("clock",))
+        change = explain_changes(cameras, people, fps, settings, found) if found else None
+        if change is None or not change.is_explained or abs(change.amount[4]) < 0.1:
+            break
+        c = change.found.camera
+        courses[c] = _add_change(courses[c], change, frames)
+    return courses
+
+
+def _track_on_time(
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    courses: Sequence[Course],
+    pitch_size: tuple[float, float] | None,
+) -> KeypointDetections:
+    """Return tracked people on the common clock, by the clocks so far."""
+    frames, count = detections.score.shape[:2]
+    frame = np.arange(frames)
+    course = np.stack([np.interp(frame, *np.array(each).T) for each in courses], axis=1)
+    row = np.floor(frame[:, None] - course + 0.5).astype(np.int64)
+    outside = (row < 0) | (row >= frames)
+    row = np.clip(row, 0, frames - 1)
+    arrays = {}
+    for name, array in detections.arrays().items():
+        arrays[name] = array[row, np.arange(count)].astype(np.float64)
+        arrays[name][outside] = np.nan
+    shifted = detections.with_arrays(arrays, frame)
+    tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
+    index = tracks.detection_index
+    rest = row + np.take_along_axis(course, row, axis=0) - frame[:, None]
+    rest = np.where(np.abs(rest) < 1.0, rest, 0.0)
+    moved = move_to_match_time(arrays["keypoints"], index, rest)
+    return replace(shifted, keypoints=moved, detection_index=index)
+
+
+def _add_change(course: Course, change: MeasuredChange, frames: int) -> Course:
+    """Return a course with a change, measured in rows of the common clock."""
+    amount, row = float(change.amount[4]), change.found.row
+    course = [(a, b + change.before) for a, b in course]
+    at, there = np.array(course).T
+    if not change.found.is_sudden:
+        rows = np.unique([*at, 0, frames - 1])
+        values = np.interp(rows, at, there) + amount * rows / max(1, frames - 1)
+        return [(int(a), float(b)) for a, b in zip(rows, values, strict=True)]
+    before = [(int(a), float(b)) for a, b in course if a < row - 1]
+    after = [(int(a), float(b) + amount) for a, b in course if a > row]
+    ends = np.interp([row - 1, row], at, there)
+    return [*before, (row - 1, float(ends[0])), (row, float(ends[1]) + amount), *after]
