@@ -92,6 +92,25 @@ def _find(health: CameraHealth, c: int, kind: Kind, fps: float) -> Iterator[Chan
         if is_sudden and not _is_sharp(matrix[near], right[near], start - near.start, changing):
             continue
         yield Change(c, kind, is_sudden, start * health.length if is_sudden else 0, size, gain)
+    if kind == "view":
+        size, gain = _sway(matrix, right, total, second)
+        if gain > min_gain and size > 2.0 * min_size:
+            yield Change(c, kind, is_sudden=False, row=0, size=size, gain=gain)
+
+
+def _sway(matrix: Floats, right: Floats, total: Floats, second: int) -> tuple[float, float]:
+    """Return the usual displacement [px] and gain of a view that is another in each second."""
+    left, sizes, gains = right.copy(), [0.0], [0.0]
+    for start in range(0, len(matrix) - second + 1, second):
+        part = slice(start, start + second)
+        held, pull = matrix[part].sum(axis=0), right[part].sum(axis=0)
+        if _is_solvable(held):
+            change = np.linalg.solve(held, pull)
+            left[part] = right[part] - matrix[part] @ change
+            change[4] = 0.0
+            sizes.append(_displacement(total, change))
+            gains.append(float(pull @ np.linalg.solve(held, pull)))
+    return float(np.median(sizes)), float(np.median(gains)) / _noise(matrix, left, 1)
 
 
 def _is_sharp(matrix: Floats, right: Floats, place: int, changing: list[int]) -> bool:

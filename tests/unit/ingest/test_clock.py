@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from data_contracts.match import CameraSpec
-from worldpose.ingest.clock import camera_frames, lateness
+from worldpose.ingest.clock import camera_frames, lateness, simplest_offset
 from worldpose.ingest.footage import UnitFrames
 
 FRAME = np.arange(8)
@@ -51,3 +51,16 @@ def test_people_of_a_fast_camera_lie_on_match_frames(make_people, tmp_path):
 def test_an_offset_that_cannot_be_read_is_refused(offset, kind, told):
     with pytest.raises(ValidationError, match=told):
         CameraSpec(id="a", width=9, height=9, kind=kind, offset_frames=offset)
+
+
+@pytest.mark.parametrize(
+    ("frame", "exact", "written"),
+    [
+        ([0], [-0.4], 0),
+        ([0, 74, 75], [0.1, 0.1, -4.9], ((74, 0.0), (75, -5.0))),
+        ([0, 999], [0.0, -5.674], ((0, 0.0), (999, -5.67))),
+        ([5, 30, 31, 90], [2.0, 2.0, 0.0, 3.0], ((5, 2.0), (30, 2.0), (31, 0.0), (90, 3.0))),
+    ],
+)
+def test_offsets_are_written_as_simply_as_they_are(frame, exact, written):
+    assert simplest_offset(np.array(frame), np.array(exact)) == written

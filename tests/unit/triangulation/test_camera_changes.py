@@ -1,0 +1,148 @@
+"""Cameras that are knocked, sway, or lose frames within a clip: which one, when and how much."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from running_samples import FPS, detections, runner
+
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.triangulation import CameraChange
+from worldpose.camera_consistency.changes import find_changes
+from worldpose.camera_consistency.health import CameraHealth
+from worldpose.triangulation.camera_changes import (
+    correct_views,
+    describe_change,
+    explain_changes,
+    trace_clocks,
+    triangulate_views,
+)
+from worldpose.triangulation.settings import TriangulationSettings
+
+FRAMES = 240
+BAD = 2
+SETTINGS = TriangulationSettings()
+
+
+@pytest.fixture
+def cameras(ring):
+    return ring(4)
+
+
+def view(cameras, spoil):
+    """People as the cameras see them, with the pixels of one camera changed by `spoil`."""
+    pixels, confidence, index = detections(cameras, runner(FRAMES + 10, 3), 1.0)
+    changed = spoil(pixels[:, BAD], np.arange(FRAMES + 10)[:, None, None])
+    pixels = pixels[:FRAMES]
+    pixels[:, BAD] = changed[:FRAMES]
+    frame = np.arange(FRAMES)
+    return KeypointDetections.from_keypoints(pixels, confidence[:FRAMES], index[:FRAMES], frame)
+
+
+def explain(cameras, people):
+    health = CameraHealth.empty(FRAMES, len(cameras.focal), people.detection_index.shape[2], FPS)
+    health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
+    found = find_changes(health, FPS)
+    return explain_changes(cameras, people, FPS, SETTINGS, found) if found else None
+
+
+def late(pixels, frame):
+    """The recorder lost 5 frames after frame 119."""
+    return np.concatenate([pixels[:120], pixels[125:]])
+
+
+def fast(pixels, frame):
+    """Each image shows a moment 2 % later than the one before."""
+    at = np.arange(FRAMES) * 1.02
+    low = at.astype(int)
+    share = (at - low)[:, None, None, None]
+    return (1.0 - share) * pixels[low] + share * pixels[low + 1]
+
+
+def test_healthy_cameras_do_not_change(cameras):
+    assert explain(cameras, view(cameras, lambda pixels, frame: pixels)) is None
+
+
+CENTER = np.array([950.0, 545.0])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "row", "amount"),
+    [
+        (lambda x, f: x + (f[..., None] >= 120) * [12.0, -5.0], 120, (12.0, -5.0, 0.0, 0.0)),
+        (lambda x, f: x + f[..., None] / (FRAMES - 1) * [0.0, 20.0], None, (0.0, 20.0, 0.0, 0.0)),
+        (lambda x, f: x + (f[..., None] >= 90) * 0.05 * (x - CENTER), 90, (0.0, 0.0, 0.05, 0.0)),
+        (late, 120, 5.0),
+        (fast, None, 0.0196 * (FRAMES - 1)),
+    ],
+    ids=["knocked", "sinking", "zoomed", "lost frames", "fast clock"],
+)
+def test_the_changed_camera_is_named_and_measured(cameras, spoil, row, amount):
+    found = explain(cameras, view(cameras, spoil))
+    assert found.found.camera == BAD
+    assert found.is_explained
+    assert found.found.is_sudden == (row is not None)
+    if row is not None:
+        assert abs(found.found.row - row) <= 5
+    if isinstance(amount, tuple):
+        np.testing.assert_allclose(found.amount[:2], amount[:2], atol=0.6)
+        np.testing.assert_allclose(found.amount[2:4], amount[2:], atol=0.005)
+    else:
+        assert found.amount[4] == pytest.approx(amount, abs=0.25)
+
+
+def test_a_camera_that_sways_is_not_explained(cameras):
+    def sway(pixels, frame):
+        phase = frame[..., None] / FRAMES * 2.0 * np.pi
+        return pixels + np.concatenate([30.0 * np.sin(phase), 15.0 * np.cos(phase)], axis=-1)
+
+    found = explain(cameras, view(cameras, sway))
+    assert found.found.camera == BAD
+    assert not found.is_explained
+
+
+def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
+    people = view(cameras, late)
+    untracked = replace(people, detection_index=np.empty((0, 0, 0), np.int16))
+    courses = trace_clocks(cameras, untracked, FPS, np.array([0.0, 0.0, 2.4, 0.0]))
+    assert [len(course) for course in courses] == [1, 1, 3, 1]
+    rows, values = np.array(courses[BAD]).T
+    assert abs(rows[-1] - 120) <= 5
+    np.testing.assert_allclose(values, [0.0, 0.0, 5.0], atol=0.15)
+
+
+KNOCK = CameraChange(
+    camera="b", kind="view", frame=12, first_frame=10, frame_count=4, shift_px=(3.0, -1.0), std=0.1
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "moved"),
+    [
+        ({}, [0.0, 0.0, 3.0, 3.0, 0.0]),
+        ({"frame": None}, [0.0, 1.0, 2.0, 3.0, 0.0]),
+        ({"is_explained": False}, [np.nan] * 4 + [0.0]),
+    ],
+)
+def test_a_known_change_is_taken_back_within_its_clip(change, moved):
+    pixels = np.zeros((5, 2, 1, 1, 2))
+    known = [KNOCK.model_copy(update=change)]
+    corrected = correct_views(pixels, np.arange(10, 15), ("a", "b"), known)
+    np.testing.assert_allclose(corrected[:, 1, 0, 0, 0], -np.array(moved), atol=1e-12)
+    assert not corrected[:, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, "camera b moves at frame 12, by 3 px"),
+        ({"kind": "clock", "late_frames": 4.9}, "changes by -4.9 frames at frame 12: its recorder"),
+        (
+            {"kind": "clock", "late_frames": 0.02, "frame": None},
+            "its clock runs 0.67% fast",
+        ),
+        ({"is_explained": False}, "no single step or drift explains; its views are left out"),
+    ],
+)
+def test_a_change_is_told_with_camera_and_frame(change, said):
+    assert said in describe_change(KNOCK.model_copy(update=change))
