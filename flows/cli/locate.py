@@ -175,7 +175,7 @@ def _write(
     calibrations: dict[str, CameraCalibration], folder: Path | None, out: Path | None
 ) -> list[str]:
     """Write the calibration to a file, and into a match folder in place of its lenses."""
-    from worldpose.formats.calibration_files import write_calibration_toml
+    from worldpose.formats.calibration_writer import write_calibration_toml
     from worldpose.formats.files import whole_file
     from worldpose.ingest.match_folder import LENS_FILE
 

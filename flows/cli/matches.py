@@ -179,6 +179,7 @@ def import_command(
     detections: Path | None = None,
     videos: Path | None = None,
     boxes: Path | None = None,
+    join: Annotated[bool, typer.Option("--join")] = False,
     pose2sim: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     fps: float | None = None,
     match_id: str | None = None,
@@ -198,12 +199,15 @@ def import_command(
     Options:
         out: Match folder to create or to extend.
         calibration: Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys,
-            Vicon, OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera.
-        detections: Folder of COCO or AlphaPose results, <camera>.json, or of a folder of
-            OpenPose JSON for each camera.
-        videos: Folder of videos in place of 2D poses, <camera>.mp4.
+            Vicon, OptiTrack, OpenCap, EasyMocap, bioCV, Panoptic Studio, multical, Kalibr or
+            OpenPose, or the folder of one file per camera.
+        detections: Folder of COCO, AlphaPose, MMPose or Ultralytics results, <camera>.json,
+            or of a folder of JSON for each frame (OpenPose and the others) for each camera.
+        videos: Folder of videos in place of 2D poses, <camera>.mp4, or of a folder of
+            images for each camera.
         boxes: With --videos, or for the videos of a match folder: people's boxes, in which only
             poses are estimated: folder of MOTChallenge lines, <camera>.txt.
+        join: With --videos: join the chapters of one recording (GX010001, GX020001).
         pose2sim: Trial of Pose2Sim: Config.toml, calibration/, pose/ with OpenPose JSON,
             videos/.
         fps: Frames per second.
@@ -213,8 +217,8 @@ def import_command(
             name of a point or marking of the pitch, or a position in metres.
         camera: With --clicks or --lens: the camera, or the clip of the broadcast camera; by
             default, images and lenses are named after cameras.
-        lens: Lens without a pose: OpenCV XML or YAML, ROS YAML, npz, matrix and distortion as
-            two .npy files, or TOML.
+        lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
+            pickle, matrix and distortion as two .npy files, or TOML.
         left_handed: The survey's x, y and height are left-handed.
         unit: Unit of the calibration's positions: mm, cm, m, in, ft, yd, km, or its metres, such as
             0.08. By default people's stature tells it.
@@ -236,6 +240,7 @@ def import_command(
         "--left-handed": left_handed,
         "--unit": unit,
         "--up": up,
+        "--join": join,
     }
     given = {name for name, value in options.items() if value}
     kind = next((name for name in ALONE if name in given), None)
@@ -268,6 +273,7 @@ def import_command(
             match_id=match_id,
             boxes=boxes,
             place=place,
+            join=join,
         )
         _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:

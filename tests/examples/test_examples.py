@@ -11,7 +11,7 @@ import pytest
 from command_line import TINY, succeed
 
 import worldpose
-from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.challenge import read_camera
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -195,7 +195,7 @@ def test_a_full_disk_leaves_no_match(lab, monkeypatch):
     def full(source, target):
         raise OSError(errno.ENOSPC, "No space left on device", str(target))
 
-    monkeypatch.setattr("worldpose.ingest.importing.shutil.copyfile", full)
+    monkeypatch.setattr("worldpose.ingest.camera_videos.shutil.copyfile", full)
     given = ["import", "--videos", str(lab / "videos"), "--out", str(lab / "new" / "out")]
     result = CliRunner().invoke(app, given)
     assert isinstance(result.exception, InputError), result.exception

@@ -15,7 +15,7 @@ from flows.cli import run as run_command
 from flows.cli.app import app
 from flows.registering import find_registration, open_for_review, register
 from worldpose.errors import InputError, UsageError
-from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.store.store import Store
 
 

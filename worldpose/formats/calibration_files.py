@@ -1,6 +1,6 @@
 """Cameras of a calibration file: checks that all forms share, and Anipose's TOML.
 
-Reader and writer of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
+Reader of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
 other forms are in `calibration_systems` and `calibration_forms`.
 
 One table per camera with `size`, `matrix`, `distortions` (k1 k2 p1 p2 k3, as OpenCV), `rotation`
@@ -16,6 +16,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -96,9 +97,8 @@ def build_camera(
             rotation, or the name is unfit for a file.
     """
     if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
-        raise calibration_error(
-            f"{where}: size", f"whole pixels from 1 to {SIZE_LIMIT}", str(size.tolist())
-        )
+        expected = f"whole pixels from 1 to {SIZE_LIMIT}; an import with --videos takes theirs"
+        raise calibration_error(f"{where}: size", expected, str(size.tolist()))
     require_optics(where, size, focal, principal_point)
     far = float(np.max(np.abs(translation)))
     if far > DISTANCE_LIMIT:
@@ -246,13 +246,17 @@ def _shorten(value: object) -> str:
 
 
 def read_calibration_toml(
-    path: Path, left_out: LeftOut | None = None
+    path: Path,
+    left_out: LeftOut | None = None,
+    sizes: Mapping[str, tuple[int, int]] = MappingProxyType({}),
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
 
     Args:
         path: the file.
         left_out: receives cameras without a pose; None = all must have one.
+        sizes: width and height [px] of videos, for files whose size is no whole number: programs
+            that do not know it write twice the principal point.
 
     Raises:
         InputError: an entry is missing or invalid, a camera is a fisheye, the unit is another, or
@@ -267,7 +271,8 @@ def read_calibration_toml(
         left_out.update({camera_id(name): "it has no pose" for name in lacking})
         tables = posed
     cameras = []
-    for where, name, table in tables:
+    for where, name, given in tables:
+        table = _with_size(given, sizes.get(camera_id(name)))
         if "matrix" in table and not {"rotation", "translation"} & table.keys():
             raise InputError(
                 f"{where}.rotation",
@@ -278,6 +283,15 @@ def read_calibration_toml(
             )
         cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
     return index_by_name(path, cameras)
+
+
+def _with_size(table: Mapping[str, Any], size: tuple[int, int] | None) -> Mapping[str, Any]:
+    """Return a camera's table, with the video's size if its own is near that, but not whole."""
+    given = _plain_numbers(table.get("size"))
+    if size is None or given is None or given.shape != (2,) or np.all(given == np.round(given)):
+        return table
+    near = np.all(np.abs(given / np.array(size) - 1.0) < 0.05)
+    return {**table, "size": list(size)} if near else table
 
 
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
@@ -324,9 +338,12 @@ def camera_tables(
     content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
+    entries = {"size", "matrix", "distortions", "rotation", "translation"}
+    known = [each for each in tables.values() if isinstance(each, dict) and entries & each.keys()]
     for key, table in tables.items():
-        if key == "metadata":
-            continue
+        is_camera = isinstance(table, dict) and entries & table.keys()
+        if key == "metadata" or (known and not is_camera):
+            continue  # caliscope's settings stand beside its cameras
         where = f"{path}: {key}" if tables is content else f"{path}: cameras.{key}"
         if not isinstance(table, dict):
             raise calibration_error(where, "a table for each camera", _shorten(table))
@@ -490,30 +507,3 @@ def _plain_numbers(value: object) -> NDArray[np.float64] | None:
         return np.array(value, dtype=np.float64)
     except (ValueError, OverflowError):
         return None
-
-
-def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibration]) -> None:
-    """Write cameras in the form that Anipose, Pose2Sim and `read_calibration` read.
-
-    Numbers keep all digits. A rotation becomes a Rodrigues vector, the only form that all of them
-    read, with rounding errors of 1e-15 on reading.
-    """
-    from scipy.spatial.transform import Rotation  # late: as above
-
-    lines = []
-    for index, (name, camera) in enumerate(calibrations.items()):
-        (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
-        rotvec = Rotation.from_matrix(np.array(camera.rotation)).as_rotvec()
-        lines += [
-            f"[cam_{index}]",
-            f'name = "{name}"',
-            f"size = {list(camera.image_size)}",
-            f"matrix = {[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]}",
-            f"distortions = {list(camera.distortion)}",
-            f"rotation = {rotvec.tolist()}",
-            f"translation = {list(camera.translation)}",
-            "fisheye = false",
-            "",
-        ]
-    lines += ["[metadata]", "adjusted = false", "error = 0.0", ""]
-    path.write_text("\n".join(lines), encoding="utf-8")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     NUMBER_LIMIT,
@@ -56,7 +56,7 @@ def read_calibration_xml(
         root = parse_xml(path.read_bytes())
     except (ValueError, OSError) as error:
         raise calibration_error(
-            str(path), "XML of Qualisys, Vicon or OptiTrack", str(error)
+            str(path), "XML of Qualisys, Vicon or OptiTrack", say_failure(error)
         ) from error
     readers = {
         "calibration": _read_qualisys,

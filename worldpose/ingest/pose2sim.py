@@ -10,7 +10,7 @@ from typing import Any, Final
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import LeftOut, camera_id
+from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
@@ -21,20 +21,23 @@ from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.files import read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
+from worldpose.ingest.camera_videos import (
+    copy_videos,
+    describe_videos,
+    find_videos,
+    require_cameras,
+)
 from worldpose.ingest.importing import (
     Placing,
     build_spec,
     camera_of,
-    copy_videos,
     describe_left_out,
     describe_people,
     find_people,
     fit_to_video,
-    list_videos,
 )
 from worldpose.ingest.writing import write_match
-from worldpose.video.files import index_frames
-from worldpose.video.names import is_video
+from worldpose.video.folder import index_video
 from worldpose.video.pictures import FrameIndex
 
 _SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
@@ -77,7 +80,7 @@ def import_pose2sim(
     calibration = _find_pose2sim_calibration(project)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
-    films = [file for file in sorted((project / "videos").glob("[!.]*")) if is_video(file)]
+    films = list(find_videos(project / "videos").values())
     if not places and not films:
         raise InputError(
             str(project),
@@ -85,7 +88,7 @@ def import_pose2sim(
             found="neither",
             todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
         )
-    known = {file: index_frames(file) for file in films}
+    known = {file: index_video(file) for file in films}
     left_out: LeftOut = {}
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
@@ -93,7 +96,8 @@ def import_pose2sim(
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        names = [camera_id(file.stem) for file in list_videos(project / "videos")]
+        require_cameras(project / "videos", {camera_of(file): file for file in films})
+        names = [camera_of(file) for file in films]
         source = project / "videos"
     else:
         shown = {camera_of(file): index.size for file, index in known.items()}
@@ -113,7 +117,9 @@ def import_pose2sim(
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
-    counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
+    clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
+    notes += describe_videos(videos, indices, clocks) if clocks else []
+    counts = map(len, clocks.values())
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}

@@ -15,7 +15,7 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.archives import write_archive
-from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.challenge import write_static_camera
 from worldpose.formats.joints_file import JointTracks, write_joints
 from worldpose.geometry.cameras import Camera

@@ -7,8 +7,8 @@ import pytest
 from calibration_writers import write_easymocap
 
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated

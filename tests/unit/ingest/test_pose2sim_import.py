@@ -10,8 +10,8 @@ from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import read_match
