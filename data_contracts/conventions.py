@@ -7,6 +7,19 @@ from __future__ import annotations
 
 from data_contracts.records import CONTRACT_VERSION, Record
 
+UNITS = {
+    "mm": (0.001, "millimetres"),
+    "cm": (0.01, "centimetres"),
+    "m": (1.0, "metres"),
+    "in": (0.0254, "inches"),
+    "ft": (0.3048, "feet"),
+    "yd": (0.9144, "yards"),
+    "km": (1000.0, "kilometres"),
+}
+"""Units of length by their sign: metres, and the name."""
+OTHER_UNITS = {name: metres for metres, name in UNITS.values() if metres != 1.0}
+"""Metres of the units by name in which a file may be that should be in metres."""
+
 _PAIRED = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 COCO17 = ("nose", *(f"{side}_{joint}" for joint in _PAIRED for side in ("left", "right")))
 """Joint order of every `keypoints` and `joints` array."""

@@ -44,7 +44,9 @@ class CameraChange(Record):
     std: float | None
     """Standard deviation of the displacement [px] or of the lateness [frame]; None if unknown."""
     is_explained: bool = True
-    """Whether this change explains its images; else its views are left out."""
+    """Whether this change explains its images."""
+    is_left_out: bool = False
+    """Whether its views within the clip are left out."""
 
 
 EXTRA_JOINTS = array_layouts(

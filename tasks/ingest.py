@@ -8,10 +8,12 @@ from pydantic import TypeAdapter
 from data_contracts.ingest import INGEST
 from tasks.unit import UnitInputs, unit_task
 from worldpose.formats.keypoint_files import read_people
+from worldpose.ingest.camera_videos import describe_gaps
 from worldpose.ingest.footage import UnitFrames, read_footage
 from worldpose.ingest.importing import describe_changes
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.store.writer import ResultWriter
+from worldpose.video.recordings import describe_video
 
 
 @unit_task
@@ -57,6 +59,9 @@ def _write_footage(inputs: UnitInputs, result: ResultWriter) -> None:
         _unit_frames(inputs),
         [(clip, first, count) for clip, (first, count) in sources["clips"].items()],
     )
+    result.warnings += describe_video(inputs.file("video"), footage.index)
+    if gaps := describe_gaps(footage.picture, footage.frame):
+        result.warnings.append(f"{inputs.unit}: {gaps}")
     inputs.require_registered("video")
     base = footage.index.time_base
     result.write(

@@ -41,6 +41,7 @@ from worldpose.tracking.plane.tracker import (
 )
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.world import doubt_world
 
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""
@@ -115,15 +116,15 @@ def _open_uncorrected(inputs: UnitInputs) -> Tracked:
 
 
 def _track_people(inputs: UnitInputs) -> Tracked:
-    clip = open_clip(inputs)
-    pitch = _pitch(inputs)
+    clip, pitch = open_clip(inputs), _pitch(inputs)
     settings = inputs.settings(TrackingSettings)
+    pitch_size = None if pitch is None else (pitch.length, pitch.width)
     tracks = track_people(
         clip.cameras,
         clip.detections,
         clip.fps,
         settings,
-        pitch_size=None if pitch is None else (pitch.length, pitch.width),
+        pitch_size=pitch_size,
         people=inputs.sources["people"],
         camera_covariance=clip.camera_covariance,
     )
@@ -147,7 +148,7 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             clip.detections,
             clip.fps,
             settings,
-            ground=pitch is not None,
+            pitch_size=pitch_size,
             births=tracks.report.births,
         )
         said = f"{inputs.recipe.name} found no person: {reason.message}"
@@ -164,11 +165,15 @@ def _track_people(inputs: UnitInputs) -> Tracked:
         elif found.on_plane.any():
             figures |= {name: number for name, number in further.items() if "plane" in name}
     warnings: tuple[str, ...] = (said,) if said else ()
+    name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
+    # With many detections left over, people are rays that meet by chance.
+    doubted = doubt_world(clip.cameras, tracks.joints, clip.fps, sizes=unmatched < 0.3)
+    warnings += tuple(f"{name}: {each}" for each in doubted)
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )
     if doubts is not None:
-        warnings += (f"{inputs.recipe.name}: {doubts}.",)
+        warnings += (f"{name}: {doubts}.",)
     return found, figures, warnings
 
 

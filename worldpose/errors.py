@@ -133,6 +133,20 @@ def require_memory(failure: BaseException, where: str = "") -> None:
         ) from failure
 
 
+def say_failure(failure: BaseException) -> str:
+    """Return what failed in plain words: no repr, no path, and no advice of another library."""
+    if isinstance(failure, OSError) and failure.strerror:
+        return failure.strerror
+    if isinstance(failure, UnicodeDecodeError):
+        return f"bytes that are not {failure.encoding.upper()}, from byte {failure.start} on"
+    if isinstance(failure, KeyError):
+        return f"no entry {failure.args[0]!r}" if failure.args else "a missing entry"
+    text = (str(failure).strip() or "nothing that can be read").splitlines()[0]
+    if isinstance(failure, AttributeError | TypeError | IndexError | AssertionError):
+        return "values of another kind, or too few"
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
 class StoreError(WorldposeError):
     """The store cannot read or write a result."""
 

@@ -1,4 +1,4 @@
-"""Python literals and sources, and npy arrays, parsed also while other threads parse.
+"""Python literals and sources, npy arrays, and cells of tables, parsed also while others parse.
 
 Python 3.11 keeps one recursion depth for the syntax trees of all threads (python/cpython issue
 106905). If a thread begins a tree while another thread is within one, the other one ends with a
@@ -8,6 +8,8 @@ file. The headers are read here without a tree; Python text is parsed through `p
 
 from __future__ import annotations
 
+import codecs
+import csv
 import math
 import re
 import zipfile
@@ -19,6 +21,8 @@ from typing import IO, Any, Final, TypeVar
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
+
+from worldpose.errors import InputError, say_failure
 
 Result = TypeVar("Result")
 
@@ -114,3 +118,70 @@ def read_npz_members(path: Path, names: Collection[str]) -> dict[str, NDArray[An
                 with file.open(found[name]) as member:
                     arrays[name] = read_npy(member)
         return arrays
+
+
+DECIMAL_COMMA: Final = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+DECIMAL_POINT: Final = re.compile(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?")
+
+
+def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[str]]], bool]:
+    """Return the rows of a table as spreadsheets save it, and whether it has decimal commas.
+
+    Text is UTF-8, UTF-16 with its mark, or Windows-1252; cells are separated by commas, semicolons
+    or tabs. Rows are numbered from 1; empty ones, and empty columns at the end, are left out.
+
+    Args:
+        path: the file.
+        limit: maximum size [byte].
+        todo: what to do about another file, for messages.
+
+    Raises:
+        InputError: no such file, too large, a workbook in place of text, or no table.
+    """
+    try:
+        if not path.is_file():
+            raise ValueError("something else" if path.exists() else "nothing")
+        if path.stat().st_size > limit:
+            raise ValueError(f"{path.stat().st_size} bytes, more than {limit}")
+        content = path.read_bytes()
+        if content.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
+            raise ValueError("a workbook, not text: save it as CSV")
+        text = _decode_table(content)
+        lines = text.splitlines()
+        hint = re.fullmatch(r"sep=(.)\W*", lines[0]) if lines else None  # of Excel
+        if hint is not None:
+            lines[0] = ""
+        first = next((each for each in lines if each.strip()), "")
+        separator = hint[1] if hint is not None else max(",;\t", key=first.count)
+        cells = enumerate(csv.reader(lines, delimiter=separator), 1)
+        rows = [(number, row) for number, row in cells if any(map(str.strip, row))]
+        width = max(
+            (n for _, row in rows for n, cell in enumerate(row, 1) if cell.strip()), default=0
+        )
+        rows = [(number, row[:width]) for number, row in rows]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(
+            str(path), expected="text in rows and columns", found=say_failure(error), todo=todo
+        ) from error
+    numbers = [cell.strip() for _, row in rows for cell in row]
+    has_commas = separator != "," and any(DECIMAL_COMMA.fullmatch(cell) for cell in numbers)
+    if has_commas and any(DECIMAL_POINT.fullmatch(cell) for cell in numbers):
+        raise InputError(
+            str(path),
+            expected="one decimal sign",
+            found="numbers with a point and numbers with a comma",
+            todo="Save the table with one decimal sign, and without signs between thousands.",
+        )
+    return rows, has_commas
+
+
+def _decode_table(content: bytes) -> str:
+    """Return the text of a table."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16")
+    if b"\0" in content:
+        raise ValueError("bytes that are no text")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from data_contracts.arrays import Image
-from flows.cli.console import JsonOption, line, print_json, print_table
+from flows.cli.console import JsonOption, errors, line, print_json, print_table
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.video.names import is_video
 
@@ -74,7 +75,7 @@ def calibrate(
     fits = {}
     files: dict[str, list[str]] = {}
     for name, place in _cameras(boards, camera).items():
-        views, size, files[name] = _read_views(place, board, every)
+        views, size, files[name] = _find_boards(name, place, board, every)
         fits[name] = calibrate_lens(name, views, size)
     with whole_file(out) as draft:
         write_lens_toml(draft, {name: fit.lens for name, fit in fits.items()})
@@ -116,6 +117,26 @@ def _camera_name(place: Path) -> str:
 
 def _images(folder: Path) -> list[Path]:
     return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in IMAGES]
+
+
+def _find_boards(
+    name: str, place: Path, board: Board, every: float
+) -> tuple[list[BoardView | None], tuple[int, int], list[str]]:
+    """Return what `_read_views` finds, where the numbers are perhaps those of the squares."""
+    from worldpose.static_calibration.boards import MIN_VIEWS
+
+    found = _read_views(place, board, every)
+    if board.dictionary is None and sum(view is not None for view in found[0]) < MIN_VIEWS:
+        inner = replace(board, columns=board.columns - 1, rows=board.rows - 1)
+        other = _read_views(place, inner, every) if min(board.columns, board.rows) > 3 else found
+        if sum(view is not None for view in other[0]) >= MIN_VIEWS:
+            line(
+                f"{name}: the board has {inner.columns} x {inner.rows} inner corners; "
+                f"{board.columns} x {board.rows} is its number of squares",
+                to=errors,
+            )
+            return other
+    return found
 
 
 def _read_views(

@@ -179,6 +179,7 @@ def import_command(
     detections: Path | None = None,
     videos: Path | None = None,
     boxes: Path | None = None,
+    join: Annotated[bool, typer.Option("--join")] = False,
     pose2sim: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     fps: float | None = None,
     match_id: str | None = None,
@@ -187,6 +188,8 @@ def import_command(
     camera: str | None = None,
     lens: list[Path] | None = None,
     left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
+    unit: str | None = None,
+    up: str | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
@@ -196,12 +199,15 @@ def import_command(
     Options:
         out: Match folder to create or to extend.
         calibration: Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys,
-            Vicon, OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera.
-        detections: Folder of COCO or AlphaPose results, <camera>.json, or of a folder of
-            OpenPose JSON for each camera.
-        videos: Folder of videos in place of 2D poses, <camera>.mp4.
+            Vicon, OptiTrack, OpenCap, EasyMocap, bioCV, Panoptic Studio, multical, Kalibr or
+            OpenPose, or the folder of one file per camera.
+        detections: Folder of COCO, AlphaPose, MMPose or Ultralytics results, <camera>.json,
+            or of a folder of JSON for each frame (OpenPose and the others) for each camera.
+        videos: Folder of videos in place of 2D poses, <camera>.mp4, or of a folder of
+            images for each camera.
         boxes: With --videos, or for the videos of a match folder: people's boxes, in which only
             poses are estimated: folder of MOTChallenge lines, <camera>.txt.
+        join: With --videos: join the chapters of one recording (GX010001, GX020001).
         pose2sim: Trial of Pose2Sim: Config.toml, calibration/, pose/ with OpenPose JSON,
             videos/.
         fps: Frames per second.
@@ -211,9 +217,13 @@ def import_command(
             name of a point or marking of the pitch, or a position in metres.
         camera: With --clicks or --lens: the camera, or the clip of the broadcast camera; by
             default, images and lenses are named after cameras.
-        lens: Lens without a pose: OpenCV XML or YAML, ROS YAML, npz, matrix and distortion as
-            two .npy files, or TOML.
+        lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
+            pickle, matrix and distortion as two .npy files, or TOML.
         left_handed: The survey's x, y and height are left-handed.
+        unit: Unit of the calibration's positions: mm, cm, m, in, ft, yd, km, or its metres, such as
+            0.08. By default people's stature tells it.
+        up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
+            By default people who stand tell it.
     """
     options = {
         "--calibration": calibration,
@@ -228,11 +238,19 @@ def import_command(
         "--camera": camera,
         "--lens": lens,
         "--left-handed": left_handed,
+        "--unit": unit,
+        "--up": up,
+        "--join": join,
     }
     given = {name for name, value in options.items() if value}
     kind = next((name for name in ALONE if name in given), None)
     if kind is not None:
         _require_alone(kind, given)
+    place = None
+    if kind in (None, "--pose2sim"):
+        from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
+
+        place = place_as_stated(unit, up)
     if kind == "--boxes" and boxes is not None:
         counts = import_boxes(boxes, out)
         lines = (f"wrote {out / 'boxes' / name}.txt: {n} boxes" for name, n in counts.items())
@@ -244,11 +262,18 @@ def import_command(
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
-        spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id)
+        spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
         _print_match(spec, out, notes, as_json=as_json)
     elif videos is not None and detections is None:
         spec, notes = import_videos(
-            calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes
+            calibration,
+            videos,
+            out,
+            fps=fps,
+            match_id=match_id,
+            boxes=boxes,
+            place=place,
+            join=join,
         )
         _print_match(spec, out, notes, as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
@@ -259,13 +284,18 @@ def import_command(
             todo="Read the help: worldpose import --help.",
         )
     else:
-        spec, notes = import_match(calibration, detections, fps, out, match_id=match_id)
+        spec, notes = import_match(
+            calibration, detections, fps, out, match_id=match_id, place=place
+        )
         _print_match(spec, out, notes, as_json=as_json)
 
 
 ALONE: Final = {
     "--boxes": ("with --videos, or with --out alone", ()),
-    "--pose2sim": ("with --out, and --fps or --match-id", ("--fps", "--match-id")),
+    "--pose2sim": (
+        "with --out, and --fps, --match-id, --unit or --up",
+        ("--fps", "--match-id", "--unit", "--up"),
+    ),
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
     "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
     "--camera": ("with --clicks or --lens", ()),

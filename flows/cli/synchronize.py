@@ -16,6 +16,7 @@ from flows.cli.console import (
     JsonOption,
     MatchArgument,
     ProjectOption,
+    errors,
     line,
     print_json,
     print_table,
@@ -59,6 +60,8 @@ class Proposal(NamedTuple):
     """The offset for match.yaml [frame]: whole, or pairs where it changes within the clip."""
     reason: str
     """Why it is not known; empty where it is."""
+    relative_to: str | None = None
+    """The camera of its group whose offset stays; None where it is not known."""
 
 
 def synchronize(
@@ -111,17 +114,17 @@ def synchronize(
     )
     known = np.isfinite(found.late)
     courses: list[Course] = [[(0, float(late))] for late in found.late]
-    if np.count_nonzero(known) > 2:
-        chosen = np.flatnonzero(known)
-        arrays = {name: array[:, chosen] for name, array in detections.arrays().items()}
+    size = None if pitch is None else (pitch.length, pitch.width)
+    for group in (np.array(each) for each in found.groups if len(each) > 2):
+        arrays = {name: array[:, group] for name, array in detections.arrays().items()}
         some = detections.with_arrays(arrays, detections.frame)
-        size = None if pitch is None else (pitch.length, pitch.width)
-        late = found.late[chosen]
-        traced = trace_clocks(cameras[chosen], some, spec.fps, late, pitch_size=size)
-        for c, course in zip(chosen, traced, strict=True):
+        late = found.late[group]
+        traced = trace_clocks(cameras[group], some, spec.fps, late, pitch_size=size)
+        for c, course in zip(group.tolist(), traced, strict=True):
             courses[c] = course
     clip_spec = spec.clip(chosen_clip)
-    rows = [_propose(spec, clip_spec, name, courses, c, found) for c, name in enumerate(names)]
+    rows = [_propose(spec, clip_spec, names, courses, c, found) for c in range(len(names))]
+    apart = [", ".join(names[c] for c in group) for group in found.groups]
     if plot is not None:
         draw_synchronization(found, names, plot)
     changed = {row.camera: row.proposed for row in rows if row.proposed != row.stated}
@@ -139,25 +142,32 @@ def synchronize(
         )
     else:
         _print(rows, changed, plot, applied=apply)
-    raise typer.Exit(0 if known.all() else 4)
+    if len(apart) > 1:
+        line(
+            f"warning: {len(apart)} groups of cameras share no person: {'; '.join(apart)}. Offsets "
+            "are relative to the first camera of each group; those between groups are unknown.",
+            to=errors,
+        )
+    raise typer.Exit(0 if known.all() and len(apart) == 1 else 4)
 
 
 def _propose(
     spec: MatchSpec,
     clip: ClipSpec,
-    name: str,
+    names: list[str],
     courses: list[Course],
     c: int,
     found: Synchronization,
 ) -> Proposal:
-    """Return the proposal of a camera: the first one that is known keeps its offset."""
+    """Return the proposal of a camera: the first one of its group keeps its offset."""
+    name = names[c]
     unit, stated = unit_frames(spec, name), spec.camera(name).offset_frames
     if not isinstance(stated, tuple):
         stated = int(stated)
-    known = np.isfinite(found.late)
-    if not known[c]:
+    if not np.isfinite(found.late[c]):
         return Proposal(name, stated, None, None, stated, found.reasons[c])
-    reference = courses[int(np.argmax(known))]
+    first = next(group[0] for group in found.groups if c in group)
+    reference = courses[first]
     pairs = unit.offset if isinstance(unit.offset, tuple) else ()
     inside = [frame - clip.first_frame for frame, _ in pairs]
     inside = [row for row in inside if 0 <= row < clip.frame_count]
@@ -167,7 +177,7 @@ def _propose(
     exact = exact_frames(frame, unit.offset) - frame - late
     is_known = isinstance(stated, tuple) and np.abs(late).max() < MIN_OFFSET_FRAMES
     proposed = stated if is_known else simplest_offset(frame, exact)
-    return Proposal(name, stated, float(exact[0]), float(found.std[c]), proposed, "")
+    return Proposal(name, stated, float(exact[0]), float(found.std[c]), proposed, "", names[first])
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:
@@ -247,7 +257,7 @@ def _print(
             "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
             "-" if row.std is None else f"{row.std:.2f}",
             "-" if row.found is None else _offset_text(row.proposed),
-            row.reason,
+            row.reason if row.relative_to is None else f"relative to {row.relative_to}",
         )
         for row in rows
     ]

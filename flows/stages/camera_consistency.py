@@ -10,10 +10,16 @@ from worldpose.camera_consistency.settings import ConsistencySettings
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip, whether it has a pitch, and the stated clock offsets of the cameras."""
-    spec = match.folder.spec
+    """Return the clip, whether it has a pitch, stated clock offsets, stills of given cameras."""
+    spec, folder = match.folder.spec, match.folder
+    stills: dict[str, JsonValue] = {
+        name: match.file_sources("still", still)
+        for name, still in folder.stills.items()
+        if name in folder.calibrations and folder.pitch is not None
+    }
     return {
         **tracking.clip_sources(match, unit),
+        **({"stills": stills, "pitch": match.pitch_source} if stills else {}),
         "ground": match.folder.pitch is not None,
         "offset_frames": [
             None if isinstance(camera.offset_frames, tuple) else camera.offset_frames

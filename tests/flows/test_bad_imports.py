@@ -8,7 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from flows.cli.app import app
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.video.files import write_video
 
 CALIBRATION = """
@@ -194,9 +195,30 @@ def test_a_full_disk_leaves_no_match(lab, monkeypatch):
     def full(source, target):
         raise OSError(errno.ENOSPC, "No space left on device", str(target))
 
-    monkeypatch.setattr("worldpose.ingest.importing.shutil.copyfile", full)
+    monkeypatch.setattr("worldpose.ingest.camera_videos.shutil.copyfile", full)
     given = ["import", "--videos", str(lab / "videos"), "--out", str(lab / "new" / "out")]
     result = CliRunner().invoke(app, given)
     assert isinstance(result.exception, InputError), result.exception
     assert "No space left on device" in str(result.exception)
     assert not (lab / "new").exists() or not list((lab / "new").iterdir())
+
+
+def test_a_stated_unit_and_axis_hold_and_absurd_distances_are_refused(lab):
+    (lab / "videos").mkdir()
+    for name in ("a.mp4", "b.mp4"):
+        write_video(lab / "videos" / name, [np.zeros((48, 64, 3), np.uint8)] * 5, 25.0)
+    far = lab / "far.toml"
+    far.write_text(CALIBRATION.replace("4.0]", "400.0]").replace("[0.0, 1.0, 0.0]", "[0, 3.1, 0]"))
+    videos, out = ("--videos", lab / "videos"), ("--out", lab / "out")
+    assert "--unit mm" in refuse("--calibration", far, *videos, *out)
+    given = ("import", "--calibration", far, *videos, *out, "--unit", "cm", "--up", "-y", "--json")
+    answer = CliRunner().invoke(app, list(map(str, given)))
+    assert (
+        "centimetres, as stated; up is -y, turned by 90.0" in json.loads(answer.output)["notes"][0]
+    )
+    found = read_calibration(lab / "out" / "calibration.toml")["a"]
+    np.testing.assert_allclose(found.translation, [0.0, 0.0, 4.0], atol=1e-12)
+    np.testing.assert_allclose(np.array(found.rotation)[:, 2], [0.0, -1.0, 0.0], atol=1e-12)
+    for option, value in (("--unit", "cm"), ("--up", "y")):
+        result = CliRunner().invoke(app, list(map(str, ("import", *videos, *out, option, value))))
+        assert isinstance(result.exception, UsageError)

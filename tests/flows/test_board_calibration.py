@@ -70,6 +70,15 @@ def test_images_and_a_video_become_lenses(boards, tmp_path):
     assert "a: 9.png is left out: no whole board found" in shown
 
 
+def test_squares_in_place_of_corners_are_told(boards, tmp_path):
+    out = tmp_path / "lenses.toml"
+    options = ("--columns", "8", "--rows", "5", "--square", "0.06", "--camera", "a")
+    result = calibrate(boards, *options, "--out", out)
+    assert "a: the board has 7 x 4 inner corners; 8 x 5 is its number of squares" in result.stderr
+    lens = read_lens_toml(out, {"a": SIZE})["a"]
+    assert lens.focal_px == pytest.approx(FOCAL, abs=max(3.0, 4.0 * lens.focal_std_px))
+
+
 @pytest.mark.parametrize(
     ("place", "options", "kind", "told"),
     [

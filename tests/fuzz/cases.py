@@ -13,6 +13,7 @@ from . import (  # noqa: F401 - they register
     camera_kinds,
     click_kinds,
     file_kinds,
+    form_kinds,
     people_kinds,
     service_kinds,
 )
@@ -32,10 +33,10 @@ from .service_kinds import ROUTES, Project, ask_all, routes, use_store
 
 WEIGHTS = {
     **{"camera": 3, "clicks": 4, "people": 4, "clips": 3, "toml": 3, "pitch": 2, "settings": 2},
-    **{"ids": 1, "bytes": 3, "video": 1, "store": 2, "request": 2},
+    **{"ids": 1, "bytes": 3, "video": 1, "store": 2, "request": 2, "forms": 3},
 }
 """How often a case begins with a kind of each group: what reaches the stages comes more often."""
-FURTHER = ("camera", "clicks", "people", "clips", "toml", "pitch")
+FURTHER = ("camera", "clicks", "people", "clips", "toml", "pitch", "forms")
 """Groups from which most further kinds of a combination come: others end most matches at once."""
 
 

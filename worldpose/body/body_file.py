@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.conventions import OTHER_UNITS
 from worldpose.body.model import POSE_FEATURES, SMPL_VERTICES, BodyModel
 from worldpose.errors import InputError, UsageError
 from worldpose.parsing import read_npz_members
@@ -230,10 +231,26 @@ def install_body(file: Path, folder: Path | None = None, name: str | None = None
             found=f"{counts[0]}, {counts[1]} and {model.shapes}",
             todo="Take SMPL's file, not that of SMPL-H, SMPL-X or another model.",
         )
+    _require_metres(file, float(np.ptp(model.template, axis=0).max()))
     path = body_path(model_name, folder)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_body(path, model)
     return load_body(path)
+
+
+def _require_metres(file: Path, span: float) -> None:
+    """Raise InputError if a body's template, whose largest span is given, is not in metres."""
+    least, most = 0.4, 2.6  # an infant, and an adult with spread arms
+    if least <= span <= most:
+        return
+    fits = [name for name, metres in OTHER_UNITS.items() if 1.4 <= span * metres <= most]
+    raise InputError(
+        f"{file}: v_template",
+        expected=f"a body in metres, {least:g} to {most:g} in its largest span",
+        found=f"{span:.4g}, as of {fits[0]}" if fits else f"{span:.4g}",
+        todo="Give SMPL's file as downloaded, or bring v_template, shapedirs and posedirs to "
+        "metres.",
+    )
 
 
 def body_path(name: str, folder: Path | None = None) -> Path:

@@ -32,13 +32,13 @@ from worldpose.bundle_adjustment.solver import solve
 from worldpose.bundle_adjustment.uncertainty import (
     add_shared_errors,
     align_points,
-    move_cameras,
     relative_covariance,
     survey_response,
 )
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.world import move_cameras
 
 _SMALL_RIG: Final = 4
 """Maximum cameras of a rig in which cameras with a covariance change together or not at all [1]:

@@ -33,12 +33,12 @@ from worldpose.bundle_adjustment.residuals import (
     keypoint_information,
     player_residuals,
 )
-from worldpose.bundle_adjustment.uncertainty import move_cameras, relative_covariance
+from worldpose.bundle_adjustment.uncertainty import relative_covariance
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Similarity
 from worldpose.static_calibration.boards import image_coverage
-from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
+from worldpose.triangulation.noise_model import PERSONAL
+from worldpose.triangulation.world import Walkers, move_cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,20 +129,20 @@ def locate_cameras(
                 f"people who determine its position within {100 * max_std:.0f} % of their distance",
                 f"{100 * std / far:.0f} %",
             )
-    people = _People.of(observed, detections.frame if len(detections.frame) else None, fps)
-    scale, scale_std = people.scale(adjusted.cameras, known)
-    world = people.orient(scale)
+    people = _walkers(observed, detections.frame if len(detections.frame) else None, fps)
+    scale, scale_std = _scale(people, adjusted.cameras, known)
+    world, vertical_std, on_feet = people.orient(scale)
     shown = [observed.image[observed.camera_of == c] for c in range(len(names))]
     std = relative * [scale, 1.0, 1.0]
     off = np.linalg.norm(player_residuals(adjusted.cameras, observed.points, observed), axis=1)
     return CamerasFromPeople(
-        cameras=move_cameras(world.similarity, adjusted.cameras),
+        cameras=move_cameras(world, adjusted.cameras),
         std=std,
         scale_std=scale_std,
         # A rig that is bent tilts the vertical, too.
-        up_std=float(np.hypot(world.std, np.median(std[:, 1]))),
-        on_feet=world.on_feet,
-        stature_m=scale * people.stature(),
+        up_std=float(np.hypot(vertical_std, np.median(std[:, 1]))),
+        on_feet=on_feet,
+        stature_m=scale * float(np.median(people.statures())),
         people=len(np.unique(observed.person_of)),
         keypoints=np.bincount(observed.camera_of, minlength=len(names)),
         residual_px=_by_camera(off, observed.camera_of, len(names)),
@@ -244,131 +244,24 @@ def _held_out(
     return _by_camera(np.concatenate(off), np.concatenate(camera_of), count)
 
 
-def _mean_direction(vectors: Floats) -> Floats:
-    """Return the unit vector (3,) of vectors (frames, persons, 3), the median of each axis."""
-    known = vectors[np.isfinite(vectors).all(axis=-1)]
-    middle = np.median(known / np.linalg.norm(known, axis=1, keepdims=True), axis=0)
-    return np.asarray(middle / np.linalg.norm(middle))
+def _walkers(observed: Observations, frame: Integers | None, fps: float) -> Walkers:
+    """Return the people of adjusted observations, in the unit of the adjustment."""
+    rows, row_of = np.unique(observed.frame_of, return_inverse=True)
+    persons = int(observed.person_of.max()) + 1
+    joints = np.full((len(rows), persons, 17, 3), np.nan)
+    joints[row_of, observed.person_of, JOINTS[observed.joint_of]] = observed.points[
+        observed.point_of
+    ]
+    return Walkers(joints, rows if frame is None else frame[rows], fps)
 
 
-class _World(NamedTuple):
-    similarity: Similarity
-    std: float
-    on_feet: bool
-
-
-class _People(NamedTuple):
-    """Joints of people in units of the adjustment; NaN where missing."""
-
-    joints: Floats
-    """(frames, persons, 17, 3)"""
-    frames: Integers
-    """(frames,) rows of the clip."""
-    fps: float
-
-    @classmethod
-    def of(cls, observed: Observations, frame: Integers | None, fps: float) -> _People:
-        """Return the people of adjusted observations."""
-        rows, row_of = np.unique(observed.frame_of, return_inverse=True)
-        persons = int(observed.person_of.max()) + 1
-        joints = np.full((len(rows), persons, 17, 3), np.nan)
-        joints[row_of, observed.person_of, JOINTS[observed.joint_of]] = observed.points[
-            observed.point_of
-        ]
-        return cls(joints, rows if frame is None else frame[rows], fps)
-
-    def stature(self) -> float:
-        """Return the people's stature by limbs and trunk, the median of all."""
-        return float(np.median([self._stature(p) for p in range(self.joints.shape[1])]))
-
-    def _stature(self, person: int) -> float:
-        found, weight = [], []
-        for each in PROPORTIONS:
-            # Detectors place hips and shoulders at various breadths.
-            if each.spread > 0.06:
-                continue
-            lengths = []
-            for ends in each.ends:
-                first, second = (self.joints[:, person, list(end)].mean(axis=1) for end in ends)
-                lengths.append(np.linalg.norm(first - second, axis=1))
-            known = np.concatenate(lengths)
-            known = known[np.isfinite(known)]
-            if len(known):
-                found.append(float(np.median(known)) / each.share)
-                # A detector's label is not the joint's centre.
-                offset = (0.024 / (each.share * STATURE[0])) ** 2 * each.offsets
-                weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
-        return float(np.average(found, weights=weight))
-
-    def scale(self, cameras: Camera, known: KnownLength) -> tuple[float, float]:
-        """Return metres per unit and their relative deviation."""
-        if known.cameras is not None:
-            a, b = known.cameras
-            apart = float(np.linalg.norm(cameras.center[a] - cameras.center[b]))
-            return known.length_m / apart, known.std_m / known.length_m
-        statures = np.array([self._stature(p) for p in range(self.joints.shape[1])])
-        return known.length_m / float(np.median(statures)), float(
-            np.hypot(PERSONAL, known.std_m / known.length_m) / np.sqrt(len(statures))
-        )
-
-    def orient(self, scale: float) -> _World:
-        """Return the transform to the world, with the vertical's deviation [rad]."""
-        joints = scale * self.joints
-        shoulders, hips = joints[:, :, [5, 6]].mean(axis=2), joints[:, :, [11, 12]].mean(axis=2)
-        ankles = joints[:, :, [15, 16]]
-        trunk, legs = _mean_direction(shoulders - hips), _mean_direction(hips - ankles.mean(axis=2))
-        lean = (trunk + legs) / np.linalg.norm(trunk + legs)
-        # A person bent at the hips is not upright: trunk and legs then disagree.
-        bent = float(np.arccos(np.clip(trunk @ legs, -1.0, 1.0)))
-        # Mean lean of people who walk [rad].
-        lean_std = float(np.hypot(0.07, 0.5 * bent))
-        up = lean
-        feet = self._standing_feet(ankles)
-        for _ in range(5):
-            spread = feet - (feet.mean(axis=0) if len(feet) else 0.0)
-            off = spread @ up
-            # 3 cm: a foot that rolls off lifts its ankle.
-            weight = 1.0 / (0.03**2 + (off / 3.0) ** 2)
-            level = np.eye(3) - np.outer(up, up)
-            information = level @ (weight * spread.T) @ spread @ level + level / lean_std**2
-            slope = level @ (spread.T @ (weight * off) + (up - lean) / lean_std**2)
-            up = up - np.linalg.lstsq(information, slope, rcond=1e-9)[0]
-            up = up / np.linalg.norm(up)
-        values = np.linalg.eigvalsh(information)[1:]
-        places = hips.reshape(-1, 3)[np.isfinite(hips.reshape(-1, 3)).all(axis=1)]
-        middle = np.median(places, axis=0)
-        lowest = ankles.reshape(-1, 3) @ up
-        ground = np.median(feet @ up) if len(feet) else np.nanquantile(lowest, 0.05)
-        # Height of a standing foot's ankle, by the stature.
-        height = 0.045 * scale * self.stature()
-        origin = middle + (ground - height - middle @ up) * up
-        x = np.linalg.svd((places - middle) @ (np.eye(3) - np.outer(up, up)))[2][0]
-        x = x - (x @ up) * up
-        x = x / np.linalg.norm(x)
-        rotation = np.stack([x, np.cross(up, x), up])
-        return _World(
-            Similarity(np.array(scale), rotation, -rotation @ origin),
-            float(1.0 / np.sqrt(values.min())),
-            bool(values.min() > 2.0 / lean_std**2),
-        )
-
-    def _standing_feet(self, ankles: Floats) -> Floats:
-        """Return the mean ankle (n, 3) [m] of each time that a foot stands."""
-        time = self.frames / self.fps
-        # The speed of an ankle is measured over 0.2 s.
-        half = max(1, round(0.5 * 0.2 / float(np.median(np.diff(time)))))
-        if len(time) <= 2 * half:
-            return np.empty((0, 3))
-        gap = (time[2 * half :] - time[: -2 * half])[:, None, None]
-        moved = np.linalg.norm(ankles[2 * half :] - ankles[: -2 * half], axis=-1)
-        # A foot with a slower ankle stands.
-        still = np.nan_to_num(moved / gap, nan=np.inf) < 0.4
-        found = []
-        for person, side in np.ndindex(still.shape[1:]):
-            rows = np.flatnonzero(still[:, person, side]) + half
-            for part in np.split(rows, np.flatnonzero(np.diff(rows) > half) + 1):
-                there = ankles[part, person, side]
-                there = there[np.isfinite(there[:, 0])]
-                if len(there):
-                    found.append(there.mean(axis=0))
-        return np.array(found).reshape(-1, 3)
+def _scale(people: Walkers, cameras: Camera, known: KnownLength) -> tuple[float, float]:
+    """Return metres per unit and their relative deviation."""
+    if known.cameras is not None:
+        a, b = known.cameras
+        apart = float(np.linalg.norm(cameras.center[a] - cameras.center[b]))
+        return known.length_m / apart, known.std_m / known.length_m
+    statures = people.statures()
+    return known.length_m / float(np.median(statures)), float(
+        np.hypot(PERSONAL, known.std_m / known.length_m) / np.sqrt(len(statures))
+    )

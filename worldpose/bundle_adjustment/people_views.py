@@ -192,16 +192,39 @@ class Views:
                 f"two cameras that show one person for {MIN_FRAMES} frames",
                 "none whose joints agree",
             )
-        errors: list[InputError] = []
-        found = []
-        for pair in good[:3]:
-            try:
-                found.append(self._grow(pair))
-            except InputError as error:
-                errors.append(error)
+        found, groups = list[Start](), list[tuple[int, ...]]()
+        for pair in good:
+            if len(groups) >= 3 and found:
+                break
+            poses, shown = self._grow(pair)
+            groups.append(tuple(sorted(poses)))
+            if len(poses) == len(self.names):
+                found.append(self._start(poses, shown))
         if not found:
-            raise errors[0]
+            raise self._explain_groups(sorted(groups, key=len, reverse=True))
         return found
+
+    def _explain_groups(self, groups: list[tuple[int, ...]]) -> InputError:
+        """Return the error of cameras that could not be joined, the largest groups first."""
+        apart: list[tuple[int, ...]] = []
+        for group in groups:
+            if not any(set(group) & set(other) for other in apart):
+                apart.append(group)
+        named = [", ".join(self.names[c] for c in group) for group in sorted(apart)]
+        rest = [name for c, name in enumerate(self.names) if c not in apart[0]]
+        if len(apart) == 1:
+            return refusal(
+                rest,
+                f"a person for {MIN_FRAMES} frames that the others show at the same time",
+                "none whose joints agree",
+            )
+        return InputError(
+            "cameras from people",
+            expected="a person whom cameras of all groups show at the same time",
+            found=f"{len(apart)} groups that share no person: {'; '.join(named)}",
+            todo="Locate one group at a time: take the others out of match.yaml. Or film a person "
+            "who walks from one group's view into the other's.",
+        )
 
     def _pair(self, a: int, b: int) -> _Pair | None:
         """Return the pose of b by its people; None if no person is in both cameras."""
@@ -270,8 +293,11 @@ class Views:
         chosen = zip(*linear_sum_assignment(-share), strict=True)
         return [(int(i), int(j)) for i, j in chosen if share[i, j] >= MIN_AGREEMENT]
 
-    def _grow(self, pair: _Pair) -> Start:
-        """Return all cameras, added to a pair one by one, the one with the most joints first."""
+    def _grow(self, pair: _Pair) -> tuple[dict[int, Rigid], list[dict[int, int]]]:
+        """Return the cameras that share people with a pair, and each person's tracks in them.
+
+        They are added one by one, the one with the most joints first.
+        """
         a, b = pair.cameras
         poses = {a: Rigid(np.eye(3), np.zeros(3)), b: pair.pose}
         shown = [{a: i, b: j} for i, j in pair.people]
@@ -283,15 +309,15 @@ class Views:
             chosen = max(rest, key=lambda c: candidates[c][0])
             agree, pose, tracks = candidates[chosen]
             if not agree or pose is None:
-                raise refusal(
-                    [self.names[c] for c in rest],
-                    f"a person for {MIN_FRAMES} frames that the others show at the same time",
-                    "none whose joints agree",
-                )
+                break
             poses[chosen] = pose
             for person, track in tracks.items():
                 shown[person][chosen] = track
             poses = self._refine(poses, shown)
+        return poses, shown
+
+    def _start(self, poses: dict[int, Rigid], shown: list[dict[int, int]]) -> Start:
+        """Return all cameras with their poses, and the joints that they see."""
         order = list(range(len(self.names)))
         cameras = self._place(order, poses)
         observed = self._observe(order, cameras, shown, poses)

@@ -20,7 +20,7 @@ from worldpose.bundle_adjustment.clip import Clip
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.covariance import invert_free
 from worldpose.geometry.optimize.losses import cauchy_weight
-from worldpose.geometry.rigid import Rigid, Similarity, align
+from worldpose.geometry.rigid import Similarity, align
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
     project_lines,
@@ -32,14 +32,6 @@ from worldpose.static_calibration.settings import LineRefinementSettings
 
 SIMILARITY: Final = 7
 """Degrees of freedom: translation, rotation, scale."""
-
-
-def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
-    """Return the cameras (cameras,) that see transformed points in the same pixels."""
-    pose = cameras.cam_from_world
-    rotation = pose.rotation @ motion.rotation.T
-    translation = motion.scale * pose.translation - rotation @ motion.translation
-    return replace(cameras, cam_from_world=Rigid(rotation, translation))
 
 
 def align_points(points: Floats, targets: Floats) -> Similarity:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -10,13 +11,14 @@ import numpy as np
 from data_contracts.arrays import ClipArray, Floats
 from data_contracts.camera_consistency import CameraFault
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency.comparison import Comparison
+from worldpose.camera_consistency.comparison import MIN_JOINTS, Comparison
 from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis, Fault
 from worldpose.camera_consistency.hypotheses import OFF_AXIS
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.tracking.diagnosis import match_pair, usable_rays
 
 
 def check_consistency(
@@ -77,7 +79,35 @@ def check_consistency(
             noise[c] = math.hypot(noise[c], _calibration_noise(cameras[c], covariance[c]))
     comparison = Comparison(cameras, noise, points, ground, settings)
     comparison.fit_noise()
-    return Diagnosis(comparison, fps, given, tilt, focal_error).run()
+    found = Diagnosis(comparison, fps, given, tilt, focal_error).run()
+    return _judge_most(cameras, found, comparison.people_seen, detections[part])
+
+
+def _judge_most(
+    cameras: Camera, found: Consistency, seen: Floats, detections: KeypointDetections
+) -> Consistency:
+    """Return the result without faults of single cameras if most cameras fit no other one.
+
+    A correction that lets a camera agree with others speaks for them. Else their calibration is
+    another match's, or their world has another unit or axis, in which people still lie on each
+    other's epipolar lines.
+    """
+    share = found.agreement / np.maximum(1.0, np.minimum(seen[:, None], seen))
+    judged = np.flatnonzero(seen >= 0.5)
+    explained = {fault.camera for fault in found.faults if (fault.share_corrected or 0.0) > 0.5}
+    weak = [c for c in judged if share[c].max() < 0.35 and c not in explained]
+    if len(judged) < 3 or 2 * len(weak) <= len(judged):
+        return found
+    rays = usable_rays(cameras, detections, MIN_JOINTS)
+    agree = np.zeros(len(seen), dtype=np.bool_)
+    for pair in itertools.combinations(judged.tolist(), 2):
+        if match_pair(cameras, rays, pair, 0, MIN_JOINTS).agrees:
+            agree[list(pair)] = True
+    alone = tuple(judged[~agree[judged]].tolist())
+    every = tuple(range(len(seen)))
+    return Consistency(
+        (), (), every, found.agreement, alone if 2 * len(alone) > len(judged) else ()
+    )
 
 
 def select_busiest_frames(confidence: ClipArray, longest: int) -> slice:

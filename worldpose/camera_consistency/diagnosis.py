@@ -78,12 +78,15 @@ class Consistency:
         confirmed: cameras in agreement with others.
         unconfirmed: cameras without people in common with others, which cannot be checked.
         agreement: (cameras, cameras) matches of two cameras above chance [persons per frame].
+        strangers: cameras whose people fit those of no other camera, if these are most cameras:
+            then none of them is diagnosed.
     """
 
     faults: tuple[Fault, ...]
     confirmed: tuple[int, ...]
     unconfirmed: tuple[int, ...]
     agreement: Floats
+    strangers: tuple[int, ...] = ()
 
 
 class Diagnosis:
@@ -115,6 +118,9 @@ class Diagnosis:
             found = self.explain(c, core, gross=True)
             if found is not None:
                 self.blame(c, found[0], core)
+                # Its group shows other people, unless the correction brings it to the core.
+                if self.has_partner(c) and (self.faults[-1].share_corrected or 0.0) <= 0.5:
+                    self.faults.pop()
         self.complete_swaps(core)
         for c in [c for c in range(count) if c not in core and c not in self.faulty and core]:
             self.record_unexplained(c, core)
@@ -130,6 +136,10 @@ class Diagnosis:
     def faulty(self) -> set[int]:
         """Cameras with a fault."""
         return {fault.camera for fault in self.faults}
+
+    def has_partner(self, c: int) -> bool:
+        """Return whether a camera agrees with another one."""
+        return bool((self.agreement[c] > 4.0 * self.deviation[c]).any())
 
     def core(self, among: Sequence[int]) -> list[int]:
         """Return the connected group of cameras with the most agreement; empty if no two agree."""
@@ -270,6 +280,8 @@ class Diagnosis:
 
     def record_unexplained(self, c: int, core: Sequence[int]) -> None:
         """Record a camera that misses people seen by the others, without a known cause."""
+        if self.has_partner(c):
+            return
         people = self.comparison.people(core, views=3)
         share, found, expected = self.comparison.shares(c, STATED, people)
         seen = np.isfinite(self.comparison.views[c].rays[..., 0]).any(axis=-1).sum()

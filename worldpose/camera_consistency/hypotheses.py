@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.camera_consistency import FaultKind
-from data_contracts.conventions import DISTORTION
+from data_contracts.conventions import DISTORTION, OTHER_UNITS
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
@@ -35,14 +35,6 @@ LENS_ORDERS: Final = (
 """Possible positions of k1 k2 p1 p2 k3 among the five stated numbers."""
 OFF_AXIS: Final = "its principal point or orientation is off"
 """What an order of coefficients with larger shifts stands for: no such lens exists."""
-LENGTH_UNITS: Final = {
-    "millimetres": 1e-3,
-    "centimetres": 1e-2,
-    "kilometres": 1e3,
-    "feet": 0.3048,
-    "yards": 0.9144,
-}
-"""Metres per unit that a position may be stated in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +108,11 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
         ((-1.0, 1.0, 1.0), "its pose is mirrored left to right"),
         ((1.0, -1.0, 1.0), "its pose is mirrored near to far"),
     ):
-        yield Hypothesis(
-            "mirrored", detail, replace_pose(camera, flip @ rotation @ np.diag(axes), flip @ t)
-        )
+        turned = replace_pose(camera, flip @ rotation @ np.diag(axes), flip @ t)
+        yield Hypothesis("mirrored", detail, turned)
+        # Clicks in a mirrored image fit exchanged names, and a camera at the mirrored place.
+        detail = "its images are mirrored, and so are the names of its clicks"
+        yield Hypothesis("mirrored", detail, turned, mirrored=True)
     yield Hypothesis("mirrored", "its images are mirrored", mirrored=True)
     yield Hypothesis("pose", "its images are upside down", upside_down=True)
     yield Hypothesis(
@@ -135,7 +129,7 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     yield Hypothesis(
         "pose", "y points up and z backwards", replace_pose(camera, opengl @ rotation, opengl @ t)
     )
-    for unit, scale in LENGTH_UNITS.items():
+    for unit, scale in OTHER_UNITS.items():
         yield Hypothesis(
             "pose", f"the position is in {unit}", replace_pose(camera, rotation, t * scale)
         )

@@ -16,7 +16,7 @@ from data_contracts.conventions import COCO17
 from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.archives import wrong
 from worldpose.formats.challenge import (
     CameraRows,
@@ -255,7 +255,7 @@ def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
             points = np.array(row["keypoints"], dtype=np.float64).reshape(len(COCO17), 3)
             pixels[frame, person] = np.where(points[:, 2:] > 0, points[:, :2], np.nan)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise wrong(str(path), "COCO keypoints with track_id", f"{error!r}") from error
+        raise wrong(str(path), "COCO keypoints with track_id", say_failure(error)) from error
     return pixels
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.errors import DegenerateError, InputError
+from worldpose.errors import DegenerateError, InputError, say_failure
 from worldpose.evaluation.matching import (
     joint_distances,
     match_people,
@@ -67,7 +67,7 @@ def read_markers(path: Path) -> Markers:
         rate, names, points, unit = _read_trc(path)
     # A truncated file lacks lines, cells or keys; text may be no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
-        raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
+        raise _wrong(path, "a complete C3D or TRC file", say_failure(error)) from error
     return _check_markers(path, rate, names, points, unit)
 
 
@@ -91,7 +91,7 @@ def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise _wrong(path, expected, str(error)) from None
+        raise _wrong(path, expected, say_failure(error)) from None
     if not isinstance(content, dict) or not all(isinstance(p, dict) for p in content.values()):
         raise _wrong(path, expected, f"a {type(content).__name__}")
     people = {}
@@ -149,7 +149,7 @@ def _read_c3d(path: Path) -> Markers:
     except MemoryError:
         raise
     except Exception as error:  # c3d documents no closed list for damaged files
-        raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
+        raise _wrong(path, "a complete C3D or TRC file", say_failure(error)) from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
     if not unit:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.files import whole_file
 from worldpose.parsing import Header, read_npy, read_npy_header
 
@@ -122,7 +122,7 @@ def open_npz(path: Path) -> zipfile.ZipFile:
         return zipfile.ZipFile(path)
     # ValueError and NotImplementedError: a damaged directory, or one of a later version.
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise wrong(str(path), "a whole npz file", _brief(error)) from error
+        raise wrong(str(path), "a whole npz file", say_failure(error)) from error
 
 
 def check_members(
@@ -171,7 +171,7 @@ def _read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> He
             shape, fortran, dtype = read_npy_header(member)
             start = member.tell()
     except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
-        raise wrong(where, "an npy array", _brief(error)) from error
+        raise wrong(where, "an npy array", say_failure(error)) from error
     if dtype.hasobject:
         raise wrong(where, "numbers", "Python objects, which are never loaded")
     size = start + math.prod(shape) * dtype.itemsize
@@ -223,9 +223,4 @@ def read_array(
     except MemoryError:
         raise
     except Exception as error:  # damaged bytes can raise nearly anything, as in _read_header
-        raise wrong(f"{path}: {info.filename}", "a whole array", _brief(error)) from error
-
-
-def _brief(error: Exception) -> str:
-    text = str(error) or type(error).__name__
-    return text if len(text) <= 200 else text[:197] + "..."
+        raise wrong(f"{path}: {info.filename}", "a whole array", say_failure(error)) from error

@@ -1,6 +1,6 @@
 """Cameras of a calibration file: checks that all forms share, and Anipose's TOML.
 
-Reader and writer of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
+Reader of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
 other forms are in `calibration_systems` and `calibration_forms`.
 
 One table per camera with `size`, `matrix`, `distortions` (as OpenCV: k1 k2 p1 p2 k3, with k4 k5 k6,
@@ -17,6 +17,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -50,12 +51,6 @@ ROTATION_TOLERANCE: Final = 1e-4
 
 MILLIMETRE: Final = 1e-3
 """[m]"""
-
-FARTHEST_M: Final = 1000.0
-"""Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m."""
-
-NEAREST_M: Final = 0.1
-"""Minimum distance of the farthest camera from the middle in a file in millimetres [m]."""
 
 FREEMOCAP: Final = (
     "charuco_square_size",
@@ -105,9 +100,8 @@ def build_camera(
     """
     size, focal, principal_point, distortion, lens_model = optics
     if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
-        raise calibration_error(
-            f"{where}: size", f"whole pixels from 1 to {SIZE_LIMIT}", str(size.tolist())
-        )
+        expected = f"whole pixels from 1 to {SIZE_LIMIT}; an import with --videos takes theirs"
+        raise calibration_error(f"{where}: size", expected, str(size.tolist()))
     require_optics(where, size, focal, principal_point)
     far = float(np.max(np.abs(translation)))
     if far > DISTANCE_LIMIT:
@@ -179,18 +173,16 @@ def camera_id(name: str) -> str:
 
 
 def index_by_name(
-    path: Path, cameras: list[tuple[str, CameraCalibration]], unit_m: float = 1.0
+    path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
     """Return the cameras by id, in file order.
 
     Args:
         path: the file, for messages.
         cameras: pairs of place in the file and camera.
-        unit_m: unit of length in the file [m].
 
     Raises:
-        InputError: there is no camera, two cameras have one name, or the cameras are so near each
-            other, or so far apart, that the file has another unit.
+        InputError: there is no camera, two cameras have one name, or no camera has a pose.
     """
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
@@ -199,18 +191,16 @@ def index_by_name(
         by_name[camera.id] = camera
     if not by_name:
         raise calibration_error(str(path), "at least one camera", "none")
-    _require_unit(path, list(by_name.values()), unit_m)
+    require_poses(path, by_name)
     return by_name
 
 
-def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -> None:
-    """Raise InputError if the cameras' distances contradict the unit of the file."""
-    if len(cameras) < 2:
-        return
-    rotations = np.array([camera.rotation for camera in cameras])
-    centers = -np.einsum("cij,ci->cj", rotations, [camera.translation for camera in cameras])
-    distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
-    if not centers.any() and (rotations == np.eye(3)).all():
+def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
+    """Raise InputError if the poses of several cameras are all zero."""
+    if len(cameras) > 1 and all(
+        not any(camera.translation) and (np.array(camera.rotation) == np.eye(3)).all()
+        for camera in cameras.values()
+    ):
         raise InputError(
             f"{path}: translation",
             expected="the poses of the cameras",
@@ -218,17 +208,6 @@ def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -
             todo="Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
             "cameras by clicks or by worldpose locate-cameras.",
         )
-    in_millimetres = unit_m == MILLIMETRE
-    if distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M):
-        return
-    raise InputError(
-        f"{path}: translation",
-        expected=f"positions in {'millimetres' if in_millimetres else 'metres'}",
-        found=f"a camera {distance:.3g} m from the middle of all cameras",
-        todo="Multiply the positions by 1000 if they are in metres."
-        if distance < NEAREST_M
-        else "Divide the positions by 1000 if they are in millimetres.",
-    )
 
 
 def calibration_error(where: str, expected: str, found: str) -> InputError:
@@ -243,20 +222,24 @@ def _shorten(value: object) -> str:
 
 
 def read_calibration_toml(
-    path: Path, left_out: LeftOut | None = None
+    path: Path,
+    left_out: LeftOut | None = None,
+    sizes: Mapping[str, tuple[int, int]] = MappingProxyType({}),
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
 
     Args:
         path: the file.
         left_out: receives cameras without a pose; None = all must have one.
+        sizes: width and height [px] of videos, for files whose size is no whole number: programs
+            that do not know it write twice the principal point.
 
     Raises:
         InputError: an entry is missing or invalid, the unit is another, or the world
             of FreeMoCap's file is not that of the ground; it names file and key.
     """
     content = read_toml(path)
-    unit_m = MILLIMETRE if _is_freemocap(path, content) else 1.0
+    unit_m = toml_unit_m(path, content)
     tables = list(camera_tables(path, content))
     posed = [each for each in tables if not _lacks_pose(each[2])]
     if left_out is not None and posed:
@@ -264,7 +247,8 @@ def read_calibration_toml(
         left_out.update({camera_id(name): "it has no pose" for name in lacking})
         tables = posed
     cameras = []
-    for where, name, table in tables:
+    for where, name, given in tables:
+        table = _with_size(given, sizes.get(camera_id(name)))
         if "matrix" in table and not {"rotation", "translation"} & table.keys():
             raise InputError(
                 f"{where}.rotation",
@@ -274,20 +258,35 @@ def read_calibration_toml(
                 "pose.",
             )
         cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
-    return index_by_name(path, cameras, unit_m)
+    return index_by_name(path, cameras)
+
+
+def _with_size(table: Mapping[str, Any], size: tuple[int, int] | None) -> Mapping[str, Any]:
+    """Return a camera's table, with the video's size if its own is near that, but not whole."""
+    given = _plain_numbers(table.get("size"))
+    if size is None or given is None or given.shape != (2,) or np.all(given == np.round(given)):
+        return table
+    near = np.all(np.abs(given / np.array(size) - 1.0) < 0.05)
+    return {**table, "size": list(size)} if near else table
 
 
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
-    """Return whether a camera has a lens but neither rotation nor translation, or empty ones."""
+    """Return whether a camera has a lens but no pose, an empty one, or one with NaN."""
     pose = [table.get(key) for key in ("rotation", "translation")]
-    return "matrix" in table and all(value in (None, "null", "None", "", []) for value in pose)
+    empty = all(value in (None, "null", "None", "", []) for value in pose)
+    return "matrix" in table and (empty or "nan" in repr(pose))
 
 
-def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:
-    """Return whether a TOML file is FreeMoCap's, whose world must have the ground as z = 0."""
+def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
+    """Return the unit of a TOML file [m]: FreeMoCap's has millimetres, and the ground as z = 0.
+
+    Raises:
+        InputError: FreeMoCap's file has no ground plane.
+    """
+    content = read_toml(path) if content is None else content
     metadata = content.get("metadata")
     if not isinstance(metadata, dict) or not any(key in metadata for key in FREEMOCAP):
-        return False
+        return 1.0
     if not (metadata.get("groundplane_calibration") or metadata.get("groundplane_applied")):
         raise InputError(
             f"{path}: metadata.groundplane_calibration",
@@ -297,7 +296,7 @@ def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:
             "Charuco as groundplane'), or import the lenses (worldpose import --lens) and locate "
             "the cameras from people (worldpose locate-cameras).",
         )
-    return True
+    return MILLIMETRE
 
 
 def camera_tables(
@@ -315,9 +314,12 @@ def camera_tables(
     content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
+    entries = {"size", "matrix", "distortions", "rotation", "translation"}
+    known = [each for each in tables.values() if isinstance(each, dict) and entries & each.keys()]
     for key, table in tables.items():
-        if key == "metadata":
-            continue
+        is_camera = isinstance(table, dict) and entries & table.keys()
+        if key == "metadata" or (known and not is_camera):
+            continue  # caliscope's settings stand beside its cameras
         where = f"{path}: {key}" if tables is content else f"{path}: cameras.{key}"
         if not isinstance(table, dict):
             raise calibration_error(where, "a table for each camera", _shorten(table))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     Keys,
@@ -27,8 +27,16 @@ from worldpose.formats.calibration_files import (
     index_by_name,
     read_calibration_toml,
     read_camera_table,
+    toml_unit_m,
+)
+from worldpose.formats.calibration_programs import (
+    is_openpose,
+    read_camera_json,
+    read_kalibr,
+    read_openpose_cameras,
 )
 from worldpose.formats.calibration_systems import read_calibration_xml
+from worldpose.formats.calibration_unit import require_metres
 from worldpose.formats.files import SETTINGS_BYTES, require_file
 from worldpose.formats.lens_files import read_file_storage
 from worldpose.video.names import is_video
@@ -91,7 +99,11 @@ def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
 
 
 def read_calibration(
-    path: Path, sizes: Sizes = MappingProxyType({}), left_out: LeftOut | None = None
+    path: Path,
+    sizes: Sizes = MappingProxyType({}),
+    left_out: LeftOut | None = None,
+    *,
+    any_unit: bool = False,
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a calibration by name, in file order.
 
@@ -99,13 +111,25 @@ def read_calibration(
         path: a file of one of `FORMS`, or a folder that has one calibration.
         sizes: image sizes that the file may lack, such as those of the videos.
         left_out: receives cameras without a pose, with the reason; None = all must have one.
+        any_unit: whether cameras may be as far apart as in another unit than the form's.
 
     Raises:
         InputError: an unknown form, a folder with no calibration or several, or an invalid entry,
             with file and key.
     """
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
-    return form.read(files, sizes, left_out)
+    cameras = form.read(files, sizes, left_out)
+    if not any_unit:
+        require_metres(path, cameras, form_unit_m(path))
+    return cameras
+
+
+def form_unit_m(path: Path) -> float:
+    """Return the unit of a calibration by its form [m]; arguments and errors as above."""
+    form, files = find_calibration(path) if path.is_dir() else _form_of(path)
+    if form is TOML:
+        return toml_unit_m(files[0])
+    return MILLIMETRE if form.unit.startswith("mm") else 1.0
 
 
 def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
@@ -147,12 +171,19 @@ def calibrations_in(folder: Path) -> list[tuple[Form, tuple[Path, ...]]]:
         or tuple(nested),
         EASYMOCAP.name: tuple(f for f in files if _is_easymocap(f)),
         BIOCV.name: tuple(f for f in files if f.suffix.lower() in BIOCV.endings),
+        OPENPOSE.name: tuple(f for f in files if is_openpose(f)),
     }
     found: list[tuple[Form, tuple[Path, ...]]] = [
         (form, (file,))
         for form in (TOML, QUALISYS, VICON, OPTITRACK)
         for file in files
         if file.name.lower().endswith(form.endings[0])
+    ]
+    found += [
+        (form, (file,))
+        for form, name in ((JSON, "calib"), (KALIBR, "camchain"))
+        for file in files
+        if file.suffix.lower() in form.endings and name in file.stem.lower()
     ]
     return found + [(form, sets[form.name]) for form in FORMS if sets.get(form.name)]
 
@@ -175,6 +206,8 @@ def _form_of(path: Path) -> tuple[Form, tuple[Path, ...]]:
     suffix = path.suffix.lower()
     if _is_easymocap(path):
         return EASYMOCAP, tuple(f for f in sorted(path.parent.iterdir()) if _is_easymocap(f))
+    if is_openpose(path):
+        return OPENPOSE, tuple(f for f in sorted(path.parent.iterdir()) if is_openpose(f))
     for form in FORMS:
         if suffix in form.endings:
             return form, (path,)
@@ -218,7 +251,7 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
                 str(file),
                 read_camera_table(
                     str(file),
-                    file.parent.name if file.stem == OPENCAP_NAME else file.stem,
+                    file.resolve().parent.name if file.stem == OPENCAP_NAME else file.stem,
                     table,
                     keys=OPENCAP_KEYS,
                     unit_m=MILLIMETRE,
@@ -227,7 +260,6 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
             )
             for file, table in tables.items()
         ],
-        MILLIMETRE,
     )
 
 
@@ -242,7 +274,7 @@ def _read_pickle(file: Path) -> dict[str, Any]:
         raise InputError(
             str(file),
             expected="OpenCap's pickle of one camera: arrays alone",
-            found=f"{error}",
+            found=say_failure(error),
             todo="Give cameraIntrinsicsExtrinsics.pickle, as OpenCap wrote it. Nothing in this "
             "file was run.",
         ) from error
@@ -373,7 +405,7 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
         try:
             numbers = [float(word) for word in file.read_text(encoding="utf-8").split()]
         except (OSError, ValueError) as error:
-            raise calibration_error(where, "32 numbers", f"{error}"[:80]) from error
+            raise calibration_error(where, "32 numbers", say_failure(error)[:80]) from error
         if len(numbers) != 32:
             raise calibration_error(
                 where, "32 numbers: width, height, K, L and five of the lens", str(len(numbers))
@@ -392,14 +424,14 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
         name = Path(file.stem).stem if is_video(file.stem) else file.stem
         camera = read_camera_table(where, name, table, keys=keys, unit_m=MILLIMETRE)
         cameras.append((where, camera))
-    return index_by_name(files[0].parent if len(files) > 1 else files[0], cameras, MILLIMETRE)
+    return index_by_name(files[0].parent if len(files) > 1 else files[0], cameras)
 
 
 TOML: Final = Form(
     "Anipose, Pose2Sim, caliscope, FreeMoCap",
     (".toml",),
     "m (FreeMoCap: mm), z up",
-    lambda files, _, left_out: read_calibration_toml(files[0], left_out),
+    lambda files, sizes, left_out: read_calibration_toml(files[0], left_out, sizes),
 )
 QUALISYS: Final = Form(
     "Qualisys",
@@ -414,5 +446,26 @@ OPENCAP: Final = Form(
 )
 EASYMOCAP: Final = Form("EasyMocap", ("intri.yml", "extri.yml"), "m, z up", _read_easymocap)
 BIOCV: Final = Form("bioCV", (".calib",), "mm, z up", lambda files, *_: _read_biocv(files))
-FORMS: Final = (TOML, QUALISYS, VICON, OPTITRACK, OPENCAP, EASYMOCAP, BIOCV)
+JSON: Final = Form(
+    "Panoptic Studio, multical",
+    (".json",),
+    "cm, y down; multical: m, first camera",
+    lambda files, _, left_out: read_camera_json(files[0], left_out),
+)
+KALIBR: Final = Form(
+    "Kalibr",
+    (".yaml", ".yml"),
+    "m, first camera",
+    lambda files, _, left_out: read_kalibr(files[0], left_out),
+)
+OPENPOSE: Final = Form(
+    "OpenPose",
+    ("<camera>.xml",),
+    "m, first camera",
+    lambda files, sizes, _: read_openpose_cameras(files, sizes),
+)
+FORMS: Final = (
+    *(TOML, QUALISYS, VICON, OPTITRACK, OPENCAP, EASYMOCAP, BIOCV),
+    *(JSON, KALIBR, OPENPOSE),
+)
 """All forms; docs/reference/formats.md describes them."""

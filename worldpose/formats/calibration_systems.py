@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import COEFFICIENTS, CameraCalibration
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     NUMBER_LIMIT,
@@ -57,7 +57,7 @@ def read_calibration_xml(
         root = parse_xml(path.read_bytes())
     except (ValueError, OSError) as error:
         raise calibration_error(
-            str(path), "XML of Qualisys, Vicon or OptiTrack", str(error)
+            str(path), "XML of Qualisys, Vicon or OptiTrack", say_failure(error)
         ) from error
     readers = {
         "calibration": _read_qualisys,
@@ -123,7 +123,7 @@ def _read_qualisys(
                 left_out[element.get("serial", where)] = why
         active = [each for each, why in zip(active, lacks, strict=True) if not why]
     cameras = [(where, _read_qualisys_camera(where, element)) for where, element in active]
-    return index_by_name(path, cameras, MILLIMETRE)
+    return index_by_name(path, cameras)
 
 
 def _qualisys_lack(element: ET.Element, has_video: bool) -> str:
@@ -209,7 +209,7 @@ def _read_vicon(
             todo="Calibrate the video cameras with the others, and export again.",
         )
     cameras = [(where, _read_vicon_camera(where, element)) for where, element in elements]
-    return index_by_name(path, cameras, MILLIMETRE)
+    return index_by_name(path, cameras)
 
 
 def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:

@@ -3,7 +3,8 @@
 Per person: `image_id`; `keypoints`, x y c of each point, where c is the confidence (in a data set
 perhaps COCO's visibility 0, 1, 2) and 0 means missing; `bbox` or `box` (x y width height) and
 `score` are optional: the defaults are the box of the found joints and their mean confidence. Within
-each frame, people keep the file's order. AlphaPose, MMPose and detectors of COCO write this form.
+each frame, people keep the file's order. AlphaPose and detectors of COCO write this form;
+`worldpose.formats.pose_forms` brings that of others into it.
 
 The frame is a whole `image_id`, or the last number in an `image_id` that is a file's name. In a
 data set it is the last number in the `file_name` of the image. `worldpose.formats.keypoint_sets`
@@ -36,6 +37,7 @@ from worldpose.formats.keypoint_sets import (
     people_by_frame,
     unknown_size,
 )
+from worldpose.formats.pose_forms import plain_entries
 
 JSON_BYTES: Final = 1 << 30
 """Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""
@@ -63,12 +65,15 @@ def read_coco_results(path: Path) -> PeopleFile:
             scale, no frame number, or too many people per frame; the error names file, result and
             point.
     """
-    items = JsonItems(path, "annotations", JSON_BYTES, keep=("images", "categories"))
-    batches = [_read_batch(path, results, first) for first, results in _batches(path, items)]
+    keep = ("images", "categories", "meta_info")
+    items = JsonItems(path, "annotations", JSON_BYTES, keep, other_key="instance_info")
+    entries = plain_entries(str(path), items)
+    batches = [_read_batch(path, results, first) for first, results in _batches(path, entries)]
     if not items.has_list:
         raise InputError(
             str(path),
-            expected="a list of COCO keypoint results, or a COCO data set with `annotations`",
+            expected="a list of COCO keypoint results, a COCO data set with `annotations`, or the "
+            "results of MMPose or Ultralytics",
             found=_shorten(items.other),
             todo="Export the poses as COCO keypoint results.",
         )
@@ -79,12 +84,12 @@ def read_coco_results(path: Path) -> PeopleFile:
     sure = points[..., 2]
     wrong_scale = (sure < 0) | (sure > MAX_CONFIDENCE)  # NaN is a missing point
     _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", _CONFIDENCE_TODO)
-    names = _point_names(path, items.kept.get("categories"))
-    where = f"{path}: categories" if names else str(path)
+    names, where = _point_names(path, items.kept.get("categories")), f"{path}: categories"
+    names = names or _model_names(items.kept.get("meta_info"))
     if names and len(names) != points.shape[1] and len(points):
         raise _wrong(where, f"names of {points.shape[1]} keypoints", f"{len(names)} names")
-    order = order_by_names(where, names) if names else order_by_points(where, points)
-    points, changed = clean_points(points[:, order.places])
+    order = order_by_names(where, names) if names else order_by_points(str(path), points)
+    points, changed = clean_points(order.select(points))
     frames = _frames(path, found.images, items.kept.get("images"))
     people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, _limit(path))
     return PeopleFile(people, order.name, changed._replace(nobody=nobody))
@@ -222,6 +227,14 @@ def _point_names(path: Path, categories: object) -> list[str]:
             raise _wrong(f"{path}: categories", "the keypoints of one category", f"{len(names)}")
         names = people
     return list(names[0]) if names else []
+
+
+def _model_names(about: object) -> list[str]:
+    """Return the names of the points in MMPose's `meta_info`; none where it has none."""
+    named = about.get("keypoint_id2name") if isinstance(about, dict) else None
+    if not isinstance(named, dict) or sorted(named) != sorted(map(str, range(len(named)))):
+        return []
+    return [str(named[str(index)]) for index in range(len(named))]
 
 
 def _table(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
-from worldpose.formats.files import read_json, require_file
+from worldpose.formats.files import read_json
 from worldpose.formats.keypoint_sets import (
     COORDINATE_LIMIT,
     KNOWN_SETS,
@@ -26,9 +26,11 @@ from worldpose.formats.keypoint_sets import (
     order_by_points,
     people_by_frame,
 )
+from worldpose.formats.pose_forms import plain_person
+from worldpose.parsing import read_cells
 
-KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints")
-"""Of version 1 and later, and of version 0."""
+KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
+"""Of OpenPose's version 1 and later, of its versions 0, and of other programs."""
 BOX_BYTES: Final = 1 << 28
 """Maximum size of a file of boxes [byte]: that of 22 people in an hour has 200 MB."""
 BOX_COLUMNS: Final = range(6, 11)
@@ -67,7 +69,7 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     frames = np.repeat(list(read), [len(people or ()) for people in read.values()])
     points = np.array(found, np.float32) if found else np.empty((0, 17, 3), np.float32)
     order = order_by_points(str(folder), points, model)
-    points, changed = clean_points(points[:, order.places])
+    points, changed = clean_points(order.select(points))
     people, nobody = people_by_frame(folder, frames.astype(np.int64), points)
     people = people.reindex(np.array(list(read), np.int64))
     kind = order.name if found else None
@@ -108,21 +110,23 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
     if not file.stat().st_size:
         return None
     content = read_json(file)
-    people = content.get("people") if isinstance(content, dict) else content
-    if people == [] and content == []:
+    known = ("people", "bodies", "instance_info", "results")
+    keys = [key for key in known if isinstance(content, dict) and key in content]
+    people = content[keys[0]] if keys else content
+    if content == []:
         return None
-    if not isinstance(people, list) or not isinstance(content, dict) or len(people) > PEOPLE_LIMIT:
+    if not isinstance(people, list) or len(people) > PEOPLE_LIMIT:
         raise InputError(
             f"{file}: people",
             expected=f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it",
-            found=f"{len(people)}" if isinstance(people, list) else type(content).__name__,
+            found=f"{len(people)} people" if isinstance(people, list) else type(people).__name__,
             todo="Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose').",
         )
     return [_read_person(f"{file}: people[{n}]", person) for n, person in enumerate(people)]
 
 
 def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
-    entries = person if isinstance(person, dict) else {}
+    entries = plain_person(person) or (person if isinstance(person, dict) else {})
     key = next((key for key in KEYPOINTS_KEYS if key in entries), KEYPOINTS_KEYS[0])
     numbers = entries.get(key)
     if (
@@ -231,7 +235,6 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
 def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     """Return the number and text of each line that is not empty, and its numbers."""
-    require_file(file, BOX_BYTES)
 
     def wrong(where: str, expected: str, found: str) -> InputError:
         return InputError(
@@ -241,13 +244,11 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
             todo="Write lines of MOTChallenge: frame,id,left,top,width,height,confidence.",
         )
 
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise wrong(str(file), "text", str(error)) from error
-    lines = [(n, each) for n, each in enumerate(text.splitlines(), 1) if each.strip()]
-    if not lines:
+    cells, has_commas = read_cells(file, BOX_BYTES, "Write lines of MOTChallenge.")
+    if not cells:
         raise wrong(str(file), "boxes", "an empty file")
+    sign = "." if has_commas else ","
+    lines = [(n, ",".join(cell.replace(",", sign) for cell in row)) for n, row in cells]
     count = lines[0][1].count(",") + 1
     for number, each in lines:
         if each.count(",") + 1 != count or count not in BOX_COLUMNS:

@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 
 
 @contextmanager
@@ -131,7 +131,7 @@ def require_file(path: Path, limit: int | None = None) -> int:
         raise InputError(
             str(path),
             expected="a readable file",
-            found=str(error),
+            found=say_failure(error),
             todo="Check its name and rights.",
         ) from error
     if limit is not None and size > limit:
@@ -150,7 +150,10 @@ def _read_text(path: Path, limit: int) -> str:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(
-            str(path), expected="readable UTF-8 text", found=str(error), todo="Save it as UTF-8."
+            str(path),
+            expected="readable UTF-8 text",
+            found=say_failure(error),
+            todo="Save it as UTF-8.",
         ) from error
 
 
@@ -261,7 +264,9 @@ class JsonItems:
         kept: values of the other keys to keep; filled while iterating.
     """
 
-    def __init__(self, path: Path, key: str, limit: int, keep: Collection[str] = ()) -> None:
+    def __init__(
+        self, path: Path, key: str, limit: int, keep: Collection[str] = (), other_key: str = ""
+    ) -> None:
         """Prepare reading.
 
         Args:
@@ -269,12 +274,13 @@ class JsonItems:
             key: key of the list if the file is a mapping.
             limit: maximum size of the file [byte].
             keep: further keys of the mapping whose values are kept.
+            other_key: another name of the key.
 
         Raises:
             InputError: no such file, or too large.
         """
         require_file(path, limit)
-        self.path, self.key = path, key
+        self.path, self.keys = path, (key, other_key)
         self.is_mapping = False
         self.has_list = False
         self.other: Any = None
@@ -296,12 +302,15 @@ class JsonItems:
             raise self._wrong(f"{error.msg} (character {error.pos})") from error
         except UnicodeDecodeError as error:
             raise InputError(
-                str(self.path), expected="UTF-8 text", found=str(error), todo="Save it as UTF-8."
+                str(self.path),
+                expected="UTF-8 text",
+                found=say_failure(error),
+                todo="Save it as UTF-8.",
             ) from error
         except ValueError as error:  # a number with more digits than Python converts
-            raise self._wrong(str(error)) from error
+            raise self._wrong(say_failure(error)) from error
         except OSError as error:
-            raise self._wrong(str(error)) from error
+            raise self._wrong(say_failure(error)) from error
 
     def _entries(self, text: _Text) -> Iterator[Any]:
         if text.ahead() == "[":
@@ -325,10 +334,10 @@ class JsonItems:
             if name in self.keep:
                 is_list = text.ahead() == "["
                 self.kept[name] = list(_read_list(text)) if is_list else text.value()
-            elif name != self.key:
+            elif name not in self.keys:
                 _skip(text)
             elif self.has_list or self.other is not None:
-                raise text.error(f"{self.key!r} is given twice")
+                raise text.error(f"{name!r} is given twice")
             elif text.ahead() == "[":
                 self.has_list = True
                 yield from _read_list(text)

@@ -38,25 +38,27 @@ class PointOrder(NamedTuple):
 
     name: str
     joints: tuple[int, ...]
-    """(17,) places of COCO-17's joints."""
+    """(17,) places of COCO-17's joints; -1 = the set lacks it."""
     feet: tuple[int, ...] = ()
     """(6,) places of `FEET`; none if it has no feet."""
 
-    @property
-    def places(self) -> tuple[int, ...]:
-        """Places of all points that are used."""
-        return (*self.joints, *self.feet)
+    def select(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return COCO-17 and perhaps `FEET` of points (people, points, 3); 0 = missing."""
+        places = np.array([*self.joints, *self.feet])
+        return np.where(places[:, None] >= 0, points[:, places], np.float32(0.0))
 
 
 def _order(name: str, points: Sequence[str]) -> PointOrder:
     feet = tuple(map(points.index, FEET)) if set(FEET) <= set(points) else ()
-    return PointOrder(name, tuple(map(points.index, COCO17)), feet)
+    joints = tuple(points.index(joint) if joint in points else -1 for joint in COCO17)
+    return PointOrder(name, joints, feet)
 
 
 _COCO18: Final = (*BODY25[:8], *BODY25[9:19])  # OpenPose's BODY_25 without mid-hip and feet
 _FIRST17: Final = tuple(range(17))
 _HALPE_FEET: Final = (20, 22, 24, 21, 23, 25)
 _SETS: Final = {
+    15: (PointOrder("MPI-15", (*[-1] * 5, 5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10)),),
     17: (PointOrder("COCO-17", _FIRST17),),
     18: (_order("COCO-18", _COCO18),),
     25: (_order("BODY_25", BODY25), PointOrder("BODY_25B", _FIRST17, tuple(range(19, 25)))),
@@ -92,6 +94,8 @@ MODELS: Final = {
 }
 """Pose2Sim's names of models and the sets that they give."""
 
+FACE: Final = 5
+"""Number of COCO-17's joints that belong to the face, the first ones."""
 _BONES: Final = {
     "thigh": ((11, 13), (12, 14)),
     "shank": ((13, 15), (14, 16)),
@@ -117,18 +121,22 @@ _SAMPLE: Final = 2000
 def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
     """Return the order of points whose names a file gives, in any usual spelling.
 
+    A set may lack joints of the face.
+
     Raises:
-        InputError: a joint of COCO-17 is missing, or two names are the same.
+        InputError: another joint of COCO-17 is missing, or two names are the same.
     """
     plain = [_plain(str(name)) for name in names]
-    missing = [joint for joint in COCO17 if joint not in plain]
+    if "left_ankle" not in plain:  # Human3.6M calls them feet
+        plain = [re.sub(r"^(left|right)_foot$", r"\1_ankle", name) for name in plain]
+    missing = [joint for joint in COCO17[FACE:] if joint not in plain]
     if missing or any(plain.count(joint) > 1 for joint in (*COCO17, *FEET)):
         unknown = [str(n) for n, one in zip(names, plain, strict=True) if one not in COCO17]
-        kind = " (Human3.6M?)" if {"thorax", "spine"} & set(plain) and len(plain) == 17 else ""
         raise InputError(
             where,
-            expected="the names of COCO's 17 joints, each once: " + ", ".join(COCO17),
-            found=f"{', '.join(unknown) or ', '.join(map(str, names))}{kind}; missing are "
+            expected="the names of COCO's joints, each once, perhaps without those of the face: "
+            + ", ".join(COCO17),
+            found=f"{', '.join(unknown) or ', '.join(map(str, names))}; missing are "
             + (", ".join(missing) or "none"),
             todo="Export the points of COCO-17, or name them so.",
         )
@@ -170,11 +178,19 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     for order in orders:
         if order.name == named:
             return order
-    misfits = [_misfit(points, _pairs(order), _LENGTHS) for order in orders]
+    pairs = np.array(list(_BONES.values()))
+    misfits = [_misfit(order.select(points), pairs, _LENGTHS) for order in orders]
     chosen = orders[0]
     for order, misfit in zip(orders, misfits, strict=True):
         if misfit <= _PLAUSIBLE and misfits[0] - misfit >= _MARGIN:
             chosen = order
+    if chosen.name == "MPI-15" and len(points) and not misfits[0] <= _PLAUSIBLE:
+        raise InputError(
+            where,
+            expected="limbs of usual lengths in the order of MPI, the known set of 15 points",
+            found="others: the points are of another set",
+            todo="Estimate poses with a model of COCO, or name the points in `categories`.",
+        )
     if size == len(COCO17):
         other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
         if other <= _PLAUSIBLE and misfits[0] - other >= _MARGIN:
@@ -195,11 +211,6 @@ def unknown_size(where: str, size: int) -> InputError:
         found=f"{size} points",
         todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
     )
-
-
-def _pairs(order: PointOrder) -> NDArray[np.int64]:
-    pairs: NDArray[np.int64] = np.array(order.joints)[np.array(list(_BONES.values()))]
-    return pairs
 
 
 def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> float:
@@ -247,8 +258,10 @@ def clean_points(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], Chan
     """Return points (people, points, 3) with confidences of at most 1, and what was changed.
 
     A point that is not finite is missing, as one of confidence 0 is: x, y and confidence are 0.
+    So is one at exactly 0, 0: programs write missing points so, with a confidence or not.
     """
     there = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0.0)
+    there &= (points[..., :2] != 0.0).any(axis=-1)
     clean = np.where(there[..., None], points, np.float32(0.0))
     clamped = int((clean[..., 2] > 1.0).sum())
     clean[..., 2] = np.minimum(clean[..., 2], 1.0)
@@ -277,6 +290,13 @@ def people_by_frame(
         InputError: too many people in a frame, or arrays that are too large.
     """
     found: Flags = np.asarray(points[..., 2] > 0)
+    if found.sum() >= len(COCO17) and float(np.abs(points[found, :2]).max()) < 2.0:
+        raise InputError(
+            str(path),
+            expected="keypoints in pixels",
+            found=f"none beyond {float(np.abs(points[found, :2]).max()):.3g}: shares of the image?",
+            todo="Export pixels (Ultralytics: normalize=False).",
+        )
     seen: Flags = np.asarray(found[:, : len(COCO17)].any(axis=1))
     boxed: Flags = np.zeros(len(seen), np.bool_)
     if boxes is not None:

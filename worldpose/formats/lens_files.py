@@ -7,7 +7,7 @@ In the TOML form each table has `size`, `matrix` and `distortions` as in calibra
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from data_contracts.arrays import Floats
 from data_contracts.cameras import LensCalibration
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.archives import read_npz
 from worldpose.formats.calibration_files import (
     calibration_error,
@@ -38,11 +38,12 @@ DISTORTION_STD: Final = 0.005
 seldom reach the corners."""
 MATRIX_NAMES: Final = (
     *("camera_matrix", "cameraMatrix", "Camera_Matrix", "camMatrix", "mtx", "K", "matrix"),
+    *("Intrinsics", "intrinsicMat", "intrinsic_matrix", "intrinsics"),
 )
 DISTORTION_NAMES: Final = (
     *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs"),
     *("dist_coefs", "dist_coeff", "distCoef", "distCoeff", "dist", "distortions", "distortion"),
-    *("distortion_coeffs", "D"),
+    *("distortion_coeffs", "Distortion", "D"),
 )
 MODEL_NAMES: Final = ("distortion_model", "lens_model", "model_type", "fisheye_model", "fisheye")
 FISHEYE_WORDS: Final = (
@@ -78,6 +79,11 @@ def read_lenses(
     first = files[0]
     if first.suffix.lower() == ".toml":
         return read_lens_toml(first, sizes, camera)
+    chain = _read_camchain(first)
+    if chain is not None:
+        if len(chain) == 1 and camera is not None:
+            chain = {camera: next(iter(chain.values()))}
+        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in chain.items()], sizes, camera)
     if camera is None:
         raise InputError(
             str(first),
@@ -96,7 +102,7 @@ def read_lenses(
     try:
         matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
     except (ValueError, TypeError) as error:
-        raise calibration_error(where, "matrices of numbers", str(error)) from error
+        raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
     size = _image_size(given, sizes[camera])
     table = {
         "size": list(size),
@@ -120,8 +126,18 @@ def read_lens_toml(
     Raises:
         InputError: as in `read_lenses`.
     """
+    return _lenses(file, camera_tables(file), sizes, camera)
+
+
+def _lenses(
+    file: Path,
+    tables: Iterable[tuple[str, str, Mapping[str, Any]]],
+    sizes: Mapping[str, tuple[int, int]],
+    camera: str | None,
+) -> dict[str, LensCalibration]:
+    """Return the lenses of tables with their places and names; see `read_lens_toml`."""
     found = {}
-    for where, name, table in camera_tables(file):
+    for where, name, table in tables:
         if camera is not None and name != camera:
             continue
         if name not in sizes:
@@ -163,21 +179,114 @@ def _read_file(file: Path) -> dict[str, Any]:
                 array = read_npy(stream)
             return {"K" if array.shape == (3, 3) else "dist": array}
     except (OSError, ValueError, EOFError) as error:
-        raise calibration_error(str(file), "arrays of numbers", str(error)) from error
+        raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
     if suffix in (".yml", ".yaml"):
-        with file.open("rb") as stream:
-            is_storage = b"%YAML:" in stream.read(64) or b"!!opencv-matrix" in stream.read()
-        return read_file_storage(file) if is_storage else _read_yaml(file)
+        return read_file_storage(file) if _is_storage(file) else _read_yaml(file)
+    if suffix in (".pkl", ".pickle"):
+        return _read_pickled_lens(file)
     if suffix in (".xml", ".json"):
         return read_file_storage(file)
     raise InputError(
         str(file),
-        expected="a lens file: .toml, OpenCV's .xml, .yml, .yaml or .json, .npy or .npz",
+        expected="a lens file: .toml, .xml, .yml, .yaml, .json, .npy, .npz, or OpenCap's .pickle",
         found=repr(file.suffix),
         todo="Save the camera matrix and the distortion coefficients in one of these forms.",
     )
+
+
+def _read_pickled_lens(file: Path) -> dict[str, Any]:
+    """Return the arrays of OpenCap's cameraIntrinsics.pickle; its size has the height first."""
+    from worldpose.pickles import read_pickle  # late: it imports scipy
+
+    try:
+        content = read_pickle(file)
+    except (OSError, ValueError) as error:
+        found = say_failure(error)
+        raise calibration_error(str(file), "OpenCap's pickle, arrays alone", found) from error
+    if not isinstance(content, dict):
+        raise calibration_error(str(file), "a dictionary", type(content).__name__)
+    given = {str(key): value for key, value in content.items()}
+    if "imageSize" in given and np.size(given["imageSize"]) == 2:
+        given["imageSize"] = np.ravel(given["imageSize"])[::-1]
+    return given
+
+
+def _read_camchain(file: Path) -> dict[str, dict[str, Any]] | None:
+    """Return the tables of a Kalibr camchain by camera; None for another file."""
+    if file.suffix.lower() not in (".yml", ".yaml") or _is_storage(file):
+        return None
+    content = read_yaml(file)
+    return dict(kalibr_tables(file, content)) if is_kalibr(content) else None
+
+
+def is_kalibr(content: object) -> bool:
+    """Return whether the content of a YAML file is a camchain."""
+    tables = list(content.values()) if isinstance(content, dict) else []
+    cameras = [each for each in tables if isinstance(each, dict) and "camera_model" in each]
+    return any("intrinsics" in each for each in cameras)
+
+
+def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the name of each camera of a camchain, and its table in the form of Anipose.
+
+    Raises:
+        InputError: the content is no camchain, or a camera has another model than the pinhole with
+            `radtan`, `equidistant` or no distortion.
+    """
+    if not isinstance(content, dict) or not is_kalibr(content):
+        expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
+        raise calibration_error(str(path), expected, f"{content!r:.60}")
+    pose: NDArray[np.float64] | None = np.eye(4)
+    for index, (name, given) in enumerate(content.items()):
+        where = f"{path}: {name}"
+        given = given if isinstance(given, dict) else {}
+        model, lens = given.get("camera_model"), given.get("distortion_model", "none")
+        if model != "pinhole" or lens not in ("radtan", "equidistant", "none"):
+            raise InputError(
+                where,
+                expected="camera_model pinhole with distortion_model radtan, equidistant or none",
+                found=f"{model} with {lens}",
+                todo="Calibrate again with --models pinhole-radtan or pinhole-equi.",
+            )
+        numbers = given.get("intrinsics")
+        if not isinstance(numbers, list) or len(numbers) != 4:
+            raise calibration_error(f"{where}.intrinsics", "fx, fy, cx, cy", f"{numbers!r:.60}")
+        fx, fy, cx, cy = numbers
+        table: dict[str, Any] = {
+            "size": given.get("resolution", []),
+            "matrix": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+            "distortions": given.get("distortion_coeffs") or [0.0] * 4,
+            **({"fisheye": True} if lens == "equidistant" else {}),
+        }
+        if index:
+            pose = _chain(f"{where}.T_cn_cnm1", given.get("T_cn_cnm1"), pose)
+        if pose is not None:
+            table |= {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
+        yield str(name), table
+
+
+def _chain(
+    where: str, step: object, pose: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """Return the pose (4, 4) of a camera from that of the camera before; None if not known."""
+    if step is None or pose is None:
+        return None
+    try:
+        matrix = np.array(step, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4):
+        raise calibration_error(where, "numbers of shape (4, 4)", f"{step!r:.60}")
+    return matrix @ pose
+
+
+def _is_storage(file: Path) -> bool:
+    """Return whether a YAML file is one of OpenCV's FileStorage."""
+    require_file(file, SETTINGS_BYTES)
+    with file.open("rb") as stream:
+        return b"%YAML:" in stream.read(64) or b"!!opencv-matrix" in stream.read()
 
 
 def _read_yaml(file: Path) -> dict[str, Any]:
@@ -198,7 +307,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
                 found[str(name)] = np.reshape(value["data"], (value["rows"], value["cols"]))
             except (ValueError, TypeError) as error:
                 raise calibration_error(
-                    f"{file}: {name}", "rows x cols numbers", str(error)
+                    f"{file}: {name}", "rows x cols numbers", say_failure(error)
                 ) from error
         elif isinstance(value, list | int | float | str):
             found[str(name)] = value

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import shutil
-from collections.abc import Collection, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +23,32 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
 from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
+from worldpose.ingest.camera_videos import (
+    copy_videos,
+    describe_videos,
+    find_videos,
+    require_cameras,
+)
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
+from worldpose.ingest.registration import file_state, require_settled
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
-from worldpose.video.files import VideoReader, index_frames
-from worldpose.video.names import VIDEO_SUFFIXES, is_video
+from worldpose.video.folder import index_video, open_video
+from worldpose.video.names import VIDEO_SUFFIXES
 from worldpose.video.pictures import FrameIndex
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
 MAX_BLACK: Final = 16.0
 """Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
+
+
+Placing: TypeAlias = Callable[
+    [Path, Mapping[str, CameraCalibration], Mapping[str, KeypointDetections], float],
+    tuple[dict[str, CameraCalibration], list[str]],
+]
+"""Brings the cameras of a calibration to metres with z up, by their 2D poses (none = unknown) and
+the frame rate [1/s]; returns them with sentences about what it changed."""
 
 
 def import_match(
@@ -43,6 +58,7 @@ def import_match(
     out: Path,
     match_id: str | None = None,
     pitch: Literal["none"] | None = "none",
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and their detections.
 
@@ -57,6 +73,7 @@ def import_match(
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
         pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -66,7 +83,7 @@ def import_match(
             empty; nothing is written then.
     """
     left_out: LeftOut = {}
-    cameras = read_calibration(calibration, left_out=left_out)
+    cameras = read_calibration(calibration, left_out=left_out, any_unit=place is not None)
     files = detections_by_camera(detections, list(cameras), calibration, left_out)
     read = {name: read_people(file) for name, file in files.items()}
     people = {name: found.people for name, found in read.items()}
@@ -75,13 +92,24 @@ def import_match(
     spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
+    notes: list[str] = []
+    if place is not None:
+        cameras, notes = place(calibration, cameras, people, fps)
     write_match(out, spec, calibrations=cameras, observations=people)
-    return spec, describe_left_out(left_out) + describe_people(read)
+    return spec, notes + describe_left_out(left_out) + describe_people(read)
 
 
 def describe_left_out(left_out: LeftOut) -> list[str]:
-    """Return a sentence about each camera that is left out."""
-    return [f"camera {name} is left out: {why}" for name, why in left_out.items()]
+    """Return a sentence about the cameras that are left out for each reason."""
+    notes = []
+    for why in dict.fromkeys(left_out.values()):
+        names = [name for name, reason in left_out.items() if reason == why]
+        if len(names) == 1:
+            notes.append(f"camera {names[0]} is left out: {why}")
+        else:
+            more = f" and {len(names) - 20} more" if len(names) > 20 else ""
+            notes.append(f"cameras {', '.join(names[:20])}{more} are left out: {why}")
+    return notes
 
 
 def camera_of(place: Path) -> str:
@@ -101,8 +129,10 @@ def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
     notes = []
     for kind in sorted({found.kind for found in read.values() if found.kind} - {"COCO-17"}):
         which = [name for name, found in read.items() if found.kind == kind]
-        kept = "the 17 keypoints of COCO"
-        kept += " and heels and toes" if read[which[0]].people.points else ""
+        people = read[which[0]].people
+        has_face = np.isfinite(people.confidence[..., :5]).any()
+        kept = "the 17 keypoints of COCO" if has_face else "COCO's 12 of the body, not of the face"
+        kept += " and heels and toes" if people.points else ""
         whose = "" if len(which) == len(read) else f" of {', '.join(which)}"
         notes.append(f"2D poses{whose}: {kind}; kept are {kept}; the others are left out")
     return notes + describe_changes(read)
@@ -136,7 +166,13 @@ def detections_by_camera(
     folders = {camera_of(each): each for each in places if camera_of(each) not in left_out}
     if sorted(folders) == sorted(cameras):
         return {name: folders[name] for name in cameras}
-    return files_by_camera(folder, cameras, calibration, (".json", ".npz"), left_out)
+    suffixes = (".json", ".npz")
+    files: dict[str, Path] = {}
+    for file in sorted(folder.glob("[!.]*")):
+        name = camera_id(file.stem)
+        if file.suffix.lower() in suffixes:
+            files[file.name if name in files else name] = file  # a second one fits no camera
+    return pick_cameras(folder, files, cameras, calibration, suffixes, left_out)
 
 
 def import_lenses(
@@ -177,31 +213,38 @@ def import_lenses(
     return lenses
 
 
-def files_by_camera(
+def pick_cameras(
     folder: Path,
+    found: Mapping[str, Path],
     cameras: Sequence[str],
     calibration: Path,
     suffixes: Collection[str],
     left_out: Collection[str] = (),
 ) -> dict[str, Path]:
-    """Return the file of each camera in a folder, by the camera's name; others are ignored.
+    """Return the file of each camera.
+
+    Args:
+        folder: holds them, for messages.
+        found: its files, by name of a camera.
+        cameras: the cameras.
+        calibration: file of the cameras, for messages.
+        suffixes: endings of such files, for messages.
+        left_out: further cameras, whose files are ignored.
 
     Raises:
         InputError: a camera lacks its file, or a file its camera.
     """
-    there = sorted(folder.glob("[!.]*"))
-    files = [file for file in there if file.suffix.lower() in suffixes]
-    files = [file for file in files if camera_id(file.stem) not in left_out]
-    if sorted(camera_id(file.stem) for file in files) != sorted(cameras):
+    files = {name: file for name, file in found.items() if name not in left_out}
+    if sorted(files) != sorted(cameras):
+        there = files.values() or sorted(folder.glob("[!.]*"))
         raise InputError(
             str(folder),
             expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
             + ", ".join(cameras),
-            found=", ".join(file.name for file in files or there) or "no such file",
+            found=", ".join(file.name for file in there) or "no such file",
             todo="Rename the files as the cameras, and leave neither over.",
         )
-    by_name = {camera_id(file.stem): file for file in files}
-    return {name: by_name[name] for name in cameras}
+    return {name: files[name] for name in cameras}
 
 
 def build_spec(
@@ -242,14 +285,6 @@ def build_spec(
     return validate_record(MatchSpec, content, str(out / "match.yaml"))
 
 
-def copy_videos(files: Mapping[str, Path], folder: Path) -> None:
-    """Copy the videos of cameras into a match folder."""
-    if files:
-        (folder / "videos").mkdir()
-    for file in files.values():
-        shutil.copyfile(file, folder / "videos" / file.name)
-
-
 def find_people(folder: Path, people: Mapping[str, KeypointDetections]) -> tuple[int, int]:
     """Return the first frame with a person in any camera, and the one after the last."""
     seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
@@ -273,23 +308,27 @@ def import_videos(
     fps: float | None = None,
     match_id: str | None = None,
     boxes: Path | None = None,
+    place: Placing | None = None,
+    join: bool = False,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
     Without a calibration each video is a camera, to be located by clicks or by people. A camera
     that was calibrated in larger or smaller images of the same shape is scaled to its video.
 
-    The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
-    in match.yaml can shift them afterwards.
+    The only clip, `clip`, is as long as the shortest video; `offset_frames` can shift videos later.
 
     Args:
         calibration: a file or folder that `read_calibration` reads; None = not known.
-        videos: folder with a video for each camera of the calibration, called as the camera.
+        videos: folder with a video, or a folder of numbered images, for each camera of the
+            calibration, called as the camera.
         out: the match folder, absent or empty.
-        fps: frame rate of all videos [1/s]; None = from the videos.
+        fps: frame rate of all videos [1/s]; None = from the videos; images have none.
         match_id: id of the match; None = the name of `out`.
         boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
             estimated, for some of the cameras or all; None = people are detected.
+        place: brings the cameras to metres with z up; None = they are.
+        join: whether chapters of one recording, as GoPro names them, become one video.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -298,51 +337,69 @@ def import_videos(
         InputError: a file is invalid, names or rates do not match, or `out` is not empty; nothing
             is written then.
     """
+    with tempfile.TemporaryDirectory(prefix="worldpose-") as joined:
+        found = find_videos(videos, Path(joined) if join else None)
+        return _import_found(calibration, videos, found, out, fps, match_id, boxes, place)
+
+
+def _import_found(
+    calibration: Path | None,
+    folder: Path,
+    found: Mapping[str, Path],
+    out: Path,
+    fps: float | None,
+    match_id: str | None,
+    boxes: Path | None,
+    place: Placing | None,
+) -> tuple[MatchSpec, list[str]]:
+    """Write a match folder with these videos; see `import_videos`."""
+    if calibration is None:
+        require_cameras(folder, found)
+    states = {file: file_state(file) for file in found.values()}
+    indices = {name: index_video(file) for name, file in found.items()}
     cameras: dict[str, CameraCalibration] = {}
     notes: list[str] = []
-    if calibration is None:
-        files = {camera_id(file.stem): file for file in list_videos(videos)}
-        indices = {name: index_frames(file) for name, file in files.items()}
-    else:
-        filmed = [file for file in sorted(videos.glob("[!.]*")) if is_video(file)]
-        known = {camera_id(file.stem): index_frames(file) for file in filmed}
+    files = dict(found)
+    if calibration is not None:
         left_out: LeftOut = {}
-        cameras = read_calibration(calibration, {n: one.size for n, one in known.items()}, left_out)
+        shown = {name: index.size for name, index in indices.items()}
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes += describe_left_out(left_out)
-        files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES, left_out)
-        indices = {name: known[name] for name in files}
+        endings = VIDEO_SUFFIXES
+        files = pick_cameras(folder, found, list(cameras), calibration, endings, left_out)
+        indices = {name: indices[name] for name in files}
         for name, file in files.items():
             cameras[name] = fit_to_video(file, cameras[name], indices[name], notes)
-    rate = round(next(iter(indices.values())).fps, 3) if fps is None else fps
-    counts = {name: len(index.on_clock(rate, str(files[name]))) for name, index in indices.items()}
+    rate = _first_rate(files, indices) if fps is None else fps
+    clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
+    notes += describe_videos(files, indices, clocks)
     sizes = {name: index.size for name, index in indices.items()}
-    spec = build_spec(out, match_id, rate, sizes, (0, min(counts.values())), videos=files)
+    count = min(map(len, clocks.values()))
+    spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)
+    if place is not None:
+        cameras, notes[:0] = place(calibration or folder, cameras, {}, rate)
 
-    def copy(folder: Path) -> None:
-        copy_videos(files, folder)
+    def copy(match: Path) -> None:
+        copy_videos(files, match)
+        require_settled({files[name]: states[files[name]] for name in files}, "import again")
         if boxes is not None:
-            copy_boxes(boxes, indices, folder)
+            copy_boxes(boxes, indices, match)
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
     return spec, notes
 
 
-def list_videos(folder: Path) -> list[Path]:
-    """Return the videos of a folder, each of which is a camera.
-
-    Raises:
-        InputError: there are fewer than two, or two of one name.
-    """
-    there = sorted(folder.glob("[!.]*"))
-    files = [file for file in there if is_video(file)]
-    if len({camera_id(file.stem) for file in files}) != len(files) or len(files) < 2:
+def _first_rate(files: Mapping[str, Path], indices: Mapping[str, FrameIndex]) -> float:
+    """Return the rate of the first video that has one [1/s]; InputError if none has."""
+    rates = [index.fps for index in indices.values() if np.isfinite(index.fps)]
+    if not rates:
         raise InputError(
-            str(folder),
-            expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)})",
-            found=", ".join(file.name for file in files or there) or "no video",
-            todo="Name each video after its camera.",
+            str(next(iter(files.values()))),
+            expected="frames per second, which images and a single frame do not tell",
+            found="none",
+            todo="Add for example --fps 25.",
         )
-    return files
+    return round(rates[0], 3)
 
 
 def fit_to_video(
@@ -379,7 +436,7 @@ def fit_to_video(
     scale = float((shown / own).min())
     bar = 0.5 * (shown - scale * own)
     if (shown / own).max() > (1.0 + SAME_SHAPE) * scale:
-        with VideoReader(file, index) as video:
+        with open_video(file, index) as video:
             if not _has_black_bars(video.frame(0), bar):
                 raise video_size_error(file, camera, index)
     # Pixel centres are whole numbers, so that the picture's corner is at -0.5.

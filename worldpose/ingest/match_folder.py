@@ -15,6 +15,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import read_calibration_toml
+from worldpose.formats.calibration_unit import require_metres
 from worldpose.formats.files import read_yaml
 from worldpose.formats.lens_files import read_lens_toml
 from worldpose.ingest.annotations import (
@@ -241,6 +242,7 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
         return {}
     file = existing_file(folder, "calibration.toml", str(folder))
     calibrations = read_calibration_toml(file)
+    require_metres(file, calibrations)
     static = {camera.id: camera for camera in spec.static_cameras}
     extra = [name for name in calibrations if name not in static]
     if extra:

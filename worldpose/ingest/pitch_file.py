@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Final, TypeGuard
 
+from data_contracts.conventions import OTHER_UNITS
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
@@ -15,8 +16,6 @@ from worldpose.pitch.laws import law_points
 
 SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
 """Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90."""
-UNITS: Final = {"millimetres": 0.001, "centimetres": 0.01, "feet": 0.3048, "yards": 0.9144}
-"""Other units to guess in messages [m]."""
 FROM_LAWS: Final = 2.0
 """Maximum distance of a surveyed point from its place in the Laws, in plan [m]."""
 NO_PITCH: Final = "none"
@@ -71,7 +70,7 @@ def _check_size(content: object, file: str) -> None:
         if not _is_number(value) or value <= 0:
             continue  # the contract says what is wrong with it
         if not least <= value <= most:
-            units = [u for u, metres in UNITS.items() if least <= value * metres <= most]
+            units = [u for u, metres in OTHER_UNITS.items() if least <= value * metres <= most]
             guess = f", which looks like {units[0]}" if units else ""
             raise InputError(
                 f"{file}: {key}",
@@ -109,7 +108,7 @@ def _check_points(content: object, file: str) -> None:
     x, y = (float(value) for value in points[worst][:2])
     units = [
         name
-        for name, metres in UNITS.items()
+        for name, metres in OTHER_UNITS.items()
         if math.dist((x * metres, y * metres), laws[worst][:2]) <= FROM_LAWS
     ]
     guess = f", which looks like {units[0]}" if units else ""

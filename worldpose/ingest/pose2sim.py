@@ -10,7 +10,7 @@ from typing import Any, Final
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import LeftOut, camera_id
+from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
@@ -21,19 +21,23 @@ from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.files import read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
+from worldpose.ingest.camera_videos import (
+    copy_videos,
+    describe_videos,
+    find_videos,
+    require_cameras,
+)
 from worldpose.ingest.importing import (
+    Placing,
     build_spec,
     camera_of,
-    copy_videos,
     describe_left_out,
     describe_people,
     find_people,
     fit_to_video,
-    list_videos,
 )
 from worldpose.ingest.writing import write_match
-from worldpose.video.files import index_frames
-from worldpose.video.names import is_video
+from worldpose.video.folder import index_video
 from worldpose.video.pictures import FrameIndex
 
 _SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
@@ -41,7 +45,11 @@ _SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
 
 
 def import_pose2sim(
-    project: Path, out: Path, fps: float | None = None, match_id: str | None = None
+    project: Path,
+    out: Path,
+    fps: float | None = None,
+    match_id: str | None = None,
+    place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
 
@@ -59,6 +67,7 @@ def import_pose2sim(
         out: the match folder, absent or empty.
         fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
         match_id: id of the match; None = the name of `out`.
+        place: brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was left out.
@@ -71,7 +80,7 @@ def import_pose2sim(
     calibration = _find_pose2sim_calibration(project)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
-    films = [file for file in sorted((project / "videos").glob("[!.]*")) if is_video(file)]
+    films = list(find_videos(project / "videos").values())
     if not places and not films:
         raise InputError(
             str(project),
@@ -79,7 +88,7 @@ def import_pose2sim(
             found="neither",
             todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
         )
-    known = {file: index_frames(file) for file in films}
+    known = {file: index_video(file) for file in films}
     left_out: LeftOut = {}
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
@@ -87,11 +96,12 @@ def import_pose2sim(
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        names = [camera_id(file.stem) for file in list_videos(project / "videos")]
+        require_cameras(project / "videos", {camera_of(file): file for file in films})
+        names = [camera_of(file) for file in films]
         source = project / "videos"
     else:
         shown = {camera_of(file): index.size for file, index in known.items()}
-        cameras = read_calibration(calibration, shown, left_out)
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
         places = [each for each in places if camera_of(each) not in left_out]
@@ -107,7 +117,9 @@ def import_pose2sim(
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
-    counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
+    clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
+    notes += describe_videos(videos, indices, clocks) if clocks else []
+    counts = map(len, clocks.values())
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
@@ -116,9 +128,11 @@ def import_pose2sim(
     spec = build_spec(
         out, match_id, rate, {name: sizes[name] for name in names}, (first, stop), videos=videos
     )
-    for name, place in poses.items():
-        people[name] = on_frames(place, people[name], [(first, stop - first)])
+    for name, files in poses.items():
+        people[name] = on_frames(files, people[name], [(first, stop - first)])
 
+    if place is not None:
+        cameras, notes[:0] = place(calibration or project, cameras, people, rate)
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )

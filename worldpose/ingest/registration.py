@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
 from data_contracts.match import Registration, SourceFile
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.ingest.match_folder import LENS_FILE, MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
 from worldpose.ingest.validation import reachable
@@ -51,7 +52,8 @@ def _register(match: MatchFolder, previous: Registration | None) -> Registration
     paths = sorted({*identifying, *_further_files(match)})
     with ThreadPoolExecutor(READERS) as threads:
         files = tuple(threads.map(lambda path: _source_file(match.folder, path, known), paths))
-    _require_settled(match.folder, files)
+    states = {match.folder / file.path: (file.size, file.modified_ns) for file in files}
+    require_settled(states, "ingest again")
     identity = hashlib.sha256()
     for file in files:
         if file.path in identifying:
@@ -124,29 +126,43 @@ def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]
         raise InputError(
             str(folder / path),
             expected="a readable file",
-            found=str(error),
+            found=say_failure(error),
             todo="Check its rights, or wait until it is written.",
         ) from error
     return SourceFile(path=path, size=before.st_size, modified_ns=before.st_mtime_ns, sha256=sha256)
 
 
-def _require_settled(folder: Path, files: tuple[SourceFile, ...]) -> None:
-    """Raise InputError for files that changed during reading, or change a moment later."""
-    newest = max(file.modified_ns for file in files) / 1e9
+def file_state(path: Path) -> tuple[int, int]:
+    """Return the size [byte] and the time of change [ns] of a file, or those of a folder's files.
+
+    Raises:
+        OSError: a file is unreachable.
+    """
+    states = [file.stat() for file in (path.iterdir() if path.is_dir() else (path,))]
+    return sum(each.st_size for each in states), max((s.st_mtime_ns for s in states), default=0)
+
+
+def require_settled(states: Mapping[Path, tuple[int, int]], what: str) -> None:
+    """Raise InputError for files that changed during reading, or change a moment later.
+
+    Args:
+        states: `file_state` of each file before reading.
+        what: what to do then, for messages.
+    """
+    newest = max(modified for _, modified in states.values()) / 1e9
     wait = newest + SETTLE_SECONDS - time.time()
     if wait > 0:
         # A time in the future, of a clock that runs ahead, tells nothing about the other files.
         time.sleep(min(wait, SETTLE_SECONDS))
-    for file in files:
+    for path, state in states.items():
         try:
-            now = (folder / file.path).stat()
-            same = (now.st_size, now.st_mtime_ns) == (file.size, file.modified_ns)
+            same = file_state(path) == state
         except OSError:
             same = False
         if not same:
             raise InputError(
-                str(folder / file.path),
+                str(path),
                 expected="a finished file",
                 found="one that is still being written",
-                todo="Wait until it is complete, then ingest again.",
+                todo=f"Wait until it is complete, then {what}.",
             )

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from data_contracts.records import Record
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 
 R = TypeVar("R", bound=Record)
 
@@ -42,7 +42,7 @@ def validate_record(model: type[R], data: object, file: str) -> R:
         raise InputError(
             file,
             expected="mappings, lists, text and numbers",
-            found=str(error),
+            found=say_failure(error),
             todo="Write plain values.",
         ) from error
     try:
@@ -167,7 +167,7 @@ def reachable(folder: Path) -> Iterator[None]:
         raise InputError(
             str(error.filename or folder),
             expected="a match folder that this user can read",
-            found=error.strerror or str(error),
+            found=say_failure(error),
             todo="Mount its disk, or give this user permission to read it.",
         ) from error
 

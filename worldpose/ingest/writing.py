@@ -20,7 +20,7 @@ from data_contracts.match import ClockOffset, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.compiled import map_in_threads
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
 from worldpose.formats.files import FULL, sync_path, whole_file
@@ -127,7 +127,7 @@ def write_match(
         raise InputError(
             str(folder),
             expected="space for the match folder",
-            found=error.strerror or str(error),
+            found=say_failure(error),
             todo="Free some, or choose another place; nothing was written.",
         ) from error
     sync_path(folder.parent)
@@ -156,7 +156,7 @@ def _make_parent(folder: Path) -> None:
         raise InputError(
             str(folder),
             expected="a place where a folder can be made",
-            found=str(error),
+            found=say_failure(error),
             todo="Choose another place.",
         ) from error
 

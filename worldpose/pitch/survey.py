@@ -6,8 +6,8 @@ it reject surveys in another unit, in a mirrored frame, or with wrong names.
 
 from __future__ import annotations
 
-import csv
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -21,6 +21,7 @@ from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from worldpose.errors import InputError
+from worldpose.parsing import read_cells
 from worldpose.pitch.laws import law_lines, law_points
 
 COLUMNS: Final[Mapping[str, str]] = {
@@ -30,6 +31,7 @@ COLUMNS: Final[Mapping[str, str]] = {
     "easting": "x",
     "northing": "y",
     "height": "z",
+    "elevation": "z",
 }
 """Axis of each column; a grid's easting and northing make a right-handed frame whatever their order
 in the file."""
@@ -54,17 +56,19 @@ def read_survey(path: Path) -> Survey:
     """Read the positions in a CSV file with the columns name, x, y and, if heights are known, z.
 
     A name is a point of the pitch template, or an end of a line as `<line>.start` or `<line>.end`.
-    `easting`, `northing` and `height` may replace x, y and z. Separators are commas, semicolons or
-    tabs.
+    `easting`, `northing` and `height` or `elevation` may replace x, y and z, and `point` name; a
+    unit `(m)` or `[m]` may follow. `read_cells` says how the text may be saved.
 
     Raises:
         InputError: the error names file and row: the file is unreadable, or has a missing or
             unknown column, an unknown or repeated name, or text that is no number.
     """
-    rows = _rows(path)
+    most = 1 << 20  # all named points take 3 kB
+    rows, has_commas = read_cells(path, most, "Correct the survey file.")
     if not rows:
         raise _wrong(str(path), "a header and one row for each point", "nothing")
-    header = [title.strip().lower() for title in rows[0]]
+    header = [re.sub(r"\s*[\[(]m[\])]$", "", title.strip().lower()) for title in rows[0][1]]
+    header = ["name" if title == "point" else title for title in header]
     axes = [COLUMNS.get(title) for title in header if title != "name"]
     if (
         header.count("name") != 1
@@ -74,12 +78,12 @@ def read_survey(path: Path) -> Survey:
         raise _wrong(
             f"{path}: row 1",
             "the columns name, x, y and, where there are heights, z (or easting, northing, height)",
-            ", ".join(rows[0]),
+            ", ".join(rows[0][1]),
         )
     ends = line_ends()
     known = [*law_points(105.0, 68.0), *ends]
     places: dict[str, list[float]] = {}
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in rows[1:]:
         where = f"{path}: row {number}"
         if len(row) != len(header):
             raise _wrong(where, f"{len(header)} columns", f"{len(row)}")
@@ -92,6 +96,8 @@ def read_survey(path: Path) -> Survey:
         name = ends.get(given, given)
         if name in places:
             raise _wrong(f"{where}: name", "every point once", f"{given!r}, which is {name} again")
+        if has_commas:
+            values = {title: text.replace(",", ".") for title, text in values.items()}
         place = {COLUMNS[title]: _number(f"{where}: {title}", title, values) for title in values}
         places[name] = [place["x"], place["y"], place.get("z", math.nan)]
     return Survey(str(path), tuple(places), np.array(list(places.values())).reshape(-1, 3))
@@ -104,21 +110,6 @@ def line_ends() -> dict[str, str]:
     return starts | {f"{name}.end": line.end for name, line in lines.items()}
 
 
-def _rows(path: Path) -> list[list[str]]:
-    most = 1 << 20  # all named points take 3 kB
-    try:
-        if not path.is_file():
-            raise _wrong(str(path), "a CSV file", "nothing", "Check the path.")
-        if path.stat().st_size > most:
-            raise _wrong(str(path), f"at most {most} bytes", f"{path.stat().st_size}")
-        text = path.read_text(encoding="utf-8-sig")
-        first = text.partition("\n")[0]
-        separator = max(",;\t", key=first.count)
-        return [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(row)]
-    except (OSError, ValueError, csv.Error) as error:
-        raise _wrong(str(path), "readable UTF-8 text in rows and columns", str(error)) from error
-
-
 def _number(where: str, title: str, values: Mapping[str, str]) -> float:
     """Return the finite number in a column of one row; NaN for an empty height."""
     text = values[title]
@@ -129,7 +120,7 @@ def _number(where: str, title: str, values: Mapping[str, str]) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise _wrong(where, "a number, with a point as decimal sign", repr(text))
+        raise _wrong(where, "a number", repr(text))
     return value
 
 

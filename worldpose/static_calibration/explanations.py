@@ -184,8 +184,9 @@ def check_mirrored(found: Explanation) -> None:
             found.problem.where,
             expected="names as seen from this camera's side of the pitch",
             found=f"{describe_clicks(evidence)} that fit only with left and right exchanged",
-            todo="Exchange left and right (or near and far) in all names: left is negative x, "
-            "near is negative y, the main camera's side.",
+            todo="Are the names right and the image is mirrored? Then mirror the video back. Else "
+            "exchange left and right (or near and far) in all names: left is negative x, near is "
+            "negative y, the main camera's side. If the image is mirrored, people then tell it.",
         )
 
 

@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Flags, Floats, Integers
+from data_contracts.conventions import OTHER_UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import size_ratios
 from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
 from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.vertical import find_vertical, name_axis
 
 SAMPLES: Final = 24
 """Most frames in which detections are compared."""
@@ -35,13 +37,13 @@ MATCH: Final = np.dtype(
         ("distance", np.float64),
         # Limb lengths relative to an adult's [1]; NaN where unknown.
         ("size", np.float64),
-        # Mean height of the joints over z = 0 [m].
-        ("height", np.float64),
+        # The joints [m].
+        ("joints", np.float64, (17, 3)),
         # Distance from the first camera [m].
         ("depth", np.float64),
     ]
 )
-"""Two detections that may show one person; medians over the joints."""
+"""Two detections that may show one person; medians over joints."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ def _joint_spreads(rays: Floats) -> Floats:
 
 def _locate_match(
     origin: Floats, p: Floats, baseline: Floats, q: Floats
-) -> tuple[float, ...] | None:
+) -> tuple[float | Floats, ...] | None:
     """Return one match; None behind a camera."""
     cosine = (p * q).sum(axis=-1)
     sine = np.linalg.norm(np.cross(p, q), axis=-1)
@@ -177,7 +179,7 @@ def _locate_match(
     size = float(np.nanmedian(limbs)) if np.isfinite(limbs).any() else math.nan
     angle = float(np.nanmedian(np.arctan2(sine, np.abs(cosine))))
     distance = float(np.nanmean(np.linalg.norm(near - far, axis=-1)))
-    return angle, distance, size, float(np.nanmean(joints[:, 2])), float(np.nanmedian(s))
+    return angle, distance, size, joints, float(np.nanmedian(s))
 
 
 def diagnose_no_people(
@@ -187,7 +189,7 @@ def diagnose_no_people(
     fps: float,
     settings: TrackingSettings,
     *,
-    ground: bool,
+    pitch_size: tuple[float, float] | None = None,
     births: int = 0,
 ) -> NoPeople:
     """Return the reason why tracking found no person in the clip.
@@ -198,9 +200,11 @@ def diagnose_no_people(
         detections: (frames, cameras, detections); a confidence of 0, less or NaN where not found.
         fps: frames per second [1/s].
         settings: settings of the tracking run.
-        ground: whether people stand on z = 0.
+        pitch_size: length and width of the pitch around the origin [m], on which people stand at
+            z = 0; None = they may be anywhere.
         births: tracks that began and were dropped again.
     """
+    ground = pitch_size is not None
     joints = _count_joints(detections)
     usable = joints >= settings.min_joints
     present = np.asarray(usable.any(axis=-1))
@@ -210,7 +214,7 @@ def diagnose_no_people(
     if empty is not None:
         return empty
     frames = _common_window(present)
-    rays = _usable_rays(cameras, detections[frames], settings.min_joints)
+    rays = usable_rays(cameras, detections[frames], settings.min_joints)
     extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
     if extent < 1e-3:  # [m]
         together = " and ".join(name for name, count in detected.items() if count > 0)
@@ -237,7 +241,7 @@ def diagnose_no_people(
     # Cameras at nearly one position share few people if they look in different directions.
     some = [each for each in matches if (each.agrees if best.agrees else each.count)]
     if best.agrees or (some and max(each.angle for each in some) < settings.min_angle_rad):
-        return _explain_limit(cameras, camera_ids, some, settings, ground, births)
+        return _explain_limit(cameras, camera_ids, some, settings, pitch_size, births)
     found = _explain_clock_offset(cameras, camera_ids, rays, matches, fps, settings)
     if found is not None:
         return found
@@ -329,7 +333,7 @@ def _common_window(present: Flags) -> slice:
     return slice(start, min(len(present), start + WINDOW))
 
 
-def _usable_rays(cameras: Camera, detections: KeypointDetections, least: int) -> Floats:
+def usable_rays(cameras: Camera, detections: KeypointDetections, least: int) -> Floats:
     """Return unit rays (frames, cameras, detections, 17, 3) [world]; NaN where not usable."""
     image = np.asarray(detections.keypoints, dtype=np.float64)
     rays = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
@@ -344,16 +348,20 @@ def _explain_limit(
     names: Sequence[str],
     agreeing: list[PairMatches],
     settings: TrackingSettings,
-    ground: bool,
+    pitch_size: tuple[float, float] | None,
     births: int,
 ) -> NoPeople:
     """Return the limit that rejects people seen by two cameras."""
     best = agreeing[0]
     a, b = (names[n] for n in best.cameras)
     apart = float(np.linalg.norm(np.subtract(*cameras.center[list(best.cameras)])))
-    angle, distance, height, depth = (
-        float(np.median(best.matches[name])) for name in ("angle", "distance", "height", "depth")
+    angle, distance, depth = (
+        float(np.median(best.matches[name])) for name in ("angle", "distance", "depth")
     )
+    middle = np.nanmean(best.matches["joints"], axis=1)
+    x, y, height = np.median(middle, axis=0).tolist()
+    outside = np.abs(middle[:, :2]) - 0.5 * np.array(pitch_size or (np.inf, np.inf))
+    vertical = find_vertical(best.matches["joints"])
     known = best.matches["size"][np.isfinite(best.matches["size"])]
     size = float(np.median(known)) if len(known) else math.nan
     seen = f"{best.count} of {best.possible} detections of {a} and {b} match"
@@ -379,7 +387,21 @@ def _explain_limit(
             f"metres; {a} and {b} are {apart:.4g} apart.",
         ),
         (
-            ground and not low <= height <= high,
+            vertical is not None and vertical.is_clear and not vertical.is_z,
+            "not_upright",
+            f"{'' if vertical is None else vertical.describe()}. Import the calibration again with "
+            f"worldpose import --up {'' if vertical is None else name_axis(vertical.axis)}, which "
+            "turns it to z up.",
+        ),
+        (
+            pitch_size is not None and outside.max(axis=1).min() > settings.pitch_margin_m,
+            "outside_pitch",
+            f"they are {math.hypot(x, y):.0f} m from the centre spot, at x = {x:.0f}, y = {y:.0f}, "
+            f"outside the pitch ({' x '.join(f'{side:g}' for side in pitch_size or ())} m). The "
+            "world's origin is the centre spot: move it there, or write pitch: none.",
+        ),
+        (
+            pitch_size is not None and not low <= height <= high,
             "wrong_height",
             f"the middle of their bodies is at z = {height:.2f} m (tracking.body_heights_m accepts "
             f"{low:g} to {high:g}). On a pitch people stand at z = 0 and z points up: look at the "
@@ -414,8 +436,7 @@ def _explain_limit(
 
 def _guess_unit(size: float) -> str:
     """Return what translations that make people `size` times as large may be in."""
-    units = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
-    off, unit = min((abs(math.log(size / factor)), name) for factor, name in units.items())
+    off, unit = min((abs(math.log(size * m)), name) for name, m in OTHER_UNITS.items())
     return f"translations seem to be in {unit}" if off < 0.3 else "is the unit the metre?"
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
-from worldpose.camera_consistency.changes import Change, find_changes, measure_step
+from worldpose.camera_consistency.changes import Change, Kind, find_changes, measure_step
 from worldpose.camera_consistency.health import LIMBS, UNKNOWNS, CameraHealth
 from worldpose.geometry.cameras import Camera
 from worldpose.tracking.settings import TrackingSettings
@@ -39,6 +39,7 @@ class MeasuredChange:
             after a sudden change, or at the end of the clip.
         std: standard deviation of its size [frame] or [px].
         is_explained: whether all cameras agree with the change corrected.
+        is_left_out: whether its views are useless if the change does not explain them.
         before: lateness of a changed clock before the change [frame].
     """
 
@@ -46,6 +47,7 @@ class MeasuredChange:
     amount: Floats
     std: float
     is_explained: bool = True
+    is_left_out: bool = False
     before: float = 0.0
 
     def at(self, rows: Floats, frames: int) -> Floats:
@@ -81,15 +83,23 @@ def explain_changes(
     usual = float(np.median(np.delete(without, culprit)))
     if usual - without[culprit] < 0.25 * usual / (len(without) - 1):
         return None
-    own = [trial.measure(each) for each in found if each.camera == culprit]
+    # Its change without its own share in the people, which hides a part.
+    near = [each for each in found if each.camera == culprit] or list(found)
+    alone, misfit = trial.find_alone(culprit, near[0], sorted({each.kind for each in near}))
+    # Real cameras that stand still: up to 1.7 times the misfit of the others.
+    if misfit < 2.0 * without[culprit]:
+        return None
+    own = [trial.measure(each) for each in alone or near if each.camera == culprit]
+    is_left_out = misfit > 8.0 * without[culprit]
     if not own:
-        swaying = replace(found[0], camera=culprit, is_sudden=False)
-        return MeasuredChange(swaying, np.zeros(UNKNOWNS), np.inf, is_explained=False)
+        swaying = replace(near[0], camera=culprit, is_sudden=False)
+        unknown = MeasuredChange(swaying, np.zeros(UNKNOWNS), np.inf)
+        return replace(unknown, is_explained=False, is_left_out=is_left_out)
     after = [trial.misfit(windows, each) for each in own]
     best = int(np.argmin(after))
     # A camera that sways is not explained by one change.
     is_explained = before - after[best] > 0.7 * (before - without[culprit])
-    return replace(own[best], is_explained=is_explained)
+    return replace(own[best], is_explained=is_explained, is_left_out=is_left_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +123,27 @@ class _Trial:
         before = starts[starts + length + gap <= found.row][-6:]
         after = np.arange(found.row + gap, frames - length + 1, length)[:6]
         return [slice(int(start), int(start) + length) for start in (*before, *after)]
+
+    def find_alone(
+        self, camera: int, near: Change, kinds: Sequence[Kind]
+    ) -> tuple[list[Change], float]:
+        """Return a camera's changes and misfit [1] towards the people whom the others place."""
+        frames, count = len(self.people.detection_index), len(self.cameras.focal)
+        first = 0 if frames <= 6000 else max(0, min(near.row, frames - 3000) - 1500)
+        span = range(first, frames if frames <= 6000 else first + 3000)
+        index = self.people.detection_index
+        health = CameraHealth.empty(len(span), count, index.shape[2], self.fps)
+        for start in span[::512]:
+            rows = slice(max(0, start - 1), min(span.stop, start + 513))
+            seen = self.people[rows]
+            joints = triangulate_views(self.cameras, _without(seen, camera), self.settings)
+            health.add(self.cameras, seen, joints, rows.start - first)
+        changes = [
+            replace(each, row=each.row + first)
+            for each in find_changes(health, self.fps, kinds)
+            if each.camera == camera
+        ]
+        return changes, float(health.cost[camera] / max(1.0, 2.0 * health.scale[camera, 1]))
 
     def measure(self, found: Change) -> MeasuredChange:
         """Return a change with its size."""
@@ -154,14 +185,20 @@ class _Trial:
         cameras, seen = self.cameras, self.people[window]
         if change is not None:
             seen = correct_window(cameras, self.people, window, change)
-        if without is not None:
-            index = seen.detection_index.copy()
-            index[:, without] = -1
-            seen = seen.assign_people(index)
+        seen = _without(seen, without)
         joints = triangulate_views(cameras, seen, self.settings)
         one = CameraHealth.empty(len(joints), len(cameras.focal), joints.shape[1], self.fps)
         one.add(cameras, seen, joints, 0)
         return one, int(np.isfinite(joints[1:-1, :, LIMBS, 0]).sum())
+
+
+def _without(seen: KeypointDetections, camera: int | None) -> KeypointDetections:
+    """Return the people without the views of a camera."""
+    if camera is None:
+        return seen
+    index = seen.detection_index.copy()
+    index[:, camera] = -1
+    return seen.assign_people(index)
 
 
 def triangulate_views(
@@ -204,7 +241,7 @@ def correct_views(
         after = frame - change.first_frame
         inside = (after >= 0) & (after < change.frame_count)
         if not change.is_explained:
-            moved[inside, c] = np.nan
+            moved[inside, c] = np.nan if change.is_left_out else moved[inside, c]
             continue
         gradual: Floats = np.asarray(after / max(1.0, change.frame_count - 1.0))
         sudden = (frame >= (change.frame or 0)).astype(np.float64)
@@ -223,7 +260,7 @@ def describe_change(change: CameraChange) -> str:
     todo = "worldpose synchronize proposes offsets that change with it"
     if not change.is_explained:
         what = "its clock changes" if change.kind == "clock" else "it moves"
-        left = "" if change.kind == "clock" else "; its views are left out"
+        left = "; its views are left out" if change.is_left_out else ""
         return (
             f"camera {camera}: {what} within the clip in a way that no single step or drift "
             f"explains{left}"
@@ -275,6 +312,7 @@ def change_record(
         late_frames=late,
         std=change.std if np.isfinite(change.std) else None,
         is_explained=change.is_explained,
+        is_left_out=not change.is_explained and change.is_left_out and found.kind == "view",
     )
 
 

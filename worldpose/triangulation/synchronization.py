@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.comparison import Comparison
 from worldpose.camera_consistency.consistency import select_busiest_frames
@@ -53,10 +53,12 @@ class Synchronization:
     """Clock offsets of a clip's cameras.
 
     Attributes:
-        late: (cameras,) [frame]: frame t shows the time t + late; NaN where not determined.
+        late: (cameras,) [frame]: frame t shows the time t + late, relative to the other cameras of
+            its group; NaN where not determined.
         std: (cameras,) standard deviation [frame]; infinite where not determined.
         reasons: why the offset of each camera is not determined; empty where it is.
         shifts: (n,) compared offsets [frame].
+        groups: cameras that share people, in order; groups share none.
         matches: (cameras, n) people of a camera who meet those of all others at each offset, with
             the others at their own offsets [persons per frame]; NaN where not determined.
     """
@@ -66,6 +68,7 @@ class Synchronization:
     reasons: tuple[str, ...]
     shifts: Integers
     matches: Floats
+    groups: tuple[tuple[int, ...], ...] = ()
 
 
 def synchronize(
@@ -110,17 +113,17 @@ def synchronize(
     points = np.where((confidence > 0.0)[..., None], keypoints, np.nan).astype(np.float64)
     most = min(round(max_offset_s * fps), len(points) // 2)
     table = _Table(cameras, points, fps, most, ground=pitch is not None)
-    whole, span, reasons = table.solve()
+    whole, span, reasons, groups = table.solve()
     late, std = whole.astype(np.float64), np.full(count, np.inf)
     known = np.isfinite(span)
-    if np.count_nonzero(known) >= 2:
-        chosen = np.flatnonzero(known)
-        late[chosen], std[chosen] = _refine(
-            cameras[chosen], detections, fps, chosen, whole[chosen], pitch
-        )
-        # Largest standard error of a determined offset [frame]: twice of it is half a frame.
-        known &= std <= 0.25
-        known &= np.abs(late - whole) <= MAX_SPAN
+    for group in groups:
+        chosen = np.array([camera for camera in group if known[camera]], dtype=np.int64)
+        if len(chosen) >= 2:
+            late[chosen], std[chosen] = _refine(
+                cameras[chosen], detections, fps, chosen, whole[chosen], pitch
+            )
+    # Largest standard error of a determined offset [frame]: twice of it is half a frame.
+    known &= (std <= 0.25) & (np.abs(late - whole) <= MAX_SPAN)
     for camera in np.flatnonzero(~known & np.isfinite(span)):
         reasons[camera] = (
             "its people move too little, or other cameras contradict each other about it"
@@ -130,9 +133,17 @@ def synchronize(
         late, std = _compare_places(cameras, detections, fps, pitch, max_offset_s)
         known = np.isfinite(std)
         reasons = ["" if told else reason for told, reason in zip(known, reasons, strict=True)]
-    late = np.where(known, late - np.median(late[known]) if known.any() else 0.0, np.nan)
-    steps = np.rint(np.where(known, late, 0.0)).astype(np.int64)
-    return Synchronization(late, std, tuple(reasons), table.shifts, table.curves(steps, known))
+        groups = [np.flatnonzero(known).tolist()]
+    groups = [[camera for camera in sorted(group) if known[camera]] for group in groups]
+    groups = sorted(group for group in groups if len(group) > 1)
+    matches = np.full((count, len(table.shifts)), np.nan)
+    for group in groups:
+        late[group] -= np.median(late[group])
+        matches[group] = table.curves(np.rint(late).astype(np.int64), group)
+    joined = np.isin(np.arange(count), [camera for group in groups for camera in group])
+    late, std = np.where(joined, late, np.nan), np.where(joined, std, np.inf)
+    each = tuple(tuple(group) for group in groups)
+    return Synchronization(late, std, tuple(reasons), table.shifts, matches, each)
 
 
 def _compare_places(
@@ -326,8 +337,8 @@ class _Table:
             table[inside] = found
             self.scores[a, b] = table
 
-    def solve(self) -> tuple[Integers, Floats, list[str]]:
-        """Return whole offsets, the distance of other likely ones, and reasons.
+    def solve(self) -> tuple[Integers, Floats, list[str], list[list[int]]]:
+        """Return whole offsets, the distance of other likely ones, reasons, and groups.
 
         The distance is infinite where no offset is known [frame].
         """
@@ -337,9 +348,9 @@ class _Table:
         draws = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), 200)
         curves = self._means(np.ones((1, blocks)))
         drawn = self._means(draws.astype(np.float64))
-        order, late, reasons = self._join(curves, drawn)
+        groups, late, reasons = self._join(curves, drawn)
         span = np.full(self.count, np.inf)
-        for camera in order if len(order) > 1 else ():
+        for order, camera in ((group, camera) for group in groups for camera in group):
             own = self._total(curves, camera, late, order)[0]
             others = self._total(drawn, camera, late, order)
             best = int(np.nanargmax(own))
@@ -355,16 +366,12 @@ class _Table:
                 ends = f"{likely.min():+d} to {likely.max():+d}"
                 reasons[camera] = f"offsets of {ends} frames explain its people equally well"
                 span[camera] = np.inf
-        return late, span, reasons
+        return late, span, reasons, groups
 
-    def curves(self, late: Integers, known: Flags) -> Floats:
-        """Return the matches (cameras, n) of each camera with all others by its offset."""
-        found = np.full((self.count, len(self.shifts)), np.nan)
+    def curves(self, late: Integers, group: Sequence[int]) -> Floats:
+        """Return the matches (members, n) of each camera of a group with the others by offset."""
         means = self._means(np.ones((1, int(self._block.max()) + 1)))
-        order = np.flatnonzero(known).tolist()
-        for camera in order if len(order) > 1 else ():
-            found[camera] = self._total(means, camera, late, order)[0]
-        return found
+        return np.stack([self._total(means, camera, late, group)[0] for camera in group])
 
     def _means(self, weights: Floats) -> dict[tuple[int, int], Floats]:
         """Return mean matches (draws, n) of each pair; weights are (draws, blocks)."""
@@ -405,30 +412,40 @@ class _Table:
 
     def _join(
         self, curves: dict[tuple[int, int], Floats], drawn: dict[tuple[int, int], Floats]
-    ) -> tuple[list[int], Integers, list[str]]:
-        """Return the cameras in the order of their clearness, and their offsets."""
+    ) -> tuple[list[list[int]], Integers, list[str]]:
+        """Return groups of cameras, each in the order of clearness, their offsets, and reasons.
+
+        A camera that joins no group can begin another one.
+        """
         late = np.zeros(self.count, dtype=np.int64)
         reasons = [
             "no offset stands out: its people move too little, or no other camera shows them"
         ] * self.count
         clearness = {pair: _contrast(curves[pair][0], drawn[pair]) for pair in curves}
-        best = max(clearness, key=lambda pair: clearness[pair])
         # Least peak of a camera's matches above the median shift, in standard errors [1]. By
         # chance one of 200 shifts of 153 pairs of cameras passes 5.4 in one of a thousand clips.
         min_contrast = 6.0
-        order = [best[0]] if clearness[best] >= min_contrast else []
-        while order and len(order) < self.count:
-            rest = [c for c in range(self.count) if c not in order]
-            totals = {c: self._total(curves, c, late, order)[0] for c in rest}
-            clear = {c: _contrast(totals[c], self._total(drawn, c, late, order)) for c in rest}
-            chosen = max(clear, key=lambda c: clear[c])
-            if clear[chosen] < min_contrast:
+        groups: list[list[int]] = []
+        while True:
+            apart = [c for c in range(self.count) if all(c not in group for group in groups)]
+            pairs = [pair for pair in combinations(apart, 2) if clearness[pair] >= min_contrast]
+            if not pairs:
                 break
-            late[chosen] = self.shifts[int(np.nanargmax(totals[chosen]))]
-            order.append(chosen)
-        for camera in order:
+            order = [max(pairs, key=lambda pair: clearness[pair])[0]]
+            while len(order) < len(apart):
+                rest = [c for c in apart if c not in order]
+                totals = {c: self._total(curves, c, late, order)[0] for c in rest}
+                clear = {c: _contrast(totals[c], self._total(drawn, c, late, order)) for c in rest}
+                chosen = max(clear, key=lambda c: clear[c])
+                if clear[chosen] < min_contrast:
+                    break
+                late[chosen] = self.shifts[int(np.nanargmax(totals[chosen]))]
+                order.append(chosen)
+            groups.append(order)
+        groups = [group for group in groups if len(group) > 1]
+        for camera in (camera for group in groups for camera in group):
             reasons[camera] = ""
-        return order, late, reasons
+        return groups, late, reasons
 
 
 def _contrast(curve: Floats, drawn: Floats) -> float:

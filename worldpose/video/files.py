@@ -18,7 +18,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.video.pictures import FrameIndex, Pictures, convert_pixels
 
 MAX_STRETCH: Final = 0.01
@@ -42,7 +42,7 @@ def index_frames(path: Path) -> FrameIndex:
                 raise _no_video(path, "a video stream that this program has no decoder for")
             size: tuple[int, int] | None = None
             packets: list[tuple[int | None, bool]] = []
-            for packet in _packets(container, stream):
+            for packet in read_packets(container, stream):
                 size = _shown_size(packet) if size is None else size
                 if packet.size and not packet.is_discard:
                     packets.append((packet.pts, packet.is_keyframe))
@@ -61,7 +61,7 @@ def index_frames(path: Path) -> FrameIndex:
         if not is_told:
             return _count_frames(path, given, len(packets), base, size)
     except (av.error.FFmpegError, OSError) as error:
-        raise _no_video(path, f"{error}") from error
+        raise _no_video(path, say_failure(error)) from error
     stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     key = np.array([key for _, key in packets], dtype=np.bool_)[order]
@@ -92,7 +92,7 @@ def _shown_stamps(path: Path, most: int | None = None) -> list[int | None]:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        pictures = _decode(_packets(container, stream))
+        pictures = decode_packets(read_packets(container, stream))
         return [picture.pts for picture in islice(pictures, most)]
 
 
@@ -102,7 +102,9 @@ def _rise(stamps: Sequence[int | None]) -> bool:
     return len(known) == len(stamps) and all(one < two for one, two in pairwise(known))
 
 
-def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Packet[VideoStream]]:
+def read_packets(
+    container: InputContainer, stream: VideoStream
+) -> Iterator[av.Packet[VideoStream]]:
     """Yield the packets of a stream; a truncated file ends where it was cut."""
     packets = container.demux(stream)
     while True:
@@ -115,7 +117,7 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Pack
         yield packet
 
 
-def _decode(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFrame]:
+def decode_packets(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFrame]:
     """Yield the frames in the order shown, without those of packets that cannot be decoded."""
     for packet in packets:
         try:
@@ -129,7 +131,7 @@ def _decode(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFrame
 
 def _shown_size(packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
     """Return width and height as displayed: an upright camera stores rotated frames."""
-    for picture in _decode([packet]):
+    for picture in decode_packets([packet]):
         if picture.rotation % 180:
             return picture.height, picture.width
         return picture.width, picture.height
@@ -276,7 +278,7 @@ class VideoReader(Pictures):
 
     def _number_shown(self, begin: int) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield frames as decoding from frame `begin` on shows them, with their numbers or -1."""
-        for count, picture in enumerate(_decode(self.packets_from(begin))):
+        for count, picture in enumerate(decode_packets(self.packets_from(begin))):
             stamp = -1 if picture.pts is None else int(picture.pts)
             yield count if self.index.is_counted else self._number.get(stamp, -1), picture
 
@@ -291,7 +293,7 @@ class VideoReader(Pictures):
         while stamp - lead >= self.index.stamps[0] and not self.index.is_counted:
             self._container.seek(stamp - lead, stream=self._stream, backward=True, any_frame=False)
             before: list[av.Packet[VideoStream]] = []
-            packets = _packets(self._container, self._stream)
+            packets = read_packets(self._container, self._stream)
             for packet in packets:
                 if packet.pts == stamp:
                     self._lead = lead
@@ -307,7 +309,7 @@ class VideoReader(Pictures):
             lead = 2 * lead or max(1, round(0.5 / self.index.time_base))
         self.close()
         self._open()
-        packets = _packets(self._container, self._stream)
+        packets = read_packets(self._container, self._stream)
         if is_key and not self.index.is_counted:
             packets = dropwhile(lambda packet: packet.pts != stamp, packets)
         yield from packets

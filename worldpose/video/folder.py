@@ -19,6 +19,7 @@ from data_contracts.arrays import Flags, Image
 from worldpose.errors import InputError
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.pictures import FrameIndex, Pictures
+from worldpose.video.recordings import read_dpx
 
 MAX_PIXELS: Final = 200_000_000
 """No camera takes larger images; a few hundred bytes can declare gigabytes."""
@@ -66,7 +67,7 @@ FORMATS: Final = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 """Pillow's names of the kinds of images that are read."""
 ORIENTATION: Final = 0x0112
 """EXIF tag of the way in which an image is shown."""
-SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".dpx")
 
 
 class ImageFolder(Pictures):
@@ -97,7 +98,15 @@ class ImageFolder(Pictures):
         """Yield images as `frames` does, with None for each unreadable one; see `VideoReader`."""
         for number in range(start, len(self) if stop is None else stop):
             if only is None or number in only:
-                yield number, _read(self._files[number], grey=grey)
+                picture = _read(self._files[number], grey=grey)
+                if picture is not None and picture.shape[1::-1] != self.index.size:
+                    raise InputError(
+                        str(self._files[number]),
+                        expected="images of {} x {} px, as the first one".format(*self.index.size),
+                        found=f"{picture.shape[1]} x {picture.shape[0]}",
+                        todo="Keep the images of one camera and one mode in a folder.",
+                    )
+                yield number, picture
 
     def damage_error(self, number: int) -> InputError:
         """Return the error of a file that is no image."""
@@ -176,6 +185,8 @@ def open_video(
 
 def _read(file: Path, *, grey: bool) -> Image | None:
     """Return an image as displayed, RGB or grey; None if the file is no image."""
+    if file.suffix.lower() == ".dpx":
+        return read_dpx(file, grey=grey)
     return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)
 
 

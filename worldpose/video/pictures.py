@@ -64,9 +64,9 @@ class FrameIndex:
     def on_clock(self, fps: float, where: str) -> Integers:
         """Return the number of the video frame for each clock frame (frames,); -1 if missing.
 
-        Frame n is shown n / fps after the first one. A frame that a recorder dropped leaves its
-        clock frame empty and shifts no later one; of two video frames for one clock frame the
-        nearer counts.
+        Frame n is shown n / fps after the first one. A frame that a recorder dropped, or a pause,
+        leaves its clock frames empty and shifts no later one; of two video frames for one clock
+        frame the nearer counts.
 
         Raises:
             InputError: the video has another rate or none, or implausibly many frames.
@@ -90,7 +90,7 @@ class FrameIndex:
         picture = np.full(slot[-1] + 1, -1, dtype=np.int64)
         picture[slot[order]] = order
         filled = int(np.count_nonzero(picture >= 0))
-        odd = (len(picture) - filled) + (len(slot) - filled)
+        odd = (len(picture) - filled) + (len(slot) - filled) - _count_dropped(np.diff(exact))
         if self.time_base is not None and odd > RATE_SLACK * max(len(picture), len(slot)):
             raise self._rate_error(fps, where)
         return picture
@@ -109,9 +109,23 @@ class FrameIndex:
             where,
             expected=f"{fps:g} frames per second throughout",
             found=f"a rate that varies: images are {step.min():.4g} to {step.max():.4g} s apart, "
-            f"most of all after {self.times[step.argmax()]:.2f} s",
+            f"most of all after image {step.argmax()} at {self.times[step.argmax()]:.2f} s",
             todo="Convert the video to a constant frame rate with any video tool.",
         )
+
+
+def _count_dropped(steps: Floats) -> int:
+    """Return how many frames a recorder of the clock's rate left out.
+
+    Args:
+        steps: (pictures - 1,) steps between images [frames of the clock].
+    """
+    if not len(steps) or abs(float(np.median(steps)) - 1.0) > RATE_SLACK:
+        return 0
+    whole = np.rint(steps)
+    # A pause may end between two frames of the clock; a slower rate has short steps between them.
+    is_gap = (whole >= 2) & ((np.abs(steps - whole) < RATE_SLACK) | (steps > 4.5))
+    return int((whole[is_gap] - 1).sum())
 
 
 class Pictures(ABC):

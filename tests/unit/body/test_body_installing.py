@@ -87,6 +87,7 @@ def test_a_truncated_file_is_refused(official, tmp_path):
     [
         ({"v_template": np.zeros((6889, 3))}, "expected shape"),
         ({"weights": np.zeros((6890, 55))}, "weights"),
+        ({"v_template": np.linspace(-900.0, 900.0, 6890)[:, None] * [0, 1, 0]}, "of millimetres"),
         ({"posedirs": np.zeros((6890, 3, 0))}, "6890, 0 and 10"),
         ({"shapedirs": np.zeros((6890, 3, 0))}, "6890, 207 and 0"),
         ({"posedirs": "text"}, "posedirs that is not an array"),

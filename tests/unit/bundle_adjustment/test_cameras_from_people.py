@@ -175,3 +175,14 @@ def test_people_who_determine_no_cameras_are_refused(walkers, cameras, count, sh
     given = show(lambda joints: seen(cameras[:count], joints), walkers[:, :1])
     with pytest.raises(InputError, match=message):
         locate_cameras(lenses(cameras)[:count], given, FPS, KnownLength(1.8))
+
+
+def test_groups_that_show_different_people_are_named(walkers, cameras):
+    first, second = (seen(cameras, walkers[:, p : p + 1] * flip) for p, flip in ((0, 1), (1, -1)))
+    keypoints = np.concatenate([first.keypoints, second.keypoints[::-1]], axis=1)
+    both = KeypointDetections.from_keypoints(
+        keypoints, np.where(np.isfinite(keypoints[..., 0]), 0.9, np.nan)
+    )
+    halls = [lens(cameras[c], f"{hall}{c}") for hall in "ab" for c in range(4)]
+    with pytest.raises(InputError, match="2 groups that share no person: a0, a1, a2, a3; b0, b1"):
+        locate_cameras(halls, both, FPS, KnownLength(1.8))

@@ -5,12 +5,12 @@ import pytest
 from lab import ring
 
 from worldpose.bundle_adjustment.uncertainty import (
-    move_cameras,
     relative_covariance,
     similarity_steps,
 )
 from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
+from worldpose.triangulation.world import move_cameras
 
 ORIGIN = np.array([0.3, -0.2, 1.0])
 

@@ -9,10 +9,7 @@ from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import check_consistency
-from worldpose.camera_consistency.hypotheses import (
-    lens_hypotheses,
-    tangential_shift,
-)
+from worldpose.camera_consistency.hypotheses import LEFT_RIGHT, lens_hypotheses, tangential_shift
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
@@ -113,20 +110,61 @@ def test_cameras_that_agree_are_confirmed(pitch):
     assert result.confirmed == (0, 1, 2, 3, 4)
 
 
-@pytest.mark.parametrize("kind", ["flipped", "mirrored", "focal", "pose", "degrees"])
+@pytest.mark.parametrize("kind", ["flipped", "mirrored", "both", "focal", "pose", "degrees"])
 def test_a_wrong_calibration_is_named_with_its_fault(kind):
     cameras = rig()
     keypoints = seen(cameras, walkers())
-    cameras[3] = stated(cameras[3], kind)
+    if kind == "both":  # a mirrored image, whose clicks have exchanged names
+        keypoints[:, 3] = (keypoints[:, 3] * [-1.0, 1.0] + [1919.0, 0.0])[..., LEFT_RIGHT, :]
+    cameras[3] = stated(cameras[3], "mirrored" if kind == "both" else kind)
     result = check(cameras, keypoints)
-    assert named(result) == [(3, "pose" if kind == "degrees" else kind)]
+    assert named(result) == [(3, {"degrees": "pose", "both": "mirrored"}.get(kind, kind))]
     assert result.confirmed == (0, 1, 2, 4)
     fault = result.faults[0]
     assert fault.share_corrected > max(0.8, fault.share_now)
     if kind == "focal":
         assert fault.value == pytest.approx(1.1, abs=0.02)
-    if kind == "degrees":
-        assert "degrees" in fault.detail
+    details = {"degrees": "degrees", "both": "its images are mirrored, and so are the names"}
+    assert details.get(kind, "") in fault.detail
+
+
+def test_cameras_of_another_match_are_strangers_without_a_diagnosis():
+    keypoints = seen(rig(), walkers())
+    others = [(-5, -50, 12), (45, -38, 8), (55, 5, 16), (40, 40, 9), (5, 52, 10)]
+    result = check([looking(place, (25.0, 1.0, 1.0)) for place in others], keypoints)
+    assert result.faults == ()
+    assert result.strangers == (0, 1, 2, 3, 4)
+
+
+@pytest.mark.parametrize("change", ["axes", "unit"])
+def test_a_wrong_world_is_no_fault_of_its_cameras(change):
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    for n, camera in enumerate(cameras):
+        pose = camera.cam_from_world
+        unit = 1000.0 if change == "unit" else 1.0
+        rotation = pose.rotation if change == "unit" else pose.rotation @ turn.T
+        cameras[n] = posed(camera, rotation, unit * pose.translation)
+    result = check(cameras, keypoints)
+    assert (result.faults, result.strangers) == ((), ())
+
+
+def test_a_group_of_cameras_that_shows_other_people_is_no_fault():
+    world, far = walkers(), [60.0, 0.0, 0.0]
+    halls = (
+        rig()[:3],
+        [
+            posed(
+                c,
+                c.cam_from_world.rotation,
+                c.cam_from_world.translation - c.cam_from_world.rotation @ far,
+            )
+            for c in rig()[:3]
+        ],
+    )
+    keypoints = np.concatenate([seen(halls[0], world), seen(halls[1], walkers(seed=5) + far)], 1)
+    assert check([*halls[0], *halls[1]], keypoints, pitch=None).faults == ()
 
 
 def test_the_tangential_shift_is_that_of_a_corner_in_opencv():

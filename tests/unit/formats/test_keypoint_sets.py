@@ -162,7 +162,7 @@ def test_a_data_set_gives_names_of_points_and_numbers_of_images(tmp_path):
             "images",
             "2 images with 1 numbers",
         ),
-        ([{"id": 1, "file_name": "a1.jpg"}], HUMAN36M, "categories", "Human3.6M"),
+        ([{"id": 1, "file_name": "a1.jpg"}], HUMAN36M[2:], "categories", "missing are right_hip"),
     ],
 )
 def test_a_data_set_that_does_not_say_is_refused(tmp_path, images, names, place, words):
@@ -170,6 +170,27 @@ def test_a_data_set_that_does_not_say_is_refused(tmp_path, images, names, place,
         read_coco_results(data_set(tmp_path / "a.json", images, names))
     assert caught.value.where.endswith(place)
     assert words in str(caught.value)
+
+
+MPI = (
+    *("head_top", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder"),
+    *("left_elbow", "left_wrist", "right_hip", "right_knee", "right_ankle", "left_hip"),
+    *("left_knee", "left_ankle", "spine"),
+)
+
+
+def test_a_set_may_lack_the_face(tmp_path):
+    images = [{"id": 3, "file_name": "a_5.jpg"}]
+    named = [name.replace("ankle", "foot").replace("nose", "neck_base") for name in HUMAN36M]
+    category = {"id": 1, "name": "person", "keypoints": named}
+    path = data_set(tmp_path / "a.json", images, HUMAN36M)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"categories": [category]}))
+    for found in (read_coco_results(path), read_openpose_folder(frames(tmp_path / "b", MPI))):
+        wanted = np.array([BODY[name] for name in COCO17[5:]]) + (500, 300)
+        np.testing.assert_allclose(found.people.keypoints[0, 0, 5:], wanted)
+        assert np.isnan(found.people.keypoints[0, 0, :5]).all()
+    with pytest.raises(InputError, match="order of MPI, the known set of 15 points"):
+        read_openpose_folder(frames(tmp_path / "c", MPI[::-1]))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Known cameras, and writers of them in the terms of each calibration program."""
 
+import json
 import pickle
 
 import cv2
@@ -195,6 +196,72 @@ def write_freemocap(folder, cameras, metadata="groundplane_calibration = true"):
     return folder / "calibration.toml"
 
 
+def write_panoptic(folder, cameras):
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # of y down to z up
+    tables = [
+        {
+            "name": one.id,
+            "type": "hd",
+            "resolution": list(SIZE),
+            "K": matrix(one).tolist(),
+            "distCoef": list(one.distortion),
+            "R": (np.array(one.rotation) @ axes).tolist(),
+            "t": [[100.0 * value] for value in one.translation],
+        }
+        for one in cameras
+    ]
+    path = folder / "calibration_160224.json"
+    path.write_text(json.dumps({"calibDataSource": "160224", "cameras": tables}))
+    return path
+
+
+def write_multical(folder, cameras):
+    lenses = {
+        one.id: {
+            "model": "standard",
+            "image_size": list(SIZE),
+            "K": matrix(one).tolist(),
+            "dist": [list(one.distortion)],
+        }
+        for one in cameras
+    }
+    poses = {
+        one.id + ("_to_a1" if one.id != "a1" else ""): {"R": one.rotation, "T": one.translation}
+        for one in cameras
+    }
+    path = folder / "calibration.json"
+    path.write_text(json.dumps({"cameras": lenses, "camera_poses": poses, "image_sets": {}}))
+    return path
+
+
+def write_kalibr(folder, cameras, model="radtan"):
+    """Write a camchain, whose world is that of the first camera."""
+    lines, before = [], None
+    for index, one in enumerate(cameras):
+        (fx, fy), (cx, cy) = one.focal_px, one.principal_point_px
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = one.rotation, one.translation
+        lines += [f"cam{index}:", "  camera_model: pinhole", f"  intrinsics: {[fx, fy, cx, cy]}"]
+        lines += [f"  distortion_model: {model}", f"  distortion_coeffs: {[*one.distortion[:4]]}"]
+        lines += [f"  resolution: {list(SIZE)}", f"  rostopic: /{one.id}/image"]
+        if before is not None:
+            step = (pose @ np.linalg.inv(before)).tolist()
+            lines += ["  T_cn_cnm1:", *(f"  - {row}" for row in step)]
+        before = pose
+    (folder / "camchain.yaml").write_text("\n".join(lines) + "\n")
+    return folder / "camchain.yaml"
+
+
+def write_openpose(folder, cameras):
+    for one in cameras:
+        file = cv2.FileStorage(str(folder / f"{one.id}.xml"), cv2.FILE_STORAGE_WRITE)
+        file.write("CameraMatrix", np.c_[np.array(one.rotation), np.array(one.translation)])
+        file.write("Intrinsics", matrix(one))
+        file.write("Distortion", np.array([*one.distortion, 0.0, 0.0, 0.0])[:, None])
+        file.release()
+    return folder
+
+
 WRITERS = {
     "Vicon": write_vicon,
     "OptiTrack": write_optitrack,
@@ -202,4 +269,6 @@ WRITERS = {
     "EasyMocap": write_easymocap,
     "bioCV": write_biocv,
     "FreeMoCap": write_freemocap,
+    "Panoptic": write_panoptic,
+    "multical": write_multical,
 }

@@ -1,3 +1,4 @@
+import re
 import tomllib
 
 import cv2
@@ -105,6 +106,8 @@ def test_anipose_camera_is_called_by_its_name(read):
 
 
 def test_caliscope_camera_is_called_by_its_number_and_may_give_a_matrix(read):
+    settings = "camera_count = 1\nCreationDate = 2023-02-11T13:53:13Z\n[charuco]\ncolumns = 4\n"
+    assert read(settings + CALISCOPE) == read(CALISCOPE)
     cameras = read(CALISCOPE)
     assert list(cameras) == ["cam_3"]
     camera = cameras["cam_3"]
@@ -138,7 +141,6 @@ def test_caliscope_camera_is_called_by_its_number_and_may_give_a_matrix(read):
         ("[-0.1, 0.02, 0.001, -0.002, 0.003]", "[0.1, 0.2]", "cam_0.distortions", "k1 k2 p1 p2"),
         ('"left"', '"../left"', "cam_0: name", "letters"),
         ("[metadata]", "fisheye = true\n[metadata]", "cam_0.distortions", "k1 k2 k3 k4"),
-        ("[cam_0]", "title = 1\n[cam_0]", "title", "a table for each camera"),
         ("1063.5", "6.2", "cam_0: focal length", "in pixels"),
         ("511.7", "1e6", "cam_0: principal point", "in pixels"),
         ("[1.5, -0.6, 0.7]", "[90.0, 10.0, -45.0]", "cam_0.rotation", "degrees"),
@@ -157,7 +159,19 @@ def test_no_camera_two_of_one_name_and_other_kinds_of_file_are_refused(refusal):
     assert refusal("[metadata]\nerror = 0.0\n").expected == "at least one camera"
     twice = ANIPOSE + ANIPOSE.replace("[cam_0]", "[cam_1]").split("[metadata]")[0]
     assert "'left' a second time" in refusal(twice).found
-    assert "'.yaml'" in refusal("", "calibration.yaml").found
+    assert "a camchain of Kalibr" in refusal("a: 1", "calibration.yaml").expected
+    assert "'.ini'" in refusal("", "calibration.ini").found
+
+
+def test_a_size_that_is_no_whole_number_is_that_of_the_video(tmp_path):
+    """Programs that do not know the size write twice the principal point."""
+    path = tmp_path / "calibration.toml"
+    size = re.search(r"size = \[(\d+)[.\d]*, (\d+)[.\d]*\]", ANIPOSE)
+    path.write_text(ANIPOSE.replace(size[0], f"size = [{int(size[1]) - 6.21}, {size[2]}.758]"))
+    with pytest.raises(InputError, match=r"size: expected whole pixels .* --videos takes theirs"):
+        read_calibration(path)
+    shown = (int(size[1]), int(size[2]))
+    assert read_calibration(path, {"left": shown})["left"].image_size == shown
 
 
 def test_written_cameras_come_back(tmp_path, make_camera):

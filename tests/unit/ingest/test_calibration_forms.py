@@ -1,5 +1,6 @@
 """Calibrations of other programs: known cameras written in each form, and bad files of each."""
 
+import json
 import os
 import pickle
 import re
@@ -18,7 +19,9 @@ from calibration_writers import (
     rig,
     write_biocv,
     write_easymocap,
+    write_kalibr,
     write_opencap,
+    write_openpose,
     write_vicon,
 )
 from scipy.optimize import brentq
@@ -26,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import FORMS, read_calibration, read_cameras
+from worldpose.formats.lens_files import read_lenses
 
 
 def assert_same(found, known):
@@ -52,6 +56,54 @@ def test_known_cameras_are_read_back(tmp_path, form):
     (folder / "Config.toml").write_text("[project]\n")
     (folder / "notes.md").write_text("# notes\n")
     assert list(read_cameras(folder)) == [one.id for one in known]
+
+
+def test_a_camchain_counts_from_its_first_camera(tmp_path):
+    known = rig(lens=(*LENS[:4], 0.0))
+    path = write_kalibr(tmp_path, known)
+    found = read_calibration(path)
+    assert list(found) == ["cam0", "cam1", "cam2"]
+    turn, shift = np.array(known[0].rotation), np.array(known[0].translation)
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (20, 3)) + [0.0, 0.0, 1.0]
+    for one, other in zip(known, found.values(), strict=True):
+        np.testing.assert_allclose(
+            project(other, points @ turn.T + shift), project(one, points), atol=1e-6
+        )
+    sizes = dict.fromkeys(found, SIZE)
+    lenses = read_lenses([path], None, sizes)
+    np.testing.assert_allclose(lenses["cam2"].distortion, (*LENS[:4], 0.0))
+    path.write_text(path.read_text().replace("pinhole", "omni"))
+    with pytest.raises(InputError, match="found omni with radtan"):
+        read_calibration(path)
+
+
+def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):
+    path = WRITERS["Panoptic"](tmp_path, rig())
+    content = json.loads(path.read_text())
+    content["cameras"][1]["K"][0][1] = 0.403304
+    path.write_text(json.dumps(content))
+    left_out = {}
+    assert list(read_calibration(path, left_out=left_out)) == ["a1", "c3"]
+    assert "skew" in left_out["b2"]
+
+
+def test_openposes_cameras_take_the_size_of_the_videos(tmp_path):
+    known = rig()
+    folder = write_openpose(tmp_path, known)
+    sizes = dict.fromkeys(["a1", "b2", "c3"], SIZE)
+    assert_same(read_calibration(folder, sizes), known)
+    assert_same(read_calibration(folder / "b2.xml", sizes), known)
+    with pytest.raises(InputError, match="OpenPose's files lack"):
+        read_calibration(folder)
+
+
+def test_opencaps_lens_without_a_pose_and_its_relative_path(tmp_path, monkeypatch):
+    known = rig()
+    file = next(write_opencap(tmp_path, known, STANDING).glob("a1/*.pickle"))
+    lens = read_lenses([file], "a1", {"a1": SIZE})["a1"]
+    assert (lens.focal_px, lens.image_size) == (pytest.approx(1500.0), SIZE)
+    monkeypatch.chdir(file.parent)
+    assert list(read_calibration(Path(file.name))) == ["a1"]
 
 
 @pytest.mark.parametrize(

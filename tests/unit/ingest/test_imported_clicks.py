@@ -166,10 +166,50 @@ def test_lines_of_soccernet_are_clicks_in_its_json_and_by_its_names(tmp_path):
     assert clicked(tmp_path / "n")[1][0].name == "touch_line_near"
 
 
-def test_tracks_of_a_video_are_refused_with_the_way_out(tmp_path):
-    (tmp_path / "clicks").write_text("<annotations><track id='0' label='a'/></annotations>")
-    with pytest.raises(InputError, match="export as `CVAT for images`"):
-        read_marked_images(tmp_path / "clicks")
+@pytest.mark.parametrize(("start", "first"), [(0, 10), (100, 110), (100, 2)])
+def test_key_frames_of_tracks_are_clicks_at_their_frames(tmp_path, start, first):
+    """The last numbers those of a task's own frames, each fifth one: 2 is frame 110."""
+    shapes = "".join(
+        f'<{kind} frame="{first + n}" keyframe="{int(n != 1)}" outside="{int(n == 3)}" '
+        f'points="{text}"/>'
+        for n in range(4)
+        for kind, text in [("points", f"{400.75 + n},901.0")]
+    )
+    line = f'<polyline frame="{first}" keyframe="1" outside="0" points="100.5,200.5;300.5,251.0"/>'
+    filtered = "<frame_filter>step=5</frame_filter>" if first < start else ""
+    (tmp_path / "clicks.xml").write_text(
+        f"<annotations><meta><task><start_frame>{start}</start_frame>{filtered}<original_size>"
+        "<width>1920</width><height>1080</height></original_size></task></meta>"
+        f'<track id="0" label="corner_left_near">{shapes}</track>'
+        f'<track id="1" label="touch_line_near">{line}</track></annotations>'
+    )
+    images = read_marked_images(tmp_path / "clicks.xml")
+    number = start + 5 * first if first < start else first
+    step = 5 if first < start else 1
+    assert [each.name for each in images] == [
+        f"frame_{number:06d}",
+        f"frame_{number + 2 * step:06d}",
+    ]
+    ((label, pixel),) = images[0].points
+    np.testing.assert_allclose(pixel, CLICKS[label])
+    np.testing.assert_allclose(images[0].lines[0][1], [(100.0, 200.0), (300.0, 250.5)])
+
+
+def test_lines_of_game_states_are_key_frames_from_the_first_image(tmp_path):
+    images = [{"image_id": f"30000{n}", "file_name": f"{n:06d}.jpg"} for n in (1, 2, 3)]
+    share = [{"x": x / SIZE[0], "y": y / SIZE[1]} for x, y in LINE]
+    marks = {"image_id": "300003", "category_id": 5, "lines": {"Side line bottom": share}}
+    people = {"image_id": "300001", "category_id": 1, "bbox_image": {"x": 1}}
+    content = {"images": images, "annotations": [people, marks], "categories": []}
+    (tmp_path / "labels.json").write_text(json.dumps(content))
+    folder = match(tmp_path / "m")
+    import_clicks(tmp_path / "labels.json", folder, "goal")
+    file = folder / "annotations/broadcast_calibration/goal.json"
+    (frame,) = json.loads(file.read_text())["key_frames"]
+    assert frame["frame"] == 2
+    (line,) = frame["markings"]["drawn"]
+    assert line["name"] == "touch_line_near"
+    np.testing.assert_allclose(line["xy"], LINE, atol=1e-9)
 
 
 def seen(places):
@@ -242,7 +282,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
 @pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "c").write_bytes(content)
-    with pytest.raises(InputError, match="CVAT for images"):
+    with pytest.raises(InputError, match="labelled points of CVAT"):
         read_marked_images(tmp_path / "c")
 
 

@@ -123,6 +123,33 @@ def test_too_few_points_or_a_line_of_them_are_refused(names):
         fit_survey(survey)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("separator", [";", "\t", ","])
+def test_a_file_is_read_as_spreadsheets_save_it(tmp_path, encoding, separator):
+    sign = "." if separator == "," else ","
+    rows = [["Point", "X (m)", "y", "Elevation [m]"], ["center_mark", "1.5", "-2", "0.25"]]
+    text = "\r\n".join(separator.join(row) for row in rows).replace(".", sign)
+    path = tmp_path / "survey.csv"
+    hinted = f"sep={separator}\r\n" + text.replace("\r\n", 2 * separator + "\r\n")
+    for content in (text, hinted):  # Excel's hint, and its empty columns
+        path.write_bytes((content + "\r\n").encode(encoding))
+        np.testing.assert_array_equal(read_survey(path).places, [[1.5, -2.0, 0.25]])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"name;x;y\ncenter_mark;1,5;1.234\n", "a point and numbers with a comma"),
+        (b"PK\x03\x04 name", "a workbook, not text"),
+        (b"name,x [mm],y\ncenter_mark,1,2\n", "row 1"),
+    ],
+)
+def test_other_tables_are_refused(tmp_path, content, words):
+    (tmp_path / "survey.csv").write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_survey(tmp_path / "survey.csv")
+
+
 def test_a_file_is_read_by_its_header(tmp_path):
     path = tmp_path / "survey.csv"
     path.write_text(

@@ -42,7 +42,7 @@ def reason(cameras, keypoints, confidence, *, ground=True, settings=SETTINGS):
     assert tracks.report.people == 0
     names = [f"cam{n}" for n in range(len(cameras.focal))]
     given = (cameras, names, detections(keypoints, confidence), FPS, settings)
-    return diagnose_no_people(*given, ground=ground, births=tracks.report.births)
+    return diagnose_no_people(*given, pitch_size=pitch, births=tracks.report.births)
 
 
 def beside(ring, apart):
@@ -117,6 +117,26 @@ def test_a_world_whose_zero_is_not_the_ground(ring, people, seen):
     assert height == pytest.approx(5.1, abs=0.2)
 
 
+@pytest.mark.parametrize(("sign", "up"), [(1.0, "y"), (-1.0, "-y")])
+def test_a_world_with_another_axis_up(ring, people, seen, sign, up):
+    keypoints, confidence = seen(ring(4), walk(people))
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, sign], [0.0, -sign, 0.0]])
+    pose = ring(4).cam_from_world
+    cameras = replace(ring(4), cam_from_world=Rigid(pose.rotation @ turn.T, pose.translation))
+    given = (cameras, list("abcd"), detections(keypoints, confidence), FPS, SETTINGS)
+    found = diagnose_no_people(*given, pitch_size=(105.0, 68.0))
+    assert found.cause == "not_upright"
+    assert f"axis of people is {up}, not z" in found.message
+    assert f"--up {up}," in found.message
+
+
+def test_people_beside_the_pitch(ring, people, seen):
+    keypoints, confidence = seen(ring(4), walk(people))
+    found = reason(moved(ring(4), ring(4).center + [90.0, 0.0, 0.0]), keypoints, confidence)
+    assert found.cause == "outside_pitch"
+    assert re.search(r"they are (8[89]|9[0-2]) m from the centre spot", found.message)
+
+
 def test_a_clock_that_is_off(ring, people, seen):
     late = 12
     cameras = ring(5)[np.array([0, 2])]
@@ -131,7 +151,7 @@ def test_a_clock_that_is_off(ring, people, seen):
         FPS,
         SETTINGS,
     )
-    found = diagnose_no_people(*given, ground=True)
+    found = diagnose_no_people(*given, pitch_size=(105.0, 68.0))
     assert found.cause == "clock"
     assert f"by {abs(late)}" in found.message
 

@@ -121,7 +121,8 @@ KNOCK = CameraChange(
     [
         ({}, [0.0, 0.0, 3.0, 3.0, 0.0]),
         ({"frame": None}, [0.0, 1.0, 2.0, 3.0, 0.0]),
-        ({"is_explained": False}, [np.nan] * 4 + [0.0]),
+        ({"is_explained": False}, [0.0] * 5),
+        ({"is_explained": False, "is_left_out": True}, [np.nan] * 4 + [0.0]),
     ],
 )
 def test_a_known_change_is_taken_back_within_its_clip(change, moved):
@@ -141,7 +142,10 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
             {"kind": "clock", "late_frames": 0.02, "frame": None},
             "its clock runs 0.67% fast",
         ),
-        ({"is_explained": False}, "no single step or drift explains; its views are left out"),
+        (
+            {"is_explained": False, "is_left_out": True},
+            "no single step or drift explains; its views are left out",
+        ),
     ],
 )
 def test_a_change_is_told_with_camera_and_frame(change, said):

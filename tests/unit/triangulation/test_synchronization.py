@@ -7,11 +7,12 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.triangulation.synchronization import synchronize
+from worldpose.triangulation.world import move_cameras
 
 LATE = np.array([-12.0, -3.5, 0.0, 2.25, 20.0])
 """Offset of each camera [frame]: its frame t shows the time t + offset."""
@@ -96,3 +97,22 @@ def test_a_camera_that_shows_other_people_has_no_offset(scene, pitch):
     assert found.reasons[3]
     rest = np.array([0, 1, 2, 4])
     assert np.abs(errors(found)[rest]).max() < 0.2
+
+
+def test_groups_that_share_no_person_have_offsets_of_their_own(scene):
+    cameras, seen = turned(scene, 0.0), shifted(scene)
+    other = {name: array[::-1] for name, array in seen.arrays().items()}
+    arrays = {
+        name: np.concatenate([array[:, :3], other[name][:, [0, 3, 4]]], axis=1)
+        for name, array in seen.arrays().items()
+    }
+    away = cameras[np.array([0, 3, 4])]
+    away = move_cameras(Similarity(np.array(1.0), np.eye(3), np.array([300.0, 0.0, 0.0])), away)
+    both = Camera.stack([*(cameras[c] for c in range(3)), *(away[c] for c in range(3))])
+    found = synchronize(both, seen.with_arrays(arrays, seen.frame), FPS)
+    assert found.groups == ((0, 1, 2), (3, 4, 5))
+    off = found.late[:3] - LATE[:3]
+    assert np.abs(off - np.median(off)).max() < 0.3
+    reversed_late = -LATE[[0, 3, 4]]
+    off = found.late[3:] - reversed_late
+    assert np.abs(off - np.median(off)).max() < 0.3

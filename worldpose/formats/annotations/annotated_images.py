@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.review import Origin
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 
 Content = TypeVar("Content")
 
@@ -54,9 +54,11 @@ def decode_file(
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(map(str, first["loc"]))
-        found = f"{place}: {first['msg']}" if place else first["msg"]
+        said = "nothing" if first["type"] == "missing" else first["msg"]
+        said = said.replace("Input should be", "something that is not")
+        found = f"{place}: {said}" if place else said
     except (OSError, ContentError) as error:
-        found = str(error)
+        found = say_failure(error)
     raise InputError(str(path), expected=expected, found=found[:300], todo=todo)
 
 

@@ -1,5 +1,7 @@
 """Clicked points and drawn lines of images in files of CVAT, Label Studio, COCO and SoccerNet.
 
+CVAT for video gives the images of its key frames; what it interpolates between them is no click.
+
 Pixels follow this project: (0, 0) is the centre of the top-left pixel.
 """
 
@@ -7,10 +9,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from pydantic import Field, TypeAdapter
@@ -55,7 +58,7 @@ class MarkedImage:
 
 
 def read_marked_images(path: Path) -> list[MarkedImage]:
-    """Return the images of CVAT for images XML, Label Studio JSON, COCO or SoccerNet's lines JSON.
+    """Return the images of CVAT's XML, Label Studio's, COCO's or SoccerNet's JSON.
 
     Raises:
         InputError: the file has none of these forms, or no labelled point or line.
@@ -73,10 +76,7 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
             raise ContentError("no labelled point or line")
         return images
 
-    expected = (
-        "labelled points as CVAT for images XML 1.1, Label Studio JSON or COCO keypoints, or lines "
-        "of SoccerNet"
-    )
+    expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
     todo = "Export the clicks from the annotator in one of these forms."
     return decode_file(path, MAX_BYTES, decode, expected, todo)
 
@@ -86,31 +86,67 @@ def _read_cvat(content: bytes) -> Iterator[MarkedImage]:
     if root.tag != "annotations":
         raise ContentError(f"the root is <{root.tag[:40]}>, not <annotations>")
     if root.find("track") is not None:
-        raise ContentError("tracks: export as `CVAT for images`, not `for video`")
+        yield from _read_tracks(root)
     for image in root.iter("image"):
-        name = image.get("name", "")
-        points: list[tuple[str, Floats]] = []
-        lines: list[tuple[str, Floats]] = []
-        for shape in image.iter():
-            if shape.tag not in ("points", "polyline") or shape.get("outside") == "1":
-                continue
-            label, text = shape.get("label", ""), shape.get("points", "")
-            given = text.split(";")
-            if not all(_PAIRS.fullmatch(pair.strip()) for pair in given):
-                raise ContentError(f"{name}: {label}: points are {text[:60]!r}")
-            try:
-                pixels = np.array([pair.split(",") for pair in given], dtype=np.float64) - CORNER
-            except ValueError:
-                raise ContentError(f"{name}: {label}: points are {text[:60]!r}") from None
-            if shape.tag == "points":
-                points += [(label, pixel) for pixel in pixels]
-            else:
-                lines.append((label, pixels))
+        size = image.get("width"), image.get("height")
+        shapes = [(shape.get("label", ""), shape) for shape in image.iter()]
+        yield _marked(image.get("name", ""), size, shapes)
+
+
+def _marked(
+    name: str, size: tuple[str | None, str | None], shapes: Iterable[tuple[str, Element]]
+) -> MarkedImage:
+    """Return an image with the points and lines among labelled shapes of CVAT."""
+    points: list[tuple[str, Floats]] = []
+    lines: list[tuple[str, Floats]] = []
+    for label, shape in shapes:
+        if shape.tag not in ("points", "polyline") or shape.get("outside") == "1":
+            continue
+        text = shape.get("points", "")
+        given = text.split(";")
+        if not all(_PAIRS.fullmatch(pair.strip()) for pair in given):
+            raise ContentError(f"{name}: {label}: points are {text[:60]!r}")
         try:
-            size = (int(image.get("width", "")), int(image.get("height", "")))
+            pixels = np.array([pair.split(",") for pair in given], dtype=np.float64) - CORNER
         except ValueError:
-            raise ContentError(f"{name}: an image without width and height") from None
-        yield MarkedImage(name, size, tuple(points), tuple(lines))
+            raise ContentError(f"{name}: {label}: points are {text[:60]!r}") from None
+        if shape.tag == "points":
+            points += [(label, pixel) for pixel in pixels]
+        else:
+            lines.append((label, pixels))
+    try:
+        width, height = (int(side or "") for side in size)
+    except ValueError:
+        raise ContentError(f"{name}: an image without width and height") from None
+    return MarkedImage(name, (width, height), tuple(points), tuple(lines))
+
+
+def _read_tracks(root: Element) -> Iterator[MarkedImage]:
+    """Yield the key frames of CVAT for video, named by their frames in the video.
+
+    CVAT counts the frames of the whole video; where some are before the task's first one, they
+    count its chosen frames.
+    """
+    found: dict[int, list[tuple[str, Element]]] = {}
+    for track in root.iter("track"):
+        for shape in track:
+            if shape.get("keyframe", "1") != "1" or shape.get("outside") == "1":
+                continue
+            text = shape.get("frame", "")
+            if not text.isdecimal() or len(text) > 9:
+                raise ContentError(f"track {track.get('id')}: frame {text[:40]!r}")
+            parts = list(shape) if shape.tag == "skeleton" else [shape]
+            labels = [part.get("label", track.get("label", "")) for part in parts]
+            found.setdefault(int(text), []).extend(zip(labels, parts, strict=True))
+    first = root.findtext(".//start_frame") or "0"
+    every = re.fullmatch(r"step=(\d{1,6})", (root.findtext(".//frame_filter") or "").strip())
+    start = int(first) if first.isdecimal() else 0
+    is_relative = min(found, default=start) < start
+    size = root.findtext(".//original_size/width"), root.findtext(".//original_size/height")
+    step = int(every[1]) if every else 1
+    for number, shapes in sorted(found.items()):
+        frame = start + number * step if is_relative else number
+        yield _marked(f"frame_{frame:06d}", size, shapes)
 
 
 _LABELS: Final = ("keypointlabels", "polygonlabels", "vectorlabels")
@@ -224,8 +260,13 @@ class _Dataset(Given):
 def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     given = json.loads(content)
     if isinstance(given, dict) and SOCCERNET_MARKINGS.keys() & {name.strip() for name in given}:
-        yield _read_soccernet(given)
+        yield _read_soccernet("picture", given)
         return
+    if isinstance(given, dict) and isinstance(given.get("annotations"), list):
+        marked = [each for each in given["annotations"] if isinstance(each, dict)]
+        if any(isinstance(each.get("lines"), dict) for each in marked):
+            yield from _read_game_state({**given, "annotations": marked})
+            return
     dataset = _Dataset.model_validate(given)
     names = {category.id: category.keypoints for category in dataset.categories}
     for image in dataset.images:
@@ -251,7 +292,25 @@ class _Share(Given):
     y: float
 
 
-def _read_soccernet(given: dict[str, Any]) -> MarkedImage:
+def _read_game_state(given: dict[str, Any]) -> Iterator[MarkedImage]:
+    """Yield the images of SoccerNet's Labels-GameState.json; its first image is frame 0."""
+    listed = TypeAdapter(tuple[dict[str, Any], ...]).validate_python(given.get("images"))
+    numbers = {}
+    for image in listed:
+        digits = re.search(r"(\d{1,9})\.\w+$", str(image.get("file_name")))
+        if digits is None:
+            raise ContentError(f"an image without a number: {image.get('file_name')!r:.40}")
+        numbers[str(image.get("image_id"))] = int(digits[1])
+    for each in given["annotations"]:
+        lines, image_id = each.get("lines"), str(each.get("image_id"))
+        if lines and image_id not in numbers:
+            raise ContentError(f"lines of image {image_id:.40}, which is not there")
+        if lines:
+            number = numbers[image_id] - min(numbers.values())
+            yield _read_soccernet(f"frame_{number:06d}", lines)
+
+
+def _read_soccernet(image: str, given: dict[str, Any]) -> MarkedImage:
     """Return the image of SoccerNet's lines: shares of width and height by names of markings."""
     lines = []
     for name, places in TypeAdapter(dict[str, tuple[_Share, ...]]).validate_python(given).items():
@@ -259,7 +318,7 @@ def _read_soccernet(given: dict[str, Any]) -> MarkedImage:
         inside = [(at.x, at.y) for at in places if 0.0 <= at.x <= 1.0 and 0.0 <= at.y <= 1.0]
         if inside and "unknown" not in name.lower():  # SoccerNet's word for lines of no name
             lines.append((name, np.array(inside)))
-    return MarkedImage("picture", None, (), tuple(lines))
+    return MarkedImage(image, None, (), tuple(lines))
 
 
 def _soccernet_markings() -> dict[str, str]:

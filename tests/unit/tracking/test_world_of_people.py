@@ -1,0 +1,166 @@
+"""A calibration's unit and up axis follow from the people, or from what the user states."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_contracts.keypoints import KeypointDetections
+from worldpose.errors import InputError, UsageError
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Similarity
+from worldpose.triangulation.world import (
+    StatedWorld,
+    doubt_statures,
+    doubt_world,
+    move_cameras,
+    place_cameras,
+    read_stated_world,
+)
+
+FPS = 25.0
+NOTHING = StatedWorld()
+CALIBRATION = Path("cal.mcal")
+LYING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Rotation from people who stand along z to ones who lie along y."""
+
+
+@pytest.fixture(autouse=True)
+def calibration(tmp_path, monkeypatch):
+    """A file whose ending tells that its cameras are in metres."""
+    monkeypatch.chdir(tmp_path)
+    CALIBRATION.touch()
+
+
+def walk(people, frames=40):
+    time = np.arange(frames)[:, None] / FPS
+    turn = np.array([1.0, -0.7, 0.5]) * time + np.arange(3)
+    return people(2.0 * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+
+
+def records(cameras):
+    return {f"c{n}": cameras[n].to_calibration(f"c{n}") for n in range(len(cameras.focal))}
+
+
+def poses(keypoints, confidence):
+    frame = np.arange(len(keypoints))
+    return {
+        f"c{n}": KeypointDetections.from_keypoints(keypoints[:, n], confidence[:, n], frame=frame)
+        for n in range(keypoints.shape[1])
+    }
+
+
+def placed(true, given, keypoints, stated=NOTHING):
+    """Errors of the placed cameras: tilt [degree], height [m], scale [1]; and the sentences."""
+    found, notes = place_cameras(CALIBRATION, records(given), keypoints, FPS, stated)
+    cameras = Camera.stack([Camera.from_calibration(each) for each in found.values()])
+    turn = np.swapaxes(cameras.cam_from_world.rotation, -1, -2) @ true.cam_from_world.rotation
+    tilt = float(np.degrees(np.arccos(np.clip(turn[:, 2, 2], -1.0, 1.0))).max())
+    size = np.ptp(cameras.center[:, :2]) / np.ptp(true.center[:, :2])
+    apart = [np.linalg.norm(each.center[1:] - each.center[0], axis=1) for each in (cameras, true)]
+    assert size > 0.5
+    height = float(np.abs(cameras.center[:, 2] - true.center[:, 2]).max())
+    return tilt, height, float((apart[0] / apart[1]).mean()), notes
+
+
+@pytest.mark.parametrize(
+    ("unit_m", "turn", "said"),
+    [
+        (1.0, Rotation.identity(), ()),
+        (0.001, Rotation.identity(), ("its unit is millimetres, by 3 people of",)),
+        (0.01, Rotation.identity(), ("centimetres",)),
+        (0.0254, Rotation.identity(), ("inches",)),
+        (0.3048, Rotation.identity(), ("feet",)),
+        (1000.0, Rotation.identity(), ("kilometres",)),
+        (1.0, Rotation.from_euler("x", -90, degrees=True), ("up is y", "90.0 degrees about x")),
+        (1.0, Rotation.from_euler("x", 90, degrees=True), ("up is -y", "90.0 degrees about -x")),
+        (1.0, Rotation.from_euler("x", 180, degrees=True), ("up is -z", "180.0 degrees about x")),
+        (1.0, Rotation.from_euler("y", 90, degrees=True), ("up is x", "90.0 degrees about -y")),
+        (0.001, Rotation.from_euler("xy", [110, 30], degrees=True), ("millimetres", "up is ")),
+    ],
+)
+def test_people_tell_the_unit_the_vertical_and_the_ground(ring, people, seen, unit_m, turn, said):
+    true = ring(4)
+    keypoints = poses(*seen(true, walk(people)))
+    turned = turn.magnitude() > 0.0
+    shift = np.array([0.4, -0.3, 0.5]) / unit_m if turned else np.zeros(3)
+    given = move_cameras(Similarity(np.array(1.0 / unit_m), turn.as_matrix(), shift), true)
+    tilt, height, scale, notes = placed(true, given, keypoints)
+    arbitrary = len(said) > 1 and said[0] == "millimetres"
+    assert tilt < (1.0 if arbitrary else 1e-5)
+    assert height < (0.3 if arbitrary else 0.05 if turned else 1e-9)  # 30 m away
+    assert scale == pytest.approx(1.0, abs=1e-9)
+    assert len(notes) == bool(said)
+    for text in said:
+        assert text in notes[0]
+
+
+def test_what_the_user_states_holds(ring, people, seen):
+    true = ring(4)
+    keypoints = poses(*seen(true, walk(people)))
+    turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    given = move_cameras(Similarity(np.array(12.5), turn, np.zeros(3)), true)
+    tilt, height, scale, notes = placed(true, given, {}, read_stated_world("0.08", "y"))
+    assert (tilt, height, scale) == pytest.approx((0.0, 0.0, 1.0), abs=1e-5)
+    assert "0.08 m, as stated; up is y" in notes[0]
+    with pytest.raises(InputError, match=r"3 people of 2[0-9.]+ units.*make it 0.079"):
+        place_cameras(CALIBRATION, records(given), keypoints, FPS, NOTHING)
+    with pytest.raises(InputError, match=r"in millimetres, .* found 3 people of 1[.][0-9]+ units"):
+        placed(true, true, keypoints, StatedWorld(0.001))
+    # People who contradict the stated axis are told.
+    notes = placed(true, true, keypoints, read_stated_world(None, "y"))[3]
+    assert "the upright axis of people is z, not y as stated" in notes[1]
+
+
+def test_people_who_lie_before_cameras_that_stand_turn_no_world(ring, people, seen):
+    true = ring(4)
+    joints = walk(people) @ LYING.T + [0.0, 0.0, 1.0]
+    given = records(true)
+    found, notes = place_cameras(CALIBRATION, given, poses(*seen(true, joints)), FPS, NOTHING)
+    assert found == given
+    assert "the cameras stand along z" in notes[0]
+    assert doubt_world(true, joints, FPS) == []
+
+
+def test_a_run_names_the_axis_of_a_turned_world(ring, people):
+    turned = move_cameras(Similarity(np.array(1.0), LYING, np.zeros(3)), ring(4))
+    (said,) = doubt_world(turned, walk(people) @ LYING.T, FPS)
+    assert "the upright axis of people is y, not z: 100% of 120 poses" in said
+    assert "--up y" in said
+
+
+def test_without_people_cameras_alone_decide(ring):
+    near, far = (
+        records(move_cameras(Similarity(np.array(scale), np.eye(3), np.zeros(3)), ring(4)))
+        for scale in (1.0, 20.0)
+    )
+    assert place_cameras(CALIBRATION, near, {}, FPS, NOTHING) == (near, [])
+    with pytest.raises(InputError, match=r"601 units from the middle.*--unit mm"):
+        place_cameras(CALIBRATION, far, {}, FPS, NOTHING)
+    assert place_cameras(CALIBRATION, far, {}, FPS, StatedWorld(1.0)) == (far, [])
+
+
+@pytest.mark.parametrize(
+    ("statures", "said"),
+    [
+        ([1.85] * 11, ""),
+        ([1.6, 1.9], ""),
+        ([1.9], ""),
+        ([1.76 / 0.9144] * 6, "it is 1.76 m if the calibration is in yards"),
+        ([1.82 / 0.9144] * 11, "it is 1.82 m if the calibration is in yards"),
+        ([1.3] * 5, "0.76 times the true ones"),
+    ],
+)
+def test_statures_that_no_adults_have(statures, said):
+    found = doubt_statures(np.array(statures))
+    assert said in found
+    assert bool(found) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("unit", "up"), [("miles", None), ("-1", None), ("nan", None), (None, "w"), (None, "0,0,0")]
+)
+def test_options_that_state_nothing(unit, up):
+    with pytest.raises(UsageError, match=f"found {unit} and {up}"):
+        read_stated_world(unit, up)

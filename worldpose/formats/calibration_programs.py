@@ -1,0 +1,178 @@
+"""Calibrations of programs that count from the first camera, and of Panoptic Studio.
+
+Kalibr's camchain (YAML), multical's and Panoptic Studio's JSON, and OpenPose's XML, one file for
+each camera. All poses are x_cam = R x_world + t.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import (
+    Keys,
+    LeftOut,
+    calibration_error,
+    camera_id,
+    index_by_name,
+    read_camera_table,
+)
+from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml
+from worldpose.formats.lens_files import kalibr_tables, read_file_storage
+
+CENTIMETRE: Final = 1e-2
+"""[m]"""
+Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""(3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y."""
+
+
+def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
+    """Return the cameras of Panoptic Studio or multical, by name.
+
+    Raises:
+        InputError: the file is of neither, or an entry is missing or invalid.
+    """
+    content = read_json(path, 16 * SETTINGS_BYTES)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if isinstance(cameras, list) and all(isinstance(one, dict) for one in cameras):
+        return _read_panoptic(path, cameras, left_out)
+    if isinstance(cameras, dict) and all(isinstance(one, dict) for one in cameras.values()):
+        return _read_multical(path, cameras, content.get("camera_poses"), left_out)
+    raise calibration_error(
+        f"{path}: cameras",
+        "Panoptic Studio's list of cameras, or multical's mapping",
+        "nothing" if cameras is None else f"{cameras!r:.60}",
+    )
+
+
+def _read_panoptic(
+    path: Path, cameras: list[dict[str, Any]], left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
+    """Return cameras with `resolution`, `K`, `distCoef`, `R`, `t` [cm], in a world with y down.
+
+    The many cameras of low resolution have a skew, and are left out.
+    """
+    keys = Keys("resolution", "K", "distCoef", "R", "t")
+    skewed = [_has_skew(table.get("K")) for table in cameras]
+    found = []
+    for index, table in enumerate(cameras):
+        where = f"{path}: cameras[{index}]"
+        name = str(table.get("name", ""))
+        if left_out is not None and skewed[index] and not all(skewed):
+            left_out[camera_id(name)] = "its pixels are skew (K[0][1]), which no lens model has"
+            continue
+        camera = read_camera_table(
+            where, name, table, keys=keys, unit_m=CENTIMETRE, axes=Y_DOWN, where_pose=where
+        )
+        found.append((where, camera))
+    return index_by_name(path, found)
+
+
+def _has_skew(matrix: object) -> bool:
+    try:
+        return abs(float(matrix[0][1])) > 1e-9  # type: ignore[index] # the reader names a fault
+    except (TypeError, ValueError, IndexError, KeyError):
+        return False
+
+
+def _read_multical(
+    path: Path, cameras: dict[str, dict[str, Any]], poses: object, left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
+    """Return cameras with `image_size`, `K`, `dist`; the pose of `b` may be called `b_to_a`."""
+    given = poses if isinstance(poses, dict) else {}
+    by_camera = {str(key).partition("_to_")[0]: pose for key, pose in given.items()}
+    by_camera |= {key: pose for key, pose in given.items() if key in cameras}
+    tables = {}
+    for name, table in cameras.items():
+        pose = by_camera.get(name)
+        fisheye = {"fisheye": True} if table.get("model") == "fisheye" else {}
+        tables[name] = {**table, **(pose if isinstance(pose, dict) else {}), **fisheye}
+    return _read_tables(path, tables, Keys("image_size", "K", "dist", "R", "T"), left_out)
+
+
+def read_kalibr(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
+    """Return the cameras of a Kalibr camchain, in the world of its first camera [m].
+
+    Raises:
+        InputError: the file is no camchain, or an entry is missing or invalid.
+    """
+    return _read_tables(path, dict(kalibr_tables(path, read_yaml(path))), Keys(), left_out)
+
+
+def _read_tables(
+    path: Path, tables: Mapping[str, Mapping[str, Any]], keys: Keys, left_out: LeftOut | None
+) -> dict[str, CameraCalibration]:
+    """Return the cameras of tables; those without a pose are left out if others have one."""
+    posed = [name for name, table in tables.items() if keys.translation in table]
+    if left_out is not None and posed:
+        left_out.update({camera_id(name): "it has no pose" for name in tables if name not in posed})
+    elif len(posed) < len(tables) or not posed:
+        lacking = next((name for name in tables if name not in posed), "no camera")
+        raise InputError(
+            f"{path}: {lacking}",
+            expected="the pose of the camera",
+            found="a lens alone",
+            todo="Calibrate the poses too; or write the lenses as TOML, import them (worldpose "
+            "import --lens), and click the poses.",
+        )
+    cameras = []
+    for name in posed:
+        where = f"{path}: {name}"
+        cameras.append((where, read_camera_table(where, name, tables[name], keys=keys)))
+    return index_by_name(path, cameras)
+
+
+def is_openpose(path: Path) -> bool:
+    """Return whether a file is OpenPose's XML of a camera."""
+    if path.suffix.lower() != ".xml":
+        return False
+    try:
+        with path.open("rb") as file:
+            begin = file.read(4096)
+    except OSError:
+        return False
+    return b"<opencv_storage>" in begin and b"<CameraMatrix" in begin
+
+
+def read_openpose_cameras(
+    files: tuple[Path, ...], sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, CameraCalibration]:
+    """Return the cameras of OpenPose's files `<camera>.xml`, in the world of the first one [m].
+
+    `CameraMatrix` (3, 4) is [R | t], `Intrinsics` (3, 3), `Distortion` has OpenCV's coefficients.
+
+    Args:
+        files: one for each camera.
+        sizes: width and height [px] of each camera's images, which the files lack.
+
+    Raises:
+        InputError: an entry is missing or invalid, or the size is not known.
+    """
+    cameras = []
+    for file in files:
+        given, where = read_file_storage(file), str(file)
+        if camera_id(file.stem) not in sizes:
+            raise InputError(
+                where,
+                expected=f"the image size of camera {file.stem}, which OpenPose's files lack",
+                found="no video of that name",
+                todo="Import the calibration with --videos, or write it as TOML with a size.",
+            )
+        pose = np.asarray(given.get("CameraMatrix"))
+        if pose.shape != (3, 4):
+            raise calibration_error(f"{where}: CameraMatrix", "shape (3, 4)", f"{pose.shape}")
+        table: dict[str, Any] = {
+            key: np.asarray(given[key]).tolist()
+            for key in ("Intrinsics", "Distortion")
+            if key in given
+        }
+        table |= {"size": list(sizes[camera_id(file.stem)])}
+        table |= {"R": pose[:, :3].tolist(), "t": pose[:, 3].tolist()}
+        keys = Keys("size", "Intrinsics", "Distortion", "R", "t")
+        cameras.append((where, read_camera_table(where, file.stem, table, keys=keys)))
+    return index_by_name(files[0].parent, cameras)

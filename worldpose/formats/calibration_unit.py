@@ -1,0 +1,47 @@
+"""Check of the unit of length of a calibration, by the distances of its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import MILLIMETRE
+
+FARTHEST_M: Final = 1000.0
+"""Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m."""
+
+NEAREST_M: Final = 0.1
+"""Minimum distance of the farthest camera from the middle in a file in millimetres [m]."""
+
+
+def require_metres(
+    path: Path, cameras: Mapping[str, CameraCalibration], unit_m: float = 1.0
+) -> None:
+    """Raise InputError if the cameras' distances contradict the unit of the file.
+
+    Args:
+        path: the file, for messages.
+        cameras: cameras in metres, if the file has that unit.
+        unit_m: unit of length in the file [m].
+    """
+    centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
+    distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
+    in_millimetres = unit_m == MILLIMETRE
+    if len(centers) < 2 or (
+        distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M)
+    ):
+        return
+    raise InputError(
+        f"{path}: translation",
+        expected=f"positions in {'millimetres' if in_millimetres else 'metres'}",
+        found=f"a camera {distance:.3g} m from the middle of all cameras",
+        todo="Multiply the positions by 1000 if they are in metres (worldpose import --unit m)."
+        if distance < NEAREST_M
+        else "Divide the positions by 1000 if they are in millimetres (worldpose import --unit "
+        "mm).",
+    )

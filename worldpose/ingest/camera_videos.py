@@ -1,0 +1,176 @@
+"""Videos of a folder by camera: files, folders of images, and recordings in chapters."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Integers
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import camera_id
+from worldpose.ingest.footage import stretches
+from worldpose.video.folder import SUFFIXES
+from worldpose.video.names import VIDEO_SUFFIXES, is_video
+from worldpose.video.pictures import FrameIndex
+from worldpose.video.recordings import describe_video, join_videos
+
+_CHAPTER: Final = re.compile(r"(.*)(?:(G[HXLS]|GP)(\d\d)|GOPR)(\d{4})", re.IGNORECASE)
+"""GoPro's names: GX020017 is chapter 2 of recording 17, GP010017 that after GOPR0017."""
+
+
+def find_videos(folder: Path, workshop: Path | None = None) -> dict[str, Path]:
+    """Return the video of each camera in a folder: a file, or a folder of numbered images.
+
+    A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
+    folder of the camera.
+
+    Args:
+        folder: holds them.
+        workshop: where chapters of one recording are joined to one file; None = they are refused.
+
+    Raises:
+        InputError: two videos have one name, or chapters are not to be joined.
+    """
+    there = sorted(folder.glob("[!.]*"))
+    groups = [[place] for place in there if place.is_dir() and _has_images(place)]
+    groups += _recordings([file for file in there if is_video(file)])
+    for place in there:
+        if place.is_dir() and not _has_images(place):
+            groups += _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
+    found: dict[str, Path] = {}
+    for group in groups:
+        inside = group[0].parent != folder
+        if inside and len(group) == 1:
+            continue  # an only video in a folder is not named after a camera
+        place = group[0].parent if inside else group[0]
+        name = camera_id(place.stem if place.is_file() else place.name)
+        if name in found:
+            raise InputError(
+                str(folder),
+                expected="one video of each camera",
+                found=f"{found[name].name} and {place.name}",
+                todo="Name each video after its camera.",
+            )
+        found[name] = place
+        if len(group) > 1:
+            if workshop is None or not _is_whole(group):
+                raise _chapters_error(folder, group)
+            found[name] = workshop / f"{name}{group[0].suffix.lower()}"
+            join_videos(group, found[name])
+    return found
+
+
+def _has_images(folder: Path) -> bool:
+    return any(file.suffix.lower() in SUFFIXES for file in folder.glob("[!.]*"))
+
+
+def _recordings(files: Sequence[Path]) -> list[list[Path]]:
+    """Return the chapters of each recording in order; other videos are alone."""
+    found: dict[tuple[str, ...], list[tuple[int, Path]]] = {}
+    for file in files:
+        chapter = _CHAPTER.fullmatch(file.stem)
+        key: tuple[str, ...] = (file.name,)
+        number = 0
+        if chapter is not None:
+            kind = (chapter[2] or "GP").upper()  # GOPR0017 begins what GP010017 continues
+            key, number = (chapter[1], kind, chapter[4]), int(chapter[3] or 0)
+        found.setdefault(key, []).append((number, file))
+    return [[file for _, file in sorted(group)] for group in found.values()]
+
+
+def _is_whole(group: Sequence[Path]) -> bool:
+    """Return whether a recording has its first chapter, and those up to its last."""
+    chapters = [_CHAPTER.fullmatch(file.stem) for file in group]
+    numbers = [int(each[3] or 0) for each in chapters if each is not None]
+    first = 0 if (chapters[0] and (chapters[0][2] or "GP").upper() == "GP") else 1
+    return numbers == list(range(first, first + len(numbers)))
+
+
+def _chapters_error(folder: Path, group: Sequence[Path]) -> InputError:
+    is_whole = _is_whole(group)
+    return InputError(
+        str(folder),
+        expected="one video of each camera" if is_whole else "all chapters of a recording",
+        found=f"chapters of one recording: {', '.join(file.name for file in group)}",
+        todo="Add --join, which joins them, or join them with ffmpeg: -f concat -safe 0 -i LIST -c "
+        "copy OUT.mp4, with a line file 'NAME' for each chapter in LIST."
+        if is_whole
+        else "Add the missing chapter.",
+    )
+
+
+def require_cameras(folder: Path, found: Mapping[str, Path]) -> None:
+    """Raise InputError if a folder has the videos of fewer than two cameras."""
+    if len(found) < 2:
+        there = sorted(folder.glob("[!.]*"))
+        raise InputError(
+            str(folder),
+            expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)}), or "
+            "a folder of images",
+            found=", ".join(place.name for place in there) or "no video",
+            todo="Name each video after its camera.",
+        )
+
+
+def describe_videos(
+    files: Mapping[str, Path], indices: Mapping[str, FrameIndex], clocks: Mapping[str, Integers]
+) -> list[str]:
+    """Return sentences about what cameras' videos lack.
+
+    Args:
+        files: the videos.
+        indices: their frames.
+        clocks: (frames,) number of the video frame for each frame of the clock; -1 = missing.
+    """
+    notes = []
+    for name, clock in clocks.items():
+        notes += describe_video(files[name], indices[name])
+        if gaps := describe_gaps(clock):
+            notes.append(f"{name}: {gaps}")
+    counts = {name: len(clock) for name, clock in clocks.items()}
+    if max(counts.values()) > min(counts.values()):
+        shortest = min(counts, key=lambda name: counts[name])
+        notes.append(
+            f"the clip ends after {counts[shortest]} frames with the video of {shortest}; the "
+            f"longest has {max(counts.values())}"
+        )
+    return notes
+
+
+def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
+    """Return a sentence about the frames that a video lacks between others; empty if none.
+
+    Args:
+        clock: (frames,) number of the video frame; -1 = missing.
+        frame: (frames,) rising numbers to name them by; None = from 0.
+    """
+    shown = np.flatnonzero(clock >= 0)
+    if not len(shown):
+        return ""
+    numbers = np.arange(len(clock)) if frame is None else frame
+    between = slice(int(shown[0]), int(shown[-1]))
+    gaps = stretches(numbers[between][clock[between] < 0])
+    longest = sorted(gaps, key=lambda gap: gap[0] - gap[1])[:5]
+    listed = ", ".join(f"{a} to {b}" if a < b else f"{a}" for a, b in sorted(longest))
+    count = sum(last - first + 1 for first, last in gaps)
+    more = f" and {len(gaps) - len(longest)} more gaps" if len(gaps) > len(longest) else ""
+    return f"the video lacks {count} of {len(clock)} frames: {listed}{more}" if gaps else ""
+
+
+def copy_videos(files: Mapping[str, Path], folder: Path) -> None:
+    """Copy the videos of cameras into a match folder."""
+    if files:
+        (folder / "videos").mkdir()
+    for file in files.values():
+        target = folder / "videos" / file.name
+        if file.is_dir():
+            target.mkdir()
+            for image in sorted(file.glob("[!.]*")):
+                shutil.copyfile(image, target / image.name)
+        else:
+            shutil.copyfile(file, target)
