@@ -210,7 +210,7 @@ def as_json(camera: Camera) -> dict[str, Any]:
         "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
         "R": camera.cam_from_world.rotation,
         "t": camera.cam_from_world.translation,
-        "k": camera.distortion,
+        "k": camera.coefficients,
     }
 
 

@@ -105,7 +105,7 @@ def compare_projection(options: Namespace) -> Tables:
     pixels = np.ascontiguousarray(rng.uniform(0.0, [1919.0, 1079.0], (options.points, 2)))
     rays = CAMERA.unproject(pixels)
     points = rays.origins + rays.directions * rng.uniform(40.0, 120.0, (options.points, 1))
-    lens, pose = np.array(CAMERA.distortion), CAMERA.cam_from_world
+    lens, pose = np.array(CAMERA.coefficients), CAMERA.cam_from_world
     # OpenCV 4 has the form with a stopping rule under its own name.
     iterate: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
     cv_project = partial(cv2.projectPoints, points, pose.rotvec, pose.translation, MATRIX, lens)
@@ -141,7 +141,7 @@ def compare_projection(options: Namespace) -> Tables:
 def round_trip_error(plane: np.ndarray, pixels: np.ndarray) -> float:
     """Return the largest distance in pixels after distorting `plane` again with OpenCV."""
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(pixels), 1))], axis=1)
-    distortion = np.array(CAMERA.distortion)
+    distortion = np.array(CAMERA.coefficients)
     back = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), MATRIX, distortion)[0].reshape(-1, 2)
     return float(np.linalg.norm(back - pixels, axis=1).max())
 
@@ -321,7 +321,7 @@ def make_problem(frames: int, players: int, cameras: int = 16) -> AdjustmentProb
     rng, work = np.random.default_rng(5), draw_match(frames)
     true = work.cameras[:cameras]
     # The peers' lens has k1 and k2 alone.
-    true = replace(true, distortion=true.distortion * [1.0, 1.0, 0.0, 0.0, 0.0])
+    true = replace(true, distortion=true.distortion * [1.0, 1.0, *np.zeros(6)])
     surveyed = PITCH.positions(list(PITCH.points))
     points = np.concatenate([surveyed, work.joints[:, :players].reshape(-1, 3)])
     pixels = true.project(points)

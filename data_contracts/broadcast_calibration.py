@@ -56,7 +56,7 @@ BROADCAST_CALIBRATION = GroupLayout(
             principal_point (*frame, axis) float64 [px], missing nan:
                 principal point, one for the clip
             distortion (*frame, coefficient) float64 [1], missing nan:
-                k1, k2, p1, p2, k3 in OpenCV's order
+                k1, k2, p1, p2, k3 of Brown's model in OpenCV's order; k4, k5 and k6 are 0
             rotation (*frame, cam_coordinate, coordinate) float64 [1], missing nan:
                 R in x_cam = R x_world + t
             translation (*frame, cam_coordinate) float64 [m], missing nan:

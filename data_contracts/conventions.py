@@ -91,8 +91,8 @@ _PAIRED_SIGMAS = (0.025, 0.035, 0.079, 0.072, 0.062, 0.107, 0.087, 0.089)
 COCO17_SIGMAS = (0.026, *(sigma for sigma in _PAIRED_SIGMAS for _ in ("left", "right")))
 """COCO's per-joint spread of human labels, as a fraction of person size."""
 
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-"""Order of distortion coefficients, OpenCV's."""
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Order of distortion coefficients, OpenCV's; a coefficient that a lens model lacks is 0."""
 
 
 class Conventions(Record):

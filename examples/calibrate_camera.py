@@ -28,7 +28,7 @@ def main() -> None:
 
     camera, report = found.estimate.camera, found.report
     print(f"center {camera.center.round(2)} m, focal length {camera.focal[0]:.0f} px")
-    print(f"distortion k1 k2 p1 p2 k3 {camera.distortion.round(3)}")
+    print(f"lens {camera.coefficients.round(3)}")
     for point in report.points:
         state = "" if point.inlier else f"  left out: {point.problem}"
         print(f"{np.hypot(*point.residual):8.2f} px  {point.name}{state}")

@@ -205,13 +205,14 @@ def _print(fits: dict[str, LensFit], files: dict[str, list[str]]) -> None:
                 f"{fit.rms_px:.2f}",
                 f"{lens.focal_px:.1f} +- {lens.focal_std_px:.1f}",
                 f"{x:.1f}, {y:.1f} +- {lens.principal_point_std_px:.1f}",
-                " ".join(f"{one:.4f}" for one in lens.distortion[:4]),
+                ("fisheye " if lens.lens_model == "fisheye" else "")
+                + " ".join(f"{one:.4f}" for one in lens.distortion[:4]),
                 f"{100 * fit.coverage:.0f}",
             )
         )
     head = (
         *("camera", ">images", ">residual px", ">focal length px", ">principal point px"),
-        *("k1 k2 p1 p2", ">coverage %"),
+        *("k1 k2 p1 p2, fisheye k1 to k4", ">coverage %"),
     )
     print_table("lenses", head, rows)
     for name, fit in fits.items():

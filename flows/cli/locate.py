@@ -139,6 +139,7 @@ def _lens(match: Match, camera: str) -> LensCalibration:
             focal_px=focal,
             principal_point_px=given.principal_point_px,
             distortion=given.distortion,
+            lens_model=given.lens_model,
             focal_std_px=GIVEN_FOCAL * focal,
             principal_point_std_px=GIVEN_CENTER_PX,
             distortion_std=0.005,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from glob import escape
 from pathlib import Path
 from typing import Annotated, Literal
@@ -73,6 +74,7 @@ def export(
     """
     from flows.registering import find_registration, open_match
     from flows.results.best_results import Footage, Origin, describe_later_run, open_results
+    from flows.results.export import LENS_ERRORS
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
@@ -114,6 +116,9 @@ def export(
     sizes = {
         path: f", {path.stat().st_size / 1e6:.1f} MB" for path in written if path.suffix == ".html"
     }
+    for path in (path for path in written if path.name == LENS_ERRORS):
+        off = max(each["max_error_px"] for each in json.loads(path.read_text()).values())
+        sizes[path] = f": lenses in cameras/ differ from those used by up to {off:.2g} px"
     told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
     answer(as_json, {"match": name, "files": [str(path) for path in written]}, *told)
 

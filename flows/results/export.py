@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -67,6 +68,8 @@ from worldpose.formats.challenge import (
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
 from worldpose.formats.tables import write_positions
+from worldpose.geometry.lens_fit import fit_brown_lens
+from worldpose.geometry.lens_models import LensModel
 from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
@@ -74,6 +77,8 @@ from worldpose.store.runs import pin_run
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
 
+LENS_ERRORS = "lens_errors.json"
+"""Largest differences of the lenses in cameras/ from those of the run [px]."""
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
 
@@ -116,7 +121,10 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
 
 
 def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3)."""
+    """Write `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3).
+
+    Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest error.
+    """
     for clip in origin.clips:
         model, poses, _ = fitted_bodies(origin.run, clip)
         path = out / "poses" / f"{clip}.npz"
@@ -126,9 +134,18 @@ def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
             path = out / "cameras" / f"{clip}.npz"
             write_moving_camera(path, broadcast_camera(origin.run, clip))
             yield path
+    errors: dict[str, dict[str, str | float]] = {}
     for name, camera in origin.static_cameras.items():
         path = out / "cameras" / f"{name}.npz"
+        if camera.lens_model != LensModel.BROWN:
+            kind = LensModel(int(camera.lens_model)).label
+            camera, error = fit_brown_lens(camera)
+            errors[name] = {"lens_model": kind, "max_error_px": error}
         write_static_camera(path, camera.to_calibration(name))
+        yield path
+    if errors:
+        path = out / LENS_ERRORS
+        path.write_text(json.dumps(errors, indent=1), encoding="utf-8")
         yield path
 
 

@@ -27,7 +27,7 @@ class MovingCamera:
         principal_point: (2,) [px].
         rotation: (frames, 3, 3) rotation of x_cam = R (x_world - center).
         focal: (frames,) [px]; square pixels.
-        distortion: (frames, 3) k1, k2, k3.
+        distortion: (frames, 3) k1, k2, k3 of Brown's model.
         image_size: (2,) width, height [px].
     """
 

@@ -337,7 +337,7 @@ class BroadcastCalibration:
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:
     """Return the stored arrays of a calibrated clip, by name, without the frame numbers."""
     report, before = calibration.report, camera_arrays(calibration.before.camera)
-    del before["image_size"]
+    del before["image_size"], before["lens_model"]
     return {
         **moving_arrays(calibration.camera, calibration.uncertainty),
         **{f"{name}_before": array for name, array in before.items()},

@@ -63,9 +63,10 @@ def static_covariance(camera: MovingCamera, uncertainty: Uncertainty) -> Floats:
 
 def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, NDArray[Any]]:
     """Return the stored arrays of a moving camera and its covariance, by name."""
-    covariance = uncertainty.frame
+    covariance, camera = uncertainty.frame, camera_arrays(moving.camera)
+    del camera["lens_model"]
     return {
-        **camera_arrays(moving.camera),
+        **camera,
         "image_size": moving.image_size,
         "center": moving.center,
         "covariance": covariance[:, :FRAME_SIZE, :FRAME_SIZE],

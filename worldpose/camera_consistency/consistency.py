@@ -213,7 +213,8 @@ def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int | None,
         "mirrored": f"it is mirrored: {detail}. Correct its clicks, calibration or images",
         "focal": f"its focal length is {value:.3g} times that which the other cameras show: "
         "correct its calibration",
-        "lens": f"its distortion is wrong: {detail}. worldpose reads k1 k2 p1 p2 k3",
+        "lens": f"its distortion is wrong: {detail}. worldpose reads k1 k2 p1 p2 k3, and k1 "
+        "to k4 of a lens that the file calls a fisheye",
         "swapped": f"its video is that of camera {other}: exchange the two files",
         "duplicate": f"its video is the same as that of camera {other}: give its own",
         "pose": f"its calibration is wrong: {detail}"

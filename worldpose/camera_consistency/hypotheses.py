@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.camera_consistency import FaultKind
-from data_contracts.conventions import OTHER_UNITS
+from data_contracts.conventions import DISTORTION, OTHER_UNITS
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
 
 LEFT_RIGHT: Final = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15])
@@ -146,7 +147,7 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
 
 
 def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
-    """Yield possible misreadings of lens coefficients: other order, inverted, absent.
+    """Yield possible misreadings of lens coefficients: other order, inverted, absent, fisheye.
 
     Orders with large tangential coefficients move the image nearly as a whole: they show an error
     of the principal point or the orientation.
@@ -156,14 +157,20 @@ def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     max_tangential = 0.01
     stated = camera.distortion
     tried = [stated]
-    orders = [(stated[list(order)], order) for order in LENS_ORDERS]
-    names = np.array(["k1", "k2", "p1", "p2", "k3"])
     choices = [
-        (values, "the coefficients stand in the order " + " ".join(names[np.argsort(order)]))
-        for values, order in orders
+        (-stated, "the coefficients have the opposite sign"),
+        (np.zeros(len(stated)), "the images have no distortion"),
     ]
-    choices.append((-stated, "the coefficients have the opposite sign"))
-    choices.append((np.zeros(5), "the images have no distortion"))
+    if camera.lens_model == LensModel.BROWN:
+        for order in LENS_ORDERS:
+            names = " ".join(np.array(DISTORTION[:5])[np.argsort(order)])
+            said = f"the coefficients stand in the order {names}"
+            choices.append((np.append(stated[list(order)], np.zeros(3)), said))
+        if stated.any():
+            # k1 to k4 of a fisheye, read as k1 k2 p1 p2.
+            fisheye = np.array([*stated[:2], 0.0, 0.0, *stated[2:4], 0.0, 0.0])
+            lens = replace(camera, distortion=fisheye, lens_model=LensModel.FISHEYE)
+            yield Hypothesis("lens", "the coefficients are those of a fisheye", lens)
     for values, detail in choices:
         if not any(np.array_equal(values, other) for other in tried):
             tried.append(values)

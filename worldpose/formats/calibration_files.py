@@ -3,10 +3,11 @@
 Reader of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
 other forms are in `calibration_systems` and `calibration_forms`.
 
-One table per camera with `size`, `matrix`, `distortions` (k1 k2 p1 p2 k3, as OpenCV), `rotation`
-(Rodrigues vector [rad], or 3x3) and `translation` [m] of x_cam = R x_world + t. A camera's id is
-its `name`, else its table. caliscope's own file has the tables under `cameras`, by number: camera 3
-is `cam_3`, as in its Anipose export. FreeMoCap's file, known by its `metadata`, is in millimetres.
+One table per camera with `size`, `matrix`, `distortions` (as OpenCV: k1 k2 p1 p2 k3, with k4 k5 k6,
+or k1 k2 k3 k4 where `fisheye` is true), `rotation` (Rodrigues vector [rad], or 3x3) and
+`translation` [m] of x_cam = R x_world + t. A camera's id is its `name`, else its table. caliscope's
+own file has the tables under `cameras`, by number: camera 3 is `cam_3`, as in its Anipose export.
+FreeMoCap's file, known by its `metadata`, is in millimetres.
 The reader ignores further keys.
 """
 
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from data_contracts.cameras import CameraCalibration
+from data_contracts.cameras import COEFFICIENTS, CameraCalibration, LensName
 from worldpose.errors import InputError
 from worldpose.formats.files import read_toml
 
@@ -38,6 +39,9 @@ degrees, and a telescope's of 0.06."""
 
 CENTER_SIZES: Final = 10
 """Maximum distance of the principal point from the image center, in longer sides [1]."""
+
+MAX_TANGENTIAL: Final = 0.01
+"""Maximum p1 and p2 of four numbers that do not say their model [1]; real lenses have 0.005."""
 
 DISTANCE_LIMIT: Final = 1e7
 """Maximum coordinate of a translation [m]."""
@@ -69,14 +73,21 @@ LeftOut: TypeAlias = dict[str, str]
 """Reasons why cameras are left out, by camera."""
 
 
+class Optics(NamedTuple):
+    """Size, focal lengths and principal point (2,) [px], coefficients and their lens model."""
+
+    size: NDArray[np.float64]
+    focal: NDArray[np.float64]
+    principal_point: NDArray[np.float64]
+    distortion: NDArray[np.float64]
+    lens_model: LensName = "brown"
+
+
 def build_camera(
     where: str,
     name: str,
+    optics: Optics,
     *,
-    size: NDArray[np.float64],
-    focal: NDArray[np.float64],
-    principal_point: NDArray[np.float64],
-    distortion: NDArray[np.float64],
     rotation: NDArray[np.float64],
     translation: NDArray[np.float64],
 ) -> CameraCalibration:
@@ -85,10 +96,7 @@ def build_camera(
     Args:
         where: file and camera, for messages.
         name: id of the camera.
-        size: width and height [px].
-        focal: fx, fy [px].
-        principal_point: cx, cy [px].
-        distortion: k1, k2, p1, p2, k3 [1].
+        optics: image size, camera matrix and lens.
         rotation: (3, 3), R in x_cam = R x_world + t.
         translation: t [m].
 
@@ -96,6 +104,7 @@ def build_camera(
         InputError: the size is not whole, a focal length is not positive, the matrix is no
             rotation, or the name is unfit for a file.
     """
+    size, focal, principal_point, distortion, lens_model = optics
     if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
         expected = f"whole pixels from 1 to {SIZE_LIMIT}; an import with --videos takes theirs"
         raise calibration_error(f"{where}: size", expected, str(size.tolist()))
@@ -121,6 +130,7 @@ def build_camera(
             focal_px=tuple(focal.tolist()),
             principal_point_px=tuple(principal_point.tolist()),
             distortion=tuple(distortion.tolist()),
+            lens_model=lens_model,
             rotation=tuple(tuple(row) for row in rotation.tolist()),
             translation=tuple(translation.tolist()),
         )
@@ -259,8 +269,8 @@ def read_calibration_toml(
             that do not know it write twice the principal point.
 
     Raises:
-        InputError: an entry is missing or invalid, a camera is a fisheye, the unit is another, or
-            the world of FreeMoCap's file is not that of the ground; it names file and key.
+        InputError: an entry is missing or invalid, the unit is another, or the world
+            of FreeMoCap's file is not that of the ground; it names file and key.
     """
     content = read_toml(path)
     unit_m = toml_unit_m(path, content)
@@ -350,15 +360,6 @@ def camera_tables(
         yield where, str(table.get("name", f"cam_{key}" if key.isdecimal() else key)), table
 
 
-class Optics(NamedTuple):
-    """Size, focal lengths and principal point (2,) [px], and distortion (5,) k1 k2 p1 p2 k3."""
-
-    size: NDArray[np.float64]
-    focal: NDArray[np.float64]
-    principal_point: NDArray[np.float64]
-    distortion: NDArray[np.float64]
-
-
 class Keys(NamedTuple):
     """Names of a camera's entries in a form; the defaults are Anipose's."""
 
@@ -380,31 +381,43 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
     Raises:
         InputError: an entry is missing or misshapen, or the lens has another model.
     """
-    if table.get("fisheye", False) is not False:
-        raise InputError(
-            f"{where}.fisheye",
-            expected="false: the lens model is OpenCV's k1 k2 p1 p2 k3",
-            found=_shorten(table["fisheye"]),
-            todo="Calibrate this camera with the standard model, or undistort its pictures first.",
-        )
     matrix = _read_numbers(table, where, keys.matrix, (3, 3))
     size = _read_numbers(table, where, keys.size, (2,))
-    distortion = np.ravel(_read_numbers(table, where, keys.distortions, None))
-    if len(distortion) not in (4, 5, 8, 12, 14):
-        found = f"{len(distortion)} numbers"
-        raise calibration_error(f"{where}.{keys.distortions}", "4 or 5: k1 k2 p1 p2 (k3)", found)
-    if np.any(distortion[5:] != 0):
-        raise calibration_error(
-            f"{where}.{keys.distortions}",
-            "zero beyond the fifth, k3",
-            f"{distortion[5:].tolist()}, a lens model with more terms",
-        )
+    fisheye = table.get("fisheye", False)
+    if fisheye not in (False, True):
+        raise calibration_error(f"{where}.fisheye", "true or false", _shorten(fisheye))
+    numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))
+    distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, fisheye=bool(fisheye))
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
     if np.any(np.abs(off_diagonal) > 1e-9):
         raise calibration_error(
             f"{where}.{keys.matrix}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", str(matrix.tolist())
         )
-    return Optics(size, np.diag(matrix)[:2], matrix[:2, 2], np.append(distortion, 0.0)[:5])
+    return Optics(size, np.diag(matrix)[:2], matrix[:2, 2], distortion, model)
+
+
+def _read_lens(
+    where: str, numbers: NDArray[np.float64], *, fisheye: bool
+) -> tuple[NDArray[np.float64], LensName]:
+    """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
+    is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
+    model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
+    names = COEFFICIENTS[model]
+    if len(numbers) not in (4, 5, 8, 12, 14) or np.any(numbers[len(names) :] != 0):
+        raise calibration_error(
+            where,
+            "k1 k2 k3 k4 of a fisheye" if fisheye else "k1 k2 p1 p2, with k3, or with k3 k4 k5 k6",
+            f"{len(numbers)} numbers{', a lens model with more terms' * (len(numbers) > 5)}",
+        )
+    if len(numbers) == 4 and not fisheye and np.abs(numbers[2:]).max() > MAX_TANGENTIAL:
+        raise InputError(
+            where,
+            expected=f"k1 k2 p1 p2 with p1 and p2 up to {MAX_TANGENTIAL:g}",
+            found=str(numbers.tolist()),
+            todo="If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
+            "fisheye_model: 1 in others.",
+        )
+    return np.append(numbers, 0.0)[: len(names)], model
 
 
 def read_camera_table(
@@ -438,10 +451,7 @@ def read_camera_table(
     return build_camera(
         where,
         name,
-        size=optics.size,
-        focal=optics.focal,
-        principal_point=optics.principal_point,
-        distortion=optics.distortion,
+        optics,
         rotation=rotation if axes is None else rotation @ axes.T,
         translation=translation,
     )

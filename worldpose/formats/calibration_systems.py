@@ -11,12 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.cameras import CameraCalibration
+from data_contracts.cameras import COEFFICIENTS, CameraCalibration
 from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
     MILLIMETRE,
     NUMBER_LIMIT,
     LeftOut,
+    Optics,
     build_camera,
     calibration_error,
     index_by_name,
@@ -169,10 +170,12 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
     return build_camera(
         where,
         element.get("serial", ""),
-        size=np.array([right - left + 1, bottom - top + 1]),
-        focal=read("intrinsic", ("focalLengthU", "focalLengthV")) / 64.0,
-        principal_point=read("intrinsic", ("centerPointU", "centerPointV")) / 64.0 - [left, top],
-        distortion=np.array([k1, k2, p1, p2, k3]),
+        Optics(
+            np.array([right - left + 1, bottom - top + 1]),
+            read("intrinsic", ("focalLengthU", "focalLengthV")) / 64.0,
+            read("intrinsic", ("centerPointU", "centerPointV")) / 64.0 - [left, top],
+            np.array([k1, k2, p1, p2, k3]),
+        ),
         rotation=rotation,
         translation=-rotation @ center,
     )
@@ -214,7 +217,7 @@ def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:
 
     The one `<KeyFrame>` of a static camera has the centre C (POSITION [mm]) and a quaternion
     (ORIENTATION, x y z w) of the rotation from the world to OpenCV's camera axes; z is up. The
-    lens: see `_vicon_lens`. Format: Vicon's "About calibration data (XCP) files".
+    lens: see `_vicon_optics`. Format: Vicon's "About calibration data (XCP) files".
     """
     name = element.get("DEVICEID", "")
     frames = element.findall("KeyFrames/KeyFrame")
@@ -249,23 +252,20 @@ def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:
     return build_camera(
         where,
         name,
-        size=size,
-        focal=np.array([focal, focal]),
-        principal_point=middle,
-        distortion=_vicon_lens(where, frame, size, focal, middle),
+        _vicon_optics(where, frame, size, focal, middle),
         rotation=rotation,
         translation=-rotation @ center,
     )
 
 
-def _vicon_lens(
+def _vicon_optics(
     where: str,
     frame: ET.Element,
     size: NDArray[np.float64],
     focal: float,
     middle: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return k1, k2, p1, p2, k3 (5,) of OpenCV's model, fitted to Vicon's.
+) -> Optics:
+    """Return the optics with a lens of OpenCV's models that follows Vicon's.
 
     Vicon's model goes from the pixel in the image to that without distortion: the offset d from the
     center of distortion is scaled by 1 + w1 d^2 + w2 d^4 + w3 d^6 [px]. `VICON_RADIAL2` is
@@ -293,7 +293,8 @@ def _vicon_lens(
         about = middle
         terms = np.append(_parse(f"{where}.VICON_RADIAL", frame.get("VICON_RADIAL"), 2), 0.0)
     if not np.any(terms) or not np.all(size >= 1) or focal <= 0.0:
-        return np.zeros(5)  # `build_camera` refuses an impossible size and focal length
+        # `build_camera` refuses an impossible size and focal length.
+        return Optics(size, np.full(2, focal), middle, np.zeros(5))
     across = np.stack(
         np.meshgrid(*(np.linspace(-0.5, length - 0.5, 41) for length in size)), axis=-1
     ).reshape(-1, 2)
@@ -302,31 +303,30 @@ def _vicon_lens(
     powers = np.concatenate([np.ones_like(square), square, square**2, square**3], axis=-1)
     ideal = about + offset * (powers @ np.append(1.0, terms))[:, None]
     slope = powers @ (np.append(1.0, terms) * [1.0, 3.0, 5.0, 7.0])
-    x, y = ((ideal - middle) / focal).T
-    r2 = x**2 + y**2
-    none = np.concatenate([x, y])
-    effects = np.stack(
-        [
-            none * np.tile(r2, 2),
-            none * np.tile(r2**2, 2),
-            np.concatenate([2.0 * x * y, r2 + 2.0 * y**2]),
-            np.concatenate([r2 + 2.0 * x**2, 2.0 * x * y]),
-            none * np.tile(r2**3, 2),
-        ],
-        axis=-1,
+    if slope.min() > 0.0:
+        from worldpose.geometry.cameras import Camera  # late: few files need the kernels
+        from worldpose.geometry.lens_fit import INTRINSICS, fit_lens
+        from worldpose.geometry.lens_models import LensModel
+        from worldpose.geometry.rigid import Rigid
+
+        at = Rigid.identity()
+        lens = Camera(np.full(2, focal), middle, np.zeros(8), at, size.astype(np.int64))
+        for kind, names in (
+            (LensModel.BROWN, COEFFICIENTS["brown"]),
+            (LensModel.RATIONAL, COEFFICIENTS["rational"]),
+            (LensModel.RATIONAL, (*INTRINSICS, *COEFFICIENTS["rational"])),
+        ):
+            fit = fit_lens(lens, (ideal - middle) / focal, across, kind, names)
+            if fit.error_px <= LENS_ERROR_PX:
+                lens = fit.camera
+                place = lens.principal_point
+                return Optics(size, lens.focal, place, lens.coefficients, kind.label)
+    raise InputError(
+        f"{where}.VICON_RADIAL2" if text is not None else f"{where}.VICON_RADIAL",
+        expected=f"a lens that k1 to k6, p1 and p2 follow within {LENS_ERROR_PX:g} px",
+        found="one that folds the image" if slope.min() <= 0.0 else f"{fit.error_px:.2g} px",
+        todo="Correct the videos for distortion in Vicon's program, and set the coefficients to 0.",
     )
-    seen = np.concatenate(list(((across - middle) / focal).T))
-    lens = np.linalg.lstsq(effects, seen - none, rcond=None)[0]
-    error = focal * float(np.abs(effects @ lens - (seen - none)).max())
-    if slope.min() <= 0.0 or error > LENS_ERROR_PX:
-        raise InputError(
-            f"{where}.VICON_RADIAL2" if text is not None else f"{where}.VICON_RADIAL",
-            expected=f"a lens that k1, k2, p1, p2, k3 follow within {LENS_ERROR_PX:g} px",
-            found="one that folds the image" if slope.min() <= 0.0 else f"{error:.2g} px",
-            todo="Correct the videos for distortion in Vicon's program, and set the coefficients "
-            "to 0.",
-        )
-    return np.asarray(lens)
 
 
 def _read_optitrack(
@@ -382,10 +382,12 @@ def _read_optitrack_camera(where: str, element: ET.Element) -> CameraCalibration
     return build_camera(
         where,
         name,
-        size=_numbers(f"{where}.Attributes", image, ("ImagerPixelWidth", "ImagerPixelHeight")),
-        focal=_numbers(optics, lens, ("HorizontalFocalLength", "VerticalFocalLength")),
-        principal_point=_numbers(optics, lens, ("LensCenterX", "LensCenterY")),
-        distortion=np.array([k1, k2, p1, p2, k3]),
+        Optics(
+            _numbers(f"{where}.Attributes", image, ("ImagerPixelWidth", "ImagerPixelHeight")),
+            _numbers(optics, lens, ("HorizontalFocalLength", "VerticalFocalLength")),
+            _numbers(optics, lens, ("LensCenterX", "LensCenterY")),
+            np.array([k1, k2, p1, p2, k3]),
+        ),
         rotation=rotation,
         translation=-rotation @ (Y_UP @ _numbers(pose, place, "XYZ")),
     )

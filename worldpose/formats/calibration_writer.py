@@ -1,4 +1,4 @@
-"""Writer of calibrated cameras as TOML."""
+"""Writer of calibrated cameras as TOML of Anipose, Pose2Sim and `calibration_files`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibrat
             f"distortions = {list(camera.distortion)}",
             f"rotation = {rotvec.tolist()}",
             f"translation = {list(camera.translation)}",
-            "fisheye = false",
+            f"fisheye = {str(camera.lens_model == 'fisheye').lower()}",
             "",
         ]
     lines += ["[metadata]", "adjusted = false", "error = 0.0", ""]

@@ -75,7 +75,7 @@ def write_moving_camera(path: Path, camera: Camera) -> None:
     pose = camera.cam_from_world
     write_archive(
         path,
-        {"K": intrinsics, "k": camera.distortion, "R": pose.rotation, "t": pose.translation},
+        {"K": intrinsics, "k": camera.distortion[:, :5], "R": pose.rotation, "t": pose.translation},
     )
 
 
@@ -294,7 +294,7 @@ def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None
     intrinsics[:, 2, 2] = 1.0
     arrays = {
         "K": intrinsics,
-        "k": np.array(camera.distortion),
+        "k": np.array(camera.distortion[:, :5]),
         "R": np.array(pose.rotation),
         "t": np.array(pose.translation),
     }

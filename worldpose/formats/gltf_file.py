@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
+from data_contracts.cameras import COEFFICIENTS
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 
 _KINDS: Final = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _TYPES: Final = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -92,6 +94,13 @@ def known_frames(camera: Camera) -> tuple[NDArray[np.int64], Camera]:
     numbers = [camera.focal, pose.rotation.reshape(-1, 9), pose.translation]
     rows = np.flatnonzero(np.isfinite(np.concatenate(numbers, axis=-1)).all(axis=-1))
     return rows, camera[rows]
+
+
+def lens_notes(camera: Camera) -> dict[str, Any]:
+    """Return a single camera's lens model, and its coefficients under a key that names them."""
+    model = LensModel(int(camera.lens_model)).label
+    names = "_".join(COEFFICIENTS[model])
+    return {"lens_model": model, f"distortion_{names}": camera.coefficients.tolist()}
 
 
 @dataclass
@@ -357,7 +366,7 @@ class _Writer:
         about: dict[str, Any] = {
             "image_size_px": [int(width), int(height)],
             "principal_point_px": known.principal_point[0].tolist(),
-            "distortion_k1_k2_p1_p2_k3": known.distortion[0].tolist(),
+            **lens_notes(known[0]),
         }
         if camera.batch_shape not in ((), (1,)):
             about["focal_px_by_frame"] = [

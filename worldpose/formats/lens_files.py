@@ -45,6 +45,15 @@ DISTORTION_NAMES: Final = (
     *("dist_coefs", "dist_coeff", "distCoef", "distCoeff", "dist", "distortions", "distortion"),
     *("distortion_coeffs", "Distortion", "D"),
 )
+MODEL_NAMES: Final = ("distortion_model", "lens_model", "model_type", "fisheye_model", "fisheye")
+FISHEYE_WORDS: Final = (
+    *("1", "1.0", "true", "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye"),
+)
+OTHER_WORDS: Final = (
+    *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
+    *("rational_polynomial", "rational", "full_opencv"),
+)
+"""Values of `MODEL_NAMES`, in lower case."""
 ARRAY_BYTES: Final = 1 << 26
 """Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
 MAX_ASPECT_ERROR: Final = 0.02
@@ -95,12 +104,11 @@ def read_lenses(
     except (ValueError, TypeError) as error:
         raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
     size = _image_size(given, sizes[camera])
-    is_fisheye = "fisheye_model" in given and np.any(np.asarray(given["fisheye_model"]) != 0)
     table = {
         "size": list(size),
         "matrix": matrix.tolist(),
         "distortions": distortion.tolist(),
-        **({"fisheye": True} if is_fisheye else {}),
+        "fisheye": _is_fisheye(where, given),
     }
     return {camera: _lens(where, camera, table, sizes[camera])}
 
@@ -155,6 +163,7 @@ def write_lens_toml(path: Path, lenses: Mapping[str, LensCalibration]) -> None:
             f"focal_std_px = {lens.focal_std_px}",
             f"principal_point_std_px = {lens.principal_point_std_px}",
             f"distortion_std = {lens.distortion_std}",
+            *(["fisheye = true"] if lens.lens_model == "fisheye" else []),
             "",
         ]
     path.write_text("\n".join(lines), encoding="utf-8")
@@ -286,8 +295,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
 
     Raises:
-        InputError: the file is no mapping, a matrix has other sizes than it says, or the lens model
-            is neither `plumb_bob` nor one of zeros beyond k3.
+        InputError: the file is no mapping, or a matrix has other sizes than it says.
     """
     content = read_yaml(file)
     if not isinstance(content, dict):
@@ -301,13 +309,8 @@ def _read_yaml(file: Path) -> dict[str, Any]:
                 raise calibration_error(
                     f"{file}: {name}", "rows x cols numbers", say_failure(error)
                 ) from error
-        elif isinstance(value, list | int | float):
+        elif isinstance(value, list | int | float | str):
             found[str(name)] = value
-    model = content.get("distortion_model", "plumb_bob")
-    if model in ("equidistant", "fisheye"):
-        found["fisheye_model"] = 1
-    elif model not in ("plumb_bob", "rational_polynomial"):
-        raise calibration_error(f"{file}: distortion_model", "plumb_bob", repr(model))
     return found
 
 
@@ -330,6 +333,8 @@ def read_file_storage(file: Path) -> dict[str, Any]:
                 found[name] = np.asarray(node.mat(), dtype=np.float64)
             elif node.isInt() or node.isReal():
                 found[name] = float(node.real())
+            elif node.isString():
+                found[name] = node.string()
             elif node.isSeq():
                 parts = [node.at(index) for index in range(node.size())]
                 found[name] = [
@@ -359,6 +364,22 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
         found=", ".join(sorted(given)) or "nothing",
         todo="Add it to the file, or give the file that has it: --lens may come twice.",
     )
+
+
+def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
+    """Return whether a file says that its lens is a fisheye.
+
+    Raises:
+        InputError: it names another lens model than those of OpenCV.
+    """
+    for key in MODEL_NAMES:
+        if key in given:
+            said = str(np.ravel(given[key])[0]).lower()
+            if said not in FISHEYE_WORDS + OTHER_WORDS:
+                words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
+                raise calibration_error(f"{where}: {key}", f"one of {words}", repr(said))
+            return said in FISHEYE_WORDS
+    return False
 
 
 def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
@@ -402,6 +423,7 @@ def _lens(
             focal_px=focal,
             principal_point_px=(float(middle[0]), float(middle[1])),
             distortion=tuple(optics.distortion.tolist()),
+            lens_model=optics.lens_model,
             **deviations,
         )
     except ValidationError as error:

@@ -19,6 +19,7 @@ from worldpose.formats.gltf_file import (
     INFLUENCES,
     AnimatedBody,
     known_frames,
+    lens_notes,
     people_with_bodies,
     rest_joints,
     skin_weights,
@@ -208,7 +209,10 @@ class _Writer:
             {
                 "image_size_px": self.Gf.Vec2i(int(width), int(height)),
                 "principal_point_px": self.Gf.Vec2d(*known.principal_point[0].tolist()),
-                "distortion_k1_k2_p1_p2_k3": self.Vt.DoubleArray(known.distortion[0].tolist()),
+                **{
+                    key: value if isinstance(value, str) else self.Vt.DoubleArray(value)
+                    for key, value in lens_notes(known[0]).items()
+                },
             }
         )
         placed = self.UsdGeom.Xformable(prim).AddTransformOp()

@@ -27,6 +27,8 @@ from worldpose.geometry.lens_models import (
 )
 from worldpose.geometry.rays import RayStatus
 
+DERIVATIVES: Final = 21
+"""Derivatives of a pixel that `project_with_jacobians` writes."""
 STEP: Final = 12
 """Parameters of a camera's step: rotation about its center [rad] and shift [m] in its own axes, the
 logarithm of the focal length, principal point [px], k1 k2 k3."""
@@ -213,8 +215,8 @@ def project_with_jacobians(
         cameras: (batch, WIDTH).
         points: (batch, n, 3) [m], world.
         image: (batch, n, 2) [px], written.
-        jacobian: (batch, n, 2, 18), written: by the world point, by the left tangent update
-            (rotation, translation), by fx fy cx cy, by k1 k2 p1 p2 k3.
+        jacobian: (batch, n, 2, DERIVATIVES), written: by the world point, by the left
+            tangent update (rotation, translation), by fx fy cx cy, by k1 k2 p1 p2 k3 k4 k5 k6.
         status: (batch, n) RayStatus, written.
     """
     for row in range(points.shape[0]):
@@ -233,7 +235,7 @@ def project_with_jacobians(
             image[row, i, 0], image[row, i, 1] = u, v
             a, b = x / z, y / z
             s = a * a + b * b
-            k1, k2, k3, _, _, _ = by_coefficients(camera, s)
+            k1, k2, k3, k4, k5, k6 = by_coefficients(camera, s)
             for k in range(2):
                 dx, dy, dz = (gx, gy, gz) if k == 0 else (hx, hy, hz)
                 d = jacobian[row, i, k]
@@ -244,6 +246,7 @@ def project_with_jacobians(
                 d[11], d[12] = (1.0, 0.0) if k == 0 else (0.0, 1.0)
                 f, along = (fx, a) if k == 0 else (fy, b)
                 d[13], d[14], d[17] = f * along * k1, f * along * k2, f * along * k3
+                d[18], d[19], d[20] = f * along * k4, f * along * k5, f * along * k6
                 d[15] = f * (2.0 * a * b if k == 0 else s + 2.0 * b * b)
                 d[16] = f * (s + 2.0 * a * a if k == 0 else 2.0 * a * b)
 

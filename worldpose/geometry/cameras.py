@@ -24,7 +24,8 @@ from worldpose.geometry.rigid import (
     nearest_rotation,
 )
 
-_PARTS = ("focal", "principal_point", "distortion", "image_size")
+_PARTS = {"focal": 2, "principal_point": 2, "distortion": 8, "image_size": 2}
+"""Numbers of the fields of a camera besides its pose and its lens model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,7 @@ class Projection:
     d_intrinsics: Floats
     """(..., n, 2, 4), by fx fy cx cy."""
     d_distortion: Floats
-    """(..., n, 2, 5) [px], by k1 k2 p1 p2 k3."""
+    """(..., n, 2, 8) [px], by k1 k2 p1 p2 k3 k4 k5 k6."""
     status: Image
     """(..., n) RayStatus."""
 
@@ -54,7 +55,7 @@ class Camera:
     """One pinhole camera with a distorting lens, or a batch of them.
 
     Batch dimensions of the fields broadcast against each other. A camera with a NaN is missing: its
-    pixels and rays are NaN. Files and records hold cameras of Brown's model alone.
+    pixels and rays are NaN.
 
     Raises:
         InputError: a field has the wrong shape, or the batches do not broadcast.
@@ -68,28 +69,33 @@ class Camera:
     principal_point: Floats
     """(..., 2) cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
     distortion: Floats
-    """(..., 5) k1 k2 p1 p2 k3 of Brown's model; (..., 8) of others, then k4 k5 k6. A coefficient
-    that a model does not have is 0."""
+    """(..., 8) k1 k2 p1 p2 k3 k4 k5 k6; a coefficient that a lens model lacks is 0. The constructor
+    appends zeros to Brown's five."""
     cam_from_world: Rigid
     """(...) pose."""
     image_size: Integers
     """(..., 2) width, height [px]."""
-    lens_model: LensModel = LensModel.BROWN
-    """Model of all cameras of the batch."""
+    lens_model: Integers | LensModel = LensModel.BROWN
+    """(...) LensModel."""
 
     def __post_init__(self) -> None:
-        pose = self.cam_from_world
-        lens = 5 if self.lens_model == LensModel.BROWN else 8
+        pose, lens = self.cam_from_world, np.asarray(self.distortion, dtype=np.float64)
+        if lens.shape[-1:] == (5,):
+            lens = np.concatenate([lens, np.zeros((*lens.shape[:-1], 3))], axis=-1)
         parts = {
-            name: check_shape(f"Camera.{name}", getattr(self, name), (length,))
-            for name, length in zip(_PARTS, (2, 2, lens, 2), strict=True)
+            name: check_shape(
+                f"Camera.{name}", lens if name == "distortion" else getattr(self, name), (length,)
+            )
+            for name, length in _PARTS.items()
         }
+        models = np.asarray(self.lens_model, dtype=np.int64)
         batch = common_batch(
-            "Camera", pose.batch_shape, *(part.shape[:-1] for part in parts.values())
+            "Camera", pose.batch_shape, models.shape, *(part.shape[:-1] for part in parts.values())
         )
         parts["image_size"] = parts["image_size"].astype(np.int64)
         for name, part in parts.items():
             object.__setattr__(self, name, np.broadcast_to(part, (*batch, part.shape[-1])))
+        object.__setattr__(self, "lens_model", np.broadcast_to(models, batch))
         if pose.batch_shape != batch:
             rotation = np.broadcast_to(pose.rotation, (*batch, 3, 3))
             object.__setattr__(self, "cam_from_world", Rigid(rotation, pose.translation))
@@ -99,16 +105,15 @@ class Camera:
         """Return one batch of cameras, stacked along a new first dimension.
 
         Raises:
-            InputError: there are no cameras, or their batch shapes or lens models differ.
+            InputError: there are no cameras, or their batch shapes differ.
         """
         shapes = [camera.batch_shape for camera in cameras]
-        models = [camera.lens_model.name for camera in cameras]
-        if len(set(shapes)) != 1 or len(set(models)) != 1:
+        if len(set(shapes)) != 1:
             raise InputError(
                 "Camera.stack",
-                expected="one or more cameras of one batch shape and lens model",
-                found=f"batch shapes {shapes}, lens models {models}",
-                todo="Stack single cameras of one lens model.",
+                expected="one or more cameras of one batch shape",
+                found=f"batch shapes {shapes}",
+                todo="Stack single cameras.",
             )
         poses = [camera.cam_from_world for camera in cameras]
         return cls(
@@ -117,7 +122,7 @@ class Camera:
                 np.stack([pose.rotation for pose in poses]),
                 np.stack([pose.translation for pose in poses]),
             ),
-            lens_model=cameras[0].lens_model,
+            lens_model=np.stack([camera.lens_model for camera in cameras]),
         )
 
     @classmethod
@@ -128,15 +133,18 @@ class Camera:
         rotation: ArrayLike,
         translation: ArrayLike,
         image_size: ArrayLike,
+        lens_model: LensModel = LensModel.BROWN,
     ) -> Camera:
         """Return the cameras of OpenCV's matrices; batch dimensions `...` broadcast.
 
         Args:
             matrix: (..., 3, 3), `K` [px], without skew.
-            distortion: (..., 5) k1 k2 p1 p2 k3.
+            distortion: (..., 5) k1 k2 p1 p2 k3; (..., 8) with k4 k5 k6 of the rational model; or
+                (..., 4) k1 k2 k3 k4 of the fisheye.
             rotation: (..., 3, 3) rotation of `x_cam = rotation x_world + translation`.
             translation: (..., 3) [m].
             image_size: (..., 2) width, height [px].
+            lens_model: model of all lenses.
 
         Raises:
             InputError: an array has the wrong shape, K has a skew or another last row than (0, 0,
@@ -161,9 +169,10 @@ class Camera:
         return cls(
             focal=np.stack([k[..., 0, 0], k[..., 1, 1]], axis=-1),
             principal_point=k[..., :2, 2],
-            distortion=np.asarray(distortion, dtype=np.float64),
+            distortion=_spread_coefficients("Camera.from_matrices", distortion, lens_model),
             cam_from_world=pose,
             image_size=np.asarray(image_size, dtype=np.int64),
+            lens_model=lens_model,
         )
 
     @classmethod
@@ -183,63 +192,66 @@ class Camera:
                 todo="Correct the calibration.",
             )
         rotation = nearest_rotation(f"{where}: rotation", calibration.rotation)
+        model = LensModel.named(calibration.lens_model)
         return cls(
             focal=np.array(calibration.focal_px),
             principal_point=np.array(calibration.principal_point_px),
-            distortion=np.array(calibration.distortion),
+            distortion=_spread_coefficients(where, calibration.distortion, model),
             cam_from_world=Rigid(rotation, np.array(calibration.translation)),
             image_size=np.array(calibration.image_size, dtype=np.int64),
+            lens_model=model,
         )
 
     @classmethod
     def from_lens(cls, lens: LensCalibration, image_size: ArrayLike | None = None) -> Camera:
         """Return a camera with a lens, at the origin; the image size is the lens's if None."""
+        model = LensModel.named(lens.lens_model)
         return cls(
             focal=np.array([lens.focal_px, lens.focal_px]),
             principal_point=np.array(lens.principal_point_px),
-            distortion=np.array(lens.distortion),
+            distortion=_spread_coefficients(f"lens {lens.id}", lens.distortion, model),
             cam_from_world=Rigid.identity(),
             image_size=np.array(lens.image_size if image_size is None else image_size),
+            lens_model=model,
         )
 
     @classmethod
     def from_numbers(cls, row: Floats, image_size: ArrayLike) -> Camera:
         """Return the camera of a row (WIDTH,), its rotation replaced by the nearest exact one."""
         u, _, v = np.linalg.svd(row[9:18].reshape(3, 3))
-        model = LensModel(int(row[25]))
         return cls(
             focal=row[:2],
             principal_point=row[2:4],
-            distortion=row[4:9] if model == LensModel.BROWN else row[[4, 5, 6, 7, 8, 22, 23, 24]],
+            distortion=row[[4, 5, 6, 7, 8, 22, 23, 24]],
             cam_from_world=Rigid(u @ v, row[18:21]),
             image_size=np.asarray(image_size),
-            lens_model=model,
+            lens_model=LensModel(int(row[25])),
         )
 
     def to_calibration(self, camera_id: str) -> CameraCalibration:
         """Return the record of a single camera.
 
         Raises:
-            InputError: this is a batch, or its lens model is not Brown's.
+            InputError: this is a batch.
         """
-        if self.batch_shape or self.lens_model != LensModel.BROWN:
+        if self.batch_shape:
             raise InputError(
                 "Camera.to_calibration",
-                expected="a single camera of Brown's lens model",
-                found=f"a batch of shape {self.batch_shape} of model {self.lens_model.name}",
-                todo="Index the batch first; fit Brown's model to another lens.",
+                expected="a single camera",
+                found=f"a batch of shape {self.batch_shape}",
+                todo="Index the batch first.",
             )
         width, height = (int(n) for n in self.image_size)
         fx, fy = self.focal.tolist()
         cx, cy = self.principal_point.tolist()
-        k1, k2, p1, p2, k3 = self.distortion.tolist()
         rows = tuple(_vector3(row) for row in self.cam_from_world.rotation)
         return CameraCalibration(
             id=camera_id,
             image_size=(width, height),
             focal_px=(fx, fy),
             principal_point_px=(cx, cy),
-            distortion=(k1, k2, p1, p2, k3),
+            distortion=tuple(self.coefficients.tolist()),
+            lens_model=LensModel(int(self.lens_model)).label,
             rotation=(rows[0], rows[1], rows[2]),
             translation=_vector3(self.cam_from_world.translation),
         )
@@ -248,6 +260,11 @@ class Camera:
     def batch_shape(self) -> tuple[int, ...]:
         """Shape of the batch; () for a single camera."""
         return self.focal.shape[:-1]
+
+    @property
+    def coefficients(self) -> Floats:
+        """Coefficients (n,) of a single camera's lens model, in OpenCV's order."""
+        return self.distortion[LensModel(int(self.lens_model)).columns]
 
     @property
     def center(self) -> Floats:
@@ -268,7 +285,7 @@ class Camera:
         return Camera(
             **{name: getattr(self, name)[index_leading(index, 1)] for name in _PARTS},
             cam_from_world=self.cam_from_world[index],
-            lens_model=self.lens_model,
+            lens_model=np.asarray(self.lens_model)[index],
         )
 
     def project(self, points_world: ArrayLike) -> Floats:
@@ -304,7 +321,7 @@ class Camera:
         )
         shape = points.shape[:-1]
         image = np.empty((*shape, 2))
-        jacobian = np.empty((*shape, 2, 18))
+        jacobian = np.empty((*shape, 2, camera_model.DERIVATIVES))
         status = np.empty(shape, dtype=np.uint8)
         camera_model.project_with_jacobians(cameras, points, image, jacobian, status)
         jacobian = jacobian.reshape((*batch, *jacobian.shape[1:]))
@@ -368,20 +385,33 @@ def _normalize(cameras: Floats, points: Floats) -> tuple[Floats, Image]:
     return plane, status
 
 
+def _spread_coefficients(where: str, given: ArrayLike, model: LensModel) -> Floats:
+    """Return coefficients (..., 8) as `Camera` has them from a model's own in OpenCV's order."""
+    values = check_shape(f"{where}: distortion", given, (len(model.columns),))
+    spread = np.zeros((*values.shape[:-1], _PARTS["distortion"]))
+    spread[..., model.columns] = values
+    return spread
+
+
 def _vector3(values: Floats) -> Vector3:
     x, y, z = values.tolist()
     return x, y, z
 
 
 def camera_arrays(camera: Camera) -> dict[str, NDArray[Any]]:
-    """Return the stored arrays of a single camera, by name."""
+    """Return the stored arrays of cameras, by name."""
     pose = camera.cam_from_world
     parts = {name: getattr(camera, name) for name in _PARTS}
+    parts["lens_model"] = np.asarray(camera.lens_model).astype(np.uint8)
     return {**parts, "rotation": pose.rotation, "translation": pose.translation}
 
 
 def camera_from_arrays(arrays: Mapping[Any, ArrayLike]) -> Camera:
-    """Return the camera of stored arrays, bit for bit the one that was stored."""
+    """Return the cameras of stored arrays, bit for bit those that were stored.
+
+    Moving cameras have no array `lens_model`: their model is Brown's.
+    """
     parts: dict[str, Any] = {name: np.asarray(arrays[name]) for name in _PARTS}
+    parts["lens_model"] = np.asarray(arrays.get("lens_model", LensModel.BROWN))
     rotation, translation = (np.asarray(arrays[name]) for name in ("rotation", "translation"))
     return Camera(**parts, cam_from_world=Rigid(rotation, translation))

@@ -26,6 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_contracts.arrays import Floats
+from data_contracts.cameras import COEFFICIENTS, LENS_MODELS, LensName
+from data_contracts.conventions import DISTORTION
 from worldpose.compiled import compile_kernel, inline_kernel
 from worldpose.geometry.rays import RayStatus
 from worldpose.geometry.rigid import check_shape
@@ -37,6 +39,21 @@ class LensModel(IntEnum):
     BROWN = 0
     RATIONAL = 1
     FISHEYE = 2
+
+    @classmethod
+    def named(cls, name: LensName) -> LensModel:
+        """Return the model of a record's name."""
+        return cls[name.upper()]
+
+    @property
+    def columns(self) -> list[int]:
+        """Places of the model's coefficients, in OpenCV's order, among k1 k2 p1 p2 k3 k4 k5 k6."""
+        return [DISTORTION.index(name) for name in COEFFICIENTS[self.label]]
+
+    @property
+    def label(self) -> LensName:
+        """Name in records."""
+        return LENS_MODELS[self]
 
 
 WIDTH: Final = 26
@@ -92,12 +109,12 @@ _MAX_ITERATIONS = 100
 _MISFIT = 1e-13
 
 
-def lens_rows(distortion: Floats, model: LensModel = LensModel.BROWN) -> Floats:
+def lens_rows(distortion: Floats, model: ArrayLike = LensModel.BROWN) -> Floats:
     """Return rows (..., WIDTH) of lenses alone, with their folds; other numbers are 0.
 
     Args:
         distortion: (..., 5) k1 k2 p1 p2 k3 or (..., 8), then k4 k5 k6.
-        model: the lens model.
+        model: (...) LensModel.
     """
     rows = np.zeros((*distortion.shape[:-1], WIDTH))
     rows[..., 4:9] = distortion[..., :5]

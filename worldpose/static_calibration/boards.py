@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image, Integers
-from data_contracts.cameras import LensCalibration
+from data_contracts.cameras import LensCalibration, LensName
 from worldpose.errors import InputError
+from worldpose.geometry.cameras import Camera, Projection
+from worldpose.geometry.lens_models import LensModel
+from worldpose.geometry.optimize.levenberg_marquardt import Damping, minimize
 
 MIN_VIEWS: Final = 4
 """Minimum images with a board [1]: leaving out one must leave three, which determine a lens."""
@@ -155,8 +159,9 @@ def calibrate_lens(
     """Return the lens of a camera from images of one board.
 
     Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV
-    (Zhang, 2000). Images whose corners are not on a plane, or that contradict the others, are left
-    out. The standard deviations are those of leaving out one image at a time (jackknife).
+    (Zhang, 2000); or k1 to k4 of a fisheye, if its residuals are clearly smaller. Images whose
+    corners are not on a plane, or that contradict the others, are left out. The standard deviations
+    are those of leaving out one image at a time (jackknife).
 
     Args:
         camera: its name.
@@ -170,9 +175,10 @@ def calibrate_lens(
     max_focal_std = 0.05  # relative; boards that all face the camera do not determine it
     reasons = ["" if view is not None else "no whole board found" for view in views]
     for n, view in enumerate(views):
-        # In squares: a lens bends a board less; corners that were counted wrongly have errors of 1.
-        if view is not None and view.bend > 0.25:
+        # In squares: a lens bends a board less; corners that were counted wrongly, 0.4 to 1.
+        if view is not None and view.bend > 0.35:
             reasons[n] = "its corners are not those of a flat board"
+    model = _choose_model([v for v, no in zip(views, reasons, strict=True) if v and not no], size)
     while True:
         chosen = [n for n, reason in enumerate(reasons) if not reason]
         if len(chosen) < MIN_VIEWS:
@@ -184,17 +190,19 @@ def calibrate_lens(
                 " it is tilted, sharp and near the borders.",
             )
         kept = [view for view in (views[n] for n in chosen) if view is not None]
-        numbers, residuals = _solve(kept, size)
+        numbers, residuals = _solve(kept, size, model)
         error = np.array([_rms(each) for each in residuals])
         worst = int(error.argmax())
         if error[worst] <= 0.3 or len(kept) == MIN_VIEWS:
             break
-        others = _solve(kept[:worst] + kept[worst + 1 :], size)[1]
+        others = _solve(kept[:worst] + kept[worst + 1 :], size, model)[1]
         # The worst image is left out if it doubles the residual.
         if _rms(np.concatenate(residuals)) <= 2.0 * _rms(np.concatenate(others)):
             break
         reasons[chosen[worst]] = f"it contradicts the others, by {error[worst]:.1f} px"
-    left_out = np.array([_solve(kept[:n] + kept[n + 1 :], size)[0] for n in range(len(kept))])
+    left_out = np.array(
+        [_solve(kept[:n] + kept[n + 1 :], size, model)[0] for n in range(len(kept))]
+    )
     count = len(kept)
     spread = (count - 1) / count * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
     std = np.sqrt(spread)
@@ -205,7 +213,7 @@ def calibrate_lens(
             found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
             todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
         )
-    corner = np.array([_corner_factor(each, size) for each in left_out])
+    corner = np.array([_corner_factor(each, size, model) for each in left_out])
     corner_std = np.sqrt((count - 1) / count * ((corner - corner.mean()) ** 2).sum())
     # Three coefficients share the displacement of the corner.
     lens = LensCalibration(
@@ -213,7 +221,8 @@ def calibrate_lens(
         image_size=size,
         focal_px=float(numbers[0]),
         principal_point_px=(float(numbers[1]), float(numbers[2])),
-        distortion=(*(float(one) for one in numbers[3:7]), 0.0),
+        distortion=tuple(numbers[3:].tolist()),
+        lens_model=model,
         focal_std_px=float(max(std[0], min_std_px)),
         principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), min_std_px)),
         distortion_std=float(max(corner_std, 1e-4)),
@@ -235,33 +244,125 @@ def _rms(residuals: Floats) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
-def _solve(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[Floats, list[Floats]]:
-    """Return f, cx, cy, k1, k2, p1, p2, and the residuals (n, 2) of each view [px]."""
+def _choose_model(views: Sequence[BoardView], size: tuple[int, int]) -> LensName:
+    """Return the fisheye if its residuals are clearly smaller than those of Brown's model."""
+    clear = 0.7  # ratio of median residuals: wide lenses reach 0.1 to 0.4, noise of few boards 0.9
+    if len(views) < MIN_VIEWS:
+        return "brown"
+    median = {
+        model: float(np.median([_rms(each) for each in _solve(views, size, model)[1]]))
+        for model in ("brown", "fisheye")
+    }
+    return "fisheye" if median["fisheye"] < clear * median["brown"] else "brown"
+
+
+def _solve(
+    views: Sequence[BoardView], size: tuple[int, int], model: LensName
+) -> tuple[Floats, list[Floats]]:
+    """Return f, cx, cy and the coefficients, and the residuals (n, 2) of each view [px]."""
     import cv2
 
-    places = [np.column_stack([view.places, np.zeros(len(view.places))]) for view in views]
-    objects = [each.astype(np.float32) for each in places]
+    places = [np.insert(view.places, 2, 0.0, axis=1).astype(np.float32) for view in views]
     images = [view.pixels.astype(np.float32) for view in views]
     middle = 0.5 * (np.array(size) - 1.0)
     start = np.array([[max(size), 0.0, middle[0]], [0.0, max(size), middle[1]], [0.0, 0.0, 1.0]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
-    distortion_guess = np.zeros(5)
-    _, matrix, distortion, rvecs, tvecs = cv2.calibrateCamera(
-        objects, images, size, start, distortion_guess, flags=flags
+    _, matrix, found, rvecs, tvecs = cv2.calibrateCamera(
+        places, images, size, start, np.zeros(5), flags=flags
     )
-    residuals = []
-    for each, view, rvec, tvec in zip(places, views, rvecs, tvecs, strict=True):
-        shown, _ = cv2.projectPoints(each, rvec, tvec, matrix, distortion)
-        residuals.append(view.pixels - shown.reshape(-1, 2))
-    intrinsics = [matrix[0, 0], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:4]]
-    return np.array(intrinsics, dtype=np.float64), residuals
+    lens = np.append(found.ravel()[:4], 0.0)
+    turns = np.array([cv2.Rodrigues(each)[0] for each in rvecs])
+    camera = Camera.from_matrices(matrix, lens, turns, np.reshape(tvecs, (-1, 3)), size)
+    boards = _Boards(camera, views)
+    if model == "fisheye":
+        boards = boards.fit_fisheye()
+    camera = boards.camera
+    numbers = [camera.focal[0, 0], *camera.principal_point[0], *camera[0].coefficients]
+    # A corner beyond the fold of a wrong lens counts as far off.
+    return np.array(numbers), [np.nan_to_num(each, nan=1e3) for each in boards.residuals]
 
 
-def _corner_factor(numbers: Floats, size: tuple[int, int]) -> float:
+@dataclass(frozen=True, eq=False)
+class _Boards:
+    """Boards before a camera of square pixels, as Zhang (2000) fits them.
+
+    Attributes:
+        camera: (views,) one lens, with the pose of each board.
+        views: the corners.
+    """
+
+    camera: Camera
+    views: Sequence[BoardView]
+
+    @cached_property
+    def _seen(self) -> list[Projection]:
+        return [
+            self.camera[n].project_with_jacobians(np.insert(view.places, 2, 0.0, axis=1))
+            for n, view in enumerate(self.views)
+        ]
+
+    @property
+    def residuals(self) -> list[Floats]:
+        """Corner minus its projection (n, 2) [px], by view; NaN beyond the fold."""
+        pairs = zip(self.views, self._seen, strict=True)
+        return [view.pixels - seen.points_image for view, seen in pairs]
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals [px^2]."""
+        return float(sum((each**2).sum() for each in self.residuals))
+
+    def fit_fisheye(self) -> _Boards:
+        """Return the fisheye and the poses of least squares, from a fit of Brown's model.
+
+        OpenCV's cv2.fisheye.calibrate has the same objective; it often ends far from the minimum.
+        """
+        k1, k2 = self.camera.distortion[:, :2].T
+        lens = np.zeros((len(self.views), 8))
+        lens[:, 0], lens[:, 1] = k1 + 1.0 / 3.0, k2 + k1 + 2.0 / 15.0
+        start = replace(self.camera, distortion=lens, lens_model=LensModel.FISHEYE)
+        return minimize(
+            replace(self, camera=start),
+            _Boards._step,
+            Damping(start=1e-3, decrease=10.0, lowest=1e-12, highest=1e8),
+            iterations=100,
+            converged=lambda before, after: 0.0 <= before.cost - after.cost <= 1e-9 * before.cost,
+        ).state
+
+    def _step(self, damping: float) -> _Boards:
+        """Return the boards after a damped Gauss-Newton step of the lens and all poses."""
+        columns, camera = LensModel.FISHEYE.columns, self.camera
+        shared = 3 + len(columns)
+        count = shared + 6 * len(self.views)
+        matrix, right = np.zeros((count, count)), np.zeros(count)
+        for n, (seen, off) in enumerate(zip(self._seen, self.residuals, strict=True)):
+            by_focal = (seen.d_intrinsics[..., :2] * camera.focal[n]).sum(axis=-1, keepdims=True)
+            parts = by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., columns]
+            rows = np.concatenate([*parts, seen.d_pose], axis=-1).reshape(-1, shared + 6)
+            own = np.append(np.arange(shared), shared + 6 * n + np.arange(6))
+            matrix[np.ix_(own, own)] += rows.T @ rows
+            right[own] += rows.T @ off.ravel()
+        size = np.sqrt(np.diag(matrix))
+        matrix = matrix / np.outer(size, size) + damping * np.eye(count)
+        step = np.linalg.solve(matrix, right / size) / size
+        distortion = camera.distortion.copy()
+        distortion[:, columns] += step[3:shared]
+        moved = replace(
+            camera,
+            focal=camera.focal * np.exp(step[0]),
+            principal_point=camera.principal_point + step[1:3],
+            distortion=distortion,
+            cam_from_world=camera.cam_from_world.retract(step[shared:].reshape(-1, 6)),
+        )
+        return replace(self, camera=moved)
+
+
+def _corner_factor(numbers: Floats, size: tuple[int, int], model: LensName) -> float:
     """Return the relative displacement of the image's farthest corner by the distortion [1]."""
     far = np.maximum(numbers[1:3], np.array(size) - numbers[1:3]) / numbers[0]
-    squared = float((far**2).sum())
-    return float(numbers[3] * squared + numbers[4] * squared**2)
+    powers = float((far**2).sum()) ** np.arange(1, 5)
+    terms = numbers[3:] if model == "fisheye" else numbers[[3, 4]]
+    return float(terms @ powers[: len(terms)])
 
 
 def choose_views(

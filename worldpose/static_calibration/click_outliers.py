@@ -191,18 +191,20 @@ def scale_noise(
     )
 
 
-def negative_log_posterior(found: Explanation, *, factor: float, with_prior: bool) -> float:
+def negative_log_posterior(
+    found: Explanation, *, factor: float, with_prior: bool, noise_scale: float | None = None
+) -> float:
     """Return minus twice the log posterior of an explanation, up to a constant.
 
     Comparisons of assumptions about the camera include the camera prior; in comparisons of noise it
     would count a lens that is rare under the prior as noise. The factor is the noise over the
-    stated one.
+    stated one. The scale is that of the fit, if None.
     """
     log_two_pi = float(np.log(2.0 * np.pi))
     problem, fit, settings = found.problem, found.fit, found.settings
     kept = problem.select(fit.inliers, fit.markings)
     rows = compute_residuals(kept, fit.row)
-    scale = fit.noise_scale
+    scale = fit.noise_scale if noise_scale is None else noise_scale
     squared = (_click_loss(kept, rows) + _drawn_loss(kept, rows)) / scale**2
     volume = 2.0 * float(np.log(scale)) * (2 * len(kept.click_noise) + len(kept.drawn_noise))
     volume += 4.0 * float(np.log(kept.click_noise).sum()) + 2.0 * len(kept.click_noise) * log_two_pi

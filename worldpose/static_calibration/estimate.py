@@ -12,6 +12,7 @@ from worldpose.static_calibration.evidence import check_amount, gather_evidence
 from worldpose.static_calibration.explanations import check_determined, find_explanation, try_k3
 from worldpose.static_calibration.fit import build_problem
 from worldpose.static_calibration.initialization import find_start, fit_from_starts
+from worldpose.static_calibration.lens_choice import choose_lens
 from worldpose.static_calibration.line_refinement import refine_and_judge
 from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
@@ -65,7 +66,7 @@ def calibrate_camera(
         near = find_start(problem, stated)
     else:
         near, _ = fit_from_starts(problem, start.numbers[None], stated.wrong_click)
-    found = fit_inliers_at_best_noise(problem, near, stated)
+    found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = try_k3(found)

@@ -11,7 +11,8 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.cameras import LensCalibration
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.camera_model import STEP, step_row
-from worldpose.geometry.lens_models import WIDTH
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import WIDTH, LensModel
 from worldpose.geometry.optimize.dense import solve_in_place
 from worldpose.geometry.optimize.levenberg_marquardt import Damping, is_better, next_damping
 from worldpose.static_calibration.evidence import ClickEvidence, count_neighbors
@@ -23,6 +24,8 @@ from worldpose.static_calibration.residuals import (
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
+_KEPT: Final = [6, 7, 22, 23, 24]
+"""Columns of p1, p2, k4, k5 and k6, which no fit changes."""
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
 TOLERANCE: Final = 1e-10
@@ -45,6 +48,7 @@ class CameraProblem:
         drawn_loss: Cauchy scale of drawn points [standard deviations].
         where: file or camera, for messages.
         lens: the given lens that `prior` contains; None = none is known.
+        lens_model: lens model of the camera, that of a given lens.
     """
 
     evidence: ClickEvidence
@@ -56,6 +60,7 @@ class CameraProblem:
     drawn_loss: float
     where: str = "clicked markings"
     lens: LensCalibration | None = None
+    lens_model: LensModel = LensModel.BROWN
 
     @property
     def half_diagonal(self) -> float:
@@ -127,7 +132,7 @@ def build_problem(
     prior += [*known.lens_std, known.k1, 0.0, 0.0]
     if lens is not None:
         reach = (0.5 * np.hypot(width, height) / lens.focal_px) ** 2
-        k1, k2, _, _, k3 = lens.distortion
+        k1, k2, _, _, k3 = Camera.from_lens(lens).distortion[:5]
         prior[:2] = [np.log(lens.focal_px), lens.focal_std_px / lens.focal_px]
         prior[2:5] = [*lens.principal_point_px, lens.principal_point_std_px]
         prior[6:9] = [lens.distortion_std] * 3
@@ -143,6 +148,7 @@ def build_problem(
         drawn_loss=settings.drawn_loss_scale,
         where=where,
         lens=lens,
+        lens_model=LensModel.BROWN if lens is None else LensModel.named(lens.lens_model),
     )
 
 
@@ -158,9 +164,7 @@ def fit_cameras(
     The loss of clicks is a Cauchy scale [standard deviations]; infinite = least squares.
     """
     count, evidence = len(rows), problem.evidence
-    starts = rows.copy()
-    if problem.lens is not None:
-        starts[:, 6:8] = problem.lens.distortion[2:4]  # tangential terms, which no fit changes
+    starts = _with_model(rows, problem)
     found = Fits(
         rows=starts,
         cost=np.empty(count),
@@ -184,6 +188,23 @@ def fit_cameras(
     )
     _descend(given, iterations, found)
     return found
+
+
+def _with_model(rows: Floats, problem: CameraProblem) -> Floats:
+    """Return cameras (b, WIDTH) with the problem's lens model, and what no fit changes of its lens.
+
+    A fisheye replaces Brown's lens up to the fifth power of the angle from the axis.
+    """
+    rows = rows.copy()
+    others = rows[:, 25] != problem.lens_model
+    k1, k2 = rows[others, 4], rows[others, 5]
+    rows[others, 4], rows[others, 5] = k1 + 1.0 / 3.0, k2 + k1 + 2.0 / 15.0
+    rows[others, 25] = problem.lens_model
+    if problem.lens is not None:
+        known = Camera.from_lens(problem.lens).numbers
+        rows[others, 4:9] = known[4:9]
+        rows[:, _KEPT] = known[_KEPT]
+    return rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,7 +84,7 @@ def drop_k3(camera: Camera) -> Camera:
     A coefficient that no fit changes is a statement about the lens. That of a guessed lens moved
     two real cameras by 2 and 7 px.
     """
-    k1, k2, _, _, k3 = camera.distortion
+    k1, k2, _, _, k3 = camera.distortion[:5]
     corner = 0.5 * float(np.hypot(*camera.image_size)) / float(camera.focal[0])
     radius = np.linspace(0.01, 2.0, 400) * corner
     bent = radius * (1.0 + k1 * radius**2 + k2 * radius**4 + k3 * radius**6)

@@ -21,6 +21,7 @@ from worldpose.static_calibration.ground_error import (
     ground_error_map,
     propose_clicks,
 )
+from worldpose.static_calibration.lens_choice import describe_misfit
 from worldpose.static_calibration.line_refinement import LineRefinement
 from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
 from worldpose.static_calibration.residuals import drawn_residuals
@@ -154,6 +155,13 @@ def build_report(
         drawn.append(MarkingResidual(name, len(off), rms, worst, bool(fit.markings[index])))
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
+    misfit = describe_misfit(found)
+    if reasons and not misfit and scale >= 3.0:
+        misfit = (
+            f"the errors of clicks are {scale:.1f} times the stated noise with every lens model "
+            "that was tried: check the names, or calibrate the lens (worldpose calibrate)"
+        )
+    reasons += [misfit] if misfit else []
     decisions = list(found.assumptions)
     if abs(scale - 1.0) > 0.01:
         decisions.append(
@@ -265,8 +273,9 @@ def _lens_deviations(
     focal, middle = float(camera.focal[0]), camera.principal_point - lens.principal_point_px
     reach = (half_diagonal / focal) ** 2
     given = (half_diagonal / lens.focal_px) ** 2
+    stated = Camera.from_lens(lens).distortion
     corner = [
-        camera.distortion[i] * reach**power - lens.distortion[i] * given**power
+        camera.distortion[i] * reach**power - stated[i] * given**power
         for power, i in ((1, 0), (2, 1), (3, 4))
     ]
     return {

@@ -23,12 +23,20 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.camera_model import STEP, observe, to_camera_axes
-from worldpose.geometry.lens_models import WIDTH, by_coefficients, fold_squared, load_camera, radial
+from worldpose.geometry.lens_models import (
+    WIDTH,
+    LensModel,
+    by_coefficients,
+    fold_squared,
+    load_camera,
+    radial,
+)
 from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
 
 PRIORS: Final = 9
 """Rows of the prior: focal, cx, cy, k1, k2, k3, height, distance, roll."""
 
+_BROWN = int(LensModel.BROWN)
 _LOST_RESIDUAL: Final = 1e3
 """Residual [px] of points that the camera cannot image: larger than any true residual."""
 
@@ -135,7 +143,7 @@ def click_residuals(
     if fold < np.inf:
         magnification = radial(load_camera(rows, 0), fold)[0]
         rows[1, 0], rows[1, 1] = magnification * c[0], magnification * c[1]
-        rows[1, 4:9] = rows[1, 22:] = 0.0
+        rows[1, 4:9] = rows[1, 22:] = 0.0  # Brown's model, too
     lens, straight = load_camera(rows, 0), load_camera(rows, 1)
     at_fold = by_coefficients(lens, fold)
     by_point = np.empty((2, 3))
@@ -185,9 +193,11 @@ def nearest_on_markings(
         place: (d, 3) [m], world, written; NaN where the marking is not in front of the camera.
         normal: (d, 2), written: from the marking to the pixel, either sign.
     """
-    max_radius = 1.5  # beyond, polynomials may fold a marking back into the image
+    max_radius = 1.5  # beyond, Brown's polynomials may fold a marking back into the image
     camera = load_camera(c.reshape(1, WIDTH), 0)
-    cap = min((max_radius * reach / camera.fx) ** 2, fold_squared(camera))
+    cap = fold_squared(camera)
+    if camera.model == _BROWN:
+        cap = min((max_radius * reach / camera.fx) ** 2, cap)
     image = np.empty((len(samples), 2))
     for i in range(len(samples)):
         x, y, z = to_camera_axes(camera, samples[i, 0], samples[i, 1], samples[i, 2])

@@ -219,11 +219,11 @@ class MovingJoints:
     def look(self, camera: int) -> tuple[Floats, Floats, Floats, Floats]:
         """Return what a camera sees, all 0 where it does not see the joint.
 
-        Derivatives (n, 2, 18) of pixels by points and cameras, misses (n, 2) [px], their weights
+        Derivatives (n, 2, 21) of pixels by points and cameras, misses (n, 2) [px], their weights
         (n,) [1/px^2] and scales (n,) [px/m].
         """
         n, row = len(self.at), self.rig.cameras[camera]
-        image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, 18))
+        image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, camera_model.DERIVATIVES))
         given, status = np.ascontiguousarray(self.at[None]), np.empty((1, n), np.uint8)
         camera_model.project_with_jacobians(row[None], given, image, jacobian, status)
         miss = self._pixels[:, camera][self._known] - image[0]

@@ -11,6 +11,7 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.people_cameras import KnownLength, locate_cameras
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import align
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
@@ -59,7 +60,8 @@ def lens(camera, name, focal_std=2.0, focal=None):
         image_size=SIZE,
         focal_px=float(camera.focal[0]) if focal is None else focal,
         principal_point_px=tuple(camera.principal_point.tolist()),
-        distortion=tuple(camera.distortion.tolist()),
+        distortion=tuple(camera.coefficients.tolist()),
+        lens_model=LensModel(int(camera.lens_model)).label,
         focal_std_px=focal_std,
         principal_point_std_px=2.0,
         distortion_std=0.005,
@@ -84,7 +86,13 @@ def seen(cameras, joints, noise=1.5):
     return KeypointDetections.from_keypoints(keypoints, confidence)
 
 
-def test_a_walking_person_locates_four_cameras_in_metres(walkers, cameras):
+FISHEYE = [-0.08, 0.02, 0.0, 0.0, -0.01, 0.002, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_a_walking_person_locates_four_cameras_in_metres(walkers, cameras, fisheye):
+    if fisheye:
+        cameras = replace(cameras, distortion=np.array(FISHEYE), lens_model=LensModel.FISHEYE)
     apart = float(np.linalg.norm(cameras.center[0] - cameras.center[2]))
     found = locate_cameras(
         lenses(cameras), seen(cameras, walkers[:, :1]), FPS, KnownLength(apart, (0, 2), 0.005)

@@ -9,9 +9,14 @@ from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import check_consistency
-from worldpose.camera_consistency.hypotheses import LEFT_RIGHT, tangential_shift
+from worldpose.camera_consistency.hypotheses import (
+    LEFT_RIGHT,
+    lens_hypotheses,
+    tangential_shift,
+)
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
 
 SETTINGS = ConsistencySettings(sample_frames=18)
@@ -225,3 +230,16 @@ def shifted(keypoints, frames):
     out = np.full_like(keypoints, np.nan)
     out[inside] = keypoints[frames[inside]]
     return out
+
+
+def test_four_coefficients_of_a_fisheye_read_as_browns_are_a_hypothesis():
+    true = replace(
+        look_at_camera((0.0, -20.0, 8.0), (0.0, 0.0, 1.0), 800.0),
+        distortion=np.array([-0.05, 0.01, 0.0, 0.0, -0.002, 0.0005, 0.0, 0.0]),
+        lens_model=LensModel.FISHEYE,
+    )
+    read = replace(true, distortion=[-0.05, 0.01, -0.002, 0.0005, 0.0], lens_model=LensModel.BROWN)
+    found = next(each for each in lens_hypotheses(read) if "fisheye" in each.detail)
+    np.testing.assert_array_equal(found.camera.numbers, true.numbers)
+    orders = [each for each in lens_hypotheses(true) if "order" in each.detail]
+    assert not orders  # the order of a fisheye's coefficients is not in doubt

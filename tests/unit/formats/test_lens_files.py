@@ -124,7 +124,7 @@ def test_a_broken_file_is_one_clear_error(name, content, said, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"dist": np.zeros(8) + 0.1}, "zero beyond the fifth"),
+        ({"dist": np.zeros(12) + 0.1}, "more terms"),
         ({"mtx": np.diag([1400.0, 1600.0, 1.0])}, "square pixels"),
         ({"mtx": np.diag([0.001, 0.001, 1.0])}, "focal length"),
         ({"mtx": np.full((3, 3), np.nan)}, "finite numbers"),

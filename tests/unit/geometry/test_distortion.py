@@ -92,12 +92,12 @@ def test_inverse_holds_up_to_the_brink_of_the_fold(k):
 )
 def test_distortion_and_inverse_agree_with_opencv(k1, k2, p1, p2, k3):
     camera = plane_camera(k1, k2, p1, p2, k3)
-    fold = float(fold_radius(camera.distortion))
+    fold = float(fold_radius(camera.coefficients))
     # Tangential terms of 0.01 shift the fold by a few percent; 0.8 of the radial one is inside.
     points = spokes(min(0.8 * fold, 0.6) * np.linspace(0.0, 1.0, 7))
     image = camera.project(on_plane(points))
     expected = cv2.projectPoints(
-        on_plane(points), np.zeros(3), np.zeros(3), np.eye(3), np.array(camera.distortion)
+        on_plane(points), np.zeros(3), np.zeros(3), np.eye(3), np.array(camera.coefficients)
     )[0]
     np.testing.assert_allclose(image, expected.reshape(-1, 2), atol=1e-15)
     # At 0.8 of the fold the slope is at least 0.1: rounding of 1e-16 grows tenfold.

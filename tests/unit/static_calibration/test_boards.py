@@ -105,3 +105,54 @@ def test_a_wrong_dictionary_or_marker_is_told():
         InputError, match=r"board: marker: expected .* smaller than a square of 0.06"
     ):
         Board(8, 5, 0.06, "DICT_4X4_50", 0.06).find(blank)
+
+
+FISHEYE = np.array([-0.03, 0.01, -0.004, 0.001])
+
+
+def fisheye_views(rng, reach):
+    matrix = np.array([[420.0, 0.0, 655.0], [0.0, 420.0, 349.0], [0.0, 0.0, 1.0]])
+    views = []
+    while len(views) < 14:
+        turn = cv2.Rodrigues(rng.uniform(-0.6, 0.6, 3))[0]
+        middle = 0.35 * np.append(rng.uniform(-1.0, 1.0, 2) * reach, 1.0)
+        points = np.column_stack([PLACES - PLACES.mean(axis=0), np.zeros(len(PLACES))])
+        points = points @ turn.T + middle
+        if points[:, 2].min() < 0.05:
+            continue
+        none = np.zeros(3)
+        pixels = cv2.fisheye.projectPoints(points[:, None], none, none, matrix, FISHEYE)[0]
+        pixels = pixels.reshape(-1, 2) + rng.normal(0.0, 0.1, (len(PLACES), 2))
+        if ((pixels > 0) & (pixels < SIZE)).all():
+            views.append(BoardView(PLACES, pixels))
+    return views
+
+
+@pytest.mark.parametrize("reach", [(0.9, 0.5), (1.6, 0.9)])
+def test_a_fisheye_is_chosen_and_found_within_its_stated_uncertainty(reach):
+    fit = calibrate_lens("cam", fisheye_views(np.random.default_rng(1), reach), SIZE)
+    lens = fit.lens
+    assert (lens.lens_model, len(lens.distortion), fit.used.all()) == ("fisheye", 4, True)
+    assert fit.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.15)
+    assert abs(lens.focal_px - 420.0) < 3.0 * lens.focal_std_px < 5.0
+
+
+def test_a_fisheye_is_that_of_opencv():
+    views = fisheye_views(np.random.default_rng(1), (0.9, 0.5))
+    fit = calibrate_lens("cam", views, SIZE)
+    objects = [np.insert(view.places, 2, 0.0, axis=1)[None] for view in views]
+    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
+    error, matrix, lens, _, _ = cv2.fisheye.calibrate(
+        objects, [view.pixels[None] for view in views], SIZE, np.eye(3), np.zeros(4), flags=flags
+    )
+    # OpenCV's minimum has oblong pixels, one degree of freedom more.
+    assert fit.rms_px < 1.01 * error
+    own = np.diag([fit.lens.focal_px] * 2 + [1.0])
+    own[:2, 2] = fit.lens.principal_point_px
+    rays = np.random.default_rng(0).uniform([-1.2, -0.7, 1.0], [1.2, 0.7, 1.0], (100, 1, 3))
+    none = np.zeros(3)
+    one, other = (
+        cv2.fisheye.projectPoints(rays, none, none, matrix, np.ravel(k))[0]
+        for matrix, k in ((own, fit.lens.distortion), (matrix, lens))
+    )
+    assert np.abs(one - other).max() < 1.0

@@ -17,11 +17,13 @@ from typing import Any, Final
 import numpy as np
 
 from data_contracts.arrays import Image
-from data_contracts.cameras import LensCalibration
+from data_contracts.cameras import COEFFICIENTS, LensCalibration
 from data_contracts.match import Side
 from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_fit import refit_lens
+from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
@@ -397,11 +399,12 @@ def _to_camera(candidates: Candidates, paint: PaintMap) -> Camera:
     """Return the first candidate, a camera of the straight copy, as a camera of the image."""
     rotation, center = candidates.rotations[0], candidates.centers[0]
     stretch = float(candidates.focals[0]) / paint.focal
-    k1, k2, p1, p2, k3 = paint.lens.distortion
     # The lens of a camera `stretch` times as long has the same curvature in pixels.
-    powers = stretch ** np.array([2.0, 4.0, 1.0, 1.0, 6.0])
-    distortion = np.array([k1, k2, p1, p2, k3]) * powers
-    distortion[0] += candidates.radial[0]
+    distortion = paint.lens.distortion * stretch ** np.array([2, 4, 1, 1, 6, 2, 4, 6])
+    if paint.lens.lens_model == LensModel.FISHEYE:
+        free = COEFFICIENTS["fisheye"]
+        distortion = refit_lens(paint.lens, LensModel.FISHEYE, free, stretch).camera.distortion
+    distortion = distortion + candidates.radial[0] * np.eye(8)[0]
     return replace(
         paint.lens,
         focal=paint.lens.focal * stretch,

@@ -1,0 +1,157 @@
+"""Rational and fisheye lenses at every door: what files say, and what the pixels then are."""
+
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.cameras import COEFFICIENTS, CameraCalibration
+from worldpose.errors import InputError
+from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
+from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
+from worldpose.geometry.lens_fit import fit_brown_lens
+from worldpose.geometry.rays import RayStatus
+
+LENSES = {
+    "fisheye": (-0.05, 0.01, -0.002, 0.0005),
+    "rational": (0.4, -0.05, 1e-3, -2e-3, 0.01, 0.7, 0.02, 0.003),
+}
+SIZE = {"a": (640, 480)}
+ROS = {
+    "fisheye": "equidistant",
+    "rational": "rational_polynomial",
+}
+
+
+def camera_of(model, **changes):
+    values = {
+        "id": "a",
+        "image_size": (640, 480),
+        "focal_px": (400.0, 402.0),
+        "principal_point_px": (319.5, 239.5),
+        "distortion": LENSES[model],
+        "lens_model": model,
+        "rotation": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+        "translation": (0.1, 1.2, 4.0),
+    }
+    return CameraCalibration(**{**values, **changes})
+
+
+def opencv(one, points):
+    matrix = np.diag([*one.focal_px, 1.0])
+    matrix[:2, 2] = one.principal_point_px
+    pose = cv2.Rodrigues(np.array(one.rotation))[0], np.array(one.translation)
+    project = cv2.fisheye.projectPoints if one.lens_model == "fisheye" else cv2.projectPoints
+    return project(points[:, None], *pose, matrix, np.array(one.distortion))[0].reshape(-1, 2)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_written_calibration_reads_as_the_same_camera_and_has_opencvs_pixels(model, tmp_path):
+    one = camera_of(model)
+    write_calibration_toml(tmp_path / "calibration.toml", {"a": one})
+    read = read_calibration(tmp_path / "calibration.toml")["a"]
+    assert (read.lens_model, read.distortion) == (model, one.distortion)
+    camera = Camera.from_calibration(read)
+    stored = camera_from_arrays(camera_arrays(Camera.stack([camera])))[0]
+    assert stored.to_calibration("a").distortion == one.distortion
+    points = np.random.default_rng(0).uniform([-3, -1, -1], [3, 5, 1], (100, 3))
+    np.testing.assert_allclose(camera.project(points), opencv(one, points), atol=1e-9)
+
+
+def lens_files(model, folder):
+    """Files of several programs with the lens of a model."""
+    matrix, numbers = [[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]], LENSES[model]
+    fisheye = model == "fisheye"
+    storage = cv2.FileStorage(str(folder / "opencv.xml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("fisheye_model", int(fisheye))
+    storage.write("camera_matrix", np.array(matrix))
+    storage.write("distortion_coefficients", np.array(numbers)[:, None])
+    storage.release()
+    (folder / "ros.yaml").write_text(
+        f"camera_matrix: {{rows: 3, cols: 3, data: {[each for row in matrix for each in row]}}}\n"
+        f"distortion_model: {ROS[model]}\n"
+        f"distortion_coefficients: {{rows: 1, cols: {len(numbers)}, data: {list(numbers)}}}\n"
+    )
+    np.savez(folder / "arrays.npz", K=matrix, D=np.array(numbers)[:, None], fisheye=fisheye)
+    (folder / "anipose.toml").write_text(
+        f'[cam_0]\nname = "a"\nsize = [640, 480]\nmatrix = {matrix}\n'
+        f"distortions = {list(numbers)}\nfisheye = {str(fisheye).lower()}\n"
+    )
+    return sorted(folder.iterdir())
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_every_lens_file_says_which_model_it_has(model, tmp_path):
+    for file in lens_files(model, tmp_path):
+        lens = read_lenses([file], "a", SIZE)["a"]
+        assert (lens.lens_model, lens.distortion) == (model, LENSES[model]), file
+    write_lens_toml(tmp_path / "lenses.toml", {"a": lens})
+    assert read_lens_toml(tmp_path / "lenses.toml", SIZE) == {"a": lens}
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ("distortion_model: fov\nD: [0.9]", "distortion_model: expected one of .* found 'fov'"),
+        ("D: [-0.05, 0.01, -0.2, 0.05]", "p1 and p2 up to 0.01.*fisheye_model: 1"),
+        ("fisheye_model: 1\nD: [-0.1, 0.0, 0.0, 0.0, 0.3]", "k1 k2 k3 k4 of a fisheye"),
+    ],
+)
+def test_a_lens_whose_model_is_unknown_or_unsaid_is_refused(lens, said, tmp_path):
+    file = tmp_path / "lens.yaml"
+    file.write_text(f"K: [[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]\n{lens}\n")
+    with pytest.raises(InputError, match=said):
+        read_lenses([file], "a", SIZE)
+
+
+def test_records_refuse_coefficients_of_another_model():
+    for model, names in COEFFICIENTS.items():
+        with pytest.raises(ValueError, match="found 3 numbers"):
+            camera_of("fisheye", lens_model=model, distortion=(0.0,) * 3)
+        assert camera_of("fisheye", lens_model=model, distortion=(0.0,) * len(names))
+
+
+def test_a_fisheye_tells_rays_that_it_does_not_image():
+    # The field of view ends at 90 degrees: 628 px from the centre.
+    camera = Camera.from_calibration(
+        camera_of("fisheye", distortion=(0.0,) * 4, focal_px=(400.0, 400.0))
+    )
+    middle = camera.principal_point[0]
+    status = camera.unproject([[middle + 627.0, 239.5], [middle + 629.0, 239.5]]).status
+    assert status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD]
+    behind = camera.center - [[0.0, 1.0, 0.0]]
+    assert camera.project_with_jacobians(behind).status.tolist() == [RayStatus.BEHIND]
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_browns_nearest_lens_states_its_largest_error(model):
+    camera = Camera.from_calibration(camera_of(model, focal_px=(700.0, 700.0)))
+    near, error = fit_brown_lens(camera)
+    rng = np.random.default_rng(0)
+    rays = camera.unproject(rng.uniform([0, 0], [639, 479], (500, 2)))
+    points = rays.origins + 5.0 * rays.directions
+    off = np.linalg.norm(near.project(points) - camera.project(points), axis=1)
+    assert 0.2 * error < off.max() <= 1.01 * error < 0.1
+
+
+VUE = """<Cameras><Camera DEVICEID="7" DISPLAY_TYPE="Vue" SYSTEM="DV" SENSOR_SIZE="1920 1080">
+<KeyFrames><KeyFrame FOCAL_LENGTH="1260" ORIENTATION="0 0 0 1" POSITION="0 0 2000"
+ PRINCIPAL_POINT="943 564" VICON_RADIAL2="Vicon3Parameter 943 564 {}"/></KeyFrames>
+</Camera></Cameras>"""
+
+
+def test_a_lens_of_vicons_model_is_followed_within_a_tenth_of_a_pixel(tmp_path):
+    file, terms = tmp_path / "vue.xcp", (2.75e-7, 7.6e-14, 7.8e-20)
+    file.write_text(VUE.format(" ".join(map(str, terms))))
+    camera = Camera.from_calibration(read_calibration(file)["7"])
+    pixels = np.random.default_rng(0).uniform([0, 0], [1919, 1079], (500, 2))
+    offset = pixels - [943.0, 564.0]
+    square = (offset**2).sum(axis=1)
+    ideal = offset * (1.0 + square * (terms[0] + square * (terms[1] + square * terms[2])))[:, None]
+    rays = np.column_stack([ideal / 1260.0, np.ones(500)])
+    found = camera.project(camera.cam_from_world.inverse().apply(rays))
+    assert np.linalg.norm(found - pixels, axis=1).max() < 0.1
+    file.write_text(VUE.format("2.75e-7 -7.6e-13 7.8e-19"))
+    with pytest.raises(InputError, match=r"within 0\.1 px"):
+        read_calibration(file)

@@ -1,0 +1,128 @@
+"""Fit of a lens to places and their pixels: another model for a lens, with the error it leaves.
+
+With places a_i on the plane z = 1, their pixels x_i and the projection pi of the lens L:
+
+    E(L) = 1/2 sum_i |pi(a_i; L) - x_i|^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from data_contracts.cameras import COEFFICIENTS
+from data_contracts.conventions import DISTORTION
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
+from worldpose.geometry.optimize.levenberg_marquardt import Damping, minimize
+from worldpose.geometry.rigid import Rigid
+
+_PARAMETERS: Final = ("fx", "fy", "cx", "cy", *DISTORTION)
+INTRINSICS: Final = _PARAMETERS[:4]
+"""Parameters of a fit besides the coefficients of the lens model."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedLens:
+    """A lens fitted to places and their pixels.
+
+    Attributes:
+        camera: a single camera at the origin.
+        plane: (n, 2) places on the plane z = 1.
+        pixels: (n, 2) [px].
+    """
+
+    camera: Camera
+    plane: Floats
+    pixels: Floats
+
+    @cached_property
+    def _linear(self) -> tuple[Floats, Floats]:
+        """Residuals (n, 2) [px], and derivatives (n, 2, 12) by the parameters."""
+        seen = self.camera.project_with_jacobians(np.insert(self.plane, 2, 1.0, axis=1))
+        rows = np.concatenate([seen.d_intrinsics, seen.d_distortion], axis=-1)
+        return seen.points_image - self.pixels, rows
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals [px^2]; NaN if the lens cannot image a place."""
+        return float((self._linear[0] ** 2).sum())
+
+    @property
+    def error_px(self) -> float:
+        """Largest distance of a place's image from its pixel [px]."""
+        return float(np.linalg.norm(self._linear[0], axis=1).max())
+
+    def step(self, free: Sequence[int], damping: float) -> FittedLens:
+        """Return the fit after a damped Gauss-Newton step of some parameters."""
+        residuals, rows = self._linear
+        rows = rows[..., free].reshape(-1, len(free))
+        size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        damped = np.concatenate([rows / size, np.sqrt(damping) * np.eye(len(free))])
+        wanted = np.concatenate([-residuals.ravel(), np.zeros(len(free))])
+        change = np.zeros(len(_PARAMETERS))
+        change[list(free)] = np.linalg.lstsq(damped, wanted)[0] / size
+        camera = self.camera
+        moved = replace(
+            camera,
+            focal=camera.focal + change[:2],
+            principal_point=camera.principal_point + change[2:4],
+            distortion=camera.distortion + change[4:],
+        )
+        return replace(self, camera=moved)
+
+
+def fit_lens(
+    lens: Camera, plane: Floats, pixels: Floats, model: LensModel, free: Sequence[str]
+) -> FittedLens:
+    """Return the lens of a model that images places (n, 2) on the plane z = 1 at pixels (n, 2).
+
+    Args:
+        lens: a single camera, whose focal length and principal point are a start.
+        plane: finite places.
+        pixels: their pixels [px].
+        model: lens model; coefficients that are not free are 0.
+        free: names of the free parameters, of `INTRINSICS` and `DISTORTION`.
+    """
+    start = replace(lens, distortion=np.zeros(8), lens_model=model, cam_from_world=Rigid.identity())
+    chosen = [_PARAMETERS.index(name) for name in free]
+    return minimize(
+        FittedLens(start, plane, pixels),
+        lambda fit, damping: fit.step(chosen, damping),
+        Damping(start=1e-3, decrease=10.0, lowest=1e-15, highest=1e8),
+        iterations=200,
+        converged=lambda before, after: 0.0 <= before.cost - after.cost <= 1e-9 * before.cost,
+    ).state
+
+
+def refit_lens(
+    camera: Camera, model: LensModel, free: Sequence[str], stretch: float = 1.0
+) -> FittedLens:
+    """Return a lens of some model that images as a single camera's does, over its image.
+
+    The error is that over a grid of pixels. Pixels without a ray, beyond the fold of the lens, do
+    not count. The new focal length starts at `stretch` times the old one, and places on the plane
+    z = 1 are divided by it.
+    """
+    width, height = (float(length) for length in camera.image_size)
+    across = np.meshgrid(np.linspace(-0.5, width - 0.5, 41), np.linspace(-0.5, height - 0.5, 41))
+    pixels = np.stack(across, axis=-1).reshape(-1, 2)
+    plane = camera.normalize(pixels)
+    known = np.isfinite(plane).all(axis=1)
+    lens = replace(camera, focal=stretch * camera.focal)
+    return fit_lens(lens, plane[known] / stretch, pixels[known], model, free)
+
+
+def fit_brown_lens(camera: Camera) -> tuple[Camera, float]:
+    """Return a single camera with the nearest lens of Brown's model, and the largest error [px].
+
+    Focal length and principal point follow, too; the pose stays.
+    """
+    free = (*INTRINSICS, *COEFFICIENTS["brown"])
+    fit = refit_lens(camera, LensModel.BROWN, free)
+    return replace(fit.camera, cam_from_world=camera.cam_from_world), fit.error_px

@@ -1,0 +1,114 @@
+"""Choice of a camera's lens model by its residuals, and the test that a model fits (C5)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.special import fdtrc
+
+from worldpose.errors import InputError
+from worldpose.geometry.camera_model import STEP
+from worldpose.geometry.lens_models import LensModel
+from worldpose.static_calibration.click_outliers import (
+    CLEAR_GAIN,
+    Explanation,
+    fit_inliers_at_best_noise,
+    negative_log_posterior,
+    scale_noise,
+)
+from worldpose.static_calibration.fit import compute_residuals, fit_cameras
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+
+_CHOICES: Final = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
+"""Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's."""
+_FISHEYE_STD: Final = 0.1
+"""Standard deviation of a fisheye's k1, k2 and k3 [1]: projections from orthographic to
+stereographic have k1 from -0.17 to 0.08."""
+_MIN_CLICKS: Final = 10
+"""Minimum number of clicked points that choose a lens model [1]: twenty residuals for twelve
+parameters and the noise."""
+
+
+def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explanation:
+    """Return the explanation whose lens model is most probable, Brown's k1 and k2 or a fisheye.
+
+    All models have a posterior at their own noise of clicks, learned from the residuals, so that an
+    error of the lens below the stated noise counts, too. Brown's model stands unless another one is
+    clearly more probable. A lens that is given, or whose terms a setting restricts, stays.
+    """
+    problem = found.problem
+    if problem.lens is not None or stated.distortion != "k1_k2":
+        return found
+    if len(problem.evidence.points) < _MIN_CLICKS:
+        return found
+    as_stated = scale_noise(problem, 1.0 / found.noise_factor(stated), found.settings)[0]
+    best, own = found, lens_score(found, stated)
+    # A robust fit takes a hundredth of the time of the search for outliers.
+    loss, worth_it, start = 3.0, 0.9, found.fit.row[None]
+    cost = fit_cameras(as_stated, start, click_loss=loss).cost[0]
+    lowest = own - CLEAR_GAIN
+    for model, coefficients in _CHOICES:
+        free = np.arange(STEP) < STEP - 3 + coefficients
+        prior = as_stated.prior.copy()
+        if model == LensModel.FISHEYE:
+            prior[15:18] = _FISHEYE_STD
+        wider = replace(as_stated, free=free, lens_model=model, prior=prior)
+        if fit_cameras(wider, start, click_loss=loss).cost[0] > worth_it * cost:
+            continue
+        try:
+            other = fit_inliers_at_best_noise(wider, found.fit.row, stated)
+        except InputError:
+            continue
+        score = lens_score(other, stated)
+        if score < lowest:
+            names = "k1 k2 k3"[: 3 * coefficients - 1]
+            said = (
+                f"{model.label} lens, {names}: the log probability of the clicks is "
+                f"{0.5 * (own - score):.0f} higher than with k1 k2 of brown"
+            )
+            best, lowest = replace(other, assumptions=(said,)), score
+    return best
+
+
+def lens_score(found: Explanation, stated: StaticCalibrationSettings) -> float:
+    """Return minus twice the log posterior of an explanation at its most probable noise."""
+    factor = found.noise_factor(stated)
+    return min(
+        negative_log_posterior(found, factor=factor, with_prior=True, noise_scale=float(scale))
+        for scale in np.geomspace(0.2, 5.0, 33) / factor
+    )
+
+
+def describe_misfit(found: Explanation) -> str:
+    """Return a reason for review if residuals along the radius follow the radius; empty if not.
+
+    A lens that the model does not describe moves clicks along the radius alone, by a smooth
+    function of it: odd powers explain more of these residuals than noise allows (F-test). Several
+    excluded clicks may be right, and the lens wrong.
+    """
+    significance, powers = 1e-3, np.array([1.0, 3.0, 5.0, 7.0, 9.0])
+    problem, fit = found.problem, found.fit
+    offset = problem.evidence.points_image - fit.row[2:4]
+    radius = np.linalg.norm(offset, axis=1)
+    residuals = compute_residuals(problem, fit.row).click
+    along = (residuals * offset).sum(axis=1) / np.maximum(radius, 1.0)
+    everything = np.ones(len(radius), dtype=np.bool_)
+    for kept in (fit.inliers, everything)[: 1 + int((~fit.inliers).sum() > 1)]:
+        freedom = 2 * int(kept.sum()) - int(problem.free.sum()) - len(powers)
+        if kept.sum() < _MIN_CLICKS or freedom < 1:
+            continue
+        smooth = (radius[kept, None] / problem.half_diagonal) ** powers
+        bent = smooth @ np.linalg.lstsq(smooth, along[kept])[0]
+        explained = float((bent**2).sum())
+        rest = float((residuals[kept] ** 2).sum()) - explained
+        ratio = explained / len(powers) / max(rest / freedom, 1e-12)
+        if fdtrc(len(powers), freedom, ratio) < significance:
+            model = problem.lens_model.label
+            return (
+                f"the lens bends the image otherwise than the model {model}: up to "
+                f"{np.abs(bent).max():.1f} px along the radius at the clicks. Calibrate the lens "
+                "with a board (worldpose calibrate), and import it (worldpose import --lens)"
+            )
+    return ""
