@@ -7,9 +7,16 @@ import re
 from collections import Counter
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from data_contracts.records import (
     CONTRACT_VERSION,
@@ -28,7 +35,19 @@ TEAM_SIZE: Final = 11
 """Players of a team on the pitch (Laws of the Game, 3)."""
 
 
-ClockOffset = FrameOffset | tuple[tuple[Frame, FrameOffset], ...]
+def _one_error(value: object, read: ValidatorFunctionWrapHandler) -> object:
+    """Return the value as read; of its two forms, an error names both at once."""
+    try:
+        return read(value)
+    except ValidationError as error:
+        raise PydanticCustomError(
+            "clock_offset", "Input should be a number, or pairs [match frame, number]"
+        ) from error
+
+
+ClockOffset = Annotated[
+    FrameOffset | tuple[tuple[Frame, FrameOffset], ...], WrapValidator(_one_error)
+]
 """A camera's frame minus the match frame; a number, or rising pairs of a match frame and a number,
 with linear change between them."""
 

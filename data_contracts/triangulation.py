@@ -7,7 +7,7 @@ from typing import Literal
 from data_contracts.arrays import GroupLayout, array_layouts
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
-from data_contracts.records import Count, Frame, Name, Record
+from data_contracts.records import Amount, Count, Frame, Name, Number, Record
 from data_contracts.tracking import PERSON
 
 EXCHANGED_PARTS = {
@@ -32,16 +32,16 @@ class CameraChange(Record):
     first_frame: Frame
     frame_count: Count
     """Of the clip."""
-    shift_px: tuple[float, float] = (0.0, 0.0)
+    shift_px: tuple[Number, Number] = (0.0, 0.0)
     """Displacement of the image [px]."""
-    zoom: float = 0.0
+    zoom: Number = 0.0
     """Growth of the image about the principal point [1]."""
-    roll_rad: float = 0.0
-    center_px: tuple[float, float] = (0.0, 0.0)
+    roll_rad: Number = 0.0
+    center_px: tuple[Number, Number] = (0.0, 0.0)
     """Principal point."""
-    late_frames: float = 0.0
+    late_frames: Number = 0.0
     """How much later its images are than before [frame]."""
-    std: float | None
+    std: Amount | None
     """Standard deviation of the displacement [px] or of the lateness [frame]; None if unknown."""
     is_explained: bool = True
     """Whether this change explains its images."""
