@@ -84,7 +84,11 @@ def _find(health: CameraHealth, c: int, kind: Kind, fps: float) -> Iterator[Chan
         change[changing] = by[place]
         left = right - weights[place, :, None] * (matrix @ change)
         gain = float(gains[place]) / _noise(matrix, left, second)
-        size = float(by[place, 0]) if kind == "clock" else _displacement(total, change)
+        size = (
+            float(by[place, 0])
+            if kind == "clock"
+            else _displacement(gains[place], weights[place], matrix)
+        )
         if gain < min_gain or abs(size) < min_size:
             continue
         start = place + margin
@@ -93,12 +97,12 @@ def _find(health: CameraHealth, c: int, kind: Kind, fps: float) -> Iterator[Chan
             continue
         yield Change(c, kind, is_sudden, start * health.length if is_sudden else 0, size, gain)
     if kind == "view":
-        size, gain = _sway(matrix, right, total, second)
+        size, gain = _sway(matrix, right, second)
         if gain > min_gain and size > 2.0 * min_size:
             yield Change(c, kind, is_sudden=False, row=0, size=size, gain=gain)
 
 
-def _sway(matrix: Floats, right: Floats, total: Floats, second: int) -> tuple[float, float]:
+def _sway(matrix: Floats, right: Floats, second: int) -> tuple[float, float]:
     """Return the usual displacement [px] and gain of a view that is another in each second."""
     left, sizes, gains = right.copy(), [0.0], [0.0]
     for start in range(0, len(matrix) - second + 1, second):
@@ -107,9 +111,8 @@ def _sway(matrix: Floats, right: Floats, total: Floats, second: int) -> tuple[fl
         if _is_solvable(held):
             change = np.linalg.solve(held, pull)
             left[part] = right[part] - matrix[part] @ change
-            change[4] = 0.0
-            sizes.append(_displacement(total, change))
-            gains.append(float(pull @ np.linalg.solve(held, pull)))
+            gains.append(float(pull @ change))
+            sizes.append(np.sqrt(2.0 * gains[-1] / (held[0, 0] + held[1, 1])))
     return float(np.median(sizes)), float(np.median(gains)) / _noise(matrix, left, 1)
 
 
@@ -190,7 +193,8 @@ def _is_solvable(matrix: Floats) -> bool:
     return bool(np.linalg.eigvalsh(matrix / np.outer(size, size))[0] > 1e-6)
 
 
-def _displacement(total: Floats, change: Floats) -> float:
-    """Return the root mean square displacement [px] of people by a change of the view."""
-    weight = 0.5 * (total[0, 0] + total[1, 1])
-    return float(np.sqrt(change @ total @ change / weight))
+def _displacement(gain: float, weights: Floats, matrix: Floats) -> float:
+    """Return the usual displacement [px] of people by a change of the view with this gain."""
+    shift = 0.5 * (matrix[:, 0, 0] + matrix[:, 1, 1])
+    spread = (weights**2 * shift).sum() - (weights * shift).sum() ** 2 / shift.sum()
+    return float(np.sqrt(gain / max(spread, 1e-12)))
