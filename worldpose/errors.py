@@ -6,7 +6,6 @@ import errno
 import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
-from typing import Final
 
 
 class WorldposeError(Exception):
@@ -33,14 +32,12 @@ class InputError(WorldposeError):
         return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
 
 
-_MAX_LENGTH: Final = 600
-"""Maximum characters of the input that a message repeats: a name may have a million."""
-
-
 def _shorten(text: str) -> str:
-    if len(text) <= _MAX_LENGTH:
+    # Maximum characters of the input that a message repeats: a name may have a million.
+    max_length = 600
+    if len(text) <= max_length:
         return text
-    half = _MAX_LENGTH // 2 - 20  # leaves room for the text between, so the result is short enough
+    half = max_length // 2 - 20  # leaves room for the text between, so the result is short enough
     return f"{text[:half]}...[{len(text) - 2 * half} characters]...{text[-half:]}"
 
 

@@ -26,10 +26,6 @@ from worldpose.errors import InputError, say_failure
 
 Result = TypeVar("Result")
 
-ATTEMPTS: Final = 10
-"""Attempts to parse; where a library parsed without pause, two failed one after another at most."""
-BLOCK_BYTES: Final = 1 << 18
-"""Bytes read at a time: an unpacked block fits into a processor's cache."""
 
 Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
 """Shape, whether in Fortran order, type."""
@@ -50,7 +46,10 @@ def parse_in_turn(parse: Callable[[], Result]) -> Result:
 
     A library can still parse in another thread, so a SystemError leads to another attempt.
     """
-    for _ in range(ATTEMPTS - 1):
+    # Attempts to parse; where a library parsed without pause, two failed one after another at
+    # most.
+    attempts = 10
+    for _ in range(attempts - 1):
         try:
             with _TURN:
                 return parse()
@@ -90,12 +89,13 @@ def read_npy(stream: IO[bytes]) -> NDArray[np.generic]:
     Raises:
         ValueError: this is no npy array of plain values, or it is truncated.
     """
+    block_bytes = 1 << 18  # bytes read at a time: an unpacked block fits into a processor's cache
     shape, is_fortran, dtype = read_npy_header(stream)
     if dtype.hasobject:
         raise ValueError("Python objects, which are never loaded")
     content = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)
-    for start in range(0, len(content), BLOCK_BYTES):
-        part = content[start : start + BLOCK_BYTES]
+    for start in range(0, len(content), block_bytes):
+        part = content[start : start + block_bytes]
         block = stream.read(len(part))
         if len(block) < len(part):
             raise ValueError(f"the array ends after {start + len(block)} of {len(content)} bytes")

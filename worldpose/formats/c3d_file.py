@@ -19,16 +19,8 @@ BLOCK: Final = 512
 """Size of the blocks that a C3D file consists of [byte]."""
 HEADER_FRAMES: Final = 65535
 """The header counts frames in 16 bits; POINT:LONG_FRAMES and TRIAL:ACTUAL_END_FIELD count more."""
-MAX_FRAMES: Final = 1 << 24
-"""LONG_FRAMES is a number of single precision: 46 hours at 100 frames per second."""
-MAX_TEXT_BYTES: Final = 32000
-"""Maximum length of a text parameter, whose size has 15 bits, with its padding [byte]."""
-MAX_RESIDUAL_MM: Final = 255
-"""A residual has 8 bits, and the file's scale is 1 mm."""
 MAX_DIMENSION: Final = 255
 """A dimension of a parameter has 8 bits."""
-LINE_CHARACTERS: Final = 80
-"""Length of the lines into which longer texts are wrapped."""
 _KINDS: Final = {"char": -1, "int16": 2, "float32": 4}
 _Value = str | Sequence[str] | np.generic | NDArray[np.generic]
 
@@ -56,11 +48,13 @@ def write_c3d(
     Raises:
         InputError: the clip has no or too many frames, or a note is too long.
     """
+    # LONG_FRAMES is a number of single precision: 46 hours at 100 frames per second.
+    max_frames = 1 << 24
     count = int(tracks.frames[-1] - tracks.frames[0]) + 1 if len(tracks.frames) else 0
-    if not 1 <= count <= MAX_FRAMES:
+    if not 1 <= count <= max_frames:
         raise InputError(
             str(path),
-            expected=f"1 to {MAX_FRAMES} frames, which C3D can count",
+            expected=f"1 to {max_frames} frames, which C3D can count",
             found=f"{count}",
             todo="Choose another format, such as parquet, or shorter clips.",
         )
@@ -81,6 +75,7 @@ def write_c3d(
 
 def _points(tracks: JointTracks, person: int, count: int) -> NDArray[np.float32]:
     """Return x, y, z [mm] and the residual [mm] of each frame and point (count, points, 4)."""
+    max_residual_mm = 255  # A residual has 8 bits, and the file's scale is 1 mm
     markers = tracks.markers
     joints = markers.joints[:, person]
     there = np.isfinite(joints[..., 0])
@@ -88,7 +83,7 @@ def _points(tracks: JointTracks, person: int, count: int) -> NDArray[np.float32]
     if markers.covariance is not None:
         variance = np.diagonal(markers.covariance[:, person], axis1=-2, axis2=-1).mean(-1)
         std_mm = 1000.0 * np.sqrt(np.where(np.isfinite(variance), variance, 0.0))
-        residual = np.clip(np.round(std_mm), 1, MAX_RESIDUAL_MM)
+        residual = np.clip(np.round(std_mm), 1, max_residual_mm)
     if markers.views is not None:
         residual[markers.views[:, person] == 0] = 0.0
     rows = np.zeros((count, len(markers.points), 4), np.float32)
@@ -158,12 +153,13 @@ def _parameters(
 
 def _wrap(text: str) -> str | list[str]:
     """Return a text that fits one line as it is, and a longer one as lines."""
+    line_characters = 80  # length of the lines into which longer texts are wrapped
     if len(text.encode()) <= MAX_DIMENSION and "\n" not in text:
         return text
     return [
         piece
         for line in text.splitlines()
-        for piece in textwrap.wrap(line, LINE_CHARACTERS) or [""]
+        for piece in textwrap.wrap(line, line_characters) or [""]
     ]
 
 
@@ -193,16 +189,18 @@ def _record(name: str, number: int, data: bytes) -> bytes:
 
 def _encode(where: str, value: _Value) -> bytes:
     """Return kind, dimensions and data of a parameter, first dimension fastest."""
+    # Maximum length of a text parameter, whose size has 15 bits, with its padding [byte].
+    max_text_bytes = 32000
     if isinstance(value, str):
         text = value.encode()
         return struct.pack("<bBB", _KINDS["char"], 1, len(text)) + text
     if isinstance(value, Sequence):
         rows = [row.encode() for row in value]
         width = max(map(len, rows), default=0)
-        if max(width, len(rows)) > MAX_DIMENSION or width * len(rows) > MAX_TEXT_BYTES:
+        if max(width, len(rows)) > MAX_DIMENSION or width * len(rows) > max_text_bytes:
             raise InputError(
                 where,
-                expected=f"a text of at most {MAX_DIMENSION} lines and {MAX_TEXT_BYTES} bytes",
+                expected=f"a text of at most {MAX_DIMENSION} lines and {max_text_bytes} bytes",
                 found=f"{len(rows)} lines of {width} bytes",
                 todo="Give a shorter text, such as the licence's name and address.",
             )

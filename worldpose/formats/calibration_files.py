@@ -28,23 +28,9 @@ from data_contracts.cameras import COEFFICIENTS, CameraCalibration, LensName
 from worldpose.errors import InputError
 from worldpose.formats.files import read_toml
 
-SIZE_LIMIT: Final = 1 << 16
-"""Maximum width and height of an image [px]; OpenCV's own limit for most operations."""
-
 NUMBER_LIMIT: Final = 1e9
 """Maximum absolute value of any entry, whatever its unit."""
-FOCAL_RATIOS: Final = (0.05, 1000.0)
-"""Minimum and maximum focal length over the image's longer side [1]: a field of view of 168
-degrees, and a telescope's of 0.06."""
 
-CENTER_SIZES: Final = 10
-"""Maximum distance of the principal point from the image center, in longer sides [1]."""
-
-MAX_TANGENTIAL: Final = 0.01
-"""Maximum p1 and p2 of four numbers that do not say their model [1]; real lenses have 0.005."""
-
-DISTANCE_LIMIT: Final = 1e7
-"""Maximum coordinate of a translation [m]."""
 
 ROTATION_TOLERANCE: Final = 1e-4
 """Maximum rounding error of R R^T = I [1]; four decimals give less."""
@@ -98,15 +84,18 @@ def build_camera(
         InputError: the size is not whole, a focal length is not positive, the matrix is no
             rotation, or the name is unfit for a file.
     """
+    distance_limit = 1e7  # maximum coordinate of a translation [m]
+    # Maximum width and height of an image [px]; OpenCV's own limit for most operations.
+    size_limit = 1 << 16
     size, focal, principal_point, distortion, lens_model = optics
-    if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
-        expected = f"whole pixels from 1 to {SIZE_LIMIT}; an import with --videos takes theirs"
+    if np.any(size < 1) or np.any(size > size_limit) or np.any(size != np.round(size)):
+        expected = f"whole pixels from 1 to {size_limit}; an import with --videos takes theirs"
         raise calibration_error(f"{where}: size", expected, str(size.tolist()))
     require_optics(where, size, focal, principal_point)
     far = float(np.max(np.abs(translation)))
-    if far > DISTANCE_LIMIT:
+    if far > distance_limit:
         raise calibration_error(
-            f"{where}: translation", f"metres, at most {DISTANCE_LIMIT:g}", f"{far:g}"
+            f"{where}: translation", f"metres, at most {distance_limit:g}", f"{far:g}"
         )
     error = float(np.max(np.abs(rotation @ rotation.T - np.eye(3))))
     if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -141,19 +130,24 @@ def require_optics(
     principal_point: NDArray[np.float64],
 ) -> None:
     """Raise InputError for a focal length or principal point impossible at this image size."""
+    # Maximum distance of the principal point from the image center, in longer sides [1].
+    center_sizes = 10
+    # Minimum and maximum focal length over the image's longer side [1]: a field of view of
+    # 168 degrees, and a telescope's of 0.06.
+    focal_ratios = (0.05, 1000.0)
     ratio = focal / np.max(size)
-    if np.any(ratio < FOCAL_RATIOS[0]) or np.any(ratio > FOCAL_RATIOS[1]):
-        low, high = (bound * float(np.max(size)) for bound in FOCAL_RATIOS)
+    if np.any(ratio < focal_ratios[0]) or np.any(ratio > focal_ratios[1]):
+        low, high = (bound * float(np.max(size)) for bound in focal_ratios)
         raise InputError(
             f"{where}: focal length",
             expected=f"positive pixels, {low:g} to {high:g} for {size[0]:g} x {size[1]:g}",
             found=str(focal.tolist()),
             todo="Give it in pixels: focal length in mm / sensor width in mm * image width.",
         )
-    if np.any(np.abs(principal_point - size / 2) > CENTER_SIZES * np.max(size)):
+    if np.any(np.abs(principal_point - size / 2) > center_sizes * np.max(size)):
         raise InputError(
             f"{where}: principal point",
-            expected=f"pixels within {CENTER_SIZES} image sizes of the image's centre",
+            expected=f"pixels within {center_sizes} image sizes of the image's centre",
             found=str(principal_point.tolist()),
             todo="Give it in pixels from the image's top-left corner.",
         )
@@ -366,6 +360,9 @@ def _read_lens(
     where: str, numbers: NDArray[np.float64], *, fisheye: bool
 ) -> tuple[NDArray[np.float64], LensName]:
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
+    # Maximum p1 and p2 of four numbers that do not say their model [1]; real lenses have
+    # 0.005.
+    max_tangential = 0.01
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
     names = COEFFICIENTS[model]
@@ -375,10 +372,10 @@ def _read_lens(
             "k1 k2 k3 k4 of a fisheye" if fisheye else "k1 k2 p1 p2, with k3, or with k3 k4 k5 k6",
             f"{len(numbers)} numbers{', a lens model with more terms' * (len(numbers) > 5)}",
         )
-    if len(numbers) == 4 and not fisheye and np.abs(numbers[2:]).max() > MAX_TANGENTIAL:
+    if len(numbers) == 4 and not fisheye and np.abs(numbers[2:]).max() > max_tangential:
         raise InputError(
             where,
-            expected=f"k1 k2 p1 p2 with p1 and p2 up to {MAX_TANGENTIAL:g}",
+            expected=f"k1 k2 p1 p2 with p1 and p2 up to {max_tangential:g}",
             found=str(numbers.tolist()),
             todo="If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
             "fisheye_model: 1 in others.",

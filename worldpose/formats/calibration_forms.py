@@ -49,9 +49,6 @@ OPENCAP_NAME: Final = "cameraIntrinsicsExtrinsics"
 
 OPENCAP_KEYS: Final = Keys("imageSize", "intrinsicMat", "distortion", "rotation", "translation")
 
-UPRIGHT: Final = 0.75
-"""Minimum mean cosine between the cameras' downward axes and the vertical [1]: phones that are
-tilted by 40 degrees."""
 
 STANDING: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 """(3, 3) from a board whose y points down to a world with z up."""
@@ -231,13 +228,16 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     they point down tells which. The world is the board's, turned so that z is up; of a standing
     board as in Pose2Sim's conversion: x' = -x, y' = -z, z' = -y.
     """
+    # Minimum mean cosine between the cameras' downward axes and the vertical [1]: phones that
+    # are tilted by 40 degrees.
+    upright = 0.75
     tables = {file: _read_pickle(file) for file in files}
     down = np.mean([_downward(file, table) for file, table in tables.items()], axis=0)
     cosine, axes = max(
         ((down[1], STANDING), (-down[1], ON_ITS_HEAD), (down[2], LYING)),
         key=lambda place: float(place[0]),
     )
-    if not cosine >= UPRIGHT:
+    if not cosine >= upright:
         raise InputError(
             f"{files[0]}: rotation",
             expected="cameras that are level within 40 degrees, and a board that stands or lies",

@@ -25,8 +25,6 @@ from worldpose.formats.calibration_files import (
 from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml
 from worldpose.formats.lens_files import kalibr_tables, read_file_storage
 
-CENTIMETRE: Final = 1e-2
-"""[m]"""
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """(3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y."""
 
@@ -57,6 +55,7 @@ def _read_panoptic(
 
     The many cameras of low resolution have a skew, and are left out.
     """
+    centimetre = 1e-2  # [m]
     keys = Keys("resolution", "K", "distCoef", "R", "t")
     skewed = [_has_skew(table.get("K")) for table in cameras]
     found = []
@@ -67,7 +66,7 @@ def _read_panoptic(
             left_out[camera_id(name)] = "its pixels are skew (K[0][1]), which no lens model has"
             continue
         camera = read_camera_table(
-            where, name, table, keys=keys, unit_m=CENTIMETRE, axes=Y_DOWN, where_pose=where
+            where, name, table, keys=keys, unit_m=centimetre, axes=Y_DOWN, where_pose=where
         )
         found.append((where, camera))
     return index_by_name(path, found)

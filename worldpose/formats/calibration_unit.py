@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import MILLIMETRE
-
-FARTHEST_M: Final = 1000.0
-"""Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m."""
-
-NEAREST_M: Final = 0.1
-"""Minimum distance of the farthest camera from the middle in a file in millimetres [m]."""
 
 
 def require_metres(
@@ -29,11 +22,15 @@ def require_metres(
         cameras: cameras in metres, if the file has that unit.
         unit_m: unit of length in the file [m].
     """
+    # Minimum distance of the farthest camera from the middle in a file in millimetres [m].
+    nearest_m = 0.1
+    # Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m.
+    farthest_m = 1000.0
     centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
     distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
     in_millimetres = unit_m == MILLIMETRE
     if len(centers) < 2 or (
-        distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M)
+        distance <= farthest_m and not (in_millimetres and distance < nearest_m)
     ):
         return
     raise InputError(
@@ -41,7 +38,7 @@ def require_metres(
         expected=f"positions in {'millimetres' if in_millimetres else 'metres'}",
         found=f"a camera {distance:.3g} m from the middle of all cameras",
         todo="Multiply the positions by 1000 if they are in metres (worldpose import --unit m)."
-        if distance < NEAREST_M
+        if distance < nearest_m
         else "Divide the positions by 1000 if they are in millimetres (worldpose import --unit "
         "mm).",
     )

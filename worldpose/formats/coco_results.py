@@ -39,12 +39,8 @@ from worldpose.formats.keypoint_sets import (
 )
 from worldpose.formats.pose_forms import plain_entries
 
-JSON_BYTES: Final = 1 << 30
-"""Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""
 BATCH: Final = 4096
 """Results per batch of Python objects."""
-MAX_POINTS: Final = 1000
-"""Maximum points of a person."""
 
 _NUMBER: Final = re.compile(r"[A-Za-z]*(\d{1,18})")
 _POINTS: Final = "x, y, confidence of each point"
@@ -65,8 +61,11 @@ def read_coco_results(path: Path) -> PeopleFile:
             scale, no frame number, or too many people per frame; the error names file, result and
             point.
     """
+    # Maximum size of a JSON file [byte], about two million people; npz holds more and is
+    # faster.
+    json_bytes = 1 << 30
     keep = ("images", "categories", "meta_info")
-    items = JsonItems(path, "annotations", JSON_BYTES, keep, other_key="instance_info")
+    items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
     entries = plain_entries(str(path), items)
     batches = [_read_batch(path, results, first) for first, results in _batches(path, entries)]
     if not items.has_list:
@@ -138,10 +137,11 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
 
 
 def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:
+    max_points = 1000  # maximum points of a person
     images = _images(path, results, first)
     given = results[0].get("keypoints")
     width = len(given) if type(given) is list and len(given) % 3 == 0 else 51
-    if not 0 < width <= 3 * MAX_POINTS:
+    if not 0 < width <= 3 * max_points:
         raise unknown_size(f"{path}: result {first}, keypoints", width // 3)
     table = _table(path, results, range(len(results)), "keypoints", width, first)
     points = table.reshape(-1, width // 3, 3)

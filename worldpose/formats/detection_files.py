@@ -31,12 +31,8 @@ from worldpose.parsing import read_cells
 
 KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
 """Of OpenPose's version 1 and later, of its versions 0, and of other programs."""
-BOX_BYTES: Final = 1 << 28
-"""Maximum size of a file of boxes [byte]: that of 22 people in an hour has 200 MB."""
 BOX_COLUMNS: Final = range(6, 11)
 """Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9."""
-PEDESTRIAN: Final = 1
-"""Class of people in MOTChallenge's truth."""
 _NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
 
 
@@ -183,6 +179,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
             video lacks, an id twice in a frame, an empty box, a box outside of the image, or an
             impossible confidence; the error names the line.
     """
+    pedestrian = 1  # class of people in MOTChallenge's truth
     lines, rows = _read_rows(file)
     frame, person, box = rows[:, 0], rows[:, 1], rows[:, 2:6]
     corner = box[:, :2] - 1.5
@@ -190,7 +187,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     score = rows[:, 6] if rows.shape[1] > 6 else np.full(len(rows), -1.0)
     kept = score != 0.0
     if rows.shape[1] == 9:
-        kept &= rows[:, 7] == PEDESTRIAN
+        kept &= rows[:, 7] == pedestrian
     pairs = np.stack([frame, person], axis=1)
     order = np.lexsort((np.arange(len(rows)), person, frame))
     again = np.zeros(len(rows), np.bool_)
@@ -235,6 +232,8 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
 def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     """Return the number and text of each line that is not empty, and its numbers."""
+    # Maximum size of a file of boxes [byte]: that of 22 people in an hour has 200 MB.
+    box_bytes = 1 << 28
 
     def wrong(where: str, expected: str, found: str) -> InputError:
         return InputError(
@@ -244,7 +243,7 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
             todo="Write lines of MOTChallenge: frame,id,left,top,width,height,confidence.",
         )
 
-    cells, has_commas = read_cells(file, BOX_BYTES, "Write lines of MOTChallenge.")
+    cells, has_commas = read_cells(file, box_bytes, "Write lines of MOTChallenge.")
     if not cells:
         raise wrong(str(file), "boxes", "an empty file")
     sign = "." if has_commas else ","

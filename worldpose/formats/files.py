@@ -67,10 +67,6 @@ EVENTS: Final = 100_000
 """Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
 
 
-TOML_LINE: Final = 4096
-"""Maximum line length of a TOML file; the time for a key of n dotted parts grows as n squared."""
-
-
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
     """Return the only document of a YAML file, as plain values, without aliases or repeated keys.
 
@@ -98,12 +94,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: no such file, too large, a line too long, or not TOML.
     """
+    # Maximum line length of a TOML file; the time for a key of n dotted parts grows as n
+    # squared.
+    toml_line = 4096
     text = _read_text(path, SETTINGS_BYTES)
     longest = max(map(len, text.splitlines()), default=0)
-    if longest > TOML_LINE:
+    if longest > toml_line:
         raise InputError(
             str(path),
-            expected=f"lines of at most {TOML_LINE} characters",
+            expected=f"lines of at most {toml_line} characters",
             found=f"one of {longest}",
             todo="Break the line.",
         )

@@ -29,16 +29,8 @@ _VERTICES, _INDICES = 34962, 34963
 _SHORT: Final = 32767
 INFLUENCES: Final = 8
 """Joints of a vertex in two sets of four; viewers must read one set, and most read both."""
-NEAR_M: Final = 0.1
-"""Near plane of cameras [m]."""
 FACING: Final = np.diag([1.0, -1.0, -1.0])
 """Rotation from glTF's camera axes (y up, looking along -z) to OpenCV's."""
-MARKING_WIDTH_M: Final = 0.12
-"""Width of painted lines, at most, by the Laws [m]: programs do not render lines without width."""
-LAWN_MARGIN_M: Final = 4.0
-"""Width of the lawn around the markings [m]."""
-LAWN_DEPTH_M: Final = 0.02
-"""Depth of the lawn below the lowest marking, so that it does not cover it [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,6 +337,7 @@ class _Writer:
 
     def add_camera(self, name: str, camera: Camera) -> int:
         """Add a single or a moving camera; return the node."""
+        near_m = 0.1  # near plane of cameras [m]
         rows, known = known_frames(camera)
         if not len(rows):
             return self.file.add("nodes", {"name": name})
@@ -356,7 +349,7 @@ class _Writer:
             "perspective": {
                 "yfov": float(2.0 * np.arctan(0.5 * height / focal[1])),
                 "aspectRatio": float(width / focal[0] * focal[1] / height),
-                "znear": NEAR_M,
+                "znear": near_m,
             },
         }
         turns = _continuous(
@@ -388,13 +381,16 @@ class _Writer:
 
     def add_pitch(self, markings: Sequence[Floats]) -> int:
         """Add the markings as flat strips, above a lawn; return the node."""
+        # Depth of the lawn below the lowest marking, so that it does not cover it [m].
+        lawn_depth_m = 0.02
+        lawn_margin_m = 4.0  # width of the lawn around the markings [m]
         lawn, white = (
             self._add_material(color, 1.0) for color in ((0.12, 0.35, 0.14), (1.0, 1.0, 1.0))
         )
         points = np.concatenate(list(markings))
         low, high = points.min(axis=0), points.max(axis=0)
-        (x0, y0), (x1, y1) = low[:2] - LAWN_MARGIN_M, high[:2] + LAWN_MARGIN_M
-        z = low[2] - LAWN_DEPTH_M
+        (x0, y0), (x1, y1) = low[:2] - lawn_margin_m, high[:2] + lawn_margin_m
+        z = low[2] - lawn_depth_m
         corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]], np.float32)
         up = np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (4, 1))
         halves = np.array([0, 1, 2, 0, 2, 3], np.uint16)
@@ -429,11 +425,14 @@ def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
     Args:
         markings: lines on the pitch (points, 3) [m], world, of two points or more.
     """
+    # Width of painted lines, at most, by the Laws [m]: programs do not render lines without
+    # width.
+    marking_width_m = 0.12
     vertices, triangles, first = [], [], 0
     for line in markings:
         way = np.gradient(line[:, :2], axis=0)
         way /= np.linalg.norm(way, axis=1, keepdims=True)
-        aside = 0.5 * MARKING_WIDTH_M * np.column_stack([-way[:, 1], way[:, 0], 0.0 * way[:, 0]])
+        aside = 0.5 * marking_width_m * np.column_stack([-way[:, 1], way[:, 0], 0.0 * way[:, 0]])
         vertices += [line + aside, line - aside]
         left = first + np.arange(len(line))
         right = left + len(line)

@@ -45,8 +45,6 @@ from worldpose.formats.keypoint_sets import (
 _JOINTS: Final = len(COCO17)
 _BLOCK: Final = 4096
 """Frames per block of checks, which limits their memory."""
-_BLOCK_PEOPLE: Final = 100_000
-"""Maximum detections per block."""
 
 _MEMBERS: Final = {
     "frame": Member(("frames",), "int", dtype="<i8"),
@@ -64,8 +62,6 @@ _MEMBERS: Final = {
 }
 _EXTRA: Final = ("point", "extra_keypoints", "extra_confidence")
 """Members of points besides COCO-17: all or none."""
-POINTS_LIMIT: Final = 1000
-"""Maximum number of these points."""
 
 
 def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
@@ -87,15 +83,16 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
             order, frames that do not rise, infinite values, or a keypoint without confidence; the
             error names file and member.
     """
+    points_limit = 1000  # maximum number of these points
     require_file(path)
     with open_npz(path) as file:
         infos, sizes = check_members(path, file, _MEMBERS)
         extra = [name for name in _EXTRA if name in infos]
         if extra and len(extra) < len(_EXTRA):
             raise wrong(str(path), f"all of {', '.join(_EXTRA)}, or none", ", ".join(extra))
-        if extra and not 0 < sizes["points"] <= POINTS_LIMIT:
+        if extra and not 0 < sizes["points"] <= points_limit:
             found = str(sizes["points"])
-            raise wrong(f"{path}: point", f"1 to {POINTS_LIMIT} names as text", found)
+            raise wrong(f"{path}: point", f"1 to {points_limit} names as text", found)
         if sizes["detections"] > PEOPLE_LIMIT:
             raise InputError(
                 f"{path}: score",
@@ -115,13 +112,14 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
 
 
 def _check_values(path: Path, people: KeypointDetections) -> None:
+    block_people = 100_000  # maximum detections per block
     steps = np.diff(people.frame)
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0)) + 1
         raise wrong(f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}")
     if np.any(np.abs(people.frame) > FRAME_LIMIT):
         raise wrong(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
-    block = max(1, min(_BLOCK, _BLOCK_PEOPLE // max(1, people.score.shape[1])))
+    block = max(1, min(_BLOCK, block_people // max(1, people.score.shape[1])))
     for start in range(0, len(people.frame), block):
         _check_block(path, start, people[start : start + block])
 

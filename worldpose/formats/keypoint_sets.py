@@ -112,10 +112,6 @@ _HUMAN36M_LENGTHS: Final = np.array([0.43, 0.42, 0.29, 0.26, 0.115])
 _MARGIN: Final = 0.3
 """How much better another order must explain the lengths [log]. Right orders of recordings and of
 the simulation miss by 0.03 to 0.15, wrong ones by 0.5 or more."""
-_PLAUSIBLE: Final = 0.3
-"""Largest misfit of the order that explains them [log]."""
-_SAMPLE: Final = 2000
-"""People whose lengths are compared; more add nothing."""
 
 
 def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
@@ -170,6 +166,7 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     Raises:
         InputError: no set has this number of points, or their lengths are those of another set.
     """
+    plausible = 0.3  # largest misfit of the order that explains them [log]
     size = points.shape[1]
     orders = _SETS.get(size, ())
     if not orders:
@@ -182,9 +179,9 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     misfits = [_misfit(order.select(points), pairs, _LENGTHS) for order in orders]
     chosen = orders[0]
     for order, misfit in zip(orders, misfits, strict=True):
-        if misfit <= _PLAUSIBLE and misfits[0] - misfit >= _MARGIN:
+        if misfit <= plausible and misfits[0] - misfit >= _MARGIN:
             chosen = order
-    if chosen.name == "MPI-15" and len(points) and not misfits[0] <= _PLAUSIBLE:
+    if chosen.name == "MPI-15" and len(points) and not misfits[0] <= plausible:
         raise InputError(
             where,
             expected="limbs of usual lengths in the order of MPI, the known set of 15 points",
@@ -193,7 +190,7 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
         )
     if size == len(COCO17):
         other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
-        if other <= _PLAUSIBLE and misfits[0] - other >= _MARGIN:
+        if other <= plausible and misfits[0] - other >= _MARGIN:
             raise InputError(
                 where,
                 expected="the 17 joints in COCO's order",
@@ -221,7 +218,8 @@ def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> flo
         pairs: (bones, 2, 2) places of the ends of the left and right bone.
         lengths: (bones,) usual lengths, of which only ratios count.
     """
-    some = points[:: max(1, len(points) // _SAMPLE)]
+    sample = 2000  # people whose lengths are compared; more add nothing
+    some = points[:: max(1, len(points) // sample)]
     place = np.where(some[..., 2:] > 0.0, some[..., :2], np.nan).astype(np.float64)
     span = np.linalg.norm(place[:, pairs[..., 0]] - place[:, pairs[..., 1]], axis=-1)
     known = np.isfinite(span).any(axis=0)

@@ -28,14 +28,6 @@ from worldpose.formats.calibration_files import (
 from worldpose.formats.files import SETTINGS_BYTES, read_yaml, require_file
 from worldpose.parsing import read_npy
 
-FOCAL_STD: Final = 0.01
-"""Relative deviation of a focal length whose file states none [1]: board calibrations with a dozen
-images repeat within 1 %."""
-PRINCIPAL_POINT_STD: Final = 0.005
-"""The same of the principal point, in image widths [1]."""
-DISTORTION_STD: Final = 0.005
-"""The same of the image corner's displacement, relative to its distance from the centre [1]: boards
-seldom reach the corners."""
 MATRIX_NAMES: Final = (
     *("camera_matrix", "cameraMatrix", "Camera_Matrix", "camMatrix", "mtx", "K", "matrix"),
     *("Intrinsics", "intrinsicMat", "intrinsic_matrix", "intrinsics"),
@@ -56,8 +48,6 @@ OTHER_WORDS: Final = (
 """Values of `MODEL_NAMES`, in lower case."""
 ARRAY_BYTES: Final = 1 << 26
 """Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
-MAX_ASPECT_ERROR: Final = 0.02
-"""Largest difference of fx and fy of square pixels [1]; their mean is used."""
 
 
 def read_lenses(
@@ -398,10 +388,19 @@ def _lens(
     where: str, name: str, table: Mapping[str, Any], size: tuple[int, int]
 ) -> LensCalibration:
     """Return the lens of a table at the size of the camera's images."""
+    # Largest difference of fx and fy of square pixels [1]; their mean is used.
+    max_aspect_error = 0.02
+    # The same of the image corner's displacement, relative to its distance from the centre
+    # [1]: boards seldom reach the corners.
+    distortion_std = 0.005
+    principal_point_std = 0.005  # the same of the principal point, in image widths [1]
+    # Relative deviation of a focal length whose file states none [1]: board calibrations with
+    # a dozen images repeat within 1 %.
+    focal_std = 0.01
     optics = read_optics(where, table)
     require_optics(where, optics.size, optics.focal, optics.principal_point)
     fx, fy = optics.focal.tolist()
-    if abs(fx - fy) > MAX_ASPECT_ERROR * fx:
+    if abs(fx - fy) > max_aspect_error * fx:
         raise calibration_error(
             f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
         )
@@ -410,11 +409,11 @@ def _lens(
     # Pixel centres are whole numbers, so that the image's corner is at -0.5.
     middle = (optics.principal_point + 0.5) * scale - 0.5
     deviations = {
-        "focal_std_px": _deviation(where, table, "focal_std_px", scale, FOCAL_STD * focal),
+        "focal_std_px": _deviation(where, table, "focal_std_px", scale, focal_std * focal),
         "principal_point_std_px": _deviation(
-            where, table, "principal_point_std_px", scale, PRINCIPAL_POINT_STD * size[0]
+            where, table, "principal_point_std_px", scale, principal_point_std * size[0]
         ),
-        "distortion_std": _deviation(where, table, "distortion_std", 1.0, DISTORTION_STD),
+        "distortion_std": _deviation(where, table, "distortion_std", 1.0, distortion_std),
     }
     try:
         return LensCalibration(

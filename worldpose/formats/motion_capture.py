@@ -121,10 +121,6 @@ def _labels(pixels: NDArray[np.float64], visible: NDArray[np.int64]) -> dict[str
 
 Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation of world points to the axes of OpenSim and of animation tools: x stays, y is up."""
-MILLIMETRES: Final = 1000.0
-"""Millimetres in a metre: TRC files are in millimetres, and state it."""
-TRC_DECIMALS: Final = 3
-"""Decimals of all coordinates: a micrometre."""
 
 
 def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
@@ -141,6 +137,7 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
         person: index of the person in `tracks`.
         fps: frames per second.
     """
+    trc_decimals = 3  # decimals of all coordinates: a micrometre
     first, markers = _rows(tracks, person)
     names = tracks.markers.points
     count = len(names)
@@ -155,12 +152,13 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
         "",
     ]
     values = markers.reshape(len(markers), 3 * count)
-    form = f"%.{TRC_DECIMALS}f"
+    form = f"%.{trc_decimals}f"
     write_rows(path, head, [(numbers + 1, "%d"), (numbers / fps, "%.6f"), (values, form)])
 
 
 def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
     """Return the first match frame, and markers (frames, points, 3) [mm, y up] from there."""
+    millimetres = 1000.0  # millimetres in a metre: TRC files are in millimetres, and state it
     joints = tracks.markers.joints
     seen = np.flatnonzero(np.isfinite(tracks.joints[:, person]).any((-1, -2)))
     if not len(seen):
@@ -168,12 +166,10 @@ def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
     numbers = tracks.frames[seen]
     first = int(numbers[0])
     markers = np.full((int(numbers[-1]) - first + 1, joints.shape[2], 3), np.nan)
-    markers[numbers - first] = joints[seen, person] @ Y_UP.T * MILLIMETRES
+    markers[numbers - first] = joints[seen, person] @ Y_UP.T * millimetres
     return first, markers
 
 
-CENTIMETRES: Final = 100.0
-"""Centimetres in a metre: animation tools interpret the numbers of a BVH file as centimetres."""
 BVH_DECIMALS: Final = 6
 """Decimals of all numbers: a hundredth of a micrometre, and angles that move a hand by as much."""
 _LOCKED: Final = 1e-7
@@ -197,6 +193,9 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     Raises:
         InputError: there are no frames, or a parameter is missing.
     """
+    # Centimetres in a metre: animation tools interpret the numbers of a BVH file as
+    # centimetres.
+    centimetres = 100.0
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
     if not len(angles) or not np.isfinite([angles.sum(), poses.transl.sum()]).all():
         raise InputError(
@@ -209,12 +208,12 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     rest = model.joint_template + model.joint_directions @ betas
     turns = Rigid.from_rotvec(angles.reshape(len(angles), -1, 3), np.zeros(3)).rotation.copy()
     turns[:, 0] = Y_UP @ turns[:, 0]
-    roots = (rest[0] + poses.transl) @ Y_UP.T * CENTIMETRES
+    roots = (rest[0] + poses.transl) @ Y_UP.T * centimetres
     channels = np.unwrap(np.degrees(zxy_angles(turns)), axis=0, period=360.0)
     # Depth first, the joint order of the file.
     order = list(_depth_first(model.parents, 0))
     rows = np.concatenate([roots, channels[:, order].reshape(len(roots), -1)], axis=1)
-    head = ["HIERARCHY", *_joint(rest * CENTIMETRES, model.parents, 0, "")]
+    head = ["HIERARCHY", *_joint(rest * centimetres, model.parents, 0, "")]
     head += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1.0 / fps:.9f}"]
     write_rows(path, head, [(rows, f"%.{BVH_DECIMALS}f")], " ")
 
@@ -279,8 +278,6 @@ MIRROR: Final = np.diag([1.0, 1.0, -1.0])
 """Reflection in the body's sagittal plane: a left limb's angles are those of its mirror image."""
 MID_HIP_M: Final = np.array([-0.056276, -0.07849, 0.0])
 """Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes."""
-MOT_DECIMALS: Final = 5
-"""Decimals of degrees, metres and seconds."""
 OPENSIM_COORDINATES: Final = (
     *("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz"),
     *("hip_flexion_r", "hip_adduction_r", "hip_rotation_r", "knee_angle_r", "ankle_angle_r"),
@@ -365,6 +362,7 @@ def write_opensim_motion(
     Raises:
         InputError: there are no frames, or a value is missing.
     """
+    mot_decimals = 5  # decimals of degrees, metres and seconds
     if not len(coordinates) or not np.isfinite(coordinates).all():
         raise InputError(
             str(path),
@@ -383,7 +381,7 @@ def write_opensim_motion(
         "endheader",
         "\t".join(["time", *OPENSIM_COORDINATES]),
     ]
-    write_rows(path, head, [(rows, f"%.{MOT_DECIMALS}f")])
+    write_rows(path, head, [(rows, f"%.{mot_decimals}f")])
 
 
 def _angles(rotation: Floats) -> Floats:

@@ -189,14 +189,6 @@ def people_table(positions: Positions, fps: float) -> pd.DataFrame:
     )
 
 
-MIN_STRIDE_S: Final = 0.4
-"""Shortest time between two contacts of one foot [s]: sprinters take 2.3 strides per second."""
-MAX_STRIDE_S: Final = 2.0
-"""Longest stride [s]: in a longer one the person stood."""
-MIN_STRIDE_SPEED_M_S: Final = 0.5
-"""Lowest mean speed of a stride [m/s]: slower people stand, turn or shuffle."""
-MIN_SWING_M: Final = 0.15
-"""Least travel of the ankle relative to the hips in a stride [m]."""
 _SIDES: Final = {"left": 15, "right": 16}
 
 
@@ -242,6 +234,10 @@ def _strides(
     frames: NDArray[np.integer], hips: Floats, ankle: Floats, fps: float
 ) -> list[tuple[int, int]]:
     """Return rows of the first and last frame of the strides of one foot."""
+    min_swing_m = 0.15  # least travel of the ankle relative to the hips in a stride [m]
+    # Shortest time between two contacts of one foot [s]: sprinters take 2.3 strides per
+    # second.
+    min_stride_s = 0.4
     from scipy.signal import find_peaks  # late: it takes a second, and reports need no strides
 
     half = max(1, round(0.5 * SPEED_WINDOW_S * fps))
@@ -260,8 +256,8 @@ def _strides(
     for first, last in edges.reshape(-1, 2):
         contacts, _ = find_peaks(
             ahead[first:last],
-            distance=max(1, round(MIN_STRIDE_S * fps)),
-            prominence=MIN_SWING_M,
+            distance=max(1, round(min_stride_s * fps)),
+            prominence=min_swing_m,
         )
         for a, b in pairwise((contacts + first).tolist()):
             if _is_stride(float(frames[b] - frames[a]) / fps, ankle[b] - ankle[a]):
@@ -270,8 +266,11 @@ def _strides(
 
 
 def _is_stride(duration: float, way: Floats) -> bool:
+    # Lowest mean speed of a stride [m/s]: slower people stand, turn or shuffle.
+    min_stride_speed_m_s = 0.5
+    max_stride_s = 2.0  # longest stride [s]: in a longer one the person stood
     speed = float(np.linalg.norm(way)) / duration
-    return duration <= MAX_STRIDE_S and speed >= MIN_STRIDE_SPEED_M_S
+    return duration <= max_stride_s and speed >= min_stride_speed_m_s
 
 
 def write_csv(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> list[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,9 +25,6 @@ from worldpose.formats.gltf_file import (
     skin_weights,
 )
 from worldpose.geometry.cameras import Camera
-
-APERTURE_MM: Final = 36.0
-"""Width of a camera's sensor [tenth of a unit]; only its ratio to the focal length counts."""
 
 
 def write_usd(
@@ -191,13 +188,16 @@ class _Writer:
 
     def add_camera(self, name: str, camera: Camera) -> None:
         """Add a single or a moving camera."""
+        # Width of a camera's sensor [tenth of a unit]; only its ratio to the focal length
+        # counts.
+        aperture_mm = 36.0
         prim = self.UsdGeom.Camera.Define(self.stage, f"/world/{_prim_name(name)}")
         rows, known = known_frames(camera)
         if not len(rows):
             return
         width, height = (float(n) for n in known.image_size[0])
-        per_pixel = APERTURE_MM / width
-        prim.CreateHorizontalApertureAttr(APERTURE_MM)
+        per_pixel = aperture_mm / width
+        prim.CreateHorizontalApertureAttr(aperture_mm)
         # Pixels may be oblong: USD has one focal length and two apertures.
         tall = float(np.median(known.focal[:, 0] / known.focal[:, 1]))
         prim.CreateVerticalApertureAttr(per_pixel * height * tall)

@@ -41,8 +41,6 @@ from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
 
 FORMAT: Final = "worldpose-viewer/1"
-RANGE_SECONDS: Final = 10.0
-"""Duration of a range of frames [s]."""
 JOINT_UNIT: Final = 1e-4
 """Resolution of the joints of people without a body, relative to one of them [m]."""
 SURFACE_UNIT: Final = 1e-4
@@ -140,7 +138,8 @@ class ViewerClip:
     @property
     def range_frames(self) -> int:
         """Number of frames in a range."""
-        return max(1, round(RANGE_SECONDS * self.fps))
+        range_seconds = 10.0  # duration of a range of frames [s]
+        return max(1, round(range_seconds * self.fps))
 
     @property
     def with_body(self) -> NDArray[np.int64]:

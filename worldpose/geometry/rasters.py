@@ -27,11 +27,8 @@ Box = tuple[int, int, int, int]
 
 _OK = int(RayStatus.OK)
 SAMPLES = 4
-_ACROSS = (-0.125, 0.375, -0.375, 0.125)
 _DOWN = (-0.375, -0.125, 0.125, 0.375)
 """Positions of samples in a pixel [px]: on a rotated square, no two share a row or column."""
-_WHEN = (0.125, 0.625, 0.375, 0.875)
-"""Moments of samples, as a share of the time that the shutter is open."""
 NOBODY = -1
 
 
@@ -102,6 +99,9 @@ def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples
         which: number of the object, from 0.
         samples: written.
     """
+    # Moments of samples, as a share of the time that the shutter is open.
+    when = (0.125, 0.625, 0.375, 0.875)
+    across = (-0.125, 0.375, -0.375, 0.125)
     opened, closed, faces, light = surface.opened, surface.closed, surface.faces, surface.light
     backs, texels = surface.backs, surface.texels
     left, top, depth, who = samples.left, samples.top, samples.depth, samples.who
@@ -113,7 +113,7 @@ def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         picture = surface.textures[1 if backs[f] else 0]
         for s in range(SAMPLES):
-            share, right, down = _WHEN[s], left + _ACROSS[s], top + _DOWN[s]
+            share, right, down = when[s], left + across[s], top + _DOWN[s]
             ax = opened[a, 0] + share * (closed[a, 0] - opened[a, 0]) - right
             ay = opened[a, 1] + share * (closed[a, 1] - opened[a, 1]) - down
             bx = opened[b, 0] + share * (closed[b, 0] - opened[b, 0]) - right

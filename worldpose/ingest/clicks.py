@@ -33,8 +33,6 @@ from worldpose.pitch.template import PitchTemplate
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
-SNAP_M: Final = 0.1
-"""A place closer to a known point than this is that point [m]: labels are rounded."""
 REPEATED_SUFFIX: Final = ".again"
 """Suffix of the second click with one label."""
 
@@ -250,6 +248,8 @@ class _Labels:
         return (x, y, z)
 
     def _name(self, image: MarkedImage, label: str) -> str:
+        # A place closer to a known point than this is that point [m]: labels are rounded.
+        snap_m = 0.1
         known = _find_name(label, self._template.points)
         if known is not None:
             return known
@@ -260,7 +260,7 @@ class _Labels:
         if abs(x) > 0.5 * self._pitch.length + 30.0 or abs(y) > 0.5 * self._pitch.width + 30.0:
             raise self._unknown(image, label, self._template.points)
         for name, place in self._known.items():
-            if np.hypot(*(place - [x, y])) < SNAP_M:
+            if np.hypot(*(place - [x, y])) < snap_m:
                 return name
         name = f"at_{x:.2f}_{y:.2f}"
         height = float(self._template.height(np.array(x), np.array(y)))

@@ -235,10 +235,6 @@ def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
     return [[int(a), int(b)] for a, b in zip(firsts, lasts, strict=True)]
 
 
-STILL_BYTES = 1 << 28
-"""Maximum size of a still [byte]; a noisy 4K image has 25 MB."""
-
-
 def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the image (height, width, 3), RGB.
 
@@ -249,11 +245,12 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     Raises:
         InputError: no such file, no image, or another image size.
     """
+    still_bytes = 1 << 28  # maximum size of a still [byte]; a noisy 4K image has 25 MB
     from worldpose.video.folder import MAX_PIXELS, declared_size, decode_image  # late: as above
 
     path = Path(path)
     size = require_file(path)
-    content = np.fromfile(path, dtype=np.uint8) if size <= STILL_BYTES else np.empty(0, np.uint8)
+    content = np.fromfile(path, dtype=np.uint8) if size <= still_bytes else np.empty(0, np.uint8)
     declared = declared_size(content)
     if declared is not None and declared != image_size:
         raise InputError(
@@ -266,7 +263,7 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     if image is None:
         raise InputError(
             str(path),
-            expected=f"an image of at most {STILL_BYTES} bytes and {MAX_PIXELS} pixels",
+            expected=f"an image of at most {still_bytes} bytes and {MAX_PIXELS} pixels",
             found=f"{size} bytes that are none",
             todo="Export the still again.",
         )

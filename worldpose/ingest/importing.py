@@ -37,12 +37,6 @@ from worldpose.video.folder import index_video, open_video
 from worldpose.video.names import VIDEO_SUFFIXES
 from worldpose.video.pictures import FrameIndex
 
-SAME_SHAPE: Final = 0.002
-"""Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
-MAX_BLACK: Final = 16.0
-"""Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
-
-
 Placing: TypeAlias = Callable[
     [Path, Mapping[str, CameraCalibration], Mapping[str, KeypointDetections], float],
     tuple[dict[str, CameraCalibration], list[str]],
@@ -423,6 +417,8 @@ def fit_to_video(
     Raises:
         InputError: the video is neither what was calibrated nor the same picture resized.
     """
+    # Largest relative difference of two shapes of one picture [1]: sides are whole pixels.
+    same_shape = 0.002
     if index.size == camera.image_size:
         return camera
     own, shown = np.array(camera.image_size), np.array(index.size)
@@ -435,7 +431,7 @@ def fit_to_video(
         )
     scale = float((shown / own).min())
     bar = 0.5 * (shown - scale * own)
-    if (shown / own).max() > (1.0 + SAME_SHAPE) * scale:
+    if (shown / own).max() > (1.0 + same_shape) * scale:
         with open_video(file, index) as video:
             if not _has_black_bars(video.frame(0), bar):
                 raise video_size_error(file, camera, index)
@@ -464,13 +460,15 @@ def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
         frame: (height, width, channels).
         bar: their width along x and y [px], with a fraction.
     """
+    # Largest mean brightness of a black bar [1, of 255]: the black of limited-range video.
+    max_black = 16.0
     axis = int(bar.argmax())
     width = int(bar[axis])
     lines = frame.mean(axis=(axis, 2)).astype(np.float64)
     black = np.concatenate([lines[:width], lines[len(lines) - width :]])
     # The line next to a bar with a fraction is a mixture.
     next_lines = [lines[width + 2], lines[-width - 3]]
-    return width > 0 and bool(black.max() < MAX_BLACK and min(next_lines) > MAX_BLACK)
+    return width > 0 and bool(black.max() < max_black and min(next_lines) > max_black)
 
 
 def video_size_error(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:

@@ -16,8 +16,6 @@ from worldpose.pitch.laws import law_points
 
 SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
 """Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90."""
-FROM_LAWS: Final = 2.0
-"""Maximum distance of a surveyed point from its place in the Laws, in plan [m]."""
 NO_PITCH: Final = "none"
 """Value of `pitch` in match.yaml for footage without a pitch."""
 
@@ -88,6 +86,7 @@ def _check_points(content: object, file: str) -> None:
         InputError: points are too far from the Laws; the error names the point of the largest
             distance.
     """
+    from_laws = 2.0  # maximum distance of a surveyed point from its place in the Laws, in plan [m]
     if not isinstance(content, dict) or content.get("any_size") is True:
         return
     given = {key: content.get(key, getattr(PitchSpec(), key)) for key in SIZES}
@@ -103,18 +102,18 @@ def _check_points(content: object, file: str) -> None:
         if len(place) > 1
     }
     worst = max(off, key=lambda name: off[name], default=None)
-    if worst is None or off[worst] <= FROM_LAWS:
+    if worst is None or off[worst] <= from_laws:
         return
     x, y = (float(value) for value in points[worst][:2])
     units = [
         name
         for name, metres in OTHER_UNITS.items()
-        if math.dist((x * metres, y * metres), laws[worst][:2]) <= FROM_LAWS
+        if math.dist((x * metres, y * metres), laws[worst][:2]) <= from_laws
     ]
     guess = f", which looks like {units[0]}" if units else ""
     raise InputError(
         f"{file}: points.{worst}",
-        expected=f"a place within {FROM_LAWS:g} m of the Laws': {laws[worst][0]:.2f}, "
+        expected=f"a place within {from_laws:g} m of the Laws': {laws[worst][0]:.2f}, "
         f"{laws[worst][1]:.2f} m on a pitch of {length:g} x {width:g} m",
         found=f"{x:g}, {y:g}{guess}",
         todo="Correct the name, the place, or length and width; the origin is the centre spot, x "

@@ -28,8 +28,6 @@ _KEPT: Final = [6, 7, 22, 23, 24]
 """Columns of p1, p2, k4, k5 and k6, which no fit changes."""
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
-TOLERANCE: Final = 1e-10
-"""Relative decrease of the cost below which the loop counts as converged."""
 _DAMPING: Final = Damping(start=1e-4, decrease=10.0, lowest=1e-9, highest=1e8)
 
 
@@ -248,6 +246,7 @@ def compute_residuals(problem: CameraProblem, row: Floats) -> Residuals:
 @compile_kernel
 def _descend(given: Measurements, iterations: int, found: Fits) -> None:
     """Minimize the objective from each row of `found` in place; see `fit_cameras`."""
+    tolerance = 1e-10  # relative decrease of the cost below which the loop counts as converged
     rows, cost, free = found.rows, found.cost, given.free
     trial, step = np.empty(WIDTH), np.empty(STEP)
     system, information, observed = (
@@ -275,7 +274,7 @@ def _descend(given: Measurements, iterations: int, found: Fits) -> None:
             accepted = is_better(cost[b], reached)
             damping = next_damping(damping, accepted, _DAMPING)
             if accepted:
-                stalled = stalled + 1 if cost[b] - reached < TOLERANCE * cost[b] else 0
+                stalled = stalled + 1 if cost[b] - reached < tolerance * cost[b] else 0
                 rows[b], cost[b] = trial, reached
                 found.information[b], found.evidence_information[b] = information, observed
                 gradient[:] = slope

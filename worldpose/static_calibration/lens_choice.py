@@ -23,9 +23,6 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _CHOICES: Final = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
 """Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's."""
-_FISHEYE_STD: Final = 0.1
-"""Standard deviation of a fisheye's k1, k2 and k3 [1]: projections from orthographic to
-stereographic have k1 from -0.17 to 0.08."""
 _MIN_CLICKS: Final = 10
 """Minimum number of clicked points that choose a lens model [1]: twenty residuals for twelve
 parameters and the noise."""
@@ -38,6 +35,9 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
     error of the lens below the stated noise counts, too. Brown's model stands unless another one is
     clearly more probable. A lens that is given, or whose terms a setting restricts, stays.
     """
+    # Standard deviation of a fisheye's k1, k2 and k3 [1]: projections from orthographic to
+    # stereographic have k1 from -0.17 to 0.08.
+    fisheye_std = 0.1
     problem = found.problem
     if problem.lens is not None or stated.distortion != "k1_k2":
         return found
@@ -53,7 +53,7 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
         free = np.arange(STEP) < STEP - 3 + coefficients
         prior = as_stated.prior.copy()
         if model == LensModel.FISHEYE:
-            prior[15:18] = _FISHEYE_STD
+            prior[15:18] = fisheye_std
         wider = replace(as_stated, free=free, lens_model=model, prior=prior)
         if fit_cameras(wider, start, click_loss=loss).cost[0] > worth_it * cost:
             continue

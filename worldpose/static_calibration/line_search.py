@@ -215,9 +215,6 @@ def _accumulate(
 
 
 _COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
-_FINE_SCALES: Final = (12.0, 6.0)
-"""Decreasing scales of the loss [standard deviations]: outliers lose their influence one by one,
-which avoids the nearest local minimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,9 +377,12 @@ class LineSearch:
 
     def converge(self, at: MeasuredLines, fine: bool) -> LineFit:
         """Return the converged fit to bars at fixed pixels, fitted to a subpixel if fine."""
+        # Decreasing scales of the loss [standard deviations]: outliers lose their
+        # influence one by one, which avoids the nearest local minimum.
+        fine_scales = (12.0, 6.0)
         bars = at.seen.places + at.offsets[:, None] * at.seen.normals
         final = (self.settings.loss_scale,) * 3
-        scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
+        scales: tuple[float, ...] = (*fine_scales, *final) if fine else _COARSE_SCALES
         for _ in range(4 if fine else 1):
             adjusted = self._adjust(at, scales)
             scales = (2.0 * self.settings.loss_scale, *(self.settings.loss_scale,) * 2)

@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import dropwhile, islice, pairwise
 from pathlib import Path
-from typing import Final
 
 import av
 import numpy as np
@@ -20,9 +19,6 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Image
 from worldpose.errors import InputError, say_failure
 from worldpose.video.pictures import FrameIndex, Pictures, convert_pixels
-
-MAX_STRETCH: Final = 0.01
-"""Largest deviation of a pixel's sides that rounding in a file explains [1]."""
 
 
 def index_frames(path: Path) -> FrameIndex:
@@ -140,8 +136,9 @@ def _shown_size(packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
 
 def _require_square(path: Path, stream: VideoStream) -> None:
     """Raise InputError for a video whose pixels are wider or narrower than high."""
+    max_stretch = 0.01  # largest deviation of a pixel's sides that rounding in a file explains [1]
     ratio = stream.sample_aspect_ratio
-    if ratio and abs(float(ratio) - 1.0) > MAX_STRETCH:
+    if ratio and abs(float(ratio) - 1.0) > max_stretch:
         raise InputError(
             str(path),
             expected="square pixels",

@@ -26,8 +26,6 @@ from worldpose.formats.annotations.programs import (
 
 Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
-MOST: Final = 1 << 28
-"""Maximum file size [bytes], about that of a hundred thousand people."""
 
 
 class _Codec(NamedTuple):
@@ -78,6 +76,7 @@ def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedIm
     Raises:
         InputError: the content is invalid; nothing is read.
     """
+    most = 1 << 28  # maximum file size [bytes], about that of a hundred thousand people
 
     def decode(content: bytes) -> list[AnnotatedImage]:
         pictures = _CODECS[form or detect_format(content)].decode(content)
@@ -87,4 +86,4 @@ def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedIm
 
     expected = " or ".join(codec.name for name, codec in _CODECS.items() if form in (None, name))
     todo = "Export it again from the annotator; docs/how-to/review.md says how."
-    return decode_file(path, MOST, decode, expected, todo)
+    return decode_file(path, most, decode, expected, todo)

@@ -28,8 +28,6 @@ from worldpose.formats.annotations.annotated_images import (
 )
 from worldpose.formats.annotations.programs import Answer, read_xml
 
-MAX_BYTES: Final = 1 << 26
-"""Maximum file size [bytes]."""
 _PAIRS: Final = re.compile(r"-?[0-9.]+(?:[eE][+-]?\d+)?,-?[0-9.]+(?:[eE][+-]?\d+)?")
 
 
@@ -63,6 +61,7 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
     Raises:
         InputError: the file has none of these forms, or no labelled point or line.
     """
+    max_bytes = 1 << 26  # maximum file size [bytes]
 
     def decode(content: bytes) -> list[MarkedImage]:
         begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
@@ -78,7 +77,7 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
 
     expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
     todo = "Export the clicks from the annotator in one of these forms."
-    return decode_file(path, MAX_BYTES, decode, expected, todo)
+    return decode_file(path, max_bytes, decode, expected, todo)
 
 
 def _read_cvat(content: bytes) -> Iterator[MarkedImage]:

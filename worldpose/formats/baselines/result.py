@@ -109,7 +109,6 @@ betas are not used here."""
 Place = Literal["transl", "pelvis", "mid_hip"]
 """Reference point of a position: `transl` is added to SMPL's joints; the others are points."""
 
-BODY_ANGLES: Final = 69
 _CHUNK: Final = 4096
 """Bodies posed per chunk: 50 MB."""
 
@@ -161,8 +160,9 @@ def pose_track(
     Raises:
         InputError: arrays of other shapes.
     """
+    body_angles = 69
     count = len(track.frames)
-    pose = np.zeros((count, BODY_ANGLES))
+    pose = np.zeros((count, body_angles))
     pose[:, : track.body_pose.shape[-1]] = track.body_pose
     betas = np.zeros((count, model.shapes))
     used = shape == ("open" if is_open_body(model.name) else "smpl") and track.betas is not None

@@ -8,7 +8,7 @@ correction of the cameras' gradient.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +17,6 @@ from worldpose.compiled import compile_kernel
 from worldpose.geometry.camera_model import STEP, observe, project_point
 from worldpose.geometry.lens_models import load_camera
 from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
-
-_ROUNDING: Final = 1e-10
-"""Share of a diagonal entry of a point's normal equations below which it is rounding error [1]:
-rays that meet at an angle under 2e-5 rad."""
 
 
 class PointObservations(NamedTuple):
@@ -215,9 +211,12 @@ def _factor(normal: Floats, damping: float) -> tuple[float, float, float, float,
 @compile_kernel
 def _pivot(left: float, whole: float) -> float:
     """Return the square root of a reduced diagonal entry, at least that of its rounding error."""
+    # Share of a diagonal entry of a point's normal equations below which it is rounding error
+    # [1]: rays that meet at an angle under 2e-5 rad.
+    rounding = 1e-10
     if whole <= 0.0:
         return 1.0
-    return float(np.sqrt(max(left, _ROUNDING * whole)))
+    return float(np.sqrt(max(left, rounding * whole)))
 
 
 @compile_kernel
