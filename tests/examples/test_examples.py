@@ -1,8 +1,11 @@
 """The scripts in examples/ do what they say, with the match and the run that other tests share."""
 
 import json
+import os
 import re
 import runpy
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -189,3 +192,41 @@ def test_a_detector_of_ones_own_gives_poses_that_an_import_takes(script, tmp_pat
     assert (overlap.max(axis=1) > 0.5).sum() >= 3  # of five: green and white kits look like pitch
     given = ("--calibration", match / "reference/calibration.toml", "--detections", poses)
     succeed("import", *given, "--fps", 25, "--out", tmp_path / "imported")
+
+
+FOV_LENS = """
+import numpy as np
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
+from worldpose.geometry.rigid import Rigid
+
+def camera(w):
+    lens = np.array([w, 0, 0, 0, 0, 0, 0, 0.0])
+    size, pixel = np.array([1920, 1080]), np.array([960.0, 540.0])
+    return Camera(np.array([900.0, 900.0]), pixel, lens, Rigid.identity(), size, LensModel.FOV)
+
+x, w = np.random.default_rng(0).uniform([-2, -1, 1], [2, 1, 3], (50, 3)), 0.9
+r = np.linalg.norm(x[:, :2] / x[:, 2:], axis=1, keepdims=True)
+bent = np.arctan(2.0 * r * np.tan(0.5 * w)) / (r * w)
+seen = camera(w).project_with_jacobians(x)
+np.testing.assert_allclose(seen.points_image, 900 * bent * x[:, :2] / x[:, 2:] + [960, 540])
+step = 1e-6
+by_w = (camera(w + step).project(x) - camera(w - step).project(x)) / (2 * step)
+np.testing.assert_allclose(seen.d_distortion[..., 0], by_w, atol=1e-5)
+for axis in range(3):
+    moved = step * np.eye(3)[axis]
+    by_x = (camera(w).project(x + moved) - camera(w).project(x - moved)) / (2 * step)
+    np.testing.assert_allclose(seen.d_points[..., axis], by_x, atol=1e-5)
+rays = camera(w).unproject(seen.points_image).directions
+np.testing.assert_allclose(rays, x / np.linalg.norm(x, axis=1, keepdims=True), atol=1e-12)
+"""
+
+
+def test_a_lens_model_of_ones_own_is_right_everywhere(tmp_path):
+    binary = shutil.ignore_patterns("__pycache__", "*.onnx", "*.safetensors")
+    for package in ("worldpose", "data_contracts"):
+        shutil.copytree(EXAMPLES.parent / package, tmp_path / package, ignore=binary)
+    subprocess.run(["git", "apply", EXAMPLES / "add_lens_model.patch"], cwd=tmp_path, check=True)
+    pure_python = {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(tmp_path)}
+    script = [sys.executable, "-c", FOV_LENS]
+    subprocess.run(script, cwd=tmp_path, env={**os.environ, **pure_python}, check=True)
