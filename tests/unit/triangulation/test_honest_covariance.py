@@ -99,8 +99,10 @@ def test_regions_hold_the_truth_of_one_clip():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["match", "penalty-box", "corner-kick"])
-def test_95_percent_of_clocks_lie_within_two_standard_errors(name):
+@pytest.mark.parametrize(
+    ("name", "fewest"), [("match", 60), ("penalty-box", 12), ("corner-kick", 60)]
+)
+def test_95_percent_of_clocks_lie_within_two_standard_errors(name, fewest):
     scenario, settings = SCENARIOS[name], TriangulationSettings()
     rig = scenario.rig.model_copy(update={"clock_std_frames": 0.7})
     scenario = scenario.model_copy(update={"duration": 3.0, "broadcast": None, "rig": rig})
@@ -113,7 +115,9 @@ def test_95_percent_of_clocks_lie_within_two_standard_errors(name):
         error = found.late[found.determined] - true + true.mean()
         deviations.append(error / found.standard_error[found.determined])
     deviations = np.concatenate(deviations)
-    # Cameras of a clip share its people: some 30 independent ones, sampling error 4 %.
-    assert len(deviations) > 60
-    assert 0.87 <= (np.abs(deviations) < 1.96).mean() <= 1.0
+    # In a penalty box people stand. Cameras of a clip share its people: some 30 independent ones of
+    # 60, sampling error 4 %.
+    assert len(deviations) > fewest
+    sampling_error = np.sqrt(0.05 * 0.95 / (0.5 * len(deviations)))
+    assert (np.abs(deviations) < 1.96).mean() >= 0.95 - 2.0 * sampling_error
     assert np.sqrt((deviations**2).mean()) < 1.3
