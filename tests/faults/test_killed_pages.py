@@ -96,8 +96,8 @@ class MortalServer:
     def start(self):
         last = self.lives.pop(0) if self.lives else -1
         arguments = (*self.arguments, last)
-        fork = multiprocessing.get_context("fork")
-        self.process = fork.Process(target=serve_and_die, args=arguments, daemon=True)
+        clean = multiprocessing.get_context("forkserver")
+        self.process = clean.Process(target=serve_and_die, args=arguments, daemon=True)
         self.process.start()
 
     def revive(self):

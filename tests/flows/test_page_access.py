@@ -280,6 +280,7 @@ def test_every_change_is_logged_with_who_and_what_came_of_it(project_copy, caplo
     ada = page_client.log_in(page_client.served(project_copy), "Ada")
     name, was = a_click(ada)
     preview = f"{MATCH}/pictures/cam03/preview"
+    caplog.clear()  # of the login, where another test has set the level
     with caplog.at_level(logging.INFO, logger="worldpose.pages"):
         ada.post(f"{MATCH}/corrections", json=moved(name, was, [was[0] + 1.0, was[1]]))
         ada.get(MATCH)
