@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
+from data_contracts.triangulation import CameraChange
 from flows.results.best_results import (
     PLANE,
     Origin,
@@ -75,6 +76,7 @@ from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run
 from worldpose.store.store import Store
+from worldpose.triangulation.camera_changes import move_on
 from worldpose.video.files import write_video
 
 LENS_ERRORS = "lens_errors.json"
@@ -106,14 +108,23 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
         )
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        inliers = placed_joints(origin.run, clip)["inliers"]
+        placed, frames = placed_joints(origin.run, clip), tracks.frames.astype(np.int64)
+        inliers = placed["inliers"]
+        changes = [CameraChange.model_validate(each) for each in placed.attrs["changes"]]
         for camera_id, camera in origin.static_cameras.items():
             dataset = coco_dataset(
                 camera_id,
                 camera,
                 tracks,
                 inliers.sel(camera=camera_id).values,
-                number=unit_frames(origin.spec, camera_id).numbers(tracks.frames.astype(np.int64)),
+                number=unit_frames(origin.spec, camera_id).numbers(frames),
+                move=partial(
+                    move_on,
+                    frame=frames,
+                    changes=[
+                        each for each in changes if each.camera == camera_id and each.kind == "view"
+                    ],
+                ),
             )
             path = (out if len(origin.clips) == 1 else out / clip) / f"{camera_id}.json"
             write_coco(path, dataset)

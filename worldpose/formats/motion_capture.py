@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +33,7 @@ def coco_dataset(
     observed: NDArray[np.bool_],
     *,
     number: NDArray[np.int64] | None = None,
+    move: Callable[[Floats], Floats] | None = None,
 ) -> dict[str, Any]:
     """Return the people of one static camera as a COCO keypoints data set.
 
@@ -49,11 +50,13 @@ def coco_dataset(
         observed: (frames, persons, 17), the camera's observation of the joint was an inlier.
         number: (frames,) the camera's own frame at each frame, not falling; of frames that it shows
             twice the first one counts. None = the match frames.
+        move: returns pixels (frames, persons, 17, 2) where the camera shows them, if its view
+            changes within the clip.
     """
     width, height = (int(n) for n in camera.image_size)
     frames, persons = tracks.joints.shape[:2]
     pixels = camera.project(tracks.joints.reshape(-1, 3)).reshape(frames, persons, 17, 2)
-    pixels = np.round(pixels, PIXEL_DECIMALS)
+    pixels = np.round(pixels if move is None else move(pixels), PIXEL_DECIMALS)
     within = (pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5)
     own_frames = (tracks.frames if number is None else number).tolist()
     is_first = np.diff(own_frames, prepend=-np.inf) > 0

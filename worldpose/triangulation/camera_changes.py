@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
+from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
 from worldpose.camera_consistency.changes import Change, Kind, find_changes, measure_step
@@ -228,9 +228,24 @@ def correct_window(
 
 def move_back(pixels: Floats, center: Floats, amount: Floats) -> Floats:
     """Return the pixels (..., 2) that a camera had shown before its view changed."""
-    x, y, zoom, roll = amount[:4]
-    turn = np.array([[1.0 + zoom, -roll], [roll, 1.0 + zoom]])
-    return np.asarray((pixels - center - (x, y)) @ np.linalg.inv(turn).T + center)
+    turn, shift = _view_motion(amount)
+    return np.asarray((pixels - center - shift) @ np.linalg.inv(turn).T + center)
+
+
+def move_on(pixels: Floats, frame: Integers, changes: Sequence[CameraChange]) -> Floats:
+    """Return the pixels (frames, ..., 2) of the unchanged camera where the changed one shows them.
+
+    They are missing where nothing explains the camera's views.
+    """
+    moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
+    for change in changes:
+        for row, part in enumerate(_shares(change, frame)):
+            turn, shift = _view_motion(part * _view_amount(change))
+            center = np.array(change.center_px)
+            moved[row] = (moved[row] - center) @ turn.T + center + shift
+        if change.is_left_out:
+            moved[_inside(change, frame)] = np.nan
+    return moved
 
 
 def correct_views(
@@ -239,21 +254,38 @@ def correct_views(
     """Return keypoints (frames, cameras, detections, points, 2) as unchanged cameras show them."""
     moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
     for change in changes:
-        c = list(cameras).index(change.camera)
-        after = frame - change.first_frame
-        inside = (after >= 0) & (after < change.frame_count)
-        if not change.is_explained:
-            moved[inside, c] = np.nan if change.is_left_out else moved[inside, c]
-            continue
-        gradual: Floats = np.asarray(after / max(1.0, change.frame_count - 1.0))
-        sudden = (frame >= (change.frame or 0)).astype(np.float64)
-        share = np.where(inside, gradual if change.frame is None else sudden, 0.0)
-        amount = np.array([*change.shift_px, change.zoom, change.roll_rad])
+        c, share = list(cameras).index(change.camera), _shares(change, frame)
         for part in np.unique(share[share > 0.0]):
-            rows = share == part
-            center = np.array(change.center_px)
-            moved[rows, c] = move_back(np.asarray(moved[rows, c]), center, part * amount)
+            rows, center = share == part, np.array(change.center_px)
+            amount = part * _view_amount(change)
+            moved[rows, c] = move_back(np.asarray(moved[rows, c]), center, amount)
+        if change.is_left_out:
+            moved[_inside(change, frame), c] = np.nan
     return moved
+
+
+def _view_motion(amount: Floats) -> tuple[Floats, Floats]:
+    """Return the matrix (2, 2) about the principal point and the shift (2,) of a view."""
+    x, y, zoom, roll = amount[:4]
+    return np.array([[1.0 + zoom, -roll], [roll, 1.0 + zoom]]), np.array([x, y])
+
+
+def _view_amount(change: CameraChange) -> Floats:
+    return np.array([*change.shift_px, change.zoom, change.roll_rad])
+
+
+def _inside(change: CameraChange, frame: Integers) -> Flags:
+    after = frame - change.first_frame
+    return np.asarray((after >= 0) & (after < change.frame_count))
+
+
+def _shares(change: CameraChange, frame: Integers) -> Floats:
+    """Return how much of a change match frames (n,) show; nothing if it explains nothing."""
+    share = (frame - change.first_frame) / max(1.0, change.frame_count - 1.0)
+    if change.frame is not None:
+        share = (frame >= change.frame).astype(np.float64)
+    known = _inside(change, frame) & change.is_explained
+    return np.where(known, share, 0.0)
 
 
 def describe_change(change: CameraChange) -> str:

@@ -14,6 +14,7 @@ from worldpose.triangulation.camera_changes import (
     correct_views,
     describe_change,
     explain_changes,
+    move_on,
     trace_clocks,
     triangulate_views,
 )
@@ -131,6 +132,17 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     corrected = correct_views(pixels, np.arange(10, 15), ("a", "b"), known)
     np.testing.assert_allclose(corrected[:, 1, 0, 0, 0], -np.array(moved), atol=1e-12)
     assert not corrected[:, 0].any()
+
+
+def test_a_changed_view_shows_what_is_taken_back_again():
+    moving = {"zoom": 0.03, "roll_rad": 0.01, "frame": None, "center_px": (9.0, 5.0)}
+    known, frame = [KNOCK.model_copy(update=moving)], np.arange(10, 15)
+    pixels = np.random.default_rng(1).uniform(0.0, 100.0, (5, 3, 17, 2))
+    shown = move_on(pixels, frame, known)
+    back = correct_views(shown[:, None], frame, ("b",), known)
+    np.testing.assert_allclose(back[:, 0], pixels, atol=1e-9)
+    assert np.linalg.norm(shown - pixels, axis=-1)[3].mean() > 1.0
+    np.testing.assert_allclose(shown[4], pixels[4], atol=1e-12)
 
 
 @pytest.mark.parametrize(
