@@ -172,12 +172,12 @@ class KeypointDetections(Generic[Array]):
 
     def reindex(self: KeypointDetections, frame: Integers) -> KeypointDetections:
         """Return the detections on exactly these rising frames (n,); missing frames are NaN."""
-        kept = self[np.flatnonzero(np.isin(self.frame, frame))]
-        row = np.searchsorted(frame, kept.frame)
+        kept = np.flatnonzero(np.isin(self.frame, frame))
+        row = np.searchsorted(frame, self.frame[kept])
         padded = {}
-        for name, array in kept.arrays().items():
+        for name, array in self.arrays().items():
             padded[name] = np.full((len(frame), *array.shape[1:]), np.nan, dtype=np.float32)
-            padded[name][row] = array
+            padded[name][row] = array[kept]
         return self.with_arrays(padded, frame)
 
     def arrays(self) -> dict[str, Array]:

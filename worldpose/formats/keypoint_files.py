@@ -187,37 +187,39 @@ def read_people(path: Path) -> PeopleFile:
     return read_coco_results(path)
 
 
-def read_observations(
-    path: str | os.PathLike[str], ranges: Sequence[tuple[int, int]] | None = None
-) -> KeypointDetections:
-    """Return the detections of one camera, dense over ranges of the camera's own frames.
+def read_observations(path: str | os.PathLike[str]) -> KeypointDetections:
+    """Return the detections of one camera, dense from the first to the last frame in the file.
+
+    Frames that the file lacks have no people.
 
     Args:
         path: a file or folder that `read_people` reads.
-        ranges: first frame and number of frames of each range, rising and disjoint; None = one
-            range, from the first to the last frame in the file. The result omits frames outside;
-            frames that the file lacks have no people.
 
     Raises:
-        InputError: the file is unreadable or invalid, or all people are outside the wanted frames;
-            the error names file and place.
+        InputError: the file is unreadable or invalid; the error names file and place.
     """
     path = Path(path)
-    return select_ranges(path, read_people(path).people, ranges)
+    people = read_people(path).people
+    first, stop = (int(people.frame[0]), int(people.frame[-1]) + 1) if len(people.frame) else (0, 0)
+    return on_frames(path, people, [(first, stop - first)])
 
 
 def select_ranges(
-    path: Path, people: KeypointDetections, ranges: Sequence[tuple[int, int]] | None
+    path: Path, people: KeypointDetections, ranges: Sequence[tuple[int, int]]
 ) -> KeypointDetections:
-    """Return the people of `path`, dense over ranges as in `read_observations`.
+    """Return the people of `path`, dense over ranges of the camera's own frames.
+
+    Frames outside are left out; frames that the file lacks have no people.
+
+    Args:
+        path: the file, for messages.
+        people: its people.
+        ranges: first frame and number of frames of each range, rising and disjoint.
 
     Raises:
-        InputError: all people are outside the wanted frames.
+        InputError: all people are outside the wanted frames, or these are too many.
     """
     seen = people.frame
-    if ranges is None:
-        first = int(seen[0]) if len(seen) else 0
-        return on_frames(path, people, [(first, int(seen[-1]) - first + 1 if len(seen) else 0)])
     if len(seen) and not any(((seen >= first) & (seen < first + n)).any() for first, n in ranges):
         wanted = [f"{first} to {first + count - 1}" for first, count in ranges]
         more = f" and {len(wanted) - 5} more ranges" if len(wanted) > 5 else ""

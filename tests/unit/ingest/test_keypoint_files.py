@@ -6,6 +6,8 @@ import pytest
 from worldpose.errors import InputError
 from worldpose.formats.keypoint_files import (
     read_observations,
+    read_people,
+    select_ranges,
     write_keypoint_arrays,
 )
 
@@ -30,7 +32,7 @@ def test_without_a_range_the_file_is_dense_from_its_first_to_its_last_frame(npz)
 
 def test_a_range_leaves_out_and_pads(npz):
     path, people = npz
-    read = read_observations(path, [(11, 6)])
+    read = select_ranges(path, read_people(path).people, [(11, 6)])
     np.testing.assert_array_equal(read.frame, np.arange(11, 17))
     np.testing.assert_array_equal(read.boxes[[0, 3]], people.boxes[1:])
     assert np.all(np.isnan(read.boxes[[1, 2, 4, 5]]))
@@ -39,7 +41,7 @@ def test_a_range_leaves_out_and_pads(npz):
 @pytest.mark.parametrize("first_frame", [0, 15, 2**40, -(10**30)])
 def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
     with pytest.raises(InputError, match="found frames 10 to 14") as caught:
-        read_observations(npz[0], [(first_frame, 5)])
+        select_ranges(npz[0], read_people(npz[0]).people, [(first_frame, 5)])
     assert "offset_frames" in caught.value.todo
 
 
@@ -47,4 +49,6 @@ def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
 def test_frames_beyond_belief_are_refused(tmp_path, first, count):
     (tmp_path / "empty.json").write_text("[]")
     with pytest.raises(InputError, match="frame numbers up to"):
-        read_observations(tmp_path / "empty.json", [(first, count)])
+        select_ranges(
+            tmp_path / "empty.json", read_people(tmp_path / "empty.json").people, [(first, count)]
+        )
