@@ -322,8 +322,8 @@ def describe_change(change: CameraChange) -> str:
     if change.frame is not None:
         when = f"moves at frame {change.frame}"
     return (
-        f"camera {camera} {when}, by {', '.join(parts)}: its views are corrected by that from the "
-        "people. Calibrate it anew for the rest, or cut the clip there"
+        f"camera {camera} {when}, by {', '.join(parts)}: the people tell how, and its views are "
+        "corrected by that. Calibrate it anew for more accuracy, or cut the clip there"
     )
 
 
