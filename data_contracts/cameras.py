@@ -32,7 +32,7 @@ COEFFICIENTS: Final[dict[LensName, tuple[str, ...]]] = {
 
 
 class _Lens(Record):
-    """What the records of cameras and of lenses share."""
+    """Fields that the records of cameras and of lenses share."""
 
     id: Name
     image_size: tuple[ImageLength, ImageLength]

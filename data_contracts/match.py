@@ -37,6 +37,8 @@ TEAM_SIZE: Final = 11
 
 def _one_error(value: object, read: ValidatorFunctionWrapHandler) -> object:
     """Return the value as read; of its two forms, an error names both at once."""
+    if isinstance(value, list):  # here also strict rules see Python's lists, of a JSON file
+        value = tuple(tuple(pair) if isinstance(pair, list) else pair for pair in value)
     try:
         return read(value)
     except ValidationError as error:

@@ -42,7 +42,7 @@ class CameraChange(Record):
     late_frames: Number = 0.0
     """How much later its images are than before [frame]."""
     std: Amount | None
-    """Standard deviation of the displacement [px] or of the lateness [frame]; None if unknown."""
+    """Standard deviation of the displacement [px] or of `late_frames`; None if unknown."""
     is_explained: bool = True
     """Whether this change explains its images."""
     is_left_out: bool = False

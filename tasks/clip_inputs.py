@@ -20,7 +20,7 @@ from data_contracts.triangulation import CameraChange
 from tasks.unit import UnitInputs
 from worldpose.filtering.feedback import Feedback, align_results, apply_feedback
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.ingest.clock import lateness
+from worldpose.ingest.clock import remaining_offset
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.static_calibration.venue import Venue, join_cameras
@@ -288,7 +288,7 @@ def open_tracked_clip(
     tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
     people = clip.detections.assign_people(tracks["detection_index"].values)
     if "clocks" in inputs.sources:
-        clocks = [lateness(inputs.frames, *clock) for clock in inputs.sources["clocks"]]
+        clocks = [remaining_offset(inputs.frames, *clock) for clock in inputs.sources["clocks"]]
         people = _on_match_clock(people, np.stack(clocks, axis=1))
     return replace(clip, detections=people, person=tracks["person"].values)
 

@@ -65,7 +65,7 @@ def _write_joints(
 ) -> None:
     """Triangulate every `stride`-th frame of the unit's clip in chunks, and write the joints.
 
-    Changes of cameras of these kinds are looked for; those that are known stay recorded.
+    The task searches for changes of cameras of these kinds, and keeps those that are known.
     """
     clip = open_tracked_clip(inputs)
     detections, covariance = clip.detections, camera_errors(inputs, clip)
@@ -87,19 +87,7 @@ def _write_joints(
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
         known = known_changes(inputs, inputs.unit)
-        found = _find_changes(clip, health, kinds, settings, rows)
-        if len(clip.camera_ids) > 2:
-            result.warnings += [f"{describe_change(change)}." for change in found]
-            for change in found:
-                if change.kind == "clock":
-                    result.figures[CLOCK_CHANGE + change.camera] = change.late_frames
-        elif found:
-            result.warnings.append(
-                f"cameras {' and '.join(clip.camera_ids)} cease to agree at frame "
-                f"{found[0].frame or found[0].first_frame}: one of them moved, or its clock "
-                "changed. Two cameras cannot tell which."
-            )
-            found = []
+        found = _find_changes(clip, health, kinds, settings, rows, result)
         result.write(
             layout,
             arrays=spool.arrays()
@@ -139,20 +127,32 @@ def _find_changes(
     kinds: tuple[Kind, ...],
     settings: TriangulationSettings,
     rows: NDArray[np.int64],
+    result: ResultWriter,
 ) -> list[CameraChange]:
-    """Return the clearest change of a camera within the clip, if there is one."""
+    """Return the clearest change of a camera within the clip, if there is one, and warn of it."""
     fps = clip.fps * len(rows) / max(1, len(clip.detections.frame))
     found = [
         replace(change, row=int(rows[change.row])) for change in find_changes(health, fps, kinds)
     ]
     if not found:
         return []
-    measured = explain_changes(clip.cameras, clip.detections, clip.fps, settings, found)
+    if len(clip.camera_ids) < 3:
+        when = f"at frame {clip.detections.frame[found[0].row]}" if found[0].is_sudden else "slowly"
+        result.warnings.append(
+            f"cameras {' and '.join(clip.camera_ids)} cease to agree {when}: one of them moved, or "
+            "its clock changed. Two cameras cannot tell which."
+        )
+        return []
+    measured = explain_changes(clip.cameras, clip.detections, clip.fps, settings, found, kinds)
     if measured is None:
         return []
     center = clip.cameras[measured.found.camera].principal_point
     camera = clip.camera_ids[measured.found.camera]
-    return [change_record(measured, camera, center, clip.detections.frame)]
+    change = change_record(measured, camera, center, clip.detections.frame)
+    result.warnings.append(f"{describe_change(change)}.")
+    if change.kind == "clock":
+        result.figures[CLOCK_CHANGE + camera] = change.late_frames
+    return [change]
 
 
 def camera_errors(inputs: UnitInputs, clip: ClipInputs) -> NDArray[np.float64] | None:

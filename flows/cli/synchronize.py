@@ -89,8 +89,6 @@ def synchronize(
         apply: Write the proposed offset_frames into match.yaml.
     """
     from worldpose.reports.drawing import draw_synchronization, require_plot
-    from worldpose.triangulation.camera_changes import trace_clocks
-    from worldpose.triangulation.synchronization import synchronize as estimate
 
     if plot is not None:
         require_plot(plot)
@@ -105,23 +103,9 @@ def synchronize(
         record = run_match(store, opened, request)
     cameras, names, detections = load_clip(Run(store, record), opened, chosen_clip)
     pitch = opened.folder.pitch
-    found = estimate(
-        cameras,
-        detections,
-        spec.fps,
-        max_offset_s=max_offset,
-        pitch=None if pitch is None else PitchTemplate.from_spec(pitch),
-    )
+    template = None if pitch is None else PitchTemplate.from_spec(pitch)
+    found, courses = _find_clocks(cameras, detections, spec.fps, max_offset, template)
     known = np.isfinite(found.late)
-    courses: list[Course] = [[(0, float(late))] for late in found.late]
-    size = None if pitch is None else (pitch.length, pitch.width)
-    for group in (np.array(each) for each in found.groups if len(each) > 2):
-        arrays = {name: array[:, group] for name, array in detections.arrays().items()}
-        some = detections.with_arrays(arrays, detections.frame)
-        late = found.late[group]
-        traced = trace_clocks(cameras[group], some, spec.fps, late, pitch_size=size)
-        for c, course in zip(group.tolist(), traced, strict=True):
-            courses[c] = course
     clip_spec = spec.clip(chosen_clip)
     rows = [_propose(spec, clip_spec, names, courses, c, found) for c in range(len(names))]
     apart = [", ".join(names[c] for c in group) for group in found.groups]
@@ -149,6 +133,40 @@ def synchronize(
             to=errors,
         )
     raise typer.Exit(0 if known.all() and len(apart) == 1 else 4)
+
+
+def _find_clocks(
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    max_offset_s: float,
+    pitch: PitchTemplate | None,
+) -> tuple[Synchronization, list[Course]]:
+    """Return the constant offsets of all cameras, and their offsets over the clip."""
+    from worldpose.triangulation.camera_changes import shift_by_courses, trace_clocks
+    from worldpose.triangulation.synchronization import synchronize as estimate
+
+    size = None if pitch is None else (pitch.length, pitch.width)
+    found = estimate(cameras, detections, fps, max_offset_s=max_offset_s, pitch=pitch)
+    courses: list[Course] = [[(0, float(late))] for late in found.late]
+    for group in (np.array(each) for each in found.groups if len(each) > 2):
+        arrays = {name: array[:, group] for name, array in detections.arrays().items()}
+        some = detections.with_arrays(arrays, detections.frame)
+        traced = trace_clocks(cameras[group], some, fps, found.late[group], pitch_size=size)
+        for c, course in zip(group.tolist(), traced, strict=True):
+            courses[c] = course
+    if np.isfinite(found.late).all() or len(courses) < 3:
+        return found, courses
+    # One clock that changes can hide the offsets of all others.
+    traced = trace_clocks(cameras, detections, fps, np.nan_to_num(found.late), pitch_size=size)
+    corrected, _ = shift_by_courses(detections, traced)
+    again = estimate(cameras, corrected, fps, max_offset_s=max_offset_s, pitch=pitch)
+    if np.isfinite(again.late).sum() <= np.isfinite(found.late).sum():
+        return found, courses
+    return again, [
+        [(row, value + float(late)) for row, value in course]
+        for course, late in zip(traced, again.late, strict=True)
+    ]
 
 
 def _propose(

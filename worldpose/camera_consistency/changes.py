@@ -60,7 +60,7 @@ def find_changes(
 
 
 def _find(health: CameraHealth, c: int, kind: Kind, fps: float) -> Iterator[Change]:
-    min_gain = 60.0
+    min_gain = 30.0
     # Of the clock [frame]; of the view [px], 2 cm at people. The camera's own share in the people
     # hides up to a half of a change.
     scale = health.scale[c, 0] / max(1.0, health.scale[c, 1])
@@ -166,7 +166,7 @@ def measure_step(
 ) -> tuple[Floats, float, float]:
     """Return the change (5,) with weights (bins,), the standard deviation of its size, and a rest.
 
-    The rest is the lateness of a changed clock where the weights are 0 [frame].
+    The rest is the offset of a changed clock where the weights are 0 [frame].
     """
     matrix, right = health.matrix[:, found.camera], health.right[:, found.camera]
     changing = [4] if found.kind == "clock" else [0, 1, 2, 3]

@@ -6,7 +6,7 @@ image moves by v per frame, as
     x - p = s + z q + r q' + l v + noise,
 
 with q = p less the principal point, and q' = q turned by 90 degrees: a shift s [px] and a roll r
-[rad] of a camera that was knocked, a zoom z [1], and a clock that is l frames late. Each bin of
+[rad] of a camera that was knocked, a zoom z [1], and a clock offset l [frame]. Each bin of
 frames has the normal equations of (s, z, r, l); `changes` finds where the solution changes.
 """
 
@@ -23,7 +23,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
 
 UNKNOWNS: Final = 5
-"""Shift along x and y [px], zoom [1], roll [rad], lateness [frame]."""
+"""Shift along x and y [px], zoom [1], roll [rad], clock offset [frame]."""
 LIMBS: Final = slice(5, 17)
 """Joints that are compared: those of the face move little and are often hidden."""
 
@@ -37,8 +37,6 @@ class CameraHealth:
         every: of this many frames, one is compared.
         matrix: (bins, cameras, 5, 5) normal matrices.
         right: (bins, cameras, 5) right-hand sides.
-        matched: (bins, cameras) detections of tracked people.
-        seen: (bins, cameras) all detections.
         scale: (cameras, 2) sum of the image scale at people [px/m], and number of terms.
         cost: (cameras,) sum of the robust loss of departures [1].
     """
@@ -47,8 +45,6 @@ class CameraHealth:
     every: int
     matrix: Floats
     right: Floats
-    matched: Floats
-    seen: Floats
     scale: Floats
     cost: Floats
 
@@ -60,8 +56,7 @@ class CameraHealth:
         every = length if frames * cameras * persons > 50_000 else 1
         shape = (-(-frames // length), cameras)
         matrix, right = np.zeros((*shape, UNKNOWNS, UNKNOWNS)), np.zeros((*shape, UNKNOWNS))
-        zeros = np.zeros(shape), np.zeros(shape), np.zeros((cameras, 2)), np.zeros(cameras)
-        return cls(length, every, matrix, right, *zeros)
+        return cls(length, every, matrix, right, np.zeros((cameras, 2)), np.zeros(cameras))
 
     def add(self, cameras: Camera, people: KeypointDetections, joints: Floats, start: int) -> None:
         """Add a chunk of a clip; its first and last frame give velocities only.
@@ -80,14 +75,10 @@ class CameraHealth:
         points = np.stack([joints[rows + step][:, :, LIMBS] for step in (-1, 0, 1)])
         index = people.detection_index[rows]
         for c in range(index.shape[1]):
-            slot, found = index[:, c], people.keypoints[rows, c]
-            there = slot >= 0
-            seen = np.isfinite(found[..., 0]).any(axis=-1).sum(axis=1)
-            np.add.at(self.seen[:, c], bins, seen)
-            np.add.at(self.matched[:, c], bins, there.sum(axis=1))
-            frame, person = np.nonzero(there)
+            slot = index[:, c]
+            frame, person = np.nonzero(slot >= 0)
             if len(frame):
-                pixels = found[frame, slot[frame, person]][:, LIMBS]
+                pixels = people.keypoints[rows[frame], c, slot[frame, person]][:, LIMBS]
                 self._add_departures(c, cameras[c], bins[frame], pixels, points[:, frame, person])
 
     def _add_departures(

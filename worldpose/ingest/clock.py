@@ -58,7 +58,7 @@ def camera_frames(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> In
     return np.floor(exact_frames(frame, offset, rate) + 0.5).astype(np.int64)
 
 
-def lateness(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Floats:
+def remaining_offset(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Floats:
     """Return how much later than the match frames (n,) their camera frames are [match frame]."""
     exact = exact_frames(frame, offset, rate)
     return np.asarray((np.floor(exact + 0.5) - exact) / rate)

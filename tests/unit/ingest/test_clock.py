@@ -1,4 +1,4 @@
-"""Which frame of a camera shows a match frame, by the offset and the rate of its clock."""
+"""The frame of a camera that shows a match frame, by its clock's offset and rate."""
 
 from dataclasses import replace
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from data_contracts.match import CameraSpec
-from worldpose.ingest.clock import camera_frames, lateness, simplest_offset
+from data_contracts.match import CameraSpec, MatchSpec
+from worldpose.ingest.clock import camera_frames, remaining_offset, simplest_offset
 from worldpose.ingest.footage import UnitFrames
+from worldpose.ingest.validation import validate_record
 
 FRAME = np.arange(8)
 
@@ -28,7 +29,7 @@ def test_a_match_frame_has_its_nearest_camera_frame(offset, rate, shown):
 
 def test_the_rest_is_how_much_later_the_camera_frame_is():
     # Exact frames are 0, 1.5, 3, 4.5, 6 at a rate of 1.5 frames per match frame.
-    assert lateness(FRAME[:5], 0, 1.5) == pytest.approx([0, 1 / 3, 0, 1 / 3, 0])
+    assert remaining_offset(FRAME[:5], 0, 1.5) == pytest.approx([0, 1 / 3, 0, 1 / 3, 0])
 
 
 def test_people_of_a_fast_camera_lie_on_match_frames(make_people, tmp_path):
@@ -64,3 +65,11 @@ def test_an_offset_that_cannot_be_read_is_refused(offset, kind, told):
 )
 def test_offsets_are_written_as_simply_as_they_are(frame, exact, written):
     assert simplest_offset(np.array(frame), np.array(exact)) == written
+
+
+def test_pairs_are_read_from_match_yaml(tmp_path):
+    camera = {"id": "a", "width": 9, "height": 9, "offset_frames": [[61, 0], [62, -4.0]]}
+    clip = {"id": "clip", "frame_count": 3}
+    spec = {"contract": 1, "match_id": "m", "fps": 25, "cameras": [camera], "clips": [clip]}
+    read = validate_record(MatchSpec, spec, "match.yaml")
+    assert read.cameras[0].offset_frames == ((61, 0.0), (62, -4.0))

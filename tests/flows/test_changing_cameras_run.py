@@ -1,0 +1,107 @@
+"""Matches without truth whose camera is knocked or loses frames, from import to export."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from camera_builders import look_at_camera
+from command_line import succeed
+
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.formats.joints_file import read_joints
+
+FRAMES, FPS, BAD = 125, 25, "cam2"
+KNOCK = np.array([25.0, -12.0])
+
+
+@pytest.fixture(scope="module")
+def joints(tiny):
+    """Two people (frames, 2, 17, 3) [m] who walk on circles."""
+    body = read_joints(tiny / "reference" / "joints.npz").joints[0, :2]
+    body = body - body.mean(axis=1, keepdims=True) * [1.0, 1.0, 0.0]
+    time = np.arange(FRAMES + 10)[:, None] / FPS + [0.0, 2.0]
+    way = 2.0 * np.stack([np.cos(time), np.sin(time), 0.0 * time], axis=-1)
+    return body + way[:, :, None]
+
+
+@pytest.fixture
+def imported(server, joints, tmp_path):
+    """Returns what imports a match whose bad camera's pixels (frames, 2, 17, 2) are changed."""
+
+    def build(spoil):
+        rng, records = np.random.default_rng(0), {}
+        (tmp_path / "poses").mkdir()
+        for turn in range(4):
+            name, angle = f"cam{turn}", 0.5 * np.pi * turn + 0.3
+            place = [10.0 * np.cos(angle), 10.0 * np.sin(angle), 3.0]
+            camera = look_at_camera(place, [0.0, 0.0, 1.0], 1000.0)
+            records[name] = camera.to_calibration(name)
+            pixels = camera.project(joints.reshape(-1, 3)).reshape(*joints.shape[:3], 2)
+            pixels += rng.normal(0.0, 1.0, pixels.shape)
+            pixels = (spoil(pixels) if name == BAD else pixels)[:FRAMES]
+            people = [
+                {
+                    "image_id": int(frame),
+                    "category_id": 1,
+                    "keypoints": np.insert(one, 2, 0.9, axis=-1).ravel().round(3).tolist(),
+                    "score": 0.9,
+                }
+                for frame in range(FRAMES)
+                for one in pixels[frame]
+            ]
+            (tmp_path / "poses" / f"{name}.json").write_text(json.dumps(people))
+        write_calibration_toml(tmp_path / "calibration.toml", records)
+        given = ("--calibration", tmp_path / "calibration.toml", "--detections", tmp_path / "poses")
+        succeed("import", *given, "--fps", FPS, "--out", tmp_path / "match")
+        return tmp_path / "match"
+
+    return build
+
+
+def run(match, joints):
+    """What a run up to triangulation warns of, and its mean joint error [mm]."""
+    project = match.parent / "project"
+    said = succeed("run", match, "--project", project, "--until", "retriangulation")
+    out = match.parent / "out"
+    forms = ("--format", "joints", "--format", "coco")
+    succeed("export", "match", *forms, "--project", project, "--out", out)
+    found = read_joints(out / "joints.npz").joints
+    apart = np.linalg.norm(found[:, :, None] - joints[:FRAMES, None], axis=-1).mean(axis=-1)
+    return said.err + said.out, 1000.0 * np.nanmean(np.nanmin(apart, axis=2))
+
+
+def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(imported, joints):
+    def knock(pixels):
+        return np.concatenate([pixels[:60], pixels[60:] + KNOCK])
+
+    match = imported(knock)
+    said, error = run(match, joints)
+    assert "camera cam2 moves at frame 60, by 28 px" in said
+    assert error < 11.5  # 10.5 mm; 10.3 without the knock
+    given = json.loads((match.parent / "poses/cam2.json").read_text())
+    written = json.loads((match.parent / "out/cam2.json").read_text())["annotations"]
+    for frame in (30, 100):
+        seen, shown = (
+            np.array([np.reshape(p["keypoints"], (17, 3)) for p in each if p["image_id"] == frame])
+            for each in (given, written)
+        )
+        apart = np.linalg.norm(shown[:, None, :, :2] - seen[None, :, :, :2], axis=-1)
+        assert apart.mean(axis=-1).min(axis=1).max() < 3.0
+
+
+def test_lost_frames_are_named_and_synchronized(imported, joints):
+    match = imported(lambda pixels: np.concatenate([pixels[:60], pixels[64:]]))
+    said, error = run(match, joints)
+    assert "camera cam2: its offset changes by -4.0 frames at frame 60" in said
+    project = ("--project", match.parent / "project")
+    applied = succeed("synchronize", match, "--apply", "--json", *project).json["applied"]
+    assert list(applied) == [BAD]
+    cameras = yaml.safe_load((match / "match.yaml").read_text())["cameras"]
+    (before, first), (after, last) = cameras[2]["offset_frames"]
+    assert (first, last) == (0, -4)
+    assert after == before + 1
+    assert abs(after - 60) <= 5
+    said, corrected = run(match, joints)
+    assert "camera cam2" not in said
+    assert corrected < 11.5 < error  # 10.5 and 36.8 mm
