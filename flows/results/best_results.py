@@ -113,7 +113,7 @@ def describe_later_run(store: Store, record: RunRecord) -> str:
 
 
 def clip_title(clip: str) -> str:
-    """Return a clip's heading."""
+    """Return the heading of a clip or a broadcast view."""
     return "The clip" if clip == "clip" else f"Clip {clip}"
 
 
@@ -332,8 +332,8 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     return fitted_model(run, fits), poses, fits["person"].values
 
 
-def broadcast_camera(run: Run, clip: str) -> Camera:
-    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
+def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
 
     Raises:
         InputError: the run has no such camera.
@@ -342,15 +342,33 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
         "choose another format."
     )
-    require_result(run, f"broadcast_calibration/{clip}", todo)
+    views = broadcast_views(run, clip)
+    if not views:
+        require_result(run, f"broadcast_calibration/{clip}", todo)
     bodies = bodies_unit(run, clip)
-    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
-    return camera_in_frames(run, clip, frames)
+    frames = {view: run[bodies if bodies in run else broadcast_unit(run, view)] for view in views}
+    return {view: camera_in_frames(run, view, frames[view]["frame"].values) for view in views}
 
 
-def camera_in_frames(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
-    """Return the moving camera of a clip in these match frames, NaN where it is unknown."""
-    found = run[broadcast_unit(run, clip)]
+def moving_cameras(run: Run, clip: str, frames: NDArray[np.int64]) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in these match frames, by their names in files.
+
+    The name is `broadcast`, or that of the view if the clip has several.
+    """
+    views = broadcast_views(run, clip)
+    names = views if len(views) > 1 else ["broadcast"][: len(views)]
+    found = (camera_in_frames(run, view, frames) for view in views)
+    return dict(zip(names, found, strict=True))
+
+
+def clip_of(run: Run, view: str) -> str:
+    """Return the clip of a broadcast view with a calibrated camera."""
+    return str(run[f"broadcast_calibration/{view}"].attrs["clip_id"])
+
+
+def camera_in_frames(run: Run, view: str, frames: NDArray[np.int64]) -> Camera:
+    """Return the camera of a broadcast view in these match frames, NaN where it is unknown."""
+    found = run[broadcast_unit(run, view)]
     by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
     arrays = by_frame.reindex(frame=frames).data_vars
     return camera_from_arrays({**arrays, "image_size": found["image_size"]})
@@ -453,14 +471,17 @@ def estimated_pitch(
 ) -> PitchSpec | None:
     """Return the pitch with the surface that a run estimated, for drawing; None without a pitch.
 
-    The pitch is that of the clip's broadcast camera, if it estimated one; otherwise crown and end
-    fall are those that the static cameras show together.
+    The pitch is that of the clip's broadcast camera, if it estimated one, and of several that of
+    the smallest deviation; otherwise crown and end fall are those that the static cameras show
+    together. In place of the clip, the name of one broadcast view is possible.
     """
     if pitch is None:
         return None
-    seen = f"broadcast_calibration/{clip}"
-    found = run[seen].attrs["pitch"] if clip is not None and seen in run else None
-    if found is not None:
+    views = [] if clip is None else broadcast_views(run, clip)
+    stated = [run[f"broadcast_calibration/{view}"].attrs["pitch"] for view in views]
+    estimated = [each for each in stated if each is not None]
+    if estimated:
+        found = min(estimated, key=lambda each: sum(each["std_m"]))
         names = ("length", "width", "crown", "end_fall", "points")
         sizes = {name: found[name] for name in names if name in found}
         given = pitch.model_dump(mode="json") | sizes
@@ -477,16 +498,22 @@ def estimated_pitch(
     return pitch.model_copy(update={"crown": surface[0], "end_fall": surface[1]})
 
 
-def broadcast_cameras(run: Run) -> dict[str, Camera]:
-    """Return the broadcast camera of every calibrated clip, a batch (frames,), by clip."""
+def broadcast_views(run: Run, clip: str | None = None) -> list[str]:
+    """Return the broadcast views whose camera a run calibrated, of one clip or view if given."""
+    stage = "broadcast_calibration/"
+    views = [name.removeprefix(stage) for name in run if name.startswith(stage)]
+    return [view for view in views if clip is None or clip in (view, clip_of(run, view))]
+
+
+def broadcast_cameras(run: Run, clip: str | None = None) -> dict[str, Camera]:
+    """Return the cameras (frames,) of `broadcast_views`."""
     return {
-        clip: camera_from_arrays(run[broadcast_unit(run, clip)].data_vars)
-        for stage, _, clip in (name.partition("/") for name in run)
-        if stage == "broadcast_calibration"
+        view: camera_from_arrays(run[broadcast_unit(run, view)].data_vars)
+        for view in broadcast_views(run, clip)
     }
 
 
-def broadcast_unit(run: Run, clip: str) -> str:
-    """Return the name of a clip's best broadcast camera, as `stage/unit`."""
-    pooled = f"broadcast_pooling/{clip}"
-    return pooled if pooled in run else f"broadcast_calibration/{clip}"
+def broadcast_unit(run: Run, view: str) -> str:
+    """Return the name of a view's best broadcast camera, as `stage/unit`."""
+    pooled = f"broadcast_pooling/{view}"
+    return pooled if pooled in run else f"broadcast_calibration/{view}"
