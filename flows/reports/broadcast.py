@@ -13,12 +13,10 @@ from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.reports.match_pictures import shown_pitch
 from flows.results.best_results import (
     body_tracks,
-    broadcast_cameras,
-    broadcast_unit,
-    clip_of,
     clip_title,
     joint_tracks,
 )
+from flows.results.broadcast_views import broadcast_cameras, broadcast_unit, clip_of
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration.report import camera_before

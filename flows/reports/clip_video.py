@@ -17,11 +17,11 @@ from flows.reports.broadcast import (
 from flows.reports.match_pictures import frame_pictures, shown_pitch
 from flows.results.best_results import (
     body_tracks,
-    broadcast_views,
     joint_tracks,
     placed_joints,
     static_cameras,
 )
+from flows.results.broadcast_views import broadcast_views
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.videos import overlay_frames

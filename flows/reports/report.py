@@ -28,14 +28,13 @@ from flows.reports.clips import clip_pictures, detection_pictures, disagreement_
 from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
 from flows.results.best_results import (
-    broadcast_cameras,
-    broadcast_views,
     clip_positions,
     clips_of,
     joint_tracks,
     open_results,
     static_cameras,
 )
+from flows.results.broadcast_views import broadcast_cameras, broadcast_views
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match

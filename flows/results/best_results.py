@@ -15,6 +15,12 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Track
+from flows.results.broadcast_views import (
+    BROADCAST,
+    broadcast_unit,
+    broadcast_views,
+    camera_in_frames,
+)
 from flows.stage import Match
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel, BodyParameters
@@ -342,36 +348,18 @@ def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
         "choose another format."
     )
-    views = broadcast_views(run, clip)
-    if not views:
-        require_result(run, f"broadcast_calibration/{clip}", todo)
+    views = broadcast_views(run, clip) or [require_result(run, f"{BROADCAST}{clip}", todo)]
     bodies = bodies_unit(run, clip)
-    frames = {view: run[bodies if bodies in run else broadcast_unit(run, view)] for view in views}
-    return {view: camera_in_frames(run, view, frames[view]["frame"].values) for view in views}
+    frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
+    return {view: camera_in_frames(run, view, frames) for view in views}
 
 
 def moving_cameras(run: Run, clip: str, frames: NDArray[np.int64]) -> dict[str, Camera]:
-    """Return the moving cameras of a clip in these match frames, by their names in files.
-
-    The name is `broadcast`, or that of the view if the clip has several.
-    """
+    """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone."""
     views = broadcast_views(run, clip)
-    names = views if len(views) > 1 else ["broadcast"][: len(views)]
+    names = views if len(views) > 1 else ["broadcast"] * len(views)
     found = (camera_in_frames(run, view, frames) for view in views)
     return dict(zip(names, found, strict=True))
-
-
-def clip_of(run: Run, view: str) -> str:
-    """Return the clip of a broadcast view with a calibrated camera."""
-    return str(run[f"broadcast_calibration/{view}"].attrs["clip_id"])
-
-
-def camera_in_frames(run: Run, view: str, frames: NDArray[np.int64]) -> Camera:
-    """Return the camera of a broadcast view in these match frames, NaN where it is unknown."""
-    found = run[broadcast_unit(run, view)]
-    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
-    arrays = by_frame.reindex(frame=frames).data_vars
-    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
 
 def require_result(run: Run, unit: str, todo: str) -> str:
@@ -471,16 +459,14 @@ def estimated_pitch(
 ) -> PitchSpec | None:
     """Return the pitch with the surface that a run estimated, for drawing; None without a pitch.
 
-    The pitch is that of the clip's broadcast camera, if it estimated one, and of several that of
-    the smallest deviation; otherwise crown and end fall are those that the static cameras show
-    together. In place of the clip, the name of one broadcast view is possible.
+    The pitch is that of the clip's (or the view's) broadcast camera that knows it best, if one
+    estimated it; otherwise crown and end fall are those that the static cameras show together.
     """
     if pitch is None:
         return None
     views = [] if clip is None else broadcast_views(run, clip)
-    stated = [run[f"broadcast_calibration/{view}"].attrs["pitch"] for view in views]
-    estimated = [each for each in stated if each is not None]
-    if estimated:
+    stated = (run[f"{BROADCAST}{view}"].attrs["pitch"] for view in views)
+    if estimated := [each for each in stated if each is not None]:
         found = min(estimated, key=lambda each: sum(each["std_m"]))
         names = ("length", "width", "crown", "end_fall", "points")
         sizes = {name: found[name] for name in names if name in found}
@@ -496,24 +482,3 @@ def estimated_pitch(
         return pitch
     # Not validated: an estimated crown may be slightly negative.
     return pitch.model_copy(update={"crown": surface[0], "end_fall": surface[1]})
-
-
-def broadcast_views(run: Run, clip: str | None = None) -> list[str]:
-    """Return the broadcast views whose camera a run calibrated, of one clip or view if given."""
-    stage = "broadcast_calibration/"
-    views = [name.removeprefix(stage) for name in run if name.startswith(stage)]
-    return [view for view in views if clip is None or clip in (view, clip_of(run, view))]
-
-
-def broadcast_cameras(run: Run, clip: str | None = None) -> dict[str, Camera]:
-    """Return the cameras (frames,) of `broadcast_views`."""
-    return {
-        view: camera_from_arrays(run[broadcast_unit(run, view)].data_vars)
-        for view in broadcast_views(run, clip)
-    }
-
-
-def broadcast_unit(run: Run, view: str) -> str:
-    """Return the name of a view's best broadcast camera, as `stage/unit`."""
-    pooled = f"broadcast_pooling/{view}"
-    return pooled if pooled in run else f"broadcast_calibration/{view}"

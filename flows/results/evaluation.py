@@ -11,13 +11,13 @@ from data_contracts.match import MatchSpec
 from data_contracts.run import JOINT_STAGES
 from flows.registering import find_match
 from flows.results.best_results import (
-    broadcast_cameras,
     clips_of,
     describe_later_run,
     joint_tracks,
     open_results,
     static_cameras,
 )
+from flows.results.broadcast_views import broadcast_cameras
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (

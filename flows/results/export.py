@@ -21,7 +21,6 @@ from flows.results.best_results import (
     PLANE,
     Origin,
     bodies_unit,
-    broadcast_views,
     clip_positions,
     estimated_pitch,
     filmed_cameras,
@@ -30,6 +29,7 @@ from flows.results.best_results import (
     person_kinds,
     placed_joints,
 )
+from flows.results.broadcast_views import broadcast_views
 from flows.results.outputs import (
     RELEASE,
     VIEWER_SUFFIX,

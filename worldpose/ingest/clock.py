@@ -143,9 +143,10 @@ class ImageClock:
 
         They are linear between two images, or `whole` those of the nearest one.
         """
-        count = len(values)
-        time = np.arange(count) + self.late + late
+        frame = np.arange(len(values))
         _, row = np.unique(self.number, return_index=True)
-        times = [time[0] - 1.0, *time[row], time[-1] + 1.0]
-        at = np.interp(np.arange(count), times, [-1, *row, count], left=np.nan, right=np.nan)
-        return rows_at(values, np.floor(at + 0.5) if whole else at)
+        time = (frame + self.late + late)[row]
+        times = [time[0] - 1.0 / self.rate, *time, time[-1] + 1.0 / self.rate]
+        places = np.arange(-1.0, len(row) + 1.0)
+        at = np.interp(frame, times, places, left=np.nan, right=np.nan)
+        return rows_at(values[row], np.floor(at + 0.5) if whole else at)
