@@ -28,6 +28,7 @@ from data_contracts.records import (
     ImageLength,
     Name,
     PersonId,
+    Positive,
     Record,
 )
 
@@ -127,6 +128,9 @@ class ClipSpec(Record):
     broadcast_offset_frames: CameraOffsets = 0.0
     """Frame of the broadcast clip's own video at the clip's first frame; of several broadcast
     cameras a mapping from each camera to its number."""
+    broadcast_smooth_weight: Positive = 1.0
+    """Factor on the smoothness of focal length and distortion of the clip's broadcast cameras [1],
+    whose own weight comes from the video."""
     people: dict[PersonId, Name] = {}
     """Person ids of the clip's tracks, with their ids in the roster, where known."""
 

@@ -94,6 +94,7 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
             where=file,
             first=start,
             proposed="side" in sources,
+            smooth_weight=sources.get("smooth", 1.0),
         ),
         inputs.settings(BroadcastCalibrationSettings),
     )

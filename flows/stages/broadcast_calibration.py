@@ -49,6 +49,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "key_frames": {key_frames_file(unit): clicked},
         **proposed,
         "broadcast_offset_frames": view.offset,
+        **({} if (weight := view.clip.broadcast_smooth_weight) == 1.0 else {"smooth": weight}),
     }
 
 

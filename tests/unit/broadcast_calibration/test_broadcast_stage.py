@@ -88,6 +88,7 @@ def folder(tmp_path_factory):
                 frame_count=COUNT,
                 broadcast=("wide", "fast"),
                 broadcast_offset_frames={"wide": 0.0, "fast": OFFSET},
+                broadcast_smooth_weight=2.0,
             ),
         ),
     )
@@ -255,6 +256,8 @@ def test_static_work_of_a_clip_is_planned_once_for_all_its_broadcast_cameras(cal
         "refitting/both",
         "filtering/both",
     ]
+    weighted = [n for n, unit in planned.items() if "smooth" in unit.recipe.sources]
+    assert weighted == ["broadcast_calibration/both.fast"]
     recipe = planned["refitting/both"].recipe
     assert recipe.sources["broadcast_offset_frames.both.fast"] == OFFSET
     assert {"ingest/both.fast", "broadcast_calibration/both.fast"} <= set(recipe.inputs)
