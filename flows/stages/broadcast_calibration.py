@@ -22,6 +22,17 @@ def units(match: Match) -> tuple[str, ...]:
     return match.folder.calibrated_views
 
 
+def uncalibrated_warnings(match: Match) -> tuple[str, ...]:
+    """Return sentences about cameras of clips with several whose view is not used."""
+    folder = match.folder
+    return tuple(
+        f"broadcast camera {view.camera.id} of clip {view.clip.id} is not used: it needs "
+        f"broadcast/{name}.mp4, and clicks in {key_frames_file(name)} or a stated side."
+        for name, view in folder.spec.broadcast_views.items()
+        if name not in folder.calibrated_views and len(view.clip.moving_cameras) > 1
+    )
+
+
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the broadcast camera's detections.
 

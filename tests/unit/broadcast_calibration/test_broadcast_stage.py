@@ -15,6 +15,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from flows.registering import register
 from flows.run_plan import plan_run
+from flows.stages.broadcast_calibration import uncalibrated_warnings
 from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry.cameras import Camera
@@ -244,7 +245,9 @@ def test_a_camera_of_another_rate_is_that_of_the_image_nearest_to_each_frame(cal
 
 
 def test_static_work_of_a_clip_is_planned_once_for_all_its_broadcast_cameras(calibrated):
-    _, _, planned = calibrated
+    _, match, planned = calibrated
+    (warning,) = uncalibrated_warnings(match)
+    assert "broadcast camera wide of clip both is not used" in warning
     of_clip = [name for name in planned if name.partition("/")[2].startswith("both")]
     assert of_clip == [
         "ingest/both.wide",
