@@ -316,7 +316,7 @@ def score_moving_cameras(options: Namespace) -> Tables:
     rows, stated = [], []
     for folder in options.matches:
         match = read_match(folder)
-        for clip in (each.id for each in match.spec.clips if each.id in match.key_frames):
+        for clip in match.key_frames:
             keys = match.key_frames[clip].key_frames
             number = options.key_frames or len(keys)
             chosen = [keys[int((i + 0.5) * len(keys) / number)] for i in range(number)]

@@ -265,19 +265,24 @@ class MatchSpec(Record):
                 found[_view_name(clip, name)] = BroadcastView(clip, cameras[name], offset)
         return found
 
+    def broadcast_view(self, name: str) -> BroadcastView | None:
+        """The broadcast view of this name; None without one, at once for a camera's id."""
+        is_camera = any(camera.id == name for camera in self.cameras)
+        return None if is_camera else self.broadcast_views.get(name)
+
     def views_of(self, clip_id: str) -> tuple[str, ...]:
         """The names of a clip's broadcast views."""
         return tuple(name for name, view in self.broadcast_views.items() if view.clip.id == clip_id)
 
     def filming_camera(self, owner: str) -> CameraSpec | None:
         """The static camera with this id, or the camera of the broadcast view of this name."""
-        if owner in self.broadcast_views:
-            return self.broadcast_views[owner].camera
-        return {camera.id: camera for camera in self.static_cameras}.get(owner)
+        view = self.broadcast_view(owner)
+        static = {camera.id: camera for camera in self.static_cameras}
+        return static.get(owner) if view is None else view.camera
 
     def clips_of(self, owner: str) -> tuple[ClipSpec, ...]:
         """The clips that a static camera films, which are all, or the one of a broadcast view."""
-        view = self.broadcast_views.get(owner)
+        view = self.broadcast_view(owner)
         return self.clips if view is None else (view.clip,)
 
     def clips_with(self, frame: int) -> tuple[ClipSpec, ...]:

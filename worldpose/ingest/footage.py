@@ -81,7 +81,7 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
     At the match's frame rate, the function rounds a broadcast offset to the nearest frame; the rest
     stays in the clip's `broadcast_offset_frames`.
     """
-    view = spec.broadcast_views.get(unit_id)
+    view = spec.broadcast_view(unit_id)
     camera = spec.camera(unit_id) if view is None else view.camera
     rate = (camera.fps or spec.fps) / spec.fps
     offset = camera.offset_frames
