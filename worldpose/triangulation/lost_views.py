@@ -18,7 +18,7 @@ from scipy.ndimage import uniform_filter
 from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency.changes import Change
+from worldpose.camera_consistency.changes import Change, Kind
 from worldpose.camera_consistency.health import UNKNOWNS
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import MeasuredChange
@@ -83,18 +83,19 @@ class _Meetings:
         place = _fall(met, count, max(5, second // every))
         if place is None:
             return None
-        after = rows[place:]
-        usual = met[:place].sum() / count[:place].sum()
-        now = met[place:].sum() / count[place:].sum()
-        chosen = after[np.unique(np.linspace(0, len(after) - 1, 100).astype(int))]
+        chosen = rows[np.unique(np.linspace(place, len(rows) - 1, 100).astype(int))]
         seen = self._count(chosen)
         # One person always meets the others somewhere.
         if seen[seen > 0].mean() < 1.2:
             return None
-        total = seen.sum()
         late, shift = self._best_delay(chosen, 2 * second), self._best_shift(chosen)
-        by_clock = self._met(chosen, late=late).sum() / total
-        by_view = self._met(chosen, shift=shift).sum() / total
+        # A turned view is not shifted everywhere alike.
+        wide = 2.0
+        usual = self._met(rows[:place], wide).sum() / count[:place].sum()
+        now, by_clock, by_view = (
+            self._met(chosen, wide, *change).sum() / seen.sum()
+            for change in ((), (late,), (0, shift))
+        )
         if max(by_clock, by_view) < now + 0.5 * (usual - now):
             return None
         amount = np.zeros(UNKNOWNS)
@@ -107,7 +108,7 @@ class _Meetings:
         )
         gain = self._met(near) - self._met(near, late=late, shift=shift)
         row = int(near[int(np.argmax(np.concatenate([[0], np.cumsum(gain)])[: len(near)]))])
-        kind = "clock" if late else "view"
+        kind: Kind = "clock" if late else "view"
         size = float(late or np.linalg.norm(shift))
         return MeasuredChange(Change(number, kind, True, row, size, np.inf), amount, np.inf)
 
@@ -115,11 +116,13 @@ class _Meetings:
         """Return the number (n,) of detections."""
         return np.asarray(np.isfinite(self.seen[rows, :, 0]).sum(axis=1))
 
-    def _met(self, rows: Integers, late: int = 0, shift: Floats | float = 0.0) -> Integers:
-        """Return the number (n,) of detections that meet a person of rows with a change."""
+    def _met(
+        self, rows: Integers, wide: float = 1.0, late: int = 0, shift: Floats | float = 0.0
+    ) -> Integers:
+        """Return the number (n,) of detections that meet a person within reaches, with a change."""
         image, reach, inside = self._project(rows + late)
         off = np.linalg.norm((self.seen[rows] - shift)[:, :, None] - image[:, None], axis=-1)
-        return np.asarray((inside[:, None] & (off < reach[:, None])).any(axis=2).sum(axis=1))
+        return np.asarray((inside[:, None] & (off < wide * reach[:, None])).any(axis=2).sum(axis=1))
 
     def _project(self, rows: Integers) -> tuple[Floats, Floats, Flags]:
         """Return where people are seen (n, persons, 2), their reach [px], and who there is."""
@@ -155,7 +158,7 @@ class _Meetings:
         # Cells of half a radius; the true shift is spread over some of them.
         cells = np.arange(votes.min() - radius, votes.max() + radius, 0.5 * radius)
         counts = uniform_filter(
-            np.histogram2d(*votes.T, bins=(cells, cells))[0], 3, mode="constant"
+            np.histogram2d(votes[:, 0], votes[:, 1], bins=[cells, cells])[0], 3, mode="constant"
         )
         best = np.unravel_index(np.argmax(counts), counts.shape)
         shift = cells[np.array(best)] + 0.25 * radius
