@@ -189,13 +189,10 @@ class _Trial:
             return [slice(starts[k], starts[k] + length) for k in chosen]
         # Not at the step: its place is known to some frames, and a clock's correction reads there.
         gap = length // 2
-        before = [
-            slice(start, start + length) for start in starts if start + length + gap <= found.row
-        ]
-        after = [
-            slice(start, start + length)
-            for start in range(found.row + gap, frames - length + 1, length)
-        ]
+        ends = range(length, found.row - gap + 1, length)
+        before = [slice(end - length, end) for end in ends]
+        starts = range(found.row + gap, frames - length + 1, length)
+        after = [slice(start, start + length) for start in starts]
         # Near an end of the clip, a part of a second has to do.
         if not before:
             before = [slice(0, max(3, found.row - gap // 2))]
