@@ -54,9 +54,8 @@ def trace_clocks(
     for _ in range(2 * count + 4):
         shifted, rest = shift_by_courses(detections, courses)
         tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
-        lost = find_lost_views(cameras, shifted, tracks.joints, fps)
-        if late_views := [each for each in lost if each.found.kind == "clock"]:
-            for each in late_views:
+        if lost := find_lost_views(cameras, shifted, tracks.joints, fps, ("clock",)):
+            for each in lost:
                 c = each.found.camera
                 courses[c] = _add_change(courses[c], each, frames)
             continue

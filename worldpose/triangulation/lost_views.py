@@ -10,6 +10,7 @@ once. The change is the shift of the view, or of the clock, with which most of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,11 @@ from worldpose.triangulation.camera_changes import MeasuredChange
 
 
 def find_lost_views(
-    cameras: Camera, detections: KeypointDetections[ClipArray], joints: AnyFloats, fps: float
+    cameras: Camera,
+    detections: KeypointDetections[ClipArray],
+    joints: AnyFloats,
+    fps: float,
+    kinds: Sequence[Kind] = ("clock", "view"),
 ) -> list[MeasuredChange]:
     """Return the sudden changes that keep a camera's people from meeting those of the others.
 
@@ -34,13 +39,14 @@ def find_lost_views(
         detections: all detections of a clip, (frames, cameras, detections).
         joints: (frames, persons, 17, 3) of tracked people [m], world.
         fps: frames per second [1/s].
+        kinds: what may change.
     """
     if len(cameras.focal) < 3 or not joints.shape[1]:
         return []
     seen = _middles(detections)
     people = np.asarray(joints[:, :, _TORSO], dtype=np.float64).mean(axis=2)
     each = (_Meetings(cameras[c], seen[:, c], people, fps) for c in range(len(cameras.focal)))
-    found = [camera.find_change(c) for c, camera in enumerate(each)]
+    found = [camera.find_change(c, kinds) for c, camera in enumerate(each)]
     return [change for change in found if change is not None]
 
 
@@ -74,7 +80,7 @@ class _Meetings:
     people: Floats
     fps: float
 
-    def find_change(self, number: int) -> MeasuredChange | None:
+    def find_change(self, number: int, kinds: Sequence[Kind]) -> MeasuredChange | None:
         """Return the change of this camera, the given one of the rig; None if there is none."""
         second = max(2, round(self.fps))
         every = max(1, second // 10)
@@ -89,27 +95,31 @@ class _Meetings:
         if seen[seen > 0].mean() < 1.2:
             return None
         late, shift = self._best_delay(chosen, 2 * second), self._best_shift(chosen)
+        changes: dict[Kind, tuple[int, Floats]] = {
+            "clock": (late, np.zeros(2)),
+            "view": (0, shift),
+        }
         for wide in (1.0, 2.0):  # a turned view is not shifted everywhere alike
             usual = self._met(rows[:place], wide).sum() / count[:place].sum()
-            now, by_clock, by_view = (
-                self._met(chosen, wide, *change).sum() / seen.sum()
-                for change in ((), (late,), (0, shift))
-            )
-            if max(by_clock, by_view) >= now + 0.5 * (usual - now):
+            now = self._met(chosen, wide).sum() / seen.sum()
+            by = {k: self._met(chosen, wide, *changes[k]).sum() / seen.sum() for k in kinds}
+            kind, *others = sorted(kinds, key=lambda each: -by[each])
+            # Where both may explain it, the people who are tracked tell more.
+            if by[kind] - max([now, *(by[k] for k in others)]) >= 0.4 * (usual - now):
                 break
         else:
             return None
+        late, shift = changes[kind]
+        # The tracker follows less: such a change is found from its people.
+        if abs(late) < 3 and np.linalg.norm(shift) < 0.5 * self._reach(chosen):
+            return None
         amount = np.zeros(UNKNOWNS)
-        if by_view > by_clock:
-            amount[:2], late = shift, 0
-        else:
-            amount[4], shift = late, np.zeros(2)
+        amount[:2], amount[4] = shift, late
         near = np.arange(
             max(0, rows[place] - 2 * second), min(len(self.seen), rows[place] + 2 * second)
         )
         gain = self._met(near) - self._met(near, late=late, shift=shift)
         row = int(near[int(np.argmax(np.concatenate([[0], np.cumsum(gain)])[: len(near)]))])
-        kind: Kind = "clock" if late else "view"
         size = float(late or np.linalg.norm(shift))
         return MeasuredChange(Change(number, kind, True, row, size, np.inf), amount, np.inf)
 
@@ -138,6 +148,11 @@ class _Meetings:
             reach = reach_m * self.camera.focal.mean() / depth
             inside = there[:, None] & (depth > 0.0) & np.isfinite(image).all(axis=-1)
         return image, reach, inside
+
+    def _reach(self, rows: Integers) -> float:
+        """Return the usual reach of people [px]."""
+        _, reach, inside = self._project(rows)
+        return float(np.median(reach[inside])) if inside.any() else np.inf
 
     def _best_delay(self, rows: Integers, most: int) -> int:
         """Return the delay [frame] by which most detections meet people."""
