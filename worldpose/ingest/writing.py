@@ -134,7 +134,7 @@ def write_match(
 
 
 def _require_known(spec: MatchSpec, names: list[str]) -> None:
-    named = [each.id for each in (*spec.cameras, *spec.clips)]
+    named = [camera.id for camera in spec.cameras] + [clip.id for clip in spec.clips]
     known = [*dict.fromkeys((*named, *spec.broadcast_views))]
     for name in names:
         if name not in known:
