@@ -60,8 +60,8 @@ def write_recording(
             )
         cameras = cameras or {}
         moving = {name: camera for name, camera in cameras.items() if camera.batch_shape}
-        for name, camera in cameras.items() - moving.items():
-            _log_camera(rr, stream, f"world/cameras/{name}", camera, static=True)
+        for name in [name for name in cameras if name not in moving]:
+            _log_camera(rr, stream, f"world/cameras/{name}", cameras[name], static=True)
         for row, frame in enumerate(tracks.frames):
             stream.set_time("frame", sequence=int(frame))
             stream.set_time("time", duration=float(frame) / fps)
