@@ -153,12 +153,11 @@ def move_broadcast_camera(
     aim = _smooth(_smooth(aim, 0.5 * settings.lag_s), 0.5 * settings.lag_s)
     aim = np.stack([np.interp(times, hand, axis) for axis in aim.T], axis=-1)
 
-    width = np.array(image_size, dtype=np.float64)
-    scale = width[0] / 1920.0
-    low, high = (scale * focal for focal in settings.focal_px)
+    width, scale = np.array(image_size, dtype=np.float64), image_size[0] / 1920.0
+    low, high = settings.focal_px
     period = rng.uniform(*settings.zoom_period_s)
     wave = np.sin(2.0 * np.pi * (times / period + rng.random()))
-    focal = low * (high / low) ** (0.5 + 0.5 * wave)
+    focal = scale * low * (high / low) ** (0.5 + 0.5 * wave)
     roll = np.radians(0.15) * rng.standard_normal()
     poses = [look_at(center, np.array([*point, 1.0]), roll) for point in aim]
     glass = rng.uniform(0.85, 1.15, 2)
