@@ -316,11 +316,11 @@ def score_moving_cameras(options: Namespace) -> Tables:
     rows, stated = [], []
     for folder in options.matches:
         match = read_match(folder)
-        for clip in (each.id for each in match.spec.clips if each.id in match.key_frames):
+        for clip in match.key_frames:
             keys = match.key_frames[clip].key_frames
             number = options.key_frames or len(keys)
             chosen = [keys[int((i + 0.5) * len(keys) / number)] for i in range(number)]
-            camera = match.spec.camera(match.spec.clip(clip).broadcast or "")
+            camera = match.spec.broadcast_views[clip].camera
             true = true_camera(folder, (camera.width, camera.height), clip)
             joints = read_joints(folder / "reference" / "joints.npz").joints
             people = people_of(match, joints, clip)
@@ -508,7 +508,7 @@ def simulate_cases(first: int) -> Iterator[list[Any]]:
             fps, before, frames = scenario.fps, 20, round(4.0 * scenario.fps)
             rig = scenario.rig.model_copy(update={"cameras": 5, "clock_std_frames": 0.0})
             seconds = (frames + before + 25) / fps
-            changes = {"fps": FINE * fps, "duration": seconds, "rig": rig, "broadcast": None}
+            changes = {"fps": FINE * fps, "duration": seconds, "rig": rig, "broadcast": ()}
             scene = simulate_scene(scenario.model_copy(update=changes), seed)
             rng = np.random.default_rng(seed)
             late = SHIFTS[rng.permutation(5)]

@@ -65,7 +65,7 @@ def tell(text: str) -> None:
 
 def simulate(name: str, seed: int, duration: float | None = None) -> tuple[Scenario, Scene]:
     """Return a scenario without its moving camera, and its scene."""
-    changes = {"broadcast": None} | ({} if duration is None else {"duration": duration})
+    changes = {"broadcast": ()} | ({} if duration is None else {"duration": duration})
     scenario = SCENARIOS[name].model_copy(update=changes)
     return scenario, simulate_scene(scenario, seed)
 

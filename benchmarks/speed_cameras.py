@@ -496,12 +496,11 @@ def draw_clip(frames: int, rng: np.random.Generator) -> tuple[MovingCamera, Poin
     """Return the camera of a simulated clip, and noisy pixels of people in every frame."""
     scenario = SCENARIOS["broadcast-pan"].model_copy(update={"duration": frames / 50.0})
     scene = simulate_scene(scenario, 7)
-    assert scene.broadcast is not None
-    image = scene.broadcast.project(world := scene.truth.joints.reshape(frames, -1, 3))
+    (camera,) = (view.camera for view in scene.broadcast.values())
+    image = camera.project(world := scene.truth.joints.reshape(frames, -1, 3))
     image = image + NOISE * rng.standard_normal(image.shape)
     wrong = rng.random(image.shape[:2]) < OUTLIERS
     image[wrong] += 60.0 * rng.standard_normal((int(wrong.sum()), 2))
-    camera = scene.broadcast
     moving = MovingCamera.of(camera, camera.center[0], camera.principal_point[0])
     inside = ((image > 0.0) & (image < moving.image_size - 1.0)).all(axis=-1)
     frame, _ = np.nonzero(inside)

@@ -23,7 +23,7 @@ class KeyFrame(Record):
 
 
 class KeyFrames(Record):
-    """annotations/broadcast_calibration/<clip>.json: all clicks of one clip (M2)."""
+    """annotations/broadcast_calibration/<view>.json: the clicks of one broadcast view (M2)."""
 
     contract: Literal[1] = CONTRACT_VERSION
     key_frames: tuple[KeyFrame, ...] = Field(min_length=1)
@@ -120,8 +120,8 @@ BROADCAST_CALIBRATION = GroupLayout(
         "refused_key_frames": "clicked frames that could not be used, with the reason",
         "weights": "weights and noise of the loss terms, with the rule of each",
         "feed_offset": "frame t of the clip shows the moment t + `frames` of the static cameras, "
-        "with standard error [frame] and number of pairs; `frames` is null if undetermined, the "
-        "whole entry is null without people",
+        "with standard error [match frame] and number of pairs; `frames` is null if undetermined, "
+        "the whole entry is null without people",
         "drift": "error of tracking from one key frame at the next one [px], by gap",
         "pick_next": "frames whose clicks would reduce the error most, the best first",
         "markings_off": "median distance of painted lines from their projection [px], before and "

@@ -19,7 +19,7 @@ DETECTION = GroupLayout(
     arrays=(*KEYPOINT_ARRAYS, *EXTRA_ARRAYS),
     labels=KEYPOINT_LABELS,
     attributes={
-        "camera_id": "camera of the match, or clip of its broadcast camera",
+        "camera_id": "camera of the match, or broadcast view",
         "unreadable": "[first, last] match frame of each interval without an image",
         **POINT_ATTRIBUTE,
     },

@@ -31,7 +31,7 @@ INGEST = GroupLayout(
     arrays=(*KEYPOINT_ARRAYS, *EXTRA_ARRAYS, *VIDEO_ARRAYS),
     labels=KEYPOINT_LABELS,
     attributes={
-        "camera_id": "camera of the match, or clip of its broadcast camera",
+        "camera_id": "camera of the match, or broadcast view",
         "video": "null, or a video's time_base [1, units per second], size [px], missing_frames, "
         "and is_counted if frames are known only by counting from the first",
         **POINT_ATTRIBUTE,

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 
 from pydantic import (
     Field,
@@ -28,6 +28,7 @@ from data_contracts.records import (
     ImageLength,
     Name,
     PersonId,
+    Positive,
     Record,
 )
 
@@ -35,23 +36,38 @@ TEAM_SIZE: Final = 11
 """Players of a team on the pitch (Laws of the Game, 3)."""
 
 
-def _one_error(value: object, read: ValidatorFunctionWrapHandler) -> object:
-    """Return the value as read; of its two forms, an error names both at once."""
-    if isinstance(value, list):  # here also strict rules see Python's lists, of a JSON file
-        value = tuple(tuple(pair) if isinstance(pair, list) else pair for pair in value)
-    try:
-        return read(value)
-    except ValidationError as error:
-        raise PydanticCustomError(
-            "clock_offset", "Input should be a number, or pairs [match frame, number]"
-        ) from error
+def _one_error(kind: str, forms: str) -> WrapValidator:
+    """Return a validator of values of two forms, whose error names both at once."""
+
+    def validate(value: object, read: ValidatorFunctionWrapHandler) -> object:
+        if isinstance(value, list):  # here also strict rules see Python's lists, of a JSON file
+            value = tuple(tuple(pair) if isinstance(pair, list) else pair for pair in value)
+        try:
+            return read(value)
+        except ValidationError as error:
+            raise PydanticCustomError(kind, f"Input should be {forms}") from error
+
+    return WrapValidator(validate)
 
 
 ClockOffset = Annotated[
-    FrameOffset | tuple[tuple[Frame, FrameOffset], ...], WrapValidator(_one_error)
+    FrameOffset | tuple[tuple[Frame, FrameOffset], ...],
+    _one_error("clock_offset", "a number, or pairs [match frame, number]"),
 ]
 """A camera's frame minus the match frame; a number, or rising pairs of a match frame and a number,
 with linear change between them."""
+
+Cameras = Annotated[
+    Name | tuple[Name, ...] | None,
+    _one_error("cameras", "the name of a camera, or a list of names"),
+]
+"""The name of a camera, or those of several."""
+
+CameraOffsets = Annotated[
+    FrameOffset | dict[Name, FrameOffset],
+    _one_error("camera_offsets", "a number, or a number for each broadcast camera"),
+]
+"""An offset of the only camera, or of each one by its name [frame]."""
 
 Side = Literal["near", "far", "left", "right"]
 """Side of the pitch, seen from the main camera, which is near."""
@@ -83,11 +99,14 @@ class CameraSpec(Record):
     @model_validator(mode="after")
     def _readable_clock(self) -> Self:
         offset, todo = self.offset_frames, "a broadcast clip has broadcast_offset_frames"
-        if not isinstance(offset, tuple):
-            if self.kind == "broadcast" or offset == int(offset):
+        if self.kind == "broadcast":
+            if offset == 0.0:
+                return self
+        elif not isinstance(offset, tuple):
+            if offset == int(offset):
                 return self
             todo = f"a static camera's must be whole, or in pairs as [[0, {offset:g}]]"
-        elif self.kind == "static":
+        else:
             frames = [frame for frame, _ in offset]
             if frames and all(a < b for a, b in pairwise(frames)):
                 return self
@@ -104,12 +123,56 @@ class ClipSpec(Record):
     frame_count: int = Field(gt=0, le=200_000)
     """Tracks and joints of a clip are in memory as a whole: half of a match at 60 frames/s is
     170,000 frames."""
-    broadcast: Name | None = None
-    """The broadcast camera that filmed this clip, if any."""
-    broadcast_offset_frames: FrameOffset = 0.0
-    """Frame of the broadcast clip's own video at the clip's first frame."""
+    broadcast: Cameras = None
+    """The broadcast camera that filmed this clip, if any, or a list of several."""
+    broadcast_offset_frames: CameraOffsets = 0.0
+    """Frame of the broadcast clip's own video at the clip's first frame; of several broadcast
+    cameras a mapping from each camera to its number."""
+    broadcast_smooth_weight: Positive = 1.0
+    """Factor on the smoothness of focal length and distortion of the clip's broadcast cameras [1],
+    whose own weight comes from the video."""
     people: dict[PersonId, Name] = {}
     """Person ids of the clip's tracks, with their ids in the roster, where known."""
+
+    @model_validator(mode="after")
+    def _offset_of_each(self) -> Self:
+        cameras, offset = self.moving_cameras, self.broadcast_offset_frames
+        wrong = "an empty list" if cameras == () and self.broadcast is not None else ""
+        if len({*cameras}) < len(cameras):
+            wrong = f"a camera twice: {list(cameras)}"
+        if wrong:
+            raise ValueError(f"clip {self.id} has as broadcast {wrong}; name each camera once")
+        named = list(offset) if isinstance(offset, dict) else cameras if offset else ()
+        if isinstance(offset, dict) and {*named} != {*cameras}:
+            raise ValueError(
+                f"clip {self.id} has broadcast_offset_frames of {sorted(named)}; expected those of "
+                f"its broadcast cameras {sorted(cameras)}"
+            )
+        if not isinstance(offset, dict) and len(named) > 1:
+            raise ValueError(
+                f"clip {self.id} has broadcast_offset_frames {offset:g} and several broadcast "
+                f"cameras; give each one's, as {{{cameras[0]}: {offset:g}, {cameras[1]}: 0}}"
+            )
+        return self
+
+    @property
+    def moving_cameras(self) -> tuple[str, ...]:
+        """The broadcast cameras that filmed this clip."""
+        named = self.broadcast
+        return (named,) if isinstance(named, str) else named or ()
+
+
+class BroadcastView(NamedTuple):
+    """A broadcast camera in one clip: a unit of the stages of broadcast cameras."""
+
+    clip: ClipSpec
+    camera: CameraSpec
+    offset: float
+    """Frame of its video at the clip's first frame."""
+
+
+def _view_name(clip: ClipSpec, camera: str) -> str:
+    return clip.id if len(clip.moving_cameras) == 1 else f"{clip.id}.{camera}"
 
 
 class PlayerSpec(Record):
@@ -139,16 +202,20 @@ class MatchSpec(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         ids = [camera.id for camera in self.cameras] + [clip.id for clip in self.clips]
+        for clip in self.clips:
+            views = [_view_name(clip, name) for name in clip.moving_cameras]
+            ids += views if len(views) > 1 else []
         twice = sorted({name for name in ids if ids.count(name) > 1})
         if twice:
             raise ValueError(f"ids of cameras and clips must differ; used twice: {twice}")
         broadcast = {camera.id for camera in self.cameras if camera.kind == "broadcast"}
         for clip in self.clips:
-            if clip.broadcast is not None and clip.broadcast not in broadcast:
-                raise ValueError(
-                    f"clip {clip.id} names broadcast camera {clip.broadcast!r}; "
-                    f"broadcast cameras here: {sorted(broadcast)}"
-                )
+            for name in clip.moving_cameras:
+                if name not in broadcast:
+                    raise ValueError(
+                        f"clip {clip.id} names broadcast camera {name!r}; "
+                        f"broadcast cameras here: {sorted(broadcast)}"
+                    )
         roster = {player.id for player in self.roster}
         for clip in self.clips:
             named = list(clip.people.values())
@@ -156,12 +223,6 @@ class MatchSpec(Record):
             if wrong:
                 raise ValueError(
                     f"clip {clip.id} names {wrong}, who are not in the roster or there twice"
-                )
-        for camera in self.cameras:
-            if camera.kind == "broadcast" and camera.fps not in (None, self.fps):
-                raise ValueError(
-                    f"broadcast camera {camera.id} has fps {camera.fps:g}, the match "
-                    f"{self.fps:g}; resample it first"
                 )
         return self
 
@@ -189,11 +250,40 @@ class MatchSpec(Record):
         """
         return {camera.id: camera for camera in self.cameras}[camera_id]
 
+    @property
+    def broadcast_views(self) -> dict[str, BroadcastView]:
+        """The broadcast cameras of each clip, by the name of their units and files.
+
+        It is the clip's id, or `<clip>.<camera>` if several broadcast cameras filmed the clip.
+        """
+        cameras = {camera.id: camera for camera in self.cameras}
+        found = {}
+        for clip in self.clips:
+            offsets = clip.broadcast_offset_frames
+            for name in clip.moving_cameras:
+                offset = offsets[name] if isinstance(offsets, dict) else offsets
+                found[_view_name(clip, name)] = BroadcastView(clip, cameras[name], offset)
+        return found
+
+    def broadcast_view(self, name: str) -> BroadcastView | None:
+        """The broadcast view of this name; None without one, at once for a camera's id."""
+        is_camera = any(camera.id == name for camera in self.cameras)
+        return None if is_camera else self.broadcast_views.get(name)
+
+    def views_of(self, clip_id: str) -> tuple[str, ...]:
+        """The names of a clip's broadcast views."""
+        return tuple(name for name, view in self.broadcast_views.items() if view.clip.id == clip_id)
+
     def filming_camera(self, owner: str) -> CameraSpec | None:
-        """The static camera with this id, or the broadcast camera of the clip with this id."""
-        broadcast = {clip.id: clip.broadcast for clip in self.clips}.get(owner)
-        cameras = self.static_cameras if broadcast is None else self.cameras
-        return {camera.id: camera for camera in cameras}.get(broadcast or owner)
+        """The static camera with this id, or the camera of the broadcast view of this name."""
+        view = self.broadcast_view(owner)
+        static = {camera.id: camera for camera in self.static_cameras}
+        return static.get(owner) if view is None else view.camera
+
+    def clips_of(self, owner: str) -> tuple[ClipSpec, ...]:
+        """The clips that a static camera films, which are all, or the one of a broadcast view."""
+        view = self.broadcast_view(owner)
+        return self.clips if view is None else (view.clip,)
 
     def clips_with(self, frame: int) -> tuple[ClipSpec, ...]:
         """The clips that contain a match frame."""

@@ -17,6 +17,7 @@ from data_contracts.records import (
     PersonId,
     PixelCoordinate,
     Record,
+    UnitName,
 )
 from data_contracts.static_calibration import Pixel
 
@@ -67,7 +68,7 @@ class ReviewDecision(Record):
 class ClickedPlace(Record):
     """A point, line or arc of the pitch template in one image."""
 
-    camera: Name
+    camera: UnitName
     """A static camera, or the clip of a moving one."""
     marking: Name
     """Its name in the pitch template."""
@@ -98,7 +99,7 @@ class RedrawnMarking(ClickedPlace):
 class Sighting(Record):
     """One detection that identifies a person, independent of the tracker's ids."""
 
-    camera: Name
+    camera: UnitName
     frame: Frame
     """Match frame."""
     detection: DetectionIndex

@@ -345,6 +345,7 @@ class RunLog:
             left_out=left_out,
             warnings=(
                 *left_out_warnings(self.match, left_out, tracking.MIN_CAMERAS),
+                *broadcast_calibration.uncalibrated_warnings(self.match),
                 *(text for name in self._in_order() for text in self.warnings[name]),
                 *self._doubts(),
             ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -29,7 +29,7 @@ from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.estimate import fit_in_windows
 from worldpose.body_fitting.evidence import Ground
 from worldpose.body_fitting.held_out import SeenClip, compare_held_out
-from worldpose.body_fitting.monocular import MonocularPoses
+from worldpose.body_fitting.monocular import MonocularPoses, join_poses
 from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_constraints
 from worldpose.body_fitting.report import FitMetrics, far_offsets
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
@@ -68,16 +68,16 @@ class ClipPeople:
         person: (persons,) ids.
         common_bias: (17,) per axis, systematic error shared by all views [m]; in the covariance of
             joints.
-        views: a moving camera; None without one.
+        views: the moving cameras.
     """
 
-    def __init__(self, clip: ClipInputs, placed: xr.Dataset, views: Views | None = None) -> None:
+    def __init__(self, clip: ClipInputs, placed: xr.Dataset, views: Sequence[Views] = ()) -> None:
         """Open the people.
 
         Args:
             clip: cameras and tracked people.
             placed: the people's triangulated joints.
-            views: a moving camera.
+            views: the moving cameras.
         """
         self.clip = clip
         self.person: NDArray[np.integer] = placed["person"].values
@@ -140,14 +140,10 @@ class ClipPeople:
         if self._whole is None or not _holds(self._whole[0], frames):
             placed = self.read_joints(frames)
             alone = find_ray_constraints(self.clip.cameras, _Frames(self, frames), placed.joints)
-            views, monocular = [alone], None
-            if self.views is not None:
-                moving, monocular = self.views(frames)
-                views.append(moving)
-            self._whole = (
-                frames,
-                replace(placed, ray_constraints=views, monocular_poses=monocular),
-            )
+            moving = [view(frames) for view in self.views]
+            rays = [alone, *(seen for seen, _ in moving)]
+            monocular = join_poses([poses for _, poses in moving if poses is not None])
+            self._whole = (frames, replace(placed, ray_constraints=rays, monocular_poses=monocular))
         return _part(self._whole, frames)
 
 
@@ -182,7 +178,7 @@ class _Frames:
         return self.people[self.frames.start + frames]
 
 
-def open_people(inputs: UnitInputs, views: Views | None = None) -> ClipPeople:
+def open_people(inputs: UnitInputs, views: Sequence[Views] = ()) -> ClipPeople:
     """Open the tracked and triangulated people of the unit's clip."""
     placed = inputs.open(f"retriangulation/{inputs.unit}")
     return ClipPeople(open_tracked_clip(inputs), placed, views)

@@ -26,7 +26,7 @@ from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_br
 from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES
-from worldpose.broadcast_calibration.players import People
+from worldpose.broadcast_calibration.players import People, boxes_of
 from worldpose.broadcast_calibration.report import (
     BroadcastReport,
     broadcast_arrays,
@@ -41,12 +41,13 @@ from worldpose.broadcast_calibration.uncertainty import (
     pool_centers,
     static_covariance,
 )
+from worldpose.ingest.clock import ImageClock, camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.writer import ResultWriter
 from worldpose.tracking.plane.feet import GroundPositions, locate_feet
 from worldpose.tracking.plane.shirts import measure_shirts
 from worldpose.tracking.plane.tracker import GroundTracks, track_on_plane
-from worldpose.video.folder import open_video
+from worldpose.video.folder import open_video, pictures_at
 
 SIZE_METRICS: Final = {
     "length": ("length_m", "length_std_m"),
@@ -61,58 +62,85 @@ PROPOSED_FRAMES: Final = 8
 
 @unit_task
 def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
-    """Write a camera per frame, and its uncertainty."""
-    sources = inputs.sources
-    start, count = sources["first_frame"] + sources["offset_frames"], sources["frame_count"]
+    """Write a camera per frame, and its uncertainty.
+
+    It is found for every image of the video, also if its frame rate is not that of the match.
+    """
+    sources, clock = inputs.sources, image_clock(inputs)
+    start, stop = int(clock.images[0]), int(clock.images[-1]) + 1
     ((file, clicked),) = sources["key_frames"].items()
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         with open_video(inputs.file("video")) as video:
-            yield from (picture for _, picture in video.frames(start, start + count, grey=True))
+            yield from (picture for _, picture in video.frames(start, stop, grey=True))
 
-    people, seen, boxes = _people(inputs)
+    seen, people, boxes = _people(inputs, clock)
     pitch = _open_pitch(inputs)
     key_frames = [
         KeyFrame(frame=int(frame), markings=clicked_markings(markings))
         for frame, markings in clicked.items()
-        if start <= int(frame) < start + count
+        if start <= int(frame) < stop
     ]
     if "side" in sources:
-        key_frames = _propose(inputs, pitch, people, seen)
+        key_frames = _propose(inputs, pitch, clock, people, seen)
     calibration = calibrate_broadcast(
         pitch,
         BroadcastClip(
             key_frames,
             pictures,
-            float(sources["fps"]),
+            float(sources["fps"]) * clock.rate,
             people=people,
             boxes=boxes,
             where=file,
             first=start,
             proposed="side" in sources,
+            smooth_weight=sources.get("smooth", 1.0),
         ),
         inputs.settings(BroadcastCalibrationSettings),
     )
     inputs.require_registered("video")
+    layout = BROADCAST_CALIBRATION
     result.write(
-        BROADCAST_CALIBRATION,
-        arrays=broadcast_arrays(calibration),
+        layout,
+        arrays={
+            name: values[clock.image_row] if "frame" in layout.layout(name).dims else values
+            for name, values in broadcast_arrays(calibration).items()
+        },
         coordinates={"frame": inputs.frames},
-        attributes=broadcast_attributes(inputs.unit, calibration, start),
+        attributes=broadcast_attributes(_clip_of(inputs), calibration, start, clock.rate),
     )
-    result.figures.update(_figures(calibration.report))
+    result.figures.update(_figures(calibration.report, clock.rate))
+
+
+def image_clock(inputs: UnitInputs, ends: str = "") -> ImageClock:
+    """Return the images of a broadcast view, from sources whose names end with `ends`."""
+    sources = inputs.sources
+    return ImageClock.of(
+        inputs.frames,
+        sources[f"offset_frames{ends}"],
+        sources.get(f"rate{ends}", 1.0),
+        float(sources[f"broadcast_offset_frames{ends}"]),
+    )
+
+
+def _clip_of(inputs: UnitInputs) -> str:
+    """Return the clip of a broadcast view: its name, or that of the fitted bodies."""
+    stage = "body_fitting/"
+    fitted = (name.removeprefix(stage) for name in inputs.recipe.inputs if name.startswith(stage))
+    return next(fitted, inputs.unit)
 
 
 def _propose(
     inputs: UnitInputs,
     pitch: PitchTemplate,
+    clock: ImageClock,
     people: People | None,
     seen: KeypointDetections | None,
 ) -> list[KeyFrame]:
     """Return key frames that are proposed from images spread over the clip."""
-    sources, count = inputs.sources, inputs.sources["frame_count"]
-    start = sources["first_frame"] + sources["offset_frames"]
-    numbers = np.linspace(start, start + count - 1, min(count, PROPOSED_FRAMES)).astype(int)
+    images = clock.images
+    many = min(len(images), PROPOSED_FRAMES)
+    numbers = np.linspace(images[0], images[-1], many).astype(int)
 
     def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
         with open_video(inputs.file("video")) as video:
@@ -122,9 +150,9 @@ def _propose(
     known = None
     if people is not None and seen is not None:
         feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
-        known = KnownPeople(seen, feet, float(sources["fps"]), start)
-    where = str(inputs.file("video"))
-    return propose_key_frames(spread_out(), pitch, side=sources["side"], where=where, people=known)
+        known = KnownPeople(seen[clock.frame_of(images)], feet, people.fps, int(images[0]))
+    where, side = str(inputs.file("video")), inputs.sources["side"]
+    return propose_key_frames(spread_out(), pitch, side=side, where=where, people=known)
 
 
 def _open_pitch(inputs: UnitInputs) -> PitchTemplate:
@@ -136,20 +164,19 @@ def _open_pitch(inputs: UnitInputs) -> PitchTemplate:
 
 
 def _people(
-    inputs: UnitInputs,
-) -> tuple[People | None, KeypointDetections | None, NDArray[np.float64] | None]:
-    """Return people fitted to static cameras at the time of each image, detections and boxes."""
-    sources, unit = inputs.sources, inputs.unit
+    inputs: UnitInputs, clock: ImageClock
+) -> tuple[KeypointDetections | None, People | None, NDArray[np.float64] | None]:
+    """Return detections, people fitted to static cameras in each image, and boxes in each image."""
     stored = _open_seen(inputs)
     if stored is None:
         return None, None, None
-    seen = KeypointDetections.from_arrays(stored)
-    if f"body_fitting/{unit}" not in inputs:
-        return None, seen, seen.boxes.astype(np.float64)
-    joints = inputs.open(f"body_fitting/{unit}")["joints"].values
-    people = People(joints, seen.keypoints.astype(np.float64), float(sources["fps"]))
-    offset = float(sources["broadcast_offset_frames"])
-    return people.later(round(offset) - offset), seen, None
+    seen, shown = KeypointDetections.from_arrays(stored), clock.frame_of(clock.images)
+    fitted = f"body_fitting/{_clip_of(inputs)}"
+    if fitted not in inputs:
+        return seen, None, seen.boxes.astype(np.float64)[shown]
+    keypoints, joints = seen.keypoints.astype(np.float64), inputs.open(fitted)["joints"].values
+    people = People.in_images(joints, keypoints, float(inputs.sources["fps"]), clock)
+    return seen, people, boxes_of(keypoints)[shown]
 
 
 def _open_seen(inputs: UnitInputs) -> xr.Dataset | None:
@@ -160,7 +187,7 @@ def _open_seen(inputs: UnitInputs) -> xr.Dataset | None:
     return None
 
 
-def _figures(report: BroadcastReport) -> dict[str, float]:
+def _figures(report: BroadcastReport, rate: float) -> dict[str, float]:
     """Return metrics of a calibrated clip; those that could not be computed are left out."""
     named = {
         "expected_error_median_px": report.reprojection_error,
@@ -174,7 +201,7 @@ def _figures(report: BroadcastReport) -> dict[str, float]:
     }
     offset = report.feed_offset
     if offset is not None and offset.determined:
-        figures["feed_offset_frames"] = offset.frames
+        figures["feed_offset_frames"] = offset.frames / rate
     for name, value, std in zip(SIZES, report.pitch.size, report.pitch.size_std, strict=True):
         if std > 0.0:
             figures |= dict(zip(SIZE_METRICS[name], (float(value), float(std)), strict=True))
@@ -199,7 +226,7 @@ def broadcast_pooling(inputs: UnitInputs, result: ResultWriter) -> None:
         arrays=moving_arrays(camera, uncertainty),
         coordinates={"frame": own["frame"].values},
         attributes={
-            "clip_id": inputs.unit,
+            "clip_id": own.attrs["clip_id"],
             "clips": clips,
             "distance": [float(distance) for distance in everybody.distance],
             "agree": everybody.agree,
@@ -212,10 +239,9 @@ def broadcast_pooling(inputs: UnitInputs, result: ResultWriter) -> None:
 def broadcast_tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the tracks of the clip's people and their places on the pitch."""
     sources, filmed = inputs.sources, open_broadcast(inputs)
-    start = sources["first_frame"] + sources["offset_frames"]
+    number = camera_frames(inputs.frames, sources["offset_frames"], sources["rate"])
     with open_video(inputs.file("video")) as video:
-        images = (image for _, image in video.frames(start, start + sources["frame_count"]))
-        positions = _locate_people(filmed, images)
+        positions = _locate_people(filmed, pictures_at(video, number))
     inputs.require_registered("video")
     size = (filmed.pitch.length, filmed.pitch.width)
     tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
@@ -297,12 +323,13 @@ def open_broadcast(inputs: UnitInputs) -> BroadcastInputs:
     return BroadcastInputs(seen, moving_from_arrays(moving.data_vars), pitch)
 
 
-def _locate_people(filmed: BroadcastInputs, images: Iterator[Image]) -> GroundPositions:
+def _locate_people(filmed: BroadcastInputs, images: Iterator[Image | None]) -> GroundPositions:
     """Return places and shirts of a moving camera's detections, as those of one camera."""
     (moving, uncertainty), seen = filmed.camera, filmed.detections
     covariance, cameras = static_covariance(moving, uncertainty), moving.camera
     parts = []
     for frame, image in zip(range(len(moving)), images, strict=True):
+        assert image is not None  # the calibration had it
         now = slice(frame, frame + 1)
         people = KeypointDetections.stack([seen[now]])
         found = locate_feet(cameras[now], people, filmed.pitch, camera_covariance=covariance[now])

@@ -23,7 +23,7 @@ from tasks.body_fitting import (
     open_people,
     write_fit,
 )
-from tasks.broadcast_calibration import BroadcastInputs, open_broadcast
+from tasks.broadcast_calibration import BroadcastInputs, image_clock, open_broadcast
 from tasks.clip_inputs import select_frames
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.body_fitting.bones import Shape, pool_shapes
@@ -38,13 +38,13 @@ from worldpose.body_fitting.ray_constraints import (
     RayConstraints,
     constrain_to_rays,
     identify_people,
-    shift_frames,
 )
 from worldpose.body_fitting.report import report_fit
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.broadcast_calibration.uncertainty import static_covariance
 from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.ingest.clock import ImageClock, camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.store.writer import ResultWriter
@@ -68,9 +68,9 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
     unit = inputs.unit
     before = inputs.made_from(f"body_fitting/{unit}")
     fitted = inputs.open(f"body_fitting/{unit}")
-    views: _BroadcastViews | None = None
-    if f"broadcast_calibration/{unit}" in inputs:
-        views = _BroadcastViews.open(inputs, fitted)
+    stage = "broadcast_calibration/"
+    names = sorted(name for name in inputs.recipe.inputs if name.startswith(stage))
+    views = [_BroadcastView.open(inputs, name.removeprefix(stage), fitted) for name in names]
     people = open_people(inputs, views)
     weight = before.settings(BodyFittingSettings).shape_weight
     known = _known_shapes(inputs, people.person, weight)
@@ -81,8 +81,8 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
     def further(part: slice, fit: BodyFit, evidence: ClipEvidence) -> dict[str, NDArray[Any]]:
         nonlocal recognised
         seen = np.zeros(fit.joints.shape[:2], dtype=np.bool_)
-        if views is not None:
-            seen = evidence.ray_constraints[-1].seen
+        for moving in evidence.ray_constraints[1:]:  # after those of static cameras
+            seen |= moving.seen
         recognised += int(seen.sum())
         away = np.linalg.norm(fit.joints - fitted["joints"][part].values, axis=-1)
         for place, own in enumerate(moved):
@@ -101,19 +101,19 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _BroadcastViews:
-    """Images of a clip's broadcast camera, one per frame of the clip, and what they show.
+class _BroadcastView:
+    """Images of a broadcast camera, one per frame of the clip, and what they show.
 
     Attributes:
-        number: (frames,) index of each image in its video.
+        clock: the images of the frames.
         camera: batch (frames,); NaN if too uncertain.
-        late: clock offset of the images relative to the frames [frame].
+        late: how much later than the clock says the images are [frame].
         keypoints: (frames, detections, 17, 2) [px], in the store.
         joints: (frames, persons, 17, 3) [m], world, fitted bodies' joints, in the store.
         estimates: monocular estimates; None without any.
     """
 
-    number: NDArray[np.int64]
+    clock: ImageClock
     camera: Camera
     late: float
     keypoints: xr.DataArray
@@ -121,27 +121,26 @@ class _BroadcastViews:
     estimates: MonocularEstimates | None
 
     @classmethod
-    def open(cls, inputs: UnitInputs, fitted: xr.Dataset) -> _BroadcastViews:
-        """Open the images of the unit's clip, whose bodies are `fitted`."""
-        sources, name = inputs.sources, f"broadcast_calibration/{inputs.unit}"
+    def open(cls, inputs: UnitInputs, view: str, fitted: xr.Dataset) -> _BroadcastView:
+        """Open the images of a broadcast view of the unit's clip, whose bodies are `fitted`."""
+        sources, name = inputs.sources, f"broadcast_calibration/{view}"
+        ends = "" if view == inputs.unit else f".{view}"
         found = inputs.open(name)
-        best = inputs.open_first(f"broadcast_pooling/{inputs.unit}", name)
+        best = inputs.open_first(f"broadcast_pooling/{view}", name)
         camera = camera_from_arrays(best.data_vars)
         known = found["reprojection_error"].values <= KNOWN
-        offset = float(sources["broadcast_offset_frames"])
-        late = round(offset) - offset
+        late = 0.0
         measured = (found.attrs["feed_offset"] or {}).get("frames")
         settings = inputs.made_from(name).recipe.settings
         if settings["feed_offset"] == "correct" and measured is not None:
-            late += measured
-        frame = inputs.frames
-        seen = select_frames(inputs.open(sources["seen_in_broadcast"]), frame)
+            late = measured
+        seen = select_frames(inputs.open(sources[f"seen_in_broadcast{ends}"]), inputs.frames)
         estimates = None
-        if sources["estimates"] is not None:
-            estimates = read_monocular(inputs.file("estimates"))
-            inputs.require_registered("estimates")
+        if sources[f"estimates{ends}"] is not None:
+            estimates = read_monocular(inputs.file(f"estimates{ends}"))
+            inputs.require_registered(f"estimates{ends}")
         return cls(
-            number=frame + sources["offset_frames"],
+            clock=image_clock(inputs, ends),
             camera=replace(camera, focal=np.where(known[:, None], camera.focal, np.nan)),
             late=late,
             keypoints=seen["keypoints"],
@@ -151,20 +150,20 @@ class _BroadcastViews:
 
     def __call__(self, frames: slice) -> tuple[RayConstraints, MonocularPoses | None]:
         """Return the lines of sight and the monocular poses in some frames."""
-        camera = self.camera[frames]
-        then = shift_frames(self.joints[frames].values, self.late)
+        camera, clock = self.camera[frames], self.clock[frames]
+        then = clock.to_images(self.joints[frames].values, self.late)
         own = identify_people(camera, self.keypoints[frames].values.astype(np.float64), then)
         view = constrain_to_rays(camera, own, then)
         rays = RayConstraints(
-            shift_frames(view.points, -self.late), shift_frames(view.across, -self.late)
+            clock.to_frames(view.points, self.late), clock.to_frames(view.across, self.late)
         )
         if self.estimates is None:
             return rays, None
-        seen = place_monocular_poses(self.estimates, camera, self.number[frames], then)
-        whole = -round(self.late)
-        return rays, MonocularPoses(
-            shift_frames(seen.orient, whole), shift_frames(seen.angles, whole)
+        seen = place_monocular_poses(self.estimates, camera, clock.number, then)
+        orient, angles = (
+            clock.to_frames(each, self.late, whole=True) for each in (seen.orient, seen.angles)
         )
+        return rays, MonocularPoses(orient, angles)
 
 
 def _known_shapes(
@@ -254,7 +253,7 @@ def _observe_people(
     place = tracked["ground"].values.astype(np.float64)
     return PlaneEvidence(
         camera=moving.camera,
-        number=tracked["frame"].values + sources["offset_frames"],
+        number=camera_frames(tracked["frame"].values, sources["offset_frames"], sources["rate"]),
         keypoints=keypoints.astype(np.float64),
         confidence=confidence.astype(np.float64),
         place=place,

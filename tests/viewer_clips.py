@@ -63,7 +63,7 @@ def bodies_clip(frames=60, people=2, seed=0, fps=50.0):
         bodies=BodyParameters(bodies.betas, bodies.global_orient, bodies.body_pose, transl),
         model=load_open_body(),
         cameras={"north": camera()},
-        broadcast=camera(frames),
+        moving={"broadcast": camera(frames)},
         markings=[line],
         notes={"match": "m & n", "run": "0001", "licence": "For tests alone."},
     )

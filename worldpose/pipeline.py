@@ -6,7 +6,7 @@ checks of cameras against each other, review gates, iterations, chunks, stored r
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +26,7 @@ from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.report import BundleAdjustment
 from worldpose.detection.pipeline import detect_people
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.footage import read_still, read_unit, unit_frames
+from worldpose.ingest.footage import image_clock, read_still, read_unit, unit_frames
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
@@ -49,7 +49,7 @@ class Reconstruction:
         adjusted: static cameras, adjusted to people and markings.
         joints: (frames, persons, 17, ...) triangulated joints.
         bodies: (frames, persons) bodies and their joints.
-        broadcast: the moving camera of each frame; None without one.
+        broadcast: the moving camera in each image of its video, by broadcast view.
     """
 
     frame: NDArray[np.int64]
@@ -57,7 +57,7 @@ class Reconstruction:
     adjusted: BundleAdjustment
     joints: Triangulation
     bodies: BodyFit
-    broadcast: BroadcastCalibration | None
+    broadcast: Mapping[str, BroadcastCalibration]
 
 
 def reconstruct(match: MatchFolder, clip_id: str | None = None) -> Reconstruction:
@@ -93,7 +93,8 @@ def reconstruct(match: MatchFolder, clip_id: str | None = None) -> Reconstructio
         joints.joints, joints.covariance, fps, joints.common_bias, [rays], shared_covariance=shared
     )
     bodies = fit_bodies(find_body(), evidence, ground=pitch.height)
-    broadcast = calibrate_moving_camera(match, clip_id, pitch, bodies)
+    views = (name for name in match.spec.views_of(clip_id) if name in match.key_frames)
+    broadcast = {name: calibrate_moving_camera(match, name, pitch, bodies) for name in views}
     return Reconstruction(seen.frame, tracks, adjusted, joints, bodies, broadcast)
 
 
@@ -125,23 +126,21 @@ def find_people(match: MatchFolder, clip_id: str) -> KeypointDetections:
 
 
 def calibrate_moving_camera(
-    match: MatchFolder, clip_id: str, pitch: PitchTemplate, bodies: BodyFit
-) -> BroadcastCalibration | None:
-    """Return the broadcast camera of each frame: E_field + E_player, similarity and smoothness."""
-    if clip_id not in match.key_frames:
-        return None
-    frames = unit_frames(match.spec, clip_id)
-    start = frames.number(frames.first)
+    match: MatchFolder, view: str, pitch: PitchTemplate, bodies: BodyFit
+) -> BroadcastCalibration:
+    """Return the broadcast camera of each image: E_field + E_player, similarity and smoothness."""
+    clock = image_clock(match.spec, view)
+    start, stop = int(clock.images[0]), int(clock.images[-1]) + 1
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        with open_video(match.videos[clip_id]) as video:
-            shown = video.frames(start, start + frames.count, grey=True)
-            yield from (picture for _, picture in shown)
+        with open_video(match.videos[view]) as video:
+            yield from (picture for _, picture in video.frames(start, stop, grey=True))
 
-    seen = read_unit(match, clip_id)[0] if clip_id in match.detections else None
-    keys, fps = list(match.key_frames[clip_id].key_frames), match.spec.fps
+    seen = read_unit(match, view)[0] if view in match.detections else None
+    keys, fps = list(match.key_frames[view].key_frames), match.spec.fps
     people = None
     if seen is not None:
-        people = People(bodies.joints, seen.keypoints.astype(np.float64), fps)
-    clip = BroadcastClip(keys, pictures, fps, people=people, where=clip_id, first=start)
+        keypoints = seen.keypoints.astype(np.float64)
+        people = People.in_images(bodies.joints, keypoints, fps, clock)
+    clip = BroadcastClip(keys, pictures, fps * clock.rate, people=people, where=view, first=start)
     return calibrate_broadcast(pitch, clip)

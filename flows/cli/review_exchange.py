@@ -133,7 +133,7 @@ def _places(
     """Return camera and frame of each image: of a clip's own camera, in that clip alone."""
     spec = match.folder.spec
     static = [camera.id for camera in spec.static_cameras]
-    moving = [clip.id for clip in spec.clips if clip.broadcast is not None]
+    moving = [*spec.broadcast_views]
     chosen = cameras or static
     for camera in chosen:
         if camera not in (*static, *moving):
@@ -141,8 +141,7 @@ def _places(
     places = [
         (camera, frame)
         for camera in chosen
-        for clip in spec.clips
-        if camera in (*static, clip.id)
+        for clip in spec.clips_of(camera)
         for frame in range(clip.first_frame, clip.first_frame + clip.frame_count)
         if (frame in frames if frames else (frame - clip.first_frame) % every == 0)
     ]

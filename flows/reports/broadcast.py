@@ -13,11 +13,10 @@ from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.reports.match_pictures import shown_pitch
 from flows.results.best_results import (
     body_tracks,
-    broadcast_cameras,
-    broadcast_unit,
     clip_title,
     joint_tracks,
 )
+from flows.results.broadcast_views import broadcast_cameras, broadcast_unit, clip_of
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration.report import camera_before
@@ -26,7 +25,7 @@ from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.ingest.footage import unit_frames
+from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.reports.broadcast import (
     camera_angles,
     largest_pose_changes,
@@ -39,7 +38,7 @@ from worldpose.reports.html_page import CaptionedImage, Table
 from worldpose.reports.videos import overlay_frames
 from worldpose.store.store import Run
 from worldpose.video.files import write_video
-from worldpose.video.folder import open_video
+from worldpose.video.folder import open_video, pictures_at
 
 WORST_FRAMES: Final = 2
 """Number of frames shown with the largest camera uncertainty [1]."""
@@ -49,38 +48,40 @@ MAX_VIDEO_S: Final = 30.0
 """Maximum duration of overlay videos [s]."""
 
 
-def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
-    """Plot each clip's broadcast camera over time, and its frames of largest uncertainty."""
+def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[CaptionedImage]:
+    """Plot each broadcast camera over time, and its frames of largest uncertainty.
+
+    None = of all clips; in place of a clip, the name of one broadcast view is possible.
+    """
     pictures = []
-    for clip, camera in broadcast_cameras(run).items():
-        result = run[f"broadcast_calibration/{clip}"]
+    for view, camera in broadcast_cameras(run, clip).items():
+        result, clock = run[f"broadcast_calibration/{view}"], image_clock(match.folder.spec, view)
         frame, expected = result["frame"].values, result["reprojection_error"].values
         pictures.append(
             CaptionedImage(
-                f"{clip_title(clip)}: the broadcast camera over its frames, smoothed (blue, with "
+                f"{clip_title(view)}: the broadcast camera over its frames, smoothed (blue, with "
                 "bands of two standard deviations) and each frame on its own (orange).",
                 plot_camera_course(
                     frame,
                     camera,
-                    run[broadcast_unit(run, clip)]["covariance"].values,
+                    run[broadcast_unit(run, view)]["covariance"].values,
                     camera_before(result.data_vars),
                 ),
             )
         )
         if not np.isfinite(expected).any():
             continue
-        tracks = joint_tracks(run, clip)
-        pictures += _before_and_after(run, match, clip, tracks)
-        pictures += flow_pictures(run, match, clip, camera)
-        offset = unit_frames(match.folder.spec, clip).number(0)
+        tracks = joint_tracks(run, clip_of(run, view))
+        pictures += _before_and_after(run, match, view, tracks)
+        pictures += flow_pictures(run, match, view, camera)
         for video_number in result.attrs["pick_next"][:WORST_FRAMES]:
-            number = video_number - offset
-            place = int(np.searchsorted(frame, number))
-            with open_video(match.folder.videos[clip]) as video:
+            place = int(clock.frame_of(video_number))
+            number = int(frame[place])
+            with open_video(match.folder.videos[view]) as video:
                 still = video.frame(video_number)
             pictures.append(
                 CaptionedImage(
-                    f"{clip_title(clip)}, frame {number}, {video_number} of its video, among those "
+                    f"{clip_title(view)}, frame {number}, {video_number} of its video, among those "
                     f"where the broadcast camera is known least ({expected[place]:.2g} px): "
                     "markings and people as it projects them.",
                     plot_camera_view(
@@ -89,7 +90,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
                         tracks,
                         int(np.searchsorted(tracks.frames, number)),
                         still=still,
-                        pitch=shown_pitch(run, match, clip),
+                        pitch=shown_pitch(run, match, view),
                     ),
                 )
             )
@@ -97,10 +98,10 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
 
 
 def _before_and_after(
-    run: Run, match: Match, clip: str, tracks: JointTracks
+    run: Run, match: Match, view: str, tracks: JointTracks
 ) -> list[CaptionedImage]:
     """Crop the person that player refinement moved most, before and after; else empty."""
-    result = run[f"broadcast_calibration/{clip}"]
+    result = run[f"broadcast_calibration/{view}"]
     if result.attrs["players_off"][1] is None:
         return []
     frame = result["frame"].values
@@ -113,15 +114,15 @@ def _before_and_after(
     shared = JointTracks(both, tracks.person_ids, joints)
     place, person = largest_pose_changes(before, after, shared)
     number = int(both[place])
-    (detected,) = seen_in_broadcast(match, clip)
-    with open_video(match.folder.videos[clip]) as video:
-        still = video.frame(unit_frames(match.folder.spec, clip).number(number))
+    (detected,) = seen_in_broadcast(match, view)
+    with open_video(match.folder.videos[view]) as video:
+        still = video.frame(unit_frames(match.folder.spec, view).number(number))
     markings, players = (
         "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
     )
     return [
         CaptionedImage(
-            f"{clip_title(clip)}, frame {number}: before and after players and all frames "
+            f"{clip_title(view)}, frame {number}: before and after players and all frames "
             "together. Crosses: detected keypoints. Median errors: markings "
             f"{markings} px, people {players} px.",
             plot_before_after(
@@ -132,35 +133,30 @@ def _before_and_after(
                 person,
                 still=still,
                 seen=run[detected].sel(frame=number)["keypoints"].values,
-                pitch=shown_pitch(run, match, clip),
+                pitch=shown_pitch(run, match, view),
             ),
         )
     ]
 
 
-def write_broadcast_video(run: Run, match: Match, clip: str, file: Path) -> None:
-    """Write a clip's broadcast video with markings and people overlaid.
+def write_broadcast_video(run: Run, match: Match, view: str, file: Path) -> None:
+    """Write a broadcast video with markings and people overlaid.
 
     The video has half the size and at most 25 frames per second. A clip of more than 30 s is cut to
     the 30 s around the frame with the largest camera uncertainty.
     """
     every = video_step(match)
-    chosen = broadcast_video_frames(run, match, clip)
-    frames = run[f"broadcast_calibration/{clip}"]["frame"].values[chosen]
-    start = unit_frames(match.folder.spec, clip).number(int(frames[0]))
-    stop = start + int(chosen[-1] - chosen[0]) + 1
-    with open_video(match.folder.videos[clip]) as video, whole_file(file) as draft:
-        pictures = (
-            picture
-            for number, picture in video.frames(start, stop)
-            if (number - start) % every == 0
-        )
+    chosen = broadcast_video_frames(run, match, view)
+    frames = run[f"broadcast_calibration/{view}"]["frame"].values[chosen]
+    numbers, clip = unit_frames(match.folder.spec, view).numbers(frames), clip_of(run, view)
+    with open_video(match.folder.videos[view]) as video, whole_file(file) as draft:
+        pictures = (each for each in pictures_at(video, numbers) if each is not None)
         drawn = overlay_frames(
             pictures,
-            broadcast_cameras(run)[clip][chosen],
+            broadcast_cameras(run, view)[view][chosen],
             joint_tracks(run, clip),
             frames,
-            shown_pitch(run, match, clip),
+            shown_pitch(run, match, view),
             body_tracks(run, clip),
         )
         write_video(draft, drawn, match.folder.spec.fps / every, quality=23)
@@ -171,19 +167,19 @@ def video_step(match: Match) -> int:
     return max(1, round(match.folder.spec.fps / FRAME_RATE))
 
 
-def broadcast_video_frames(run: Run, match: Match, clip: str) -> NDArray[np.int64]:
-    """Return the indices of the frames of a clip's video: the part of the largest error."""
-    expected = np.nan_to_num(run[f"broadcast_calibration/{clip}"]["reprojection_error"].values)
+def broadcast_video_frames(run: Run, match: Match, view: str) -> NDArray[np.int64]:
+    """Return the indices of the frames of a view's video: the part of the largest error."""
+    expected = np.nan_to_num(run[f"broadcast_calibration/{view}"]["reprojection_error"].values)
     most = round(MAX_VIDEO_S * match.folder.spec.fps)
     begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
     return np.arange(begin, min(begin + most, len(expected)), video_step(match))
 
 
-def broadcast_tables(run: Run, match: Match) -> list[Table]:
-    """Tabulate the evidence of each clip's frames, and the warnings for a reviewer."""
+def broadcast_tables(run: Run, match: Match, clip: str | None = None) -> list[Table]:
+    """Tabulate the evidence of each broadcast view's frames, and the warnings for a reviewer."""
     tables = []
-    for clip, camera in broadcast_cameras(run).items():
-        result = run[f"broadcast_calibration/{clip}"]
+    for view, camera in broadcast_cameras(run, clip).items():
+        result = run[f"broadcast_calibration/{view}"]
         status = np.bincount(result["status"].values, minlength=len(FRAME_STATUS))
         rows = [
             *(
@@ -205,10 +201,10 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
             ("tracking missed the next key frame by [px]", _numbers(result.attrs["drift"])),
             ("frames of its video to click next", ", ".join(map(str, result.attrs["pick_next"]))),
             *(("chosen", decision) for decision in result.attrs["decisions"]),
-            *_pooling_rows(run, clip),
+            *_pooling_rows(run, view),
             *(("look at it", reason) for reason in result.attrs["reasons"]),
         ]
-        tables.append(Table(clip_title(clip), ("", ""), tuple(rows)))
+        tables.append(Table(clip_title(view), ("", ""), tuple(rows)))
     return tables
 
 
@@ -221,9 +217,9 @@ def _motion(camera: Camera, fps: float) -> list[tuple[str, str]]:
     ]
 
 
-def _pooling_rows(run: Run, clip: str) -> list[tuple[str, str]]:
+def _pooling_rows(run: Run, view: str) -> list[tuple[str, str]]:
     """Return the agreement of the camera position with its other clips, if there are any."""
-    unit = broadcast_unit(run, clip)
+    unit = broadcast_unit(run, view)
     if "distance" not in run[unit].attrs:
         return []
     pooled = run[unit].attrs
@@ -239,12 +235,12 @@ def _numbers(values: list[float]) -> str:
     return ", ".join(f"{value:.2g}" for value in values) or "-"
 
 
-def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[CaptionedImage]:
+def flow_pictures(run: Run, match: Match, view: str, camera: Camera) -> list[CaptionedImage]:
     """Draw points tracked between the two frames with the largest rotation of the camera.
 
     The camera is a batch over the frames of its clip.
     """
-    frames = run[f"broadcast_calibration/{clip}"]["frame"].values
+    frames = run[f"broadcast_calibration/{view}"]["frame"].values
     rotation = camera.cam_from_world.rotation
     # The angle of R1^T R2 increases as the trace decreases.
     traces = np.einsum("fab,fab->f", rotation[1:], rotation[:-1])
@@ -253,11 +249,11 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Cap
         return []
     pair = int(np.argmin(np.where(known, traces, np.inf)))
     number = int(frames[pair])
-    first = unit_frames(match.folder.spec, clip).number(number)
-    with open_video(match.folder.videos[clip]) as video:
-        stills = [video.frame(first + k) for k in (0, 1)]
+    numbers = unit_frames(match.folder.spec, view).numbers(frames[pair : pair + 2])
+    with open_video(match.folder.videos[view]) as video:
+        stills = [video.frame(int(each)) for each in numbers]
     boxes = None
-    for unit in seen_in_broadcast(match, clip):
+    for unit in seen_in_broadcast(match, view):
         boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)
     own = run.record.settings.get("broadcast_calibration", {})
     settings = BroadcastCalibrationSettings.model_validate(own)
@@ -271,7 +267,7 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Cap
     png = plot_flow(stills[0], start, end, rejected, predicted)
     return [
         CaptionedImage(
-            f"{clip_title(clip)}, frame {number}, where the camera turns most from one frame to "
+            f"{clip_title(view)}, frame {number}, where the camera turns most from one frame to "
             "the next: points of the background where the next frame has them (arrows), those "
             "that do not move with the others (orange), and where the estimated camera projects "
             "them (yellow).",

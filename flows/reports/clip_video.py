@@ -17,11 +17,11 @@ from flows.reports.broadcast import (
 from flows.reports.match_pictures import frame_pictures, shown_pitch
 from flows.results.best_results import (
     body_tracks,
-    broadcast_cameras,
     joint_tracks,
     placed_joints,
     static_cameras,
 )
+from flows.results.broadcast_views import broadcast_views
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.videos import overlay_frames
@@ -30,13 +30,14 @@ from worldpose.video.files import write_video
 
 
 def clip_view(run: Run, match: Match, clip: str) -> str | None:
-    """Return the source of a clip's video: its own camera, else the static camera with most people.
+    """Return the source of a clip's video: a broadcast camera, else a static camera.
 
-    None if no camera has a video.
+    Of several it is the one with most people; None if no camera has a video.
     """
-    if clip in broadcast_cameras(run) and clip in match.folder.videos:
-        return clip
-    return static_view(run, match, clip)
+    views = [view for view in broadcast_views(run, clip) if view in match.folder.videos]
+    if not views:
+        return static_view(run, match, clip)
+    return max(views, key=lambda v: int(run[f"broadcast_calibration/{v}"]["player_count"].sum()))
 
 
 def static_view(run: Run, match: Match, clip: str) -> str | None:
@@ -61,8 +62,8 @@ def write_clip_video(
     """
     owner = owner or clip_view(run, match, clip)
     assert owner is not None  # the caller checks that there is one
-    if owner == clip:
-        write_broadcast_video(run, match, clip, file)
+    if owner in broadcast_views(run):
+        write_broadcast_video(run, match, owner, file)
         return
     tracks = joint_tracks(run, clip)
     frames = video_frames(run, match, clip, owner)
@@ -83,9 +84,9 @@ def write_clip_video(
 
 def video_frames(run: Run, match: Match, clip: str, owner: str) -> NDArray[np.int64]:
     """Return the match frames of a clip's video, as `write_clip_video` writes it for `owner`."""
-    if owner == clip:
-        frames = run[f"broadcast_calibration/{clip}"]["frame"].values
-        return np.asarray(frames[broadcast_video_frames(run, match, clip)])
+    if owner in broadcast_views(run):
+        frames = run[f"broadcast_calibration/{owner}"]["frame"].values
+        return np.asarray(frames[broadcast_video_frames(run, match, owner)])
     all_frames = joint_tracks(run, clip).frames
     spare = max(0, len(all_frames) - round(MAX_VIDEO_S * match.folder.spec.fps)) // 2
     return np.asarray(all_frames[spare : len(all_frames) - spare : video_step(match)])

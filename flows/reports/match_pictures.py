@@ -12,11 +12,11 @@ from flows.results.best_results import estimated_pitch
 from flows.stage import Match
 from worldpose.ingest.footage import read_still, unit_frames
 from worldpose.store.store import Run, Store
-from worldpose.video.folder import open_video
+from worldpose.video.folder import open_video, pictures_at
 
 
 def shown_pitch(run: Run, match: Match, clip: str | None = None) -> PitchSpec | None:
-    """Return the pitch as a run, or its camera of a clip, estimated it; None without a pitch."""
+    """Return the pitch as a run, or a clip's broadcast cameras, estimated it; None without one."""
     return estimated_pitch(run, match.folder.pitch, match.folder.spec, clip)
 
 
@@ -45,7 +45,7 @@ def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.u
 def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray[np.uint8] | None:
     """Return a camera's image (height, width, 3) RGB in a match frame; None if there is none.
 
-    The owner is a static camera, or the clip of a broadcast camera; here and below.
+    The owner is a static camera or a broadcast view; here and below.
 
     Raises:
         InputError: the image is damaged.
@@ -67,13 +67,7 @@ def frame_pictures(
     numbers = _numbers(store, match, owner, np.asarray(frames, dtype=np.int64))
     with open_video(match.folder.videos[owner]) as video:
         numbers[numbers >= len(video)] = -1
-        there = numbers[numbers >= 0]
-        shown = video.frames(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
-        at, picture = -1, None
-        for number in numbers.tolist():
-            while at < number:
-                at, picture = next(shown)
-            yield picture if number >= 0 else None
+        yield from pictures_at(video, numbers)
 
 
 def _numbers(

@@ -28,17 +28,22 @@ from flows.reports.clips import clip_pictures, detection_pictures, disagreement_
 from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
 from flows.results.best_results import (
-    broadcast_cameras,
     clip_positions,
     clips_of,
     joint_tracks,
     open_results,
     static_cameras,
 )
+from flows.results.broadcast_views import broadcast_cameras, broadcast_views
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
-from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
+from worldpose.dataset.statistics import (
+    clip_statistics,
+    data_set_statistics,
+    kind_of,
+    most_moving,
+)
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.reports.data_set import counted_section
@@ -116,7 +121,7 @@ def _load_late_modules(run: Run) -> None:
     different places, one of them gets a module without its names.
     """
     import_module("worldpose.store.groups")
-    if broadcast_cameras(run):
+    if broadcast_views(run):
         import_module("flows.reports.broadcast")
 
 
@@ -150,12 +155,11 @@ def _write_videos(
     store: Store, run: Run, match: Match, out: Path, camera: str | None
 ) -> list[Path]:
     films = []
-    if broadcast_cameras(run):
+    for view in broadcast_views(run):
         from flows.reports.broadcast import write_broadcast_video  # late: it imports estimators
 
-        for clip in broadcast_cameras(run):
-            films.append(out.with_name(f"{out.stem}-{clip}.mp4"))
-            write_broadcast_video(run, match, clip, films[-1])
+        films.append(out.with_name(f"{out.stem}-{view}.mp4"))
+        write_broadcast_video(run, match, view, films[-1])
     for clip in clips_of(run.record):
         owner = camera or static_view(run, match, clip)
         if owner is not None:
@@ -218,7 +222,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
 
 
 def _broadcast_blocks(run: Run, match: Match) -> list[CaptionedImage | Table]:
-    if not broadcast_cameras(run):
+    if not broadcast_views(run):
         return []
     # Late: it imports the estimators of a broadcast camera.
     from flows.reports.broadcast import broadcast_pictures, broadcast_tables
@@ -235,16 +239,12 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
     """Count clips, frames, poses and distances of a run; a person's position is the mid-hip."""
     from worldpose.reports.drawing import HIPS
 
-    broadcast = broadcast_cameras(run)
     clips = {}
     for clip in clips_of(run.record):
         places = joint_tracks(run, clip).joints[:, :, HIPS].mean(2)
-        camera = broadcast.get(clip)
-        kind = (
-            "S"
-            if camera is None
-            else kind_of(camera.focal.mean(-1), camera.cam_from_world.rotation)
-        )
+        moving = broadcast_cameras(run, clip).values()
+        kinds = [kind_of(each.focal.mean(-1), each.cam_from_world.rotation) for each in moving]
+        kind = most_moving(kinds) if kinds else "S"
         clips[clip] = clip_statistics(places, match.folder.spec.fps, kind)
     return data_set_statistics(clips)
 

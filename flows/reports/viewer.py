@@ -17,10 +17,10 @@ from flows.reports.clip_video import clip_view, video_frames, write_clip_video
 from flows.results.best_results import (
     Origin,
     bodies_unit,
-    camera_in_frames,
     clip_positions,
     estimated_pitch,
     fitted_bodies,
+    moving_cameras,
     person_kinds,
     static_cameras,
 )
@@ -171,9 +171,6 @@ def viewer_clip(
     if tracks.views is not None:
         views[:, column] = tracks.views
     model, bodies = _bodies(origin, clip, tracks, positions)
-    moving = None
-    if f"broadcast_calibration/{clip}" in origin.run:
-        moving = camera_in_frames(origin.run, clip, tracks.frames)
     still = static_cameras(origin.run, origin.spec, origin.stage)
     return ViewerClip(
         clip=clip,
@@ -188,7 +185,7 @@ def viewer_clip(
         bodies=bodies,
         model=model,
         cameras=still,
-        broadcast=moving,
+        moving=moving_cameras(origin.run, clip, tracks.frames),
         markings=[] if shown is None else markings(shown),
         notes=describe_clip(origin, clip) | {"units": "metres, seconds"},
         video=video,

@@ -15,6 +15,12 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Track
+from flows.results.broadcast_views import (
+    BROADCAST,
+    broadcast_unit,
+    broadcast_views,
+    camera_in_frames,
+)
 from flows.stage import Match
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel, BodyParameters
@@ -113,7 +119,7 @@ def describe_later_run(store: Store, record: RunRecord) -> str:
 
 
 def clip_title(clip: str) -> str:
-    """Return a clip's heading."""
+    """Return the heading of a clip or a broadcast view."""
     return "The clip" if clip == "clip" else f"Clip {clip}"
 
 
@@ -332,8 +338,8 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     return fitted_model(run, fits), poses, fits["person"].values
 
 
-def broadcast_camera(run: Run, clip: str) -> Camera:
-    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
+def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
 
     Raises:
         InputError: the run has no such camera.
@@ -342,18 +348,18 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
         "choose another format."
     )
-    require_result(run, f"broadcast_calibration/{clip}", todo)
+    views = broadcast_views(run, clip) or [require_result(run, f"{BROADCAST}{clip}", todo)]
     bodies = bodies_unit(run, clip)
-    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
-    return camera_in_frames(run, clip, frames)
+    frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
+    return {view: camera_in_frames(run, view, frames) for view in views}
 
 
-def camera_in_frames(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
-    """Return the moving camera of a clip in these match frames, NaN where it is unknown."""
-    found = run[broadcast_unit(run, clip)]
-    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
-    arrays = by_frame.reindex(frame=frames).data_vars
-    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
+def moving_cameras(run: Run, clip: str, frames: NDArray[np.int64]) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone."""
+    views = broadcast_views(run, clip)
+    names = views if len(views) > 1 else ["broadcast"] * len(views)
+    found = (camera_in_frames(run, view, frames) for view in views)
+    return dict(zip(names, found, strict=True))
 
 
 def require_result(run: Run, unit: str, todo: str) -> str:
@@ -453,14 +459,15 @@ def estimated_pitch(
 ) -> PitchSpec | None:
     """Return the pitch with the surface that a run estimated, for drawing; None without a pitch.
 
-    The pitch is that of the clip's broadcast camera, if it estimated one; otherwise crown and end
-    fall are those that the static cameras show together.
+    The pitch is that of the clip's (or the view's) broadcast camera that knows it best, if one
+    estimated it; otherwise crown and end fall are those that the static cameras show together.
     """
     if pitch is None:
         return None
-    seen = f"broadcast_calibration/{clip}"
-    found = run[seen].attrs["pitch"] if clip is not None and seen in run else None
-    if found is not None:
+    views = [] if clip is None else broadcast_views(run, clip)
+    stated = (run[f"{BROADCAST}{view}"].attrs["pitch"] for view in views)
+    if estimated := [each for each in stated if each is not None]:
+        found = min(estimated, key=lambda each: sum(each["std_m"]))
         names = ("length", "width", "crown", "end_fall", "points")
         sizes = {name: found[name] for name in names if name in found}
         given = pitch.model_dump(mode="json") | sizes
@@ -475,18 +482,3 @@ def estimated_pitch(
         return pitch
     # Not validated: an estimated crown may be slightly negative.
     return pitch.model_copy(update={"crown": surface[0], "end_fall": surface[1]})
-
-
-def broadcast_cameras(run: Run) -> dict[str, Camera]:
-    """Return the broadcast camera of every calibrated clip, a batch (frames,), by clip."""
-    return {
-        clip: camera_from_arrays(run[broadcast_unit(run, clip)].data_vars)
-        for stage, _, clip in (name.partition("/") for name in run)
-        if stage == "broadcast_calibration"
-    }
-
-
-def broadcast_unit(run: Run, clip: str) -> str:
-    """Return the name of a clip's best broadcast camera, as `stage/unit`."""
-    pooled = f"broadcast_pooling/{clip}"
-    return pooled if pooled in run else f"broadcast_calibration/{clip}"

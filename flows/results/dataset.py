@@ -8,7 +8,7 @@ from pathlib import Path
 from data_contracts.release import CheckReport, DataSetStatistics, Finding
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.dataset.check import check_clip
-from worldpose.dataset.contents import list_clips, read_clip
+from worldpose.dataset.contents import camera_files, list_clips, read_clip
 from worldpose.dataset.faults import CheckSettings
 from worldpose.dataset.manifest import (
     changed_files,
@@ -20,6 +20,7 @@ from worldpose.dataset.statistics import (
     camera_kind,
     clip_statistics,
     data_set_statistics,
+    most_moving,
     read_places,
 )
 from worldpose.errors import UsageError
@@ -98,11 +99,10 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
     clips = {}
     for folder in folders:
         rates = stated_rates(folder, fps)
-        cameras = sorted((folder / "cameras").glob("*.npz"))
         for name, rate in rates.items():
-            own = folder / "cameras" / f"{name}.npz"
-            kind = camera_kind(own)
-            if not own.is_file() and any(file.stem not in rates for file in cameras):
+            own, static = camera_files(folder, name, rates)
+            kind = most_moving(map(camera_kind, own))
+            if not own and static:
                 kind = "S"
             label = name if len(folders) == 1 else f"{folder.resolve().name}/{name}"
             if label in clips:

@@ -11,13 +11,13 @@ from data_contracts.match import MatchSpec
 from data_contracts.run import JOINT_STAGES
 from flows.registering import find_match
 from flows.results.best_results import (
-    broadcast_cameras,
     clips_of,
     describe_later_run,
     joint_tracks,
     open_results,
     static_cameras,
 )
+from flows.results.broadcast_views import broadcast_cameras
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (
@@ -58,7 +58,7 @@ class Side:
 
     joints: JointTracks | None
     cameras: Mapping[str, Camera]
-    """By static camera, or by clip for the broadcast camera."""
+    """By static camera, or by broadcast view."""
     match: MatchFolder | None = None
     """The match it belongs to, if known."""
     later_run: str = ""
@@ -206,20 +206,19 @@ def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str,
     """Return the true cameras with the image sizes of the match: the files lack them."""
     if spec is None:
         return dict(truth.cameras)
-    clips = {clip.id: clip.broadcast or clip.id for clip in spec.clips}
-    sizes = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
+    known = {camera.id: camera for camera in spec.cameras}
+    known |= {name: view.camera for name, view in spec.broadcast_views.items()}
     cameras = {}
     for name in truth.cameras:
-        camera_id = clips.get(name, name)
-        if camera_id not in sizes:
+        file = Path(reference) / "cameras" / f"{name}.npz"
+        if name not in known:
             raise InputError(
-                str(Path(reference) / "cameras" / f"{name}.npz"),
-                expected=f"a camera or clip of the match: {', '.join([*sizes, *clips])}",
+                str(file),
+                expected=f"a camera or clip of the match: {', '.join(known)}",
                 found=repr(name),
                 todo="Rename or remove the file.",
             )
-        file = Path(reference) / "cameras" / f"{name}.npz"
-        cameras[name] = read_camera(file, sizes[camera_id])
+        cameras[name] = read_camera(file, (known[name].width, known[name].height))
     return cameras
 
 

@@ -21,14 +21,15 @@ from flows.results.best_results import (
     PLANE,
     Origin,
     bodies_unit,
-    broadcast_camera,
-    camera_in_frames,
     clip_positions,
     estimated_pitch,
+    filmed_cameras,
     fitted_bodies,
+    moving_cameras,
     person_kinds,
     placed_joints,
 )
+from flows.results.broadcast_views import broadcast_views
 from flows.results.outputs import (
     RELEASE,
     VIEWER_SUFFIX,
@@ -69,6 +70,7 @@ from worldpose.formats.challenge import (
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
 from worldpose.formats.tables import write_positions
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import LensModel
 from worldpose.ingest.footage import unit_frames
@@ -133,7 +135,7 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
 
 
 def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3).
+    """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz` (X3).
 
     Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest error.
     """
@@ -142,9 +144,10 @@ def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
         path = out / "poses" / f"{clip}.npz"
         write_poses(path, poses, model.name)
         yield path
-        if f"broadcast_calibration/{clip}" in origin.run:
-            path = out / "cameras" / f"{clip}.npz"
-            write_moving_camera(path, broadcast_camera(origin.run, clip))
+        moving = filmed_cameras(origin.run, clip) if broadcast_views(origin.run, clip) else {}
+        for view, camera in moving.items():
+            path = out / "cameras" / f"{view}.npz"
+            write_moving_camera(path, camera)
             yield path
     errors: dict[str, dict[str, str | float]] = {}
     for name, camera in origin.static_cameras.items():
@@ -162,24 +165,21 @@ def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
 
 
 def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iterator[Path]:
-    """Write cameras, boxes, skeletons, pitch points and the submission."""
-    for clip in origin.clips:
-        fitted_bodies(origin.run, clip)
-        broadcast_camera(origin.run, clip)
+    """Write cameras, boxes, skeletons, pitch points and the submission, of each broadcast view."""
+    filmed = _filmed(origin)
     together: dict[str, ChallengeClip] = {}
     submissions: dict[str, NDArray[np.float64]] = {}
-    for clip in origin.clips:
-        camera = broadcast_camera(origin.run, clip)
+    for view, (clip, camera) in filmed.items():
         model, poses, _ = fitted_bodies(origin.run, clip)
         truth = challenge_truth(model, poses, camera)
-        submissions[clip] = truth.submission
-        path = out / "cameras" / f"{clip}.npz"
+        submissions[view] = truth.submission
+        path = out / "cameras" / f"{view}.npz"
         write_challenge_camera(path, camera, edition)
         yield path
         if edition == 2025:
-            together[clip] = truth.clip
+            together[view] = truth.clip
         else:
-            yield from write_challenge(out, {clip: truth.clip}, edition)
+            yield from write_challenge(out, {view: truth.clip}, edition)
     if edition == 2025:
         yield from write_challenge(out, together, edition)
     if origin.pitch is not None:
@@ -192,24 +192,39 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iter
     yield path
 
 
-def export_tracks(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `tracks/<clip>.txt`, our boxes in the broadcast image, and the paper's settings."""
-    yield _write_baseline_settings(out)
+def _filmed(origin: Origin) -> dict[str, tuple[str, Camera]]:
+    """Return the clip and the moving camera of every broadcast view.
+
+    Raises:
+        InputError: a clip has no fitted bodies or no such camera.
+    """
+    found: dict[str, tuple[str, Camera]] = {}
     for clip in origin.clips:
+        fitted_bodies(origin.run, clip)
+        cameras = filmed_cameras(origin.run, clip)
+        found |= {view: (clip, camera) for view, camera in cameras.items()}
+    return found
+
+
+def export_tracks(origin: Origin, out: Path) -> Iterator[Path]:
+    """Write `tracks/<view>.txt`, our boxes in the broadcast image, and the paper's settings."""
+    yield _write_baseline_settings(out)
+    for view, (clip, camera) in _filmed(origin).items():
         model, poses, persons = fitted_bodies(origin.run, clip)
-        truth = challenge_truth(model, poses, broadcast_camera(origin.run, clip))
-        path = out / "tracks" / f"{clip}.txt"
+        truth = challenge_truth(model, poses, camera)
+        path = out / "tracks" / f"{view}.txt"
         write_tracks(path, truth.clip.boxes, persons[truth.persons].astype(np.int64))
         yield path
 
 
 def export_slahmr_cameras(origin: Origin, out: Path) -> Iterator[Path]:
-    """Write `slahmr/cameras/<clip>/shot-0/cameras.npz`, and the paper's settings."""
+    """Write `slahmr/cameras/<view>/shot-0/cameras.npz`, and the paper's settings."""
     yield _write_baseline_settings(out)
     for clip in origin.clips:
-        path = out / "slahmr" / "cameras" / clip / "shot-0" / "cameras.npz"
-        write_slahmr_cameras(path, broadcast_camera(origin.run, clip))
-        yield path
+        for view, camera in filmed_cameras(origin.run, clip).items():
+            path = out / "slahmr" / "cameras" / view / "shot-0" / "cameras.npz"
+            write_slahmr_cameras(path, camera)
+            yield path
 
 
 def _write_baseline_settings(out: Path) -> Path:
@@ -225,14 +240,13 @@ def export_recording(origin: Origin, out: Path) -> Iterator[Path]:
 
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        known = f"broadcast_calibration/{clip}" in origin.run
+        moving = moving_cameras(origin.run, clip, tracks.frames)
         path = out / "rerun" / f"{clip}.rrd"
         write_recording(
             path,
             tracks,
             origin.spec.fps,
-            cameras=origin.static_cameras,
-            broadcast=camera_in_frames(origin.run, clip, tracks.frames) if known else None,
+            cameras=origin.static_cameras | moving,
             pitch=estimated_pitch(origin.run, origin.pitch, origin.spec, clip),
         )
         yield path
@@ -462,7 +476,11 @@ def _write_release(
         clips=clips,
         pictures={
             **{camera: pictures[camera] for camera in origin.static_cameras},
-            **{c.id: pictures[c.broadcast] for c in spec.clips if c.broadcast and c.id in clips},
+            **{
+                name: pictures[view.camera.id]
+                for name, view in spec.broadcast_views.items()
+                if view.clip.id in clips
+            },
         },
         pitch=spec.pitch != NO_PITCH,
         body_model=models.pop() if len(models) == 1 else None,

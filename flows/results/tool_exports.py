@@ -17,10 +17,10 @@ from flows.results.best_results import (
     PLANE,
     Origin,
     bodies_unit,
-    broadcast_camera,
     clip_positions,
     estimated_pitch,
     fitted_bodies,
+    moving_cameras,
     person_kinds,
 )
 from worldpose.errors import UsageError
@@ -209,9 +209,7 @@ def export_scenes(
                 found="none",
                 todo="Give their text, which goes into the file, or export without --surface.",
             )
-        cameras = origin.static_cameras
-        if f"broadcast_calibration/{clip}" in origin.run:
-            cameras["broadcast"] = broadcast_camera(origin.run, clip)
+        cameras = origin.static_cameras | moving_cameras(origin.run, clip, frames)
         kinds = person_kinds(origin.run, clip)
         people = [
             AnimatedBody(

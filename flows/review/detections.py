@@ -89,7 +89,7 @@ def results_of(
     names: list[str] = []
     if camera in {each.id for each in spec.static_cameras}:
         names = [seen_by(match, camera, clip.id) for clip in clips]
-    elif camera in {clip.id for clip in clips}:
+    elif camera in {view for clip in clips for view in spec.views_of(clip.id)}:
         names = [*seen_in_broadcast(match, camera)]
     results = store.run(match.match_id).results if store.runs(match.match_id) else {}
     found = tuple(dict.fromkeys(name for name in names if name in results))

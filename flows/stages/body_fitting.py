@@ -7,6 +7,8 @@ are tracked and have monocular poses.
 
 from __future__ import annotations
 
+from itertools import chain
+
 from pydantic import JsonValue
 
 from data_contracts.records import Record
@@ -67,7 +69,7 @@ def refitted_clips(match: Match) -> tuple[str, ...]:
         tracked = broadcast_calibration.clips_without_static_cameras(match)
         return tuple(clip for clip in tracked if clip in match.folder.estimates)
     clips = (clip.id for clip in match.folder.spec.clips)
-    return tuple(clip for clip in clips if _is_broadcast(match, clip) or _namesakes(match, clip))
+    return tuple(clip for clip in clips if _views(match, clip) or _namesakes(match, clip))
 
 
 def last_bodies(match: Match, clip: str) -> str:
@@ -80,30 +82,39 @@ def refitting_inputs(match: Match, unit: str) -> tuple[str, ...]:
 
     Without static cameras: the broadcast camera, its detections and the tracks on the pitch.
     """
-    camera = broadcast_calibration.camera_inputs(match, unit)
     if not match.has_static_cameras:
-        return (*camera, f"broadcast_tracking/{unit}")
+        return (*broadcast_calibration.camera_inputs(match, unit), f"broadcast_tracking/{unit}")
+    cameras = (broadcast_calibration.camera_inputs(match, view) for view in _views(match, unit))
     others = (f"body_fitting/{clip}" for clip in _namesakes(match, unit))
     fitted = (*inputs(match, unit), f"body_fitting/{unit}")
-    return (*fitted, *(camera if _is_broadcast(match, unit) else ()), *others)
+    return (*fitted, *chain.from_iterable(cameras), *others)
 
 
 def refitting_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip, monocular poses of the broadcast video, its clock, and the identities."""
-    clip = match.folder.spec.clip(unit)
-    file = match.folder.estimates.get(unit) if _is_broadcast(match, unit) else None
-    estimated = {
-        **match.file_sources("estimates", file),
-        "offset_frames": match.frame_sources(unit)["offset_frames"],
-    }
+    """Return the clip, the identities, and of each broadcast view poses, detections and clock.
+
+    The names of a view's sources end with `.<view>` if its clip has several.
+    """
+    spec, estimates = match.folder.spec, match.folder.estimates
     if not match.has_static_cameras:
-        return {**broadcast_calibration.tracking_sources(match, unit), **estimated}
-    named = {unit: clip.people, **_namesakes(match, unit)}
+        own = match.file_sources("estimates", estimates.get(unit))
+        return {**broadcast_calibration.tracking_sources(match, unit), **own}
+    named = {unit: spec.clip(unit).people, **_namesakes(match, unit)}
+    seen: dict[str, JsonValue] = {}
+    for view in _views(match, unit):
+        clock = match.frame_sources(view)
+        own = {
+            "offset_frames": clock["offset_frames"],
+            **({} if clock["rate"] == 1.0 else {"rate": clock["rate"]}),
+            "seen_in_broadcast": next(iter(detection.seen_in_broadcast(match, view)), None),
+            "broadcast_offset_frames": spec.broadcast_views[view].offset,
+        }
+        ends = "" if view == unit else f".{view}"
+        seen |= match.file_sources(f"estimates{ends}", estimates.get(view))
+        seen |= {f"{name}{ends}": value for name, value in own.items()}
     return {
         **sources(match, unit),
-        **estimated,
-        "seen_in_broadcast": next(iter(detection.seen_in_broadcast(match, unit)), None),
-        "broadcast_offset_frames": clip.broadcast_offset_frames,
+        **seen,
         "people": {
             name: {str(person): player for person, player in sorted(people.items())}
             for name, people in named.items()
@@ -111,10 +122,11 @@ def refitting_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     }
 
 
-def _is_broadcast(match: Match, unit: str) -> bool:
-    """Return whether a broadcast camera is calibrated, and has detections."""
-    seen = detection.seen_in_broadcast(match, unit)
-    return bool(seen) and unit in broadcast_calibration.units(match)
+def _views(match: Match, clip: str) -> tuple[str, ...]:
+    """Return a clip's broadcast views with a calibrated camera and detections."""
+    known = {*broadcast_calibration.units(match)}
+    views = match.folder.spec.views_of(clip)
+    return tuple(v for v in views if v in known and detection.seen_in_broadcast(match, v))
 
 
 def _namesakes(match: Match, unit: str) -> dict[str, dict[int, str]]:

@@ -1,6 +1,6 @@
-"""Stages of the broadcast camera: one unit per clip each.
+"""Stages of broadcast cameras: one unit per broadcast view, which is a camera in one clip.
 
-`broadcast_calibration` has the clips with key frames, clicked or proposed (M1-M6),
+`broadcast_calibration` has the views with key frames, clicked or proposed (M1-M6),
 `broadcast_pooling` those whose camera filmed other clips, too (M1), and `broadcast_tracking` the
 calibrated clips of a match without static cameras.
 """
@@ -18,8 +18,19 @@ from worldpose.ingest.annotations import key_frames_file
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Return the clips with a broadcast video and key frames that are clicked or proposed."""
-    return match.folder.calibrated_clips
+    """Return the broadcast views with a video and key frames that are clicked or proposed."""
+    return match.folder.calibrated_views
+
+
+def uncalibrated_warnings(match: Match) -> tuple[str, ...]:
+    """Return sentences about cameras of clips with several whose view is not used."""
+    folder = match.folder
+    return tuple(
+        f"broadcast camera {view.camera.id} of clip {view.clip.id} is not used: it needs "
+        f"broadcast/{name}.mp4, and clicks in {key_frames_file(name)} or a stated side."
+        for name, view in folder.spec.broadcast_views.items()
+        if name not in folder.calibrated_views and len(view.clip.moving_cameras) > 1
+    )
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
@@ -29,7 +40,8 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """
     fitted: tuple[str, ...] = ()
     if match.has_static_cameras:
-        fitted = (f"body_fitting/{unit}", "bundle_adjustment/cameras")
+        clip = match.folder.spec.broadcast_views[unit].clip.id
+        fitted = (f"body_fitting/{clip}", "bundle_adjustment/cameras")
     return (*detection.seen_in_broadcast(match, unit), *fitted)
 
 
@@ -39,20 +51,21 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     Clicks are listed under the file's name, by frame and marking, so that a difference between two
     runs names the file, the frame and the point.
     """
-    folder = match.folder
+    folder, view = match.folder, match.folder.spec.broadcast_views[unit]
     known = folder.key_frames[unit].key_frames if unit in folder.key_frames else ()
     clicked: dict[str, JsonValue] = {str(key.frame): key.markings.by_name() for key in known}
-    proposed = {"side": folder.broadcast_side(unit)} if unit in folder.proposed_clips else {}
+    proposed = {"side": view.camera.side} if unit in folder.proposed_views else {}
     return {
         **video_sources(match, unit),
         "key_frames": {key_frames_file(unit): clicked},
         **proposed,
-        "broadcast_offset_frames": folder.spec.clip(unit).broadcast_offset_frames,
+        "broadcast_offset_frames": view.offset,
+        **({} if (weight := view.clip.broadcast_smooth_weight) == 1.0 else {"smooth": weight}),
     }
 
 
 def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return a clip's broadcast video, its frame mapping to match time, and the pitch."""
+    """Return a broadcast video, its frame mapping to match time, and the pitch."""
     return {
         **match.file_sources("video", match.folder.videos[unit]),
         **match.frame_sources(unit),
@@ -77,12 +90,13 @@ class BroadcastPoolingSettings(Record):
 
 @once_a_match
 def pooled_clips(match: Match) -> dict[str, tuple[str, ...]]:
-    """Return the clips whose camera is also calibrated in others, each with all of these clips."""
-    clips: dict[str | None, tuple[str, ...]] = {}
-    cameras = {clip: match.folder.spec.clip(clip).broadcast for clip in units(match)}
-    for clip, camera in cameras.items():
-        clips[camera] = (*clips.get(camera, ()), clip)
-    return {clip: clips[camera] for clip, camera in cameras.items() if len(clips[camera]) > 1}
+    """Return the views whose camera is also calibrated in others, each with all of these views."""
+    views = match.folder.spec.broadcast_views
+    cameras = {unit: views[unit].camera.id for unit in units(match)}
+    of_camera: dict[str, tuple[str, ...]] = {}
+    for unit, camera in cameras.items():
+        of_camera[camera] = (*of_camera.get(camera, ()), unit)
+    return {unit: of_camera[each] for unit, each in cameras.items() if len(of_camera[each]) > 1}
 
 
 POOLING = Stage(
@@ -110,7 +124,7 @@ def clips_without_static_cameras(match: Match) -> tuple[str, ...]:
 
 
 def camera_inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return a clip's camera, also at the pooled position if there is one, and its detections."""
+    """Return a view's camera, also at the pooled position if there is one, and its detections."""
     pooled = (f"broadcast_pooling/{unit}",) if unit in pooled_clips(match) else ()
     return (*detection.seen_in_broadcast(match, unit), f"broadcast_calibration/{unit}", *pooled)
 

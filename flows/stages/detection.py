@@ -35,29 +35,27 @@ def again_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
     return tuple(name for camera in cameras for name in again(match, camera.id, clip_id))
 
 
-def seen_in_broadcast(match: Match, clip_id: str) -> tuple[str, ...]:
-    """Return the result with the detections of a clip's broadcast camera, if there is one."""
-    if clip_id in match.folder.detections:
-        return (f"ingest/{clip_id}",)
-    return (f"detection/{clip_id}",) if clip_id in _units(match) else ()
+def seen_in_broadcast(match: Match, view: str) -> tuple[str, ...]:
+    """Return the result with the detections of a broadcast view, if there is one."""
+    if view in match.folder.detections:
+        return (f"ingest/{view}",)
+    return (f"detection/{view}",) if view in _units(match) else ()
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """Return `camera.clip` of static cameras without 2D poses, then such broadcast clips."""
+    """Return `camera.clip` of static cameras without 2D poses, then such broadcast views."""
     return tuple(_units(match))
 
 
 @once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
     """Return the unit of `ingest` and the clip of each unit."""
-    folder = match.folder
-    static = {camera.id for camera in folder.spec.static_cameras}
+    folder, views = match.folder, match.folder.spec.broadcast_views
     found = [unit for unit in ingest.units(match) if unit not in folder.detections]
     return {
-        detection_unit(unit, clip.id) if unit in static else unit: (unit, clip.id)
+        unit if unit in views else detection_unit(unit, clip.id): (unit, clip.id)
         for unit in found
-        for clip in folder.spec.clips
-        if unit in static or unit == clip.id
+        for clip in ((views[unit].clip,) if unit in views else folder.spec.clips)
     }
 
 

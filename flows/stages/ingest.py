@@ -1,4 +1,4 @@
-"""Stage `ingest`: one unit per static camera, and one per broadcast clip that needs detections.
+"""Stage `ingest`: one unit per static camera, and one per broadcast view that needs detections.
 
 A unit reads given 2D poses, or else indexes its video, in which `detection` finds people.
 """
@@ -21,18 +21,15 @@ class IngestSettings(Record):
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Return static cameras in order, then clips with 2D poses, or with video and key frames.
+    """Return static cameras, then broadcast views with 2D poses, or with video and key frames.
 
-    A clip without key frames does not use the detections of its broadcast camera.
+    Without key frames, the detections of a broadcast camera are not used.
     """
     folder = match.folder
+    known = {*folder.detections, *folder.calibrated_views}
     return (
         *(camera.id for camera in folder.spec.static_cameras),
-        *(
-            clip.id
-            for clip in folder.spec.clips
-            if clip.id in folder.detections or clip.id in folder.calibrated_clips
-        ),
+        *(name for name in folder.spec.broadcast_views if name in known),
     )
 
 

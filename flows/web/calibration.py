@@ -278,9 +278,9 @@ def _pitch(drawing: PitchDrawing) -> dict[str, Any]:
 
 
 def _stated_side(match: Match, owner: str) -> str | None:
-    """Return the side of a static camera, or of a clip's broadcast camera, if it is stated."""
-    static = {each.id: each.side for each in match.folder.spec.static_cameras}
-    return static[owner] if owner in static else match.folder.broadcast_side(owner)
+    """Return the side of a static camera or a broadcast view, if it is stated."""
+    camera = match.folder.spec.filming_camera(owner)
+    return None if camera is None else camera.side
 
 
 def _round_pieces(markings: Mapping[str, list[NDArray[np.float64]]]) -> dict[str, Any]:

@@ -53,11 +53,10 @@ def routes(context: PageContext) -> APIRouter:
         spec = match.folder.spec
         frames = [
             [clip.first_frame, clip.first_frame + clip.frame_count - 1]
-            for clip in spec.clips
-            if owner in (clip.id, *(camera.id for camera in spec.static_cameras))
+            for clip in spec.clips_of(owner)
         ]
         camera = spec.filming_camera(owner)
-        if not frames or camera is None:
+        if camera is None:
             raise HTTPException(404, "no such camera")
         frame = frames[0][0] if frame is None else frame
         return {

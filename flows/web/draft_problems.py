@@ -60,7 +60,7 @@ def form_problems(
 
 def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) -> Iterator[Problem]:
     """Yield the problems of whole videos and stills, given their indexes by name."""
-    owners = {clip.id: clip.broadcast for clip in match.spec.clips}
+    views = match.spec.broadcast_views
     numbers = {camera.id: number for number, camera in enumerate(match.spec.cameras)}
     for unit, path in match.videos.items():
         index = indexes[path.relative_to(match.folder).as_posix()]
@@ -68,7 +68,7 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
         try:
             require_footage(match.spec, unit, path, index)
         except InputError as error:
-            number = numbers[owners.get(unit) or unit]
+            number = numbers[views[unit].camera.id if unit in views else unit]
             yield {**describe(error, match.folder), "place": f"cameras[{number}].video"}
     for camera, path in match.stills.items():
         size = (match.spec.camera(camera).width, match.spec.camera(camera).height)

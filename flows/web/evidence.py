@@ -224,8 +224,9 @@ def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
     return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists of edits
 
 
-def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:
-    return Evidence(tuple(broadcast_pictures(run, match)), tuple(broadcast_tables(run, match)))
+def _broadcast(store: Store, run: Run, match: Match, view: str) -> Evidence:
+    pictures, tables = broadcast_pictures(run, match, view), broadcast_tables(run, match, view)
+    return Evidence(tuple(pictures), tuple(tables))
 
 
 _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {

@@ -67,7 +67,11 @@ def routes(context: PageContext) -> APIRouter:
                 }
                 for camera in folder.spec.static_cameras
             ],
-            "clips": [_clip(context, opened, clip.id) for clip in folder.spec.clips],
+            "clips": [
+                _clip(context, opened, name)
+                for clip in folder.spec.clips
+                for name in dict.fromkeys((clip.id, *folder.spec.views_of(clip.id)))
+            ],
             "failures": []
             if latest is None
             else [
@@ -237,7 +241,7 @@ def _elsewhere(store: Store, match_id: str) -> dict[str, Any] | None:
 
 
 def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
-    """Return a clip with its broadcast key frames: the clicked ones, and those to click next."""
+    """Return a clip or broadcast view with its key frames: clicked, and those to click next."""
     latest = latest_run(context.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")
     pick_next = []

@@ -86,6 +86,7 @@ def broadcast():
             "status": (("frame",), np.ones(4, np.uint8)),
         },
         coords={"frame": frames},
+        attrs={"clip_id": "A_1", "pitch": None},
     )
 
 

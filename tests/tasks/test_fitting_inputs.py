@@ -12,6 +12,7 @@ from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
+from worldpose.ingest.clock import ImageClock
 
 
 def beside(frames):
@@ -45,7 +46,7 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_of
         unit="clip",
         sources={
             "offset_frames": 4,
-            "broadcast_offset_frames": 4.25,
+            "broadcast_offset_frames": 104.25,
             "seen_in_broadcast": "ingest/clip",
             "estimates": None,
         },
@@ -54,11 +55,11 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_of
         open_first=lambda pooled, calibrated: results[calibrated],
         made_from=lambda name: calibrated,
     )
-    pictures = refitting._BroadcastViews.open(inputs, {"joints": None})
+    pictures = refitting._BroadcastView.open(inputs, "clip", {"joints": None})
     # Match frame 100 is at 104.25 of the video: its image 104 was taken a quarter earlier. The
     # feed was measured to show what static cameras show one and a half frames on.
-    assert pictures.late == late
-    assert pictures.number.tolist() == [104, 105, 106]
+    assert (pictures.clock.late + pictures.late).tolist() == [late] * 3
+    assert pictures.clock.number.tolist() == [104, 105, 106]
     assert np.isfinite(pictures.camera.focal).all(axis=-1).tolist() == [True, False, True]
 
 
@@ -75,7 +76,8 @@ def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(late):
     middle = 0.5 * (image.min(axis=1) + image.max(axis=1))
     estimates = MonocularEstimates(104 + frame, rotations, middle, False)
     nobody, joints = xr.DataArray(np.full((12, 1, 17, 2), np.nan)), xr.DataArray(runner(frame))
-    views = refitting._BroadcastViews(104 + frame, camera, late, nobody, joints, estimates)
+    clock = ImageClock(104 + frame, np.zeros(12), 1.0)
+    views = refitting._BroadcastView(clock, camera, late, nobody, joints, estimates)
     _, found = views(slice(0, 12))
     there = np.isfinite(found.orient).all(axis=(-2, -1))[:, 0]
     assert there.sum() >= 10

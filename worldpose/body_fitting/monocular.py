@@ -11,7 +11,7 @@ an inaccurate method gets almost no weight, and an accurate one helps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -158,6 +158,21 @@ class MonocularPoses:
     def __getitem__(self, frames: slice) -> MonocularPoses:
         """Return the poses in some frames."""
         return MonocularPoses(self.orient[frames], self.angles[frames])
+
+
+def join_poses(poses: Sequence[MonocularPoses]) -> MonocularPoses | None:
+    """Return the poses of several cameras: a person's in a frame by the first that has one."""
+    joined = None
+    for each in poses:
+        if joined is None:
+            joined = each
+            continue
+        known = np.asarray(np.isfinite(joined.orient).all((-1, -2)))
+        joined = MonocularPoses(
+            np.where(known[..., None, None], joined.orient, each.orient),
+            np.where(known[..., None], joined.angles, each.angles),
+        )
+    return joined
 
 
 def place_monocular_poses(

@@ -189,17 +189,3 @@ def constrain_to_rays(camera: Camera, keypoints: Floats, joints: Floats) -> RayC
     shape = (frames, persons, 17, 3)
     origins = np.broadcast_to(rays.origins, rays.directions.shape).reshape(shape)
     return lines_of_sight(origins, rays.directions.reshape(shape), joints)
-
-
-def shift_frames(values: Floats, late: float) -> Floats:
-    """Return values (frames, ...) `late` frames later, linearly interpolated; NaN beyond ends."""
-    before = np.arange(len(values)) + int(np.floor(late))
-    share = late - np.floor(late)
-
-    def take(places: NDArray[np.int64]) -> Floats:
-        out = np.full(values.shape, np.nan)
-        inside = (places >= 0) & (places < len(values))
-        out[inside] = values[places[inside]]
-        return out
-
-    return (1.0 - share) * take(before) + share * take(before + 1) if share else take(before)

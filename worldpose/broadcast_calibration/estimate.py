@@ -68,6 +68,7 @@ class BroadcastClip:
             numbers of the video.
         proposed: the key frames are proposals: they start the fit and are no evidence in it, since
             they come from the paint that the fit measures in every frame.
+        smooth_weight: factor on the smoothness of focal length and distortion.
     """
 
     key_frames: Sequence[KeyFrame]
@@ -78,6 +79,7 @@ class BroadcastClip:
     where: str = "broadcast clip"
     first: int = 0
     proposed: bool = False
+    smooth_weight: float = 1.0
 
     @property
     def moving_boxes(self) -> Floats | None:
@@ -157,6 +159,7 @@ def refine(
     first_errors = learned.errors
     camera = tracked.chain.camera
     spread = estimate_smoothness(camera, fps)
+    spread[3:] /= np.sqrt(clip.smooth_weight)
     if not settings.smooth:
         # Smoothness of the rotation still bridges frames without evidence.
         spread[3:] = np.inf

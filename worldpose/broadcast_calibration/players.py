@@ -15,6 +15,7 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
 from worldpose.geometry.optimize.losses import geman_mcclure_loss
+from worldpose.ingest.clock import ImageClock, rows_at
 
 BONES: Final = np.array(
     [
@@ -51,21 +52,27 @@ class People:
                 todo="Give both for every frame of the clip, missing ones as NaN.",
             )
 
+    @classmethod
+    def in_images(cls, joints: Floats, keypoints: Floats, fps: float, clock: ImageClock) -> People:
+        """Return people in every image of a moving camera, with joints at its time.
+
+        Args:
+            joints: (frames, persons, 17, 3) [m], world, at match frames.
+            keypoints: (frames, detections, 17, 2) [px] in the image of each match frame.
+            fps: match frames per second.
+            clock: the images.
+        """
+        seen = np.full((len(clock.images), *keypoints.shape[1:]), np.nan)
+        seen[clock.image_row] = keypoints
+        return cls(rows_at(joints, clock.frame_row), seen, fps * clock.rate)
+
     def later(self, frames: float) -> People:
         """Return these keypoints with joints of later frames, interpolated linearly.
 
         Joints beyond the clip's ends are missing. A shift [frame] below zero = earlier.
         """
-        if frames == 0.0:
-            return self
-        whole = int(np.floor(frames))
-        share = frames - whole
-        padded = np.full((len(self.joints) + 2 * abs(whole) + 2, *self.joints.shape[1:]), np.nan)
-        begin = abs(whole)
-        padded[begin : begin + len(self.joints)] = self.joints
-        here = padded[begin + whole :][: len(self.joints)]
-        after = padded[begin + whole + 1 :][: len(self.joints)]
-        return replace(self, joints=(1.0 - share) * here + share * after if share else here)
+        rows = np.arange(len(self.joints), dtype=np.float64) + frames
+        return replace(self, joints=rows_at(self.joints, rows))
 
     @property
     def boxes(self) -> Floats:

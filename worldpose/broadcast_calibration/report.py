@@ -359,7 +359,7 @@ def camera_before(arrays: Mapping[Any, ArrayLike]) -> Camera:
 
 
 def broadcast_attributes(
-    clip_id: str, calibration: BroadcastCalibration, first: int = 0
+    clip_id: str, calibration: BroadcastCalibration, first: int = 0, rate: float = 1.0
 ) -> dict[str, Any]:
     """Return the stored attributes of a calibrated clip, with frame numbers of its video.
 
@@ -367,6 +367,7 @@ def broadcast_attributes(
         clip_id: the clip.
         calibration: its camera.
         first: number of its first frame in its video.
+        rate: frames of the video per match frame.
     """
     report, offset = calibration.report, calibration.report.feed_offset
     spec = report.pitch.spec
@@ -379,8 +380,8 @@ def broadcast_attributes(
         "feed_offset": None
         if offset is None
         else {
-            "frames": offset.frames if offset.determined else None,
-            "standard_error": offset.standard_error if offset.determined else None,
+            "frames": offset.frames / rate if offset.determined else None,
+            "standard_error": offset.standard_error / rate if offset.determined else None,
             "pairs": offset.pairs,
         },
         "drift": [float(drift) for drift in report.drift],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -203,12 +203,8 @@ def read_clip(
     sources, findings, ids = _sources(folder, clip, clips, body)
     if manifest is not None and clip in manifest.clips:
         ids = manifest.clips[clip].person_ids
-    names = (path.stem for path in sorted((folder / "cameras").glob("*.npz")))
-    rows = {
-        name: read_camera_rows(folder / "cameras" / f"{name}.npz")
-        for name in names
-        if name == clip or name not in clips
-    }
+    own, static = camera_files(folder, clip, clips)
+    rows = {path.stem: read_camera_rows(path) for path in sorted((*own, *static))}
     frames = max((len(source.points) for source in sources), default=0)
     coco = folder if len(clips) == 1 else folder / clip
     views = []
@@ -232,6 +228,15 @@ def read_clip(
             sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])
             findings += swapped
     return ShippedClip(clip, fps, tuple(sources), tuple(views), pitch, tuple(findings), given)
+
+
+def camera_files(folder: Path, clip: str, clips: Collection[str]) -> tuple[list[Path], list[Path]]:
+    """Return the camera files of one clip, `<clip>` or `<clip>.<camera>`, and those of no clip."""
+    found: dict[str, list[Path]] = {}
+    for path in sorted((folder / "cameras").glob("*.npz")):
+        owners = (each for each in clips if path.stem == each or path.stem.startswith(f"{each}."))
+        found.setdefault(max(owners, key=len, default=""), []).append(path)
+    return found.get(clip, []), found.get("", [])
 
 
 def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:

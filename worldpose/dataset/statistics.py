@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
@@ -80,7 +80,6 @@ def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistic
     ways = [way for clip in clips.values() for way in clip.trajectories_m]
     # Duration of a pose: the time until the next one.
     seconds = sum(clip.poses * clip.seconds / clip.frames for clip in clips.values() if clip.frames)
-    kinds = [clip.camera for clip in clips.values() if clip.camera is not None]
     return DataSetStatistics(
         clips=dict(clips),
         frames=frames,
@@ -90,18 +89,21 @@ def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistic
         subjects_per_frame=poses / frames if frames else None,
         speed_m_s=sum(ways) / seconds if seconds else None,
         longest_trajectory_m=max(ways, default=None),
-        camera=max(kinds, key=KINDS.index, default=None),
+        camera=most_moving(clip.camera for clip in clips.values()),
     )
 
 
+def most_moving(kinds: Iterable[CameraKind | None]) -> CameraKind | None:
+    """Return the kind of the camera that moves most; None if none is known."""
+    return max((kind for kind in kinds if kind), key=KINDS.index, default=None)
+
+
 def camera_kind(path: Path) -> CameraKind | None:
-    """Return the kind of a file's camera; None if there is no such file, or it is unknown.
+    """Return the kind of a file's camera; None if it is unknown.
 
     Raises:
         InputError: the file is damaged.
     """
-    if not path.is_file():
-        return None
     rows = read_camera_rows(path)
     return kind_of(rows.intrinsics[:, (0, 1), (0, 1)].mean(-1), rows.rotation)
 

@@ -9,8 +9,8 @@ for each range of frames. `infra/review_pages/src/viewer/payload.js` reads the s
 - Ranges: `turns` (T,B,24,3) in `turn_units` [rad] relative to the parent joint, `place` (T,B,3)
   [m], `joints` (T,L,17,3) in `joint_unit` [m] relative to `anchor` (T,L,3) for people `loose`
   without a body, `ground` (T,G,3) x, y and deviation [m] of people of kind plane, `spread`
-  (T,N,17) of joints, logarithmic: 1 = 1 mm, 255 = 1 m, 0 = unknown, `views` (T,N,17), `broadcast`
-  (T,18).
+  (T,N,17) of joints, logarithmic: 1 = 1 mm, 255 = 1 m, 0 = unknown, `views` (T,N,17), `moving`
+  (T,C,18) cameras.
 
 The file has a script of type `application/octet-stream` with base64 per part (`data-clip`,
 `data-part`: `scene`, the number of a range, or `video`).
@@ -107,8 +107,8 @@ class ViewerClip:
     """Body model of `bodies`."""
     cameras: Mapping[str, Camera]
     """Static cameras by name."""
-    broadcast: Camera | None
-    """(frames,), NaN where it is unknown."""
+    moving: Mapping[str, Camera]
+    """Moving cameras (frames,) by name, NaN where they are unknown."""
     markings: Sequence[Floats]
     """Painted lines (points, 3) [m]."""
     notes: Mapping[str, str]
@@ -132,7 +132,7 @@ class ViewerClip:
             views=self.views[:count],
             ground=self.ground[:count],
             bodies=None if self.bodies is None else self.bodies[:count],
-            broadcast=None if self.broadcast is None else self.broadcast[:count],
+            moving={name: camera[:count] for name, camera in self.moving.items()},
         )
 
     @property
@@ -182,7 +182,7 @@ def encode_scene(clip: ViewerClip) -> bytes:
             {"name": name, "row": _camera_rows(Camera.stack([camera]))[0].tolist()}
             for name, camera in clip.cameras.items()
         ],
-        "broadcast": clip.broadcast is not None,
+        "moving": list(clip.moving),
         "video": None if clip.video is None else dict(clip.video),
         "notes": dict(clip.notes),
     }
@@ -190,7 +190,7 @@ def encode_scene(clip: ViewerClip) -> bytes:
 
 
 def encode_frames(clip: ViewerClip, first: int, count: int) -> bytes:
-    """Return people and the broadcast camera in some frames.
+    """Return people and the moving cameras in some frames.
 
     Args:
         clip: the clip.
@@ -222,8 +222,9 @@ def encode_frames(clip: ViewerClip, first: int, count: int) -> bytes:
     if (clip.views[here] >= 0).any():
         views = clip.views[here]
         arrays["views"] = np.where(views < 0, 255, np.minimum(views, 254)).astype(np.uint8)
-    if clip.broadcast is not None:
-        arrays["broadcast"] = _camera_rows(clip.broadcast[here]).astype("<f4")
+    if clip.moving:
+        rows = [_camera_rows(camera[here]) for camera in clip.moving.values()]
+        arrays["moving"] = np.stack(rows, axis=1).astype("<f4")
     header = {"first": first, "count": len(joints), "loose": loose.tolist()}
     return _pack(header | {"plane": plane.tolist(), "joint_unit": unit}, arrays)
 

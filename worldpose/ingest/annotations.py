@@ -22,6 +22,9 @@ CLICKED_FOLDER: Final = "annotations/static_calibration"
 KEY_FRAMES_FOLDER: Final = "annotations/broadcast_calibration"
 """Folder of `<clip>.json`, relative to the match folder."""
 
+BROADCAST_FILES: Final = "a clip with a broadcast camera"
+"""Units of files of broadcast cameras, for messages."""
+
 
 def clicked_file(camera_id: str) -> str:
     """Return the path of a camera's clicked markings, relative to the match folder."""
@@ -77,7 +80,7 @@ def read_clicked_markings(
 
 
 def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> dict[str, KeyFrames]:
-    """Return the clicked key frames of the broadcast camera, by clip, in the order of the clips.
+    """Return the clicked key frames by broadcast view, in the order of the clips.
 
     Args:
         folder: the match folder.
@@ -87,12 +90,11 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
     Raises:
         InputError: a file belongs to no clip with a broadcast camera, or is invalid.
     """
-    clips = {clip.id: clip for clip in spec.clips if clip.broadcast is not None}
-    picked = {}
-    of_clips = "<clip>.json of a clip with a broadcast camera"
-    files = files_by_unit(folder, KEY_FRAMES_FOLDER, (".json",), clips, of_clips, alone=True)
+    views, picked = spec.broadcast_views, {}
+    of_clips = f"<clip>.json of {BROADCAST_FILES}"
+    files = files_by_unit(folder, KEY_FRAMES_FOLDER, (".json",), views, of_clips, alone=True)
     for name, file in files.items():
-        camera = spec.camera(str(clips[name].broadcast))
+        camera = views[name].camera
         template = _template(file, pitch)
         key_frames = validate_record(KeyFrames, read_json(file), str(file))
         numbers = [key_frame.frame for key_frame in key_frames.key_frames]
@@ -107,7 +109,7 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
             inside = f"key_frames[{n}].markings"
             _require_markings(str(file), inside, key_frame.markings, camera, template)
         picked[name] = key_frames
-    return {name: picked[name] for name in clips if name in picked}
+    return {name: picked[name] for name in views if name in picked}
 
 
 def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:

@@ -88,8 +88,8 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
     Args:
         file: CVAT for images XML, Label Studio JSON, COCO keypoints JSON or SoccerNet's lines.
         folder: the match folder, with match.yaml.
-        owner: the static camera, or the clip of the broadcast camera whose key frames are numbered
-            by the images' names; None: the images are named after cameras.
+        owner: the static camera, or the broadcast view whose key frames are numbered by the images'
+            names; None: the images are named after cameras.
 
     Raises:
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or
@@ -148,13 +148,13 @@ def _assign_images(
 ) -> dict[str, tuple[CameraSpec, list[MarkedImage]]]:
     """Return camera and images by static camera or clip."""
     static = {camera.id: camera for camera in spec.static_cameras}
-    clips = {clip.id: spec.camera(clip.broadcast) for clip in spec.clips if clip.broadcast}
-    if owner in clips:
-        return {owner: (clips[owner], list(images))}
+    views = spec.broadcast_views
+    if owner in views:
+        return {owner: (views[owner].camera, list(images))}
     if owner is not None and owner not in static:
         raise InputError(
             "--camera",
-            expected=f"one of {', '.join([*static, *clips])}",
+            expected=f"one of {', '.join([*static, *views])}",
             found=repr(owner),
             todo="Name a static camera, or a clip of the broadcast camera.",
         )

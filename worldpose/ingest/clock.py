@@ -13,6 +13,7 @@ or repeated. The nearest whole frame is read; the rest is corrected in the peopl
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -62,3 +63,90 @@ def remaining_offset(frame: Integers, offset: ClockOffset, rate: float = 1.0) ->
     """Return how much later than the match frames (n,) their camera frames are [match frame]."""
     exact = exact_frames(frame, offset, rate)
     return np.asarray((np.floor(exact + 0.5) - exact) / rate)
+
+
+def rows_at(values: Floats, row: Floats) -> Floats:
+    """Return values (frames, ...) at fractional rows (n,), linear in between; NaN beyond ends."""
+    row = np.where(np.isnan(row), -2.0, row)
+    before = np.floor(row).astype(np.int64)
+    share = (row - before).reshape(-1, *(1,) * (values.ndim - 1))
+
+    def take(rows: Integers) -> Floats:
+        out = np.full((len(rows), *values.shape[1:]), np.nan)
+        inside = (rows >= 0) & (rows < len(values))
+        out[inside] = values[rows[inside]]
+        return out
+
+    if not share.any():
+        return take(before)
+    between = (1.0 - share) * take(before) + share * take(before + 1)
+    return np.where(share == 0.0, take(before), between)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageClock:
+    """The images of a moving camera at match frames.
+
+    Attributes:
+        number: (frames,) number in the video of the image that is nearest to each match frame.
+        late: (frames,) how much later than the match frames these images are [match frame].
+        rate: images per match frame.
+    """
+
+    number: Integers
+    late: Floats
+    rate: float
+
+    @classmethod
+    def of(cls, frame: Integers, offset: ClockOffset, rate: float, start: float) -> ImageClock:
+        """Return the clock of a clip with these match frames (frames,), the first with `start`.
+
+        Args:
+            frame: consecutive match frames.
+            offset: as of `worldpose.ingest.footage.UnitFrames`.
+            rate: images per match frame.
+            start: exact number of the image at the first match frame.
+        """
+        number = camera_frames(frame, offset, rate)
+        return cls(number, (number - start) / rate - (frame - frame[0]), rate)
+
+    def __getitem__(self, frames: slice) -> ImageClock:
+        """Return the clock of some of the match frames."""
+        return ImageClock(self.number[frames], self.late[frames], self.rate)
+
+    @property
+    def images(self) -> Integers:
+        """Numbers (images,) of all images from the first to the last."""
+        return np.arange(self.number[0], self.number[-1] + 1)
+
+    @property
+    def image_row(self) -> Integers:
+        """(frames,), place of each match frame's image in `images`."""
+        return np.asarray(self.number - self.number[0])
+
+    @property
+    def frame_row(self) -> Floats:
+        """(images,), place of each of `images` among the match frames, fractional."""
+        return np.asarray(self.late[0] + np.arange(len(self.images)) / self.rate)
+
+    def frame_of(self, number: Integers | int) -> Integers:
+        """Return the place of the last match frame that images of these numbers do not precede."""
+        after = np.searchsorted(self.number, number, side="right")
+        return np.asarray(np.maximum(after - 1, 0), dtype=np.int64)
+
+    def to_images(self, values: Floats, late: float = 0.0) -> Floats:
+        """Return values (frames, ...) at the times of each frame's image and `late` frames on."""
+        return rows_at(values, np.arange(len(values)) + self.late + late)
+
+    def to_frames(self, values: Floats, late: float = 0.0, *, whole: bool = False) -> Floats:
+        """Return values (frames, ...) of images, `late` frames later than stated, at the frames.
+
+        They are linear between two images, or `whole` those of the nearest one.
+        """
+        frame = np.arange(len(values))
+        _, row = np.unique(self.number, return_index=True)
+        time = (frame + self.late + late)[row]
+        times = [time[0] - 1.0 / self.rate, *time, time[-1] + 1.0 / self.rate]
+        places = np.arange(-1.0, len(row) + 1.0)
+        at = np.interp(frame, times, places, left=np.nan, right=np.nan)
+        return rows_at(values[row], np.floor(at + 0.5) if whole else at)

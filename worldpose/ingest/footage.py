@@ -17,7 +17,7 @@ from data_contracts.match import ClockOffset, MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.files import require_file
 from worldpose.formats.keypoint_files import read_people, select_ranges
-from worldpose.ingest.clock import camera_frames
+from worldpose.ingest.clock import ImageClock, camera_frames
 from worldpose.ingest.match_folder import MatchFolder
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnitFrames:
-    """Match frames of a static camera, or of a clip's broadcast camera.
+    """Match frames of a static camera, or of a broadcast view.
 
     Attributes:
         first: first match frame.
@@ -76,24 +76,23 @@ class UnitFrames:
 
 
 def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
-    """Return the frames of a unit: all clips of a static camera, the clip of a broadcast camera.
+    """Return the frames of a unit: all clips of a static camera, the clip of a broadcast view.
 
-    The function rounds a broadcast offset to the nearest frame; the rest stays in the clip's
-    `broadcast_offset_frames`.
+    At the match's frame rate, the function rounds a broadcast offset to the nearest frame; the rest
+    stays in the clip's `broadcast_offset_frames`.
     """
-    clips, rate = spec.clips, 1.0
-    offset: ClockOffset
-    if unit_id in {clip.id for clip in clips}:
-        clip = spec.clip(unit_id)
-        clips = (clip,)
-        offset = round(clip.broadcast_offset_frames) - clip.first_frame
-    else:
-        camera = spec.camera(unit_id)
-        rate = (camera.fps or spec.fps) / spec.fps
-        offset = camera.offset_frames
-        offset = offset if isinstance(offset, tuple) else int(offset)
+    view = spec.broadcast_view(unit_id)
+    camera = spec.camera(unit_id) if view is None else view.camera
+    rate = (camera.fps or spec.fps) / spec.fps
+    offset = camera.offset_frames
+    if view is not None:
+        start = round(view.offset) if rate == 1.0 else view.offset
+        offset = start - view.clip.first_frame * rate
+    if isinstance(offset, float) and offset.is_integer():
+        offset = int(offset)
     ranges: list[tuple[int, int]] = []
-    for first, stop in sorted((c.first_frame, c.first_frame + c.frame_count) for c in clips):
+    spans = ((c.first_frame, c.first_frame + c.frame_count) for c in spec.clips_of(unit_id))
+    for first, stop in sorted(spans):
         if ranges and first <= sum(ranges[-1]):
             begin, count = ranges[-1]
             ranges[-1] = (begin, max(begin + count, stop) - begin)
@@ -103,14 +102,22 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
     return UnitFrames(first, sum(ranges[-1]) - first, offset, tuple(ranges), rate)
 
 
+def image_clock(spec: MatchSpec, name: str) -> ImageClock:
+    """Return the images of a broadcast view."""
+    frames = unit_frames(spec, name)
+    return ImageClock.of(
+        frames.frame, frames.offset, frames.rate, spec.broadcast_views[name].offset
+    )
+
+
 def read_unit(
     match: MatchFolder, unit_id: str
 ) -> tuple[KeypointDetections, CameraCalibration | None]:
-    """Return detections and given calibration of a static camera or a clip's broadcast camera.
+    """Return detections and given calibration of a static camera or a broadcast view.
 
     Args:
         match: match as read by `read_match`.
-        unit_id: id of a static camera, or of a clip that names a broadcast camera.
+        unit_id: id of a static camera, or name of a broadcast view.
 
     Returns:
         Detections with `frame` in match frames, and the calibration if given.
@@ -202,17 +209,13 @@ def read_footage(
 
 
 def footage_clips(spec: MatchSpec, unit_id: str) -> list[tuple[str, int, int]]:
-    """Return the clips of a video: all of a static camera, its own of a broadcast camera."""
-    clips = spec.clips
-    if unit_id in {clip.id for clip in clips}:
-        clips = (spec.clip(unit_id),)
-    return [(clip.id, clip.first_frame, clip.frame_count) for clip in clips]
+    """Return the clips of a video: all of a static camera, one of a broadcast view."""
+    return [(clip.id, clip.first_frame, clip.frame_count) for clip in spec.clips_of(unit_id)]
 
 
 def footage_size(spec: MatchSpec, unit_id: str) -> tuple[int, int]:
-    """Return width, height from match.yaml of a static camera or a clip's broadcast camera."""
-    broadcast = {clip.id: clip.broadcast for clip in spec.clips}.get(unit_id)
-    camera = spec.camera(broadcast or unit_id)
+    """Return width, height from match.yaml of a static camera or a broadcast view."""
+    camera = spec.filming_camera(unit_id) or spec.camera(unit_id)
     return camera.width, camera.height
 
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration, LensCalibration
-from data_contracts.match import MatchSpec, Side
+from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
@@ -19,6 +19,7 @@ from worldpose.formats.calibration_unit import require_metres
 from worldpose.formats.files import read_yaml
 from worldpose.formats.lens_files import read_lens_toml
 from worldpose.ingest.annotations import (
+    BROADCAST_FILES,
     clicked_file,
     key_frames_file,
     read_clicked,
@@ -45,16 +46,15 @@ class MatchFolder:
         folder: path of the folder as given.
         spec: match.yaml.
         calibrations: given static cameras by id; may lack some.
-        detections: given 2D poses, by id of the static camera or clip (its broadcast camera).
+        detections: given 2D poses, by id of the static camera or name of the broadcast view.
         pitch: the surveyed or standard pitch; None without a pitch.
-        videos: video file or folder of images, by id of the static camera or clip.
+        videos: video file or folder of images, by the same names.
         clicked: clicked markings, by id of a static camera; may lack some.
         stills: one image, by id of a static camera; may lack some.
-        key_frames: clicked key frames of the broadcast camera, by id of a clip; may lack some.
+        key_frames: clicked key frames, by name of a broadcast view; may lack some.
         lenses: given lenses without a pose, by id of a static camera; may lack some.
-        estimates: monocular body estimates of the broadcast camera, by id of a clip; may lack
-            some.
-        boxes: given boxes of people, by id of a static camera or clip with a video; may lack some.
+        estimates: monocular body estimates, by name of a broadcast view; may lack some.
+        boxes: given boxes of people, by id or name of a video; may lack some.
     """
 
     folder: Path
@@ -83,33 +83,28 @@ class MatchFolder:
         return tuple(each.id for each in self.spec.static_cameras if each.id not in known)
 
     @property
-    def proposed_clips(self) -> tuple[str, ...]:
-        """Broadcast clips without key frames whose key frames are proposed from their video.
+    def proposed_views(self) -> tuple[str, ...]:
+        """Broadcast views without key frames whose key frames are proposed from their video.
 
-        A proposal needs the clip's video, the pitch, and a stated side of the camera or of a static
+        A proposal needs the view's video, the pitch, and a stated side of the camera or of a static
         camera, whose people then tell the side of the other.
         """
         if self.pitch is None:
             return ()
         told = any(each.side is not None for each in self.spec.static_cameras)
-        clips = (each.id for each in self.spec.clips if each.broadcast is not None)
-        filmed = (each for each in clips if each in self.videos and each not in self.key_frames)
-        return tuple(each for each in filmed if told or self.broadcast_side(each) is not None)
+        views = self.spec.broadcast_views.items()
+        filmed = {name: view for name, view in views if name in self.videos}
+        return tuple(
+            name
+            for name, view in filmed.items()
+            if name not in self.key_frames and (told or view.camera.side is not None)
+        )
 
     @property
-    def calibrated_clips(self) -> tuple[str, ...]:
-        """Broadcast clips with a video whose key frames are clicked or proposed."""
-        known = {*self.key_frames, *self.proposed_clips}
-        return tuple(each.id for each in self.spec.clips if each.id in known & self.videos.keys())
-
-    def broadcast_side(self, clip_id: str) -> Side | None:
-        """The side on which a clip's broadcast camera stands, if it is stated.
-
-        Raises:
-            KeyError: no such clip.
-        """
-        broadcast = self.spec.clip(clip_id).broadcast
-        return None if broadcast is None else self.spec.camera(broadcast).side
+    def calibrated_views(self) -> tuple[str, ...]:
+        """Broadcast views with a video whose key frames are clicked or proposed."""
+        known = {*self.key_frames, *self.proposed_views} & self.videos.keys()
+        return tuple(name for name in self.spec.broadcast_views if name in known)
 
 
 def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
@@ -148,7 +143,7 @@ def read_spec(folder: Path) -> MatchSpec:
 
 def _read_match(folder: Path) -> MatchFolder:
     spec = read_spec(folder)
-    if not spec.static_cameras and not any(clip.broadcast for clip in spec.clips):
+    if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
             f"{folder / 'match.yaml'}: cameras",
             expected="a static camera, or a clip with a broadcast camera",
@@ -157,6 +152,7 @@ def _read_match(folder: Path) -> MatchFolder:
         )
     detections = _detections(folder, spec)
     videos = _videos(folder, spec)
+    _require_one_view(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
     calibrations = _calibrations(folder, spec)
@@ -207,17 +203,17 @@ def require_calibrated(match: MatchFolder) -> None:
 
 def unclicked_clips(match: MatchFolder) -> tuple[str, ...]:
     """Return the broadcast clips that need key frames; none if static cameras film the match."""
-    clips = (clip.id for clip in match.spec.clips if clip.broadcast is not None)
-    filmed = (clip for clip in clips if clip in match.videos and match.pitch is not None)
-    unclicked = tuple(clip for clip in filmed if clip not in match.calibrated_clips)
+    views = match.spec.broadcast_views
+    filmed = (name for name in views if name in match.videos and match.pitch is not None)
+    unclicked = tuple(name for name in filmed if name not in match.calibrated_views)
     return () if match.spec.static_cameras else unclicked
 
 
 def _require_key_frames(match: MatchFolder) -> None:
     """Raise InputError if no broadcast clip of a match without static cameras can be calibrated."""
-    if match.pitch is not None and match.calibrated_clips:
+    if match.pitch is not None and match.calibrated_views:
         return
-    clip = next(each.id for each in match.spec.clips if each.broadcast is not None)
+    clip = next(iter(match.spec.broadcast_views))
     found, todo = "no clip with a video", f"Add broadcast/{clip}.mp4."
     if match.pitch is None:
         found, todo = "no pitch", "Take `pitch: none` out of match.yaml."
@@ -304,18 +300,13 @@ def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:
 
 
 def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    known = [*(camera.id for camera in spec.static_cameras), *_broadcast_clips(spec)]
-    units = "a static camera or a clip with a broadcast camera"
+    known = [*(camera.id for camera in spec.static_cameras), *spec.broadcast_views]
+    units = f"a static camera or {BROADCAST_FILES}"
     return files_by_unit(folder, "detections", (".json", ".npz"), known, units)
 
 
 def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    known, units = _broadcast_clips(spec), "a clip with a broadcast camera"
-    return files_by_unit(folder, "estimates", (".npz",), known, units)
-
-
-def _broadcast_clips(spec: MatchSpec) -> list[str]:
-    return [clip.id for clip in spec.clips if clip.broadcast is not None]
+    return files_by_unit(folder, "estimates", (".npz",), spec.broadcast_views, BROADCAST_FILES)
 
 
 def _boxes(
@@ -339,13 +330,26 @@ def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
             videos[camera.id] = named[camera.id]
         elif find_file(folder, usual).exists():
             videos[camera.id] = existing_file(folder, usual, str(folder))
-    for clip in spec.clips:
-        usual = f"broadcast/{clip.id}.mp4"
-        if clip.broadcast is not None and find_file(folder, usual).exists():
-            videos[clip.id] = existing_file(folder, usual, str(folder))
-        elif clip.broadcast is not None and clip.broadcast in named:
-            videos[clip.id] = named[clip.broadcast]
+    for name, view in spec.broadcast_views.items():
+        usual = f"broadcast/{name}.mp4"
+        if find_file(folder, usual).exists():
+            videos[name] = existing_file(folder, usual, str(folder))
+        elif view.camera.id in named:
+            videos[name] = named[view.camera.id]
     return videos
+
+
+def _require_one_view(folder: Path, spec: MatchSpec) -> None:
+    """Raise InputError for several broadcast cameras in one clip without static cameras."""
+    several = [clip for clip in spec.clips if len(clip.moving_cameras) > 1]
+    if several and not spec.static_cameras:
+        raise InputError(
+            f"{folder / 'match.yaml'}: clip {several[0].id}: broadcast",
+            expected="one broadcast camera, as there are no static cameras",
+            found=", ".join(several[0].moving_cameras),
+            todo="Static cameras tell who is who in several views. Without them, give each camera "
+            "a clip of its own.",
+        )
 
 
 def _require_footage(
@@ -360,14 +364,14 @@ def _require_footage(
                 todo=f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz)"
                 f"{_another_video(folder, camera.id)}.",
             )
-    for clip in spec.clips:
-        if clip.broadcast is not None and clip.id not in detections and clip.id not in videos:
+    for name, view in spec.broadcast_views.items():
+        if name not in detections and name not in videos:
             raise InputError(
                 str(folder),
-                expected=f"footage of broadcast camera {clip.broadcast} for clip {clip.id}",
+                expected=f"footage of broadcast camera {view.camera.id} for clip {view.clip.id}",
                 found="none",
-                todo=f"Add broadcast/{clip.id}.mp4 or detections/{clip.id}.json (or .npz), or "
-                "take `broadcast` out of the clip.",
+                todo=f"Add broadcast/{name}.mp4 or detections/{name}.json (or .npz), or "
+                "take the camera out of `broadcast` of the clip.",
             )
 
 

@@ -41,7 +41,7 @@ class MatchAnnotations:
     clicked: Mapping[str, ClickedMarkings] = field(default_factory=dict)
     """Clicks in one image, by static camera id."""
     key_frames: Mapping[str, KeyFrames] = field(default_factory=dict)
-    """Clicked key frames of the broadcast camera, by clip id."""
+    """Clicked key frames by broadcast view."""
 
 
 def write_match(
@@ -64,8 +64,8 @@ def write_match(
         folder: absent, or an empty folder.
         spec: match.yaml.
         calibrations: static cameras by id.
-        observations: detections by id of a static camera or clip; `frame` is the camera's (or the
-            broadcast clip's) own frame number, as in the files, not the match frame.
+        observations: detections by id of a static camera or name of a broadcast view; `frame` is
+            the camera's own frame number, as in the files, not the match frame.
         pitch: written to the file named by `spec.pitch`, else to pitch.json.
         annotations: clicked markings of the cameras; None = no clicks.
         stills: images (height, width, 3), RGB, by camera id; written to the file named by the
@@ -134,7 +134,8 @@ def write_match(
 
 
 def _require_known(spec: MatchSpec, names: list[str]) -> None:
-    known = [camera.id for camera in spec.cameras] + [clip.id for clip in spec.clips]
+    named = [camera.id for camera in spec.cameras] + [clip.id for clip in spec.clips]
+    known = [*dict.fromkeys((*named, *spec.broadcast_views))]
     for name in names:
         if name not in known:
             raise InputError(

@@ -25,7 +25,6 @@ def write_recording(
     fps: float,
     *,
     cameras: Mapping[str, Camera] | None = None,
-    broadcast: Camera | None = None,
     pitch: PitchSpec | None = None,
 ) -> None:
     """Write a recording (.rrd) atomically, with timelines `frame` and `time`.
@@ -34,8 +33,7 @@ def write_recording(
         path: the file.
         tracks: joints of all people; missing joints are left out.
         fps: frames per second [1/s].
-        cameras: single cameras by id.
-        broadcast: one camera per frame of the tracks; NaN where missing.
+        cameras: by id, single or one per frame of the tracks; NaN where missing.
         pitch: draw its markings; None without a pitch.
 
     Raises:
@@ -60,13 +58,16 @@ def write_recording(
             stream.log(
                 "world/pitch", rr.LineStrips3D(lines, colors=[white], radii=[0.06]), static=True
             )
-        for name, camera in (cameras or {}).items():
-            _log_camera(rr, stream, f"world/cameras/{name}", camera, static=True)
+        cameras = cameras or {}
+        moving = {name: camera for name, camera in cameras.items() if camera.batch_shape}
+        for name in [name for name in cameras if name not in moving]:
+            _log_camera(rr, stream, f"world/cameras/{name}", cameras[name], static=True)
         for row, frame in enumerate(tracks.frames):
             stream.set_time("frame", sequence=int(frame))
             stream.set_time("time", duration=float(frame) / fps)
-            if broadcast is not None and not np.isnan(broadcast.numbers[row]).any():
-                _log_camera(rr, stream, "world/cameras/broadcast", broadcast[row], static=False)
+            for name, camera in moving.items():
+                if not np.isnan(camera.numbers[row]).any():
+                    _log_camera(rr, stream, f"world/cameras/{name}", camera[row], static=False)
             stream.log("world/people", _skeletons(rr, tracks, row))
         stream.flush()
         stream.disconnect()

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from data_contracts.arrays import Image, Singles
+from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.body.body_file import OPEN_BODY, load_open_body
@@ -33,7 +33,7 @@ from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.recordings import read_clip, read_trajectories
 from worldpose.simulation.reference import CLIP_ID, write_reference
 from worldpose.simulation.renderer import film_broadcast, open_view, render_frame
-from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.scene import Scene, broadcast_id, simulate_scene
 from worldpose.simulation.settings import CalibrationErrors, Scenario
 from worldpose.simulation.venues import build_venue
 from worldpose.video.files import write_video
@@ -53,13 +53,13 @@ def _film_scene(
     at_once = 4
 
     def film(name: str) -> None:
-        part = "broadcast" if name == CLIP_ID else "videos"
+        part = "broadcast" if name in stage.scene.broadcast else "videos"
         file = folder / part / f"{name}.mp4"
         file.parent.mkdir(exist_ok=True)
         labelled = _keep_labels(stage, name, folder, options, advance)
-        write_video(file, labelled, stage.scenario.fps)
+        write_video(file, labelled, stage.fps(name))
 
-    names = [*stage.scene.cameras, *([] if stage.scene.broadcast is None else [CLIP_ID])]
+    names = [*stage.scene.cameras, *stage.scene.broadcast]
     with ThreadPoolExecutor(min(at_once, os.cpu_count() or 1)) as pool:
         for _ in pool.map(film, names):
             pass
@@ -75,6 +75,16 @@ class _FilmSet:
         # open.
         self.times = np.arange(len(scene.truth.frames) + 1) / scenario.fps
 
+    def fps(self, name: str) -> float:
+        """Return the frame rate of a camera [1/s]."""
+        view = self.scene.broadcast.get(name)
+        return self.scenario.fps if view is None else view.fps
+
+    def count(self, name: str) -> int:
+        """Return the number of images of a camera."""
+        view = self.scene.broadcast.get(name)
+        return len(self.scene.truth.frames) if view is None else len(view.times)
+
     @functools.cached_property
     def poses(self) -> BodyParameters:
         """Return the bodies (persons, times)."""
@@ -89,22 +99,24 @@ class _FilmSet:
         return dress_people(betas, roles, self.seed, look.patterns)
 
     def film(self, name: str, frames: int | None = None) -> Iterator[RenderedFrame]:
-        """Yield the first frames of a static camera or the clip, by default all."""
-        moments = self._moments(self.scene.clocks.get(name, 0.0) / self.scenario.fps, frames)
-        if name == CLIP_ID:
-            assert self.scene.broadcast is not None  # callers check this
+        """Yield the first frames of a static camera or a broadcast view, by default all."""
+        fps = self.fps(name)
+        count = self.count(name) if frames is None else frames
+        late = self.scene.clocks.get(name, 0.0) / fps
+        moments = self._moments(np.arange(count + 1) / fps + late, fps)
+        if name in self.scene.broadcast:
             venue = build_venue(self.pitch, self.seed, self.scenario.look)
-            yield from film_broadcast(self.scene.broadcast, venue, moments)
+            yield from film_broadcast(self.scene.broadcast[name].camera, venue, moments)
             return
         view = open_view(self.scene.cameras[name], self.pitch, self.seed, self.scenario.look)
         for frame, each in enumerate(moments):
             yield render_frame(view, each.cast, each.opened, each.closed, frame=frame)
 
-    def _moments(self, clock_offset: float, frames: int | None) -> Iterator[Moment]:
-        """Yield the people in every frame of a camera with a clock offset [s]."""
-        times = (self.times if frames is None else self.times[: frames + 1]) + clock_offset
-        poses = self.poses if clock_offset == 0.0 else self.scene.crowd.poses(times)
-        share = self.scenario.look.exposure_s * self.scenario.fps
+    def _moments(self, times: Floats, fps: float) -> Iterator[Moment]:
+        """Yield the people in every frame of a camera, from its times and that of one more [s]."""
+        is_usual = np.array_equal(times, self.times[: len(times)])
+        poses = self.poses if is_usual else self.scene.crowd.poses(times)
+        share = self.scenario.look.exposure_s * fps
         surfaces = (self.cast.pose(poses[:, k]) for k in range(len(times)))
         for opened, following in pairwise(surfaces):
             closed = opened.toward(following, share) if share > 0.0 else opened
@@ -122,19 +134,16 @@ def _keep_labels(
     for number, frame in enumerate(stage.film(name)):
         boxes.append(frame.boxes.astype(np.float32))
         visible.append(frame.visible.astype(np.float32))
-        if options.stills and name != CLIP_ID and number == 0:
+        if options.stills and name in stage.scene.cameras and number == 0:
             write_still(folder / "stills" / f"{name}.png", frame.image)
         if options.masks:
             file = masks / f"{number:06d}.png"
             cv2.imwrite(str(file), (frame.person_ids + 1).astype(np.uint8))
         yield frame.image
         if advance is not None:
-            advance(name, number + 1, len(stage.scene.truth.frames))
+            advance(name, number + 1, stage.count(name))
     file = folder / "reference" / "boxes" / f"{name}.npz"
     write_archive(file, {"boxes": np.array(boxes), "visible": np.array(visible)})
-
-
-BROADCAST_ID = "broadcast"
 
 
 @dataclass(frozen=True)
@@ -224,14 +233,18 @@ def _describe_match(
         CameraSpec(id=name, width=width, height=height, still=still)
         for name, still in stills.items()
     ]
-    broadcast = None
-    if scene.broadcast is not None:
-        broadcast = BROADCAST_ID
-        specs.append(CameraSpec(id=BROADCAST_ID, kind="broadcast", width=width, height=height))
+    moving = []
+    for number, view in enumerate(scene.broadcast.values()):
+        wide, high = view.camera.image_size.reshape(-1, 2)[0].tolist()
+        fps = None if view.fps == scenario.fps else view.fps
+        name = broadcast_id(number)
+        moving.append(CameraSpec(id=name, kind="broadcast", width=wide, height=high, fps=fps))
+    names = tuple(camera.id for camera in moving)
+    broadcast = names if len(names) > 1 else next(iter(names), None)
     return MatchSpec(
         match_id=match_id,
         fps=scenario.fps,
-        cameras=tuple(specs),
+        cameras=(*specs, *moving),
         clips=(ClipSpec(id=CLIP_ID, frame_count=len(scene.truth.frames), broadcast=broadcast),),
     )
 
@@ -244,17 +257,20 @@ def _write_further(
     _write_truth(folder / "reference", scenario, scene, detected=not options.render)
     if options.render:
         _film_scene(stage, folder, options, advance)
-    elif scene.broadcast is not None and scenario.key_frames and options.video:
-        video = folder / "broadcast" / f"{CLIP_ID}.mp4"
-        video.parent.mkdir()
-        write_video(video, (frame.image for frame in stage.film(CLIP_ID)), scenario.fps)
-        poses, rng = scene.poses, np.random.default_rng([stage.seed, 5])
+        return
+    is_filmed = scenario.key_frames and options.video
+    for number, (name, view) in enumerate(scene.broadcast.items() if is_filmed else ()):
+        video = folder / "broadcast" / f"{name}.mp4"
+        video.parent.mkdir(exist_ok=True)
+        write_video(video, (frame.image for frame in stage.film(name)), view.fps)
+        poses = scene.poses if view.fps == scenario.fps else scene.crowd.poses(view.times)
         given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
         bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
+        rng = np.random.default_rng([stage.seed, 5, number][: 3 if number else 2])
         found = estimate_bodies(
-            load_open_body(), bodies, scene.broadcast, scenario.fps, MonocularErrors(), rng
+            load_open_body(), bodies, view.camera, view.fps, MonocularErrors(), rng
         )
-        write_archive(folder / "estimates" / f"{CLIP_ID}.npz", found)
+        write_archive(folder / "estimates" / f"{name}.npz", found)
 
 
 def _apply_options(
@@ -298,15 +314,18 @@ def _draw_stills(stage: _FilmSet) -> dict[str, Image]:
 
 
 def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFrames]:
-    """Return the annotated key frames of the broadcast camera's video, if the scenario has any."""
-    if scene.broadcast is None or not scenario.key_frames:
+    """Return the annotated key frames of the broadcast cameras' videos, if there are any."""
+    if not scenario.key_frames:
         return {}
-    painted = PitchTemplate.from_spec(scenario.pitch)
-    people, rng = scene.truth.joints, np.random.default_rng([seed, 4])
-    clicked = click_key_frames(
-        scene.broadcast, painted, people, scenario.clicks, scenario.key_frames, rng
-    )
-    return {CLIP_ID: clicked}
+    painted, rng = PitchTemplate.from_spec(scenario.pitch), np.random.default_rng([seed, 4])
+    clicked = {}
+    for name, view in scene.broadcast.items():
+        is_usual = view.fps == scenario.fps
+        people = scene.truth.joints if is_usual else scene.crowd.joints(view.times)
+        clicked[name] = click_key_frames(
+            view.camera, painted, people, scenario.clicks, scenario.key_frames, rng
+        )
+    return clicked
 
 
 def _write_truth(folder: Path, scenario: Scenario, scene: Scene, *, detected: bool) -> None:
@@ -326,5 +345,5 @@ def _write_truth(folder: Path, scenario: Scenario, scene: Scene, *, detected: bo
         scenario.pitch.model_copy(update={"points": points}),
     )
     write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
-    if scene.broadcast is not None:
-        write_moving_camera(folder / "cameras" / f"{CLIP_ID}.npz", scene.broadcast)
+    for name, view in scene.broadcast.items():
+        write_moving_camera(folder / "cameras" / f"{name}.npz", view.camera[view.number])

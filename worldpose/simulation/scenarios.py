@@ -61,7 +61,7 @@ _TINY: Final = Scenario(
     "seconds to reconstruct.",
     duration=4.0,
     rig=RigSettings(person_height_px=95.0),
-    broadcast=BroadcastSettings(),
+    broadcast=(BroadcastSettings(),),
 )
 _STADIUM: Final = RigSettings(cameras=16, seats=STADIUM_SEATS)
 _TEAMS: Final = CrowdSettings(
@@ -75,7 +75,7 @@ _MATCH: Final = Scenario(
     fps=50.0,
     crowd=_TEAMS,
     rig=_STADIUM,
-    broadcast=BroadcastSettings(),
+    broadcast=(BroadcastSettings(),),
     noise=ObservationNoise(),
 )
 _BOX: Final = CrowdSettings(
@@ -122,7 +122,7 @@ SCENARIOS: Final = {
             fps=50.0,
             crowd=_BOX,
             rig=_SPRAWL,
-            broadcast=BroadcastSettings(),
+            broadcast=(BroadcastSettings(),),
             noise=_TRIAL,
             # A line is 7 px wide here: a click on its edge instead of its middle is 3.5 px off.
             clicks=ClickSettings(clustered=1.0, clustered_points=(5, 5), noise_px=3.0),
@@ -141,7 +141,7 @@ SCENARIOS: Final = {
                 speed_m_s=(2.0, 6.0),
             ),
             rig=RigSettings(cameras=10, person_height_px=95.0, height_m=(7.0, 14.0)),
-            broadcast=BroadcastSettings(),
+            broadcast=(BroadcastSettings(),),
         ),
         Scenario(
             name="corner-kick",
@@ -156,7 +156,7 @@ SCENARIOS: Final = {
                 speed_m_s=(0.0, 5.0),
             ),
             rig=_STADIUM,
-            broadcast=BroadcastSettings(),
+            broadcast=(BroadcastSettings(),),
             # Detectors mix up limbs in crowds.
             noise=ObservationNoise(stolen=0.25),
         ),
@@ -188,7 +188,7 @@ SCENARIOS: Final = {
             duration=4.0,
             crowd=CrowdSettings(people=12, area_center_m=(38.0, -6.0), area_size_m=(26.0, 24.0)),
             rig=RigSettings(person_height_px=55.0),
-            broadcast=BroadcastSettings(),
+            broadcast=(BroadcastSettings(),),
             look=RenderingSettings(
                 light="floodlights",
                 fog_per_m=0.012,
@@ -204,7 +204,7 @@ SCENARIOS: Final = {
             "20 s of the match, the broadcast camera panning to and fro.",
             _MATCH,
             duration=20.0,
-            broadcast=BroadcastSettings(sweep_m=22.0, focal_px=(3300.0, 4200.0)),
+            broadcast=(BroadcastSettings(sweep_m=22.0, focal_px=(3300.0, 4200.0)),),
             key_frames=4,
         ),
         _variant(
@@ -212,7 +212,22 @@ SCENARIOS: Final = {
             "20 s of the match, the broadcast camera zooming from its widest to its closest.",
             _MATCH,
             duration=20.0,
-            broadcast=BroadcastSettings(focal_px=(2500.0, 7000.0), zoom_period_s=(14.0, 20.0)),
+            broadcast=(BroadcastSettings(focal_px=(2500.0, 7000.0), zoom_period_s=(14.0, 20.0)),),
+            key_frames=4,
+        ),
+        _variant(
+            "three-broadcast",
+            "6 s of the match with three broadcast cameras, one at 59.94 frames per second, one of "
+            "4K.",
+            _MATCH,
+            duration=6.0,
+            broadcast=(
+                BroadcastSettings(),
+                BroadcastSettings(fps=59.94, aside_m=12.0, focal_px=(3500.0, 5500.0)),
+                BroadcastSettings(
+                    image_size_px=(3840, 2160), aside_m=20.0, focal_px=(2500.0, 3600.0)
+                ),
+            ),
             key_frames=4,
         ),
     )

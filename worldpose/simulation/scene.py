@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyParameters
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
+from worldpose.ingest.clock import camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import Clicks, add_calibration_errors, click, every, survey
 from worldpose.simulation.crowd import Crowd, gather
@@ -130,7 +131,7 @@ def move_broadcast_camera(
 
     Args:
         settings: place, zoom and operator.
-        times: (frames,) [s].
+        times: (frames,) [s], of the camera's own images.
         action: (samples, 2) [m], world; place of the action.
         action_times: (samples,) [s], from `WARM_UP` before the first frame to the last.
         image_size: width, height [px].
@@ -152,21 +153,22 @@ def move_broadcast_camera(
     aim = _smooth(_smooth(aim, 0.5 * settings.lag_s), 0.5 * settings.lag_s)
     aim = np.stack([np.interp(times, hand, axis) for axis in aim.T], axis=-1)
 
+    width, scale = np.array(image_size, dtype=np.float64), image_size[0] / 1920.0
     low, high = settings.focal_px
     period = rng.uniform(*settings.zoom_period_s)
     wave = np.sin(2.0 * np.pi * (times / period + rng.random()))
-    focal = low * (high / low) ** (0.5 + 0.5 * wave)
+    focal = scale * low * (high / low) ** (0.5 + 0.5 * wave)
     roll = np.radians(0.15) * rng.standard_normal()
     poses = [look_at(center, np.array([*point, 1.0]), roll) for point in aim]
-    glass, width = rng.uniform(0.85, 1.15, 2), np.array(image_size, dtype=np.float64)
-    zoomed = focal / 4200.0
+    glass = rng.uniform(0.85, 1.15, 2)
+    zoomed = focal / (4200.0 * scale)
     k1 = np.clip(0.42 * glass[0] * zoomed**1.6, 0.0, 1.0)
     k2 = np.clip(1.6 * glass[1] * zoomed, 0.0, 4.3)
     nothing = np.zeros_like(k1)
     offset = np.array([rng.uniform(-16.0, 12.0), rng.uniform(-60.0, -3.0)])
     return Camera(
         focal=np.stack([focal, focal], axis=-1),
-        principal_point=np.broadcast_to((width - 1.0) / 2.0 + offset, (len(times), 2)),
+        principal_point=np.broadcast_to((width - 1.0) / 2.0 + scale * offset, (len(times), 2)),
         distortion=np.stack([k1, k2, nothing, nothing, nothing], axis=-1),
         cam_from_world=Rigid(
             np.stack([pose.rotation for pose in poses]),
@@ -187,6 +189,26 @@ def _smooth(signal: Floats, time: float) -> Floats:
 
 
 Seed = np.random.SeedSequence
+
+
+@dataclass(frozen=True, eq=False)
+class MovingView:
+    """A moving camera.
+
+    Attributes:
+        camera: a batch (images,).
+        fps: images per second.
+        number: (frames,) image that is nearest to each frame of the match.
+    """
+
+    camera: Camera
+    fps: float
+    number: Integers
+
+    @property
+    def times(self) -> Floats:
+        """Times of the images [s]."""
+        return np.arange(len(self.camera.focal)) / self.fps
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +247,8 @@ class Scene:
         poses: the bodies (persons, frames) whose keypoints the truth's joints are.
         cameras: the true static cameras by id, in the order of the rig.
         given: the same cameras with the errors of calibration.toml.
-        broadcast: the moving camera, a batch (frames,); None without.
-        observations: detections by id of a static camera, or of the clip for the broadcast camera.
+        broadcast: the moving cameras by name of their broadcast view.
+        observations: detections by id of a static camera or name of a broadcast view.
         identities: identities of the detections, by the same ids.
         clocks: offset of a static camera behind its stated clock, by id [frame].
         clicks: a person's clicks in the first frame of every static camera, by id.
@@ -239,7 +261,7 @@ class Scene:
     poses: BodyParameters
     cameras: dict[str, Camera]
     given: dict[str, Camera]
-    broadcast: Camera | None
+    broadcast: dict[str, MovingView]
     observations: dict[str, KeypointDetections]
     identities: dict[str, Report]
     clocks: dict[str, float]
@@ -358,14 +380,14 @@ def simulate_scene(
             rng=_rng(hand),
         )
         cameras[name] = camera
-    broadcast = None
-    if scenario.broadcast is not None:
+    broadcast = dict[str, MovingView]()
+    for number, settings in enumerate(scenario.broadcast):
         place, detections = broadcast_seed.spawn(2)
-        size = scenario.rig.image_size_px
-        broadcast = move_broadcast_camera(
-            scenario.broadcast, times, crowd.action, crowd.action_times, size, _rng(place)
-        )
-        reports[CLIP_ID], _ = world.film(broadcast, joints, detections)
+        name = view_name(scenario, number)
+        broadcast[name] = view = _move(settings, scenario, crowd, len(times), _rng(place))
+        faster = replace(world, scenario=scenario.model_copy(update={"fps": view.fps}))
+        seen = joints if view.fps == scenario.fps else crowd.joints(view.times)
+        reports[name], _ = faster.film(view.camera, seen, detections)
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(len(own)), joints, views=views),
         defined=joints + world.perceive(joints),
@@ -380,6 +402,32 @@ def simulate_scene(
         clicks=clicks,
         surveyed=survey(scenario.pitch, scenario.survey_error, _rng(survey_seed)),
     )
+
+
+def view_name(scenario: Scenario, number: int) -> str:
+    """Return the name of a broadcast view, the clip's if there is one alone."""
+    return CLIP_ID if len(scenario.broadcast) == 1 else f"{CLIP_ID}.{broadcast_id(number)}"
+
+
+def broadcast_id(number: int) -> str:
+    """Return the id of a broadcast camera."""
+    return f"broadcast{number + 1}" if number else "broadcast"
+
+
+def _move(
+    settings: BroadcastSettings,
+    scenario: Scenario,
+    crowd: Crowd,
+    frames: int,
+    rng: np.random.Generator,
+) -> MovingView:
+    """Return a moving camera at its own frame rate, over this number of match frames."""
+    fps = settings.fps or scenario.fps
+    number = camera_frames(np.arange(frames), 0.0, fps / scenario.fps)
+    times = np.arange(number[-1] + 1) / fps
+    size = settings.image_size_px or scenario.rig.image_size_px
+    action = (crowd.action, crowd.action_times)
+    return MovingView(move_broadcast_camera(settings, times, *action, size, rng), fps, number)
 
 
 def _rng(seed: Seed) -> np.random.Generator:

@@ -219,7 +219,8 @@ class BroadcastSettings(Record):
     aside_m: float = Field(default=0.3, ge=0, le=100)
     """Maximum distance off the halfway line [m]."""
     focal_px: Range = (2900.0, 6200.0)
-    """Widest and closest zoom within a clip [px]; all clips together span 2400 to 7100."""
+    """Widest and closest zoom within a clip, in pixels of an image 1920 wide; all clips together
+    span 2400 to 7100."""
     zoom_period_s: Range = (10.0, 24.0)
     """Time from wide to close and back [s]; the focal length then changes by at most about 20 px
     per frame."""
@@ -230,6 +231,10 @@ class BroadcastSettings(Record):
     """Drift of the aim off the action along x [m]: operators lead and trail play."""
     sweep_m: float = Field(default=0.0, ge=0, le=100)
     """Amplitude along x of a steady pan back and forth around the action [m]."""
+    fps: FramesPerSecond | None = None
+    """[1/s]; None = the scenario's."""
+    image_size_px: tuple[ImageLength, ImageLength] | None = None
+    """Width and height; None = those of the static cameras."""
 
 
 class CalibrationErrors(Record):
@@ -290,8 +295,8 @@ class Scenario(Record):
     """[1/s]"""
     crowd: CrowdSettings = CrowdSettings()
     rig: RigSettings = RigSettings()
-    broadcast: BroadcastSettings | None = None
-    """None = no moving camera."""
+    broadcast: tuple[BroadcastSettings, ...] = ()
+    """The moving cameras."""
     key_frames: int = Field(default=0, ge=0, le=100)
     """Number of annotated broadcast frames [1]; if there are any, the video is written."""
     calibration: CalibrationErrors = CalibrationErrors()

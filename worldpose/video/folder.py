@@ -204,6 +204,27 @@ def some_pictures(
         yield from video.readable(int(group[0]), int(group[-1]) + 1, only=only)
 
 
+def pictures_at(
+    video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
+) -> Iterator[Image | None]:
+    """Yield the frame of each number; None for a negative one.
+
+    Args:
+        video: their source.
+        numbers: (pictures,) rising, with repetitions.
+
+    Raises:
+        InputError: a frame cannot be decoded.
+    """
+    there = numbers[numbers >= 0]
+    shown = video.frames(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
+    at, picture = -1, None
+    for number in numbers.tolist():
+        while at < number:
+            at, picture = next(shown)
+        yield picture if number >= 0 else None
+
+
 def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]:
     """Return groups of frames, each decoded in one pass.
 

@@ -15,6 +15,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from flows.registering import register
 from flows.run_plan import plan_run
+from flows.stages.broadcast_calibration import uncalibrated_warnings
 from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry.cameras import Camera
@@ -52,11 +53,16 @@ def observed(frame, keypoints):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A match of one static camera and two broadcast clips, one in the middle of its video."""
+    """A match of one static camera and broadcast clips, one in the middle of its video.
+
+    In clip `both`, one of two broadcast cameras takes 30 images per second.
+    """
     true, rng = clip.moving(VIDEO, pan=(-2.0, 6.0)), np.random.default_rng(2)
     numbers = np.arange(VIDEO)
     seen = true.camera.project(joints(FIRST + numbers - OFFSET).reshape(VIDEO, -1, 3))
     seen = seen.reshape(VIDEO, 12, 17, 2) + rng.standard_normal((VIDEO, 12, 17, 2))
+    both = true.camera.project(joints(60 + (numbers - OFFSET) / 1.2).reshape(VIDEO, -1, 3))
+    both = both.reshape(VIDEO, 12, 17, 2) + rng.standard_normal((VIDEO, 12, 17, 2))
     static: Camera = true.camera[0]
     width, height = clip.SIZE
     spec = MatchSpec(
@@ -65,6 +71,8 @@ def folder(tmp_path_factory):
         cameras=(
             CameraSpec(id="one", width=width, height=height),
             CameraSpec(id="main", kind="broadcast", width=width, height=height),
+            CameraSpec(id="wide", kind="broadcast", width=width, height=height),
+            CameraSpec(id="fast", kind="broadcast", width=width, height=height, fps=1.2 * FPS),
         ),
         clips=(
             ClipSpec(
@@ -75,6 +83,14 @@ def folder(tmp_path_factory):
                 broadcast_offset_frames=OFFSET,
             ),
             ClipSpec(id="shot", first_frame=90, frame_count=COUNT, broadcast="main"),
+            ClipSpec(
+                id="both",
+                first_frame=60,
+                frame_count=COUNT,
+                broadcast=("wide", "fast"),
+                broadcast_offset_frames={"wide": 0.0, "fast": OFFSET},
+                broadcast_smooth_weight=2.0,
+            ),
         ),
     )
     key = KeyFrame(frame=9, markings=clicks(true, 9))
@@ -86,6 +102,11 @@ def folder(tmp_path_factory):
         goal = draft / "broadcast" / "goal.mp4"
         write_video(goal, render_broadcast(true.camera, clip.PITCH, None, 5), FPS)
         shutil.copy(goal, goal.with_name("shot.mp4"))
+        write_video(
+            goal.with_name("both.fast.mp4"),
+            render_broadcast(true.camera, clip.PITCH, None, 5),
+            1.2 * FPS,
+        )
 
     path = tmp_path_factory.mktemp("matches") / "stage"
     inside = np.where(((seen > 0) & (seen < true.image_size - 1)).all(-1, keepdims=True), seen, 5.0)
@@ -97,12 +118,15 @@ def folder(tmp_path_factory):
             "one": observed(np.arange(FIRST, FIRST + COUNT), inside[:COUNT]),
             "goal": observed(numbers, inside),
             "shot": observed(numbers, inside),
+            "both.fast": observed(numbers, np.where(np.isfinite(inside), both, 5.0)),
+            "both.wide": observed(numbers, inside),
         },
         pitch=PitchSpec(),
         annotations=MatchAnnotations(
             key_frames={
                 "goal": KeyFrames(key_frames=(key, late)),
                 "shot": KeyFrames(key_frames=(other,)),
+                "both.fast": KeyFrames(key_frames=(key,)),
             }
         ),
         further=video,
@@ -149,12 +173,14 @@ def calibrated(folder, tmp_path_factory):
     ) as result:
         result.write(surface, arrays={}, coordinates={}, attributes={"surface": None})
     there = joints(FIRST + np.arange(float(COUNT)))
+    nobody = np.full_like(there, np.nan)
+    moved = joints(60 + np.arange(float(COUNT)))
     # Nobody was found in the second clip.
-    for name, first, places in (("goal", FIRST, there), ("shot", 90, np.full_like(there, np.nan))):
+    made = (("goal", FIRST, there), ("shot", 90, nobody), ("both.fast", 60, moved))
+    for name, first, places in made:
         ingest.fn(planned[f"ingest/{name}"].work(store.url, match, "0001"))
-        prepared(
-            store, planned[f"body_fitting/{name}"].work(store.url, match, "0001"), first, places
-        )
+        fitted = planned[f"body_fitting/{name.partition('.')[0]}"]
+        prepared(store, fitted.work(store.url, match, "0001"), first, places)
         unit = planned[f"broadcast_calibration/{name}"]
         assert broadcast_calibration.fn(unit.work(store.url, match, "0001")) == unit.key
     return store, match, planned
@@ -200,3 +226,43 @@ def test_two_clips_of_one_camera_get_one_place_that_is_known_better(calibrated):
     # Sums of the same two places in either order.
     np.testing.assert_allclose(places[0], places[1], atol=1e-9)
     assert np.linalg.norm(before[0] - before[1]) > 1e-3
+
+
+def test_a_camera_of_another_rate_is_that_of_the_image_nearest_to_each_frame(calibrated):
+    store, _, planned = calibrated
+    unit = planned["broadcast_calibration/both.fast"]
+    result = store.open_result("stage", "broadcast_calibration", "both.fast", unit.key, verify=True)
+    assert result.attrs["clip_id"] == "both"
+    assert result["frame"].values.tolist() == list(range(60, 60 + COUNT))
+    # Match frame 60 + k is at 4.4 + 1.2 k of the video.
+    shown = np.array([4, 6, 7, 8, 9, 10, 12, 13, 14, 15])
+    true = clip.moving(VIDEO, pan=(-2.0, 6.0)).frames(shown)
+    turn = result["rotation"].values @ np.swapaxes(true.rotation, 1, 2)
+    off = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)))
+    # The camera turns by half a degree from image to image.
+    assert off.max() < 0.15
+    assert result.attrs["feed_offset"]["frames"] == pytest.approx(0.0, abs=0.3)
+
+
+def test_static_work_of_a_clip_is_planned_once_for_all_its_broadcast_cameras(calibrated):
+    _, match, planned = calibrated
+    (warning,) = uncalibrated_warnings(match)
+    assert "broadcast camera wide of clip both is not used" in warning
+    of_clip = [name for name in planned if name.partition("/")[2].startswith("both")]
+    assert of_clip == [
+        "ingest/both.wide",
+        "ingest/both.fast",
+        *(f"{stage}/both" for stage in ("camera_consistency", "tracking", "triangulation")),
+        "retriangulation/both",
+        "body_fitting/both",
+        "broadcast_calibration/both.fast",
+        "refitting/both",
+        "filtering/both",
+    ]
+    weighted = [n for n, unit in planned.items() if "smooth" in unit.recipe.sources]
+    assert weighted == ["broadcast_calibration/both.fast"]
+    recipe = planned["refitting/both"].recipe
+    assert recipe.sources["broadcast_offset_frames.both.fast"] == OFFSET
+    assert {"ingest/both.fast", "broadcast_calibration/both.fast"} <= set(recipe.inputs)
+    # A single camera's recipe is what it was before a clip could have several.
+    assert planned["refitting/goal"].recipe.sources["seen_in_broadcast"] == "ingest/goal"

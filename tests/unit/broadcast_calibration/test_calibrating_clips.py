@@ -83,6 +83,16 @@ def test_two_key_frames_give_every_frame(calibrated, true):
     assert np.percentile(errors, 95.0) < 1.5
 
 
+def test_a_weight_of_four_halves_the_stated_unevenness_of_the_lens(calibrated, pictures, true):
+    keys = [clicks(true, 3), clicks(true, 12)]
+    given = BroadcastClip(keys, lambda: iter(pictures), FPS, smooth_weight=4.0)
+    even = calibrate_broadcast(clip.PITCH, given, SETTINGS)
+    one, four = calibrated.report.weights, even.report.weights
+    assert four.smooth_log_focal == pytest.approx(0.5 * one.smooth_log_focal)
+    bends = [np.abs(np.diff(np.log(c.camera.focal), n=2)).mean() for c in (calibrated, even)]
+    assert bends[1] < bends[0]
+
+
 def test_proposed_key_frames_start_the_fit_and_do_not_bias_it(true, pictures):
     keys = []
     for frame in (3, 12):

@@ -47,6 +47,7 @@ def test_people_of_a_fast_camera_lie_on_match_frames(make_people, tmp_path):
         (((3, 1), (3, 2)), "static", "rising match frames"),
         ((), "static", "rising match frames"),
         (((0, 1), (9, 2)), "broadcast", "broadcast_offset_frames"),
+        (7.0, "broadcast", "broadcast_offset_frames"),
     ],
 )
 def test_an_offset_that_cannot_be_read_is_refused(offset, kind, told):

@@ -209,8 +209,7 @@ def test_the_side_of_a_static_camera_lets_key_frames_be_proposed(match_folder, e
     (match_folder / "broadcast").mkdir()
     (match_folder / "broadcast" / "goal.mp4").write_bytes(b"video")
     match = read_match(match_folder)
-    assert (match.proposed_clips, match.calibrated_clips) == ((), ())
+    assert (match.proposed_views, match.calibrated_views) == ((), ())
     edit(lambda content: content["cameras"][0].update(side="near"))
     match = read_match(match_folder)
-    assert match.broadcast_side("goal") is None
-    assert match.proposed_clips == match.calibrated_clips == ("goal",)
+    assert match.proposed_views == match.calibrated_views == ("goal",)

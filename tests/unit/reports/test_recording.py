@@ -35,7 +35,7 @@ def test_recording_has_people_markings_and_cameras(tmp_path):
     tracks, camera = scene()
     path = tmp_path / "clip.rrd"
     write_recording(
-        path, tracks, 50.0, cameras={"north": camera[0]}, broadcast=camera, pitch=PitchSpec()
+        path, tracks, 50.0, cameras={"north": camera[0], "broadcast": camera}, pitch=PitchSpec()
     )
     assert "/world/pitch" in printed(path)
     # The printer cuts long cells: each person's first bone begins there, by frame.

@@ -29,12 +29,13 @@ def test_every_scenario_makes_a_match(name, tmp_path):
         assert len(people.frame) == frames
         clicks = read.clicked[camera.id]
         assert len(clicks.points) + len(clicks.drawn) > 1
-    if scenario.broadcast is not None:
-        people, calibration = read_unit(read, "clip")
+    assert len(read.spec.broadcast_views) == len(scenario.broadcast)
+    for view in read.spec.broadcast_views:
+        people, calibration = read_unit(read, view)
         assert calibration is None
         assert len(people.frame) == frames
         assert np.isfinite(people.score).sum(axis=1).mean() > 1.0
-        camera = np.load(tmp_path / name / "reference" / "cameras" / "clip.npz")
+        camera = np.load(tmp_path / name / "reference" / "cameras" / f"{view}.npz")
         assert camera["K"].shape == camera["R"].shape == (frames, 3, 3)
 
 

@@ -14,7 +14,6 @@ const TRUNK = new Set([1, 2, 3, 6, 9]); // joints whose bones are thick
 const STRIPE = 5.5; // m
 const PERSON = 1.8; // m
 const RANGES = 12; // that stay in memory
-export const BROADCAST = "broadcast";
 
 // Whether this browser draws with the processor alone: then edges are not smoothed, and detail is reduced.
 function drawsInSoftware() {
@@ -221,9 +220,11 @@ export class Scene3D {
     if (still) return still.row;
     const frame = Math.min(this.scene.frames - 1, Math.max(0, Math.round(this.time)));
     const range = this.range(frame);
-    const rows = range?.arrays.broadcast;
-    if (!rows || name !== BROADCAST) return null;
-    const row = Array.from(rows.subarray(18 * (frame - range.first), 18 * (frame - range.first) + 18));
+    const rows = range?.arrays.moving;
+    const { moving } = this.scene;
+    if (!rows || !moving.includes(name)) return null;
+    const begin = 18 * ((frame - range.first) * moving.length + moving.indexOf(name));
+    const row = Array.from(rows.subarray(begin, begin + 18));
     return Number.isFinite(row[0]) ? row : null;
   }
 
@@ -378,12 +379,14 @@ export class Scene3D {
     gl.drawElementsInstanced(gl.TRIANGLES, this.capsules.index, gl.UNSIGNED_SHORT, 0, rows.length / 10);
   }
 
-  // Lines of each camera to the corners of its image, of the broadcast camera to the ground; and a pole for each person on a disc.
+  // Lines of each camera to the corners of its image, of a broadcast camera to the ground; and a pole for each person on a disc.
   #frusta(people) {
     const rows = [];
     for (const { name, row } of this.scene.cameras) if (this.through !== name) rows.push(...frustum(row, this.cameraDepth, [1, 1, 1, 0.75]).flat());
-    const moving = this.scene.broadcast && this.through !== BROADCAST ? this.cameraRow(BROADCAST) : null;
-    if (moving) rows.push(...frustum(moving, null, [1, 0.84, 0.29, 0.9]).flat());
+    for (const name of this.scene.moving) {
+      const row = this.through === name ? null : this.cameraRow(name);
+      if (row) rows.push(...frustum(row, null, [1, 0.84, 0.29, 0.9]).flat());
+    }
     people.forEach((person, number) => {
       if (!person?.feet) return;
       const [x, y] = person.feet;
@@ -417,7 +420,7 @@ export class Scene3D {
     if (this.labels?.ratio !== ratio) {
       this.labels?.destroy();
       const texts = this.scene.people.flatMap((_, number) => [this.#nameOf(number, false), this.#nameOf(number, true)]);
-      this.labels = new Labels(gl, [...new Set([...texts, ...this.scene.cameras.map((each) => each.name), BROADCAST])], ratio);
+      this.labels = new Labels(gl, [...new Set([...texts, ...this.scene.cameras.map((each) => each.name), ...this.scene.moving])], ratio);
       this.labels.ratio = ratio;
     }
     const rows = [];
@@ -428,11 +431,11 @@ export class Scene3D {
       const high = person.feet ? this.#groundAt(middle[1]) + this.#stature(number) + 0.1 : Math.max(top[2] + 0.26, middle[2] + 0.5);
       rows.push(...this.labels.row([top[0], top[1], high], this.#nameOf(number, Boolean(person.feet)), this.follow === number ? [1, 0.9, 0.4] : [1, 1, 1]));
     });
-    for (const name of [...this.scene.cameras.map((each) => each.name), ...(this.scene.broadcast ? [BROADCAST] : [])]) {
+    for (const name of [...this.scene.cameras.map((each) => each.name), ...this.scene.moving]) {
       const row = this.through === name ? null : this.cameraRow(name);
       if (!row) continue;
       const [x, y, z] = centreOf(row);
-      rows.push(...this.labels.row([x, y, z + 0.16 * this.cameraDepth], name, name === BROADCAST ? [1, 0.84, 0.29] : [0.87, 0.91, 0.93]));
+      rows.push(...this.labels.row([x, y, z + 0.16 * this.cameraDepth], name, this.scene.moving.includes(name) ? [1, 0.84, 0.29] : [0.87, 0.91, 0.93]));
     }
     this.words.fill(rows);
     const places = this.#use("label", M);
