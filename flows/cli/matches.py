@@ -13,6 +13,7 @@ import typer
 from rich.progress import Progress, TaskID
 
 from data_contracts.match import MatchSpec
+from data_contracts.pitch import TemplateName
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -188,6 +189,7 @@ def import_command(
     camera: str | None = None,
     lens: list[Path] | None = None,
     left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
+    template: TemplateName | None = None,
     unit: str | None = None,
     up: str | None = None,
     as_json: JsonOption = False,
@@ -220,6 +222,8 @@ def import_command(
         lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
             pickle, matrix and distortion as two .npy files, or TOML.
         left_handed: The survey's x, y and height are left-handed.
+        template: With --pitch: the game whose markings are surveyed, such as futsal; football by
+            default.
         unit: Unit of the calibration's positions: mm, cm, m, in, ft, yd, km, or its metres, such as
             0.08. By default people's stature tells it.
         up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
@@ -238,6 +242,7 @@ def import_command(
         "--camera": camera,
         "--lens": lens,
         "--left-handed": left_handed,
+        "--template": template,
         "--unit": unit,
         "--up": up,
         "--join": join,
@@ -260,7 +265,7 @@ def import_command(
     elif kind == "--clicks" and clicks is not None:
         _import_clicks(clicks, out, camera, as_json=as_json)
     elif kind == "--pitch" and pitch is not None:
-        import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
+        import_pitch(pitch, template, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
         _print_match(spec, out, notes, as_json=as_json)
@@ -299,7 +304,8 @@ ALONE: Final = {
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
     "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
     "--camera": ("with --clicks or --lens", ()),
-    "--pitch": ("with --out alone", ("--left-handed",)),
+    "--pitch": ("with --out alone", ("--left-handed", "--template")),
+    "--template": ("with --pitch", ()),
 }
 """Options that decide what is imported, the first given one; and the others that each may have."""
 
@@ -308,7 +314,7 @@ def _require_alone(kind: str, given: set[str]) -> None:
     """Refuse options of another import."""
     with_what, allowed = ALONE[kind]
     others = sorted(given - {kind, *allowed})
-    if others or kind == "--camera":
+    if others or kind in ("--camera", "--template"):
         raise UsageError(
             kind,
             expected=f"{kind} {with_what}",
@@ -379,7 +385,9 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
         line(f"warning: {text}", to=errors)
 
 
-def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
+def import_pitch(
+    survey: Path, template: TemplateName | None, out: Path, *, left_handed: bool, as_json: bool
+) -> None:
     """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats.files import whole_file
     from worldpose.ingest.pitch_file import refuse_unread_pitch
@@ -394,7 +402,9 @@ def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -
             todo="Move the file away first; another pitch makes another match.",
         )
     refuse_unread_pitch(out)
-    fit = fit_survey(read_survey(survey), SurveySettings(left_handed=left_handed))
+    fit = fit_survey(
+        read_survey(survey, template or "football"), SurveySettings(left_handed=left_handed)
+    )
     with whole_file(file) as draft:
         draft.write_text(fit.pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
     rows = sorted(

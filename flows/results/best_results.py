@@ -14,7 +14,7 @@ from data_contracts.arrays import Floats
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
-from data_contracts.tracking import Track
+from data_contracts.tracking import Join, Track
 from flows.results.broadcast_views import (
     BROADCAST,
     broadcast_unit,
@@ -34,6 +34,7 @@ from worldpose.ingest.match_folder import read_match
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store, open_run
+from worldpose.tracking.joins import identity_certainty
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -172,8 +173,29 @@ def joint_tracks(
         joints=joints,
         covariance=covariance,
         views=views,
+        identity_certainty=_identity_certainty(
+            run, clip, result["frame"].values, result["person"].values
+        ),
         extra=_extra_tracks(run, result, seen, definition),
     )
+
+
+def _identity_certainty(
+    run: Run, clip: str, frames: NDArray[np.int64], people: NDArray[np.integer]
+) -> Floats | None:
+    """Return the probability (frames, people) of identities; NaN where feet place the people.
+
+    None without static cameras.
+    """
+    tracking, _ = tracked_people(run, clip)
+    if "joins" not in tracking.attrs:
+        return None
+    joins = [Join.model_validate(join) for join in tracking.attrs["joins"]]
+    certainty = identity_certainty(joins, people, tracking.sizes["frame"])
+    if "ground" in tracking:
+        ground = tracking["ground"].sel(person=people).values[..., 0]
+        certainty[np.isfinite(ground)] = np.nan
+    return certainty[np.searchsorted(tracking["frame"].values, frames)]
 
 
 def _extra_tracks(
@@ -235,7 +257,10 @@ def clip_positions(run: Run, clip: str) -> Positions:
     if f"{PLANE}/{clip}" in run:
         on_plane = np.isfinite(xy[..., 0])
     names = [known[one].name or "" for one in person.tolist()]
-    return Positions(tracks.frames, person, names, on_plane, xy, covariance, height)
+    certainty = _identity_certainty(run, clip, tracks.frames, person)
+    if certainty is None:
+        certainty = np.full(on_plane.shape, np.nan)
+    return Positions(tracks.frames, person, names, on_plane, xy, covariance, height, certainty)
 
 
 def bodies_unit(run: Run, clip: str) -> str:

@@ -55,7 +55,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         **clip_sources(match, unit),
         "pitch": None
         if pitch is None
-        else pitch.model_dump(include={"length", "width", "crown", "end_fall"}),
+        else pitch.model_dump(include={"template", "length", "width", "crown", "end_fall"}),
         "people": match.folder.spec.max_people,
     }
 

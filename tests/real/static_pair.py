@@ -13,7 +13,7 @@ import numpy as np
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 from worldpose.video.folder import median_picture, open_video
 
@@ -37,7 +37,7 @@ def read_clicks(data, side, *, correct_labels=True):
             label that comes twice gets the suffix `.again`.
     """
     places, pixels = {}, {}
-    laws = law_points(LENGTH, WIDTH)
+    laws = prescribed_points(PitchSpec(), (LENGTH, WIDTH))
     for point in ElementTree.parse(data / f"{side}_keypoints.xml").iter("points"):
         pixel = tuple(map(float, point.get("points").split(",")))
         label = point.get("label")
@@ -98,7 +98,7 @@ def write_static_pair(
         if not clicked:
             continue
         places, pixels = read_clicks(data, side, correct_labels=correct_labels)
-        laws = law_points(LENGTH, WIDTH)
+        laws = prescribed_points(PitchSpec(), (LENGTH, WIDTH))
         points |= {name: list(place) for name, place in places.items() if name not in laws}
         clicked = [{"name": name, "xy": list(pixel)} for name, pixel in pixels.items()]
         (annotations / f"{side}.json").write_text(json.dumps({"points": clicked}))

@@ -17,7 +17,7 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.evidence import PointEvidence
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate, surface_shape
 
 SIZES: Final = ("length", "width", "crown", "end_fall")
@@ -47,7 +47,9 @@ class PitchErrors:
     @classmethod
     def of(cls, pitch: PitchTemplate, settings: BroadcastCalibrationSettings) -> PitchErrors:
         """Return the prior errors of a template."""
-        base, larger = law_points(0.0, 0.0), law_points(1.0, 1.0)
+        size = (pitch.length, pitch.width)
+        base = prescribed_points(pitch.spec, size)
+        larger = prescribed_points(pitch.spec, (size[0] + 1.0, size[1] + 1.0))
         nothing = (0.0, 0.0, 0.0)
         change = [
             np.subtract(larger.get(name, nothing), base.get(name, nothing)) for name in pitch.points
@@ -66,7 +68,7 @@ class PitchErrors:
                 [each if name in pitch.assumed else 0.0 for name, each in spread.items()]
             ),
             by_size=np.array(change)[:, :2],
-            size=(pitch.length, pitch.width),
+            size=size,
         )
 
     @property

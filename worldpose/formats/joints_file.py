@@ -25,6 +25,7 @@ MEMBERS: Final = {
     "joints": Member(("frames", "persons", JOINTS, 3), "float"),
     "covariance": Member(("frames", "persons", JOINTS, 3, 3), "float", required=False),
     "views": Member(("frames", "persons", JOINTS), "int", required=False),
+    "identity_certainty": Member(("frames", "persons"), "float", required=False),
     "points": Member(("points",), "text", required=False),
     "extra_joints": Member(("frames", "persons", "points", 3), "float", required=False),
     "extra_covariance": Member(("frames", "persons", "points", 3, 3), "float", required=False),
@@ -74,6 +75,9 @@ class JointTracks:
     truth."""
     extra: ExtraTracks | None = None
     """Points besides COCO-17 of the same frames and persons; None without any."""
+    identity_certainty: NDArray[np.float64] | None = None
+    """(frames, persons) probability that this is the person of the id's first frame [1]; NaN where
+    not stated, None if it is nowhere."""
 
     @property
     def markers(self) -> ExtraTracks:
@@ -114,6 +118,11 @@ class JointTracks:
                 if array is not None and array.shape != expected:
                     where, todo = f"{prefix}{name}", "Give all arrays alike."
                     raise wrong(where, f"shape {expected}", f"{array.shape}", todo)
+        certainty, size = self.identity_certainty, (len(self.frames), len(self.person_ids))
+        if certainty is not None and certainty.shape != size:
+            raise wrong("identity_certainty", f"shape {size}", f"{certainty.shape}", "Correct it.")
+        if certainty is not None and ((certainty < 0.0) | (certainty > 1.0)).any():
+            raise wrong("identity_certainty", "0 to 1", f"{np.nanmax(certainty)}", "Correct it.")
         if np.any(np.diff(self.frames) <= 0):
             raise wrong("frames", "frame numbers that rise", f"{self.frames}", "Sort the frames.")
         if len(np.unique(self.person_ids)) < len(self.person_ids):
@@ -175,6 +184,10 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
             path = PchipInterpolator(known, joints[known, person, joint])
             joints[gaps, person, joint] = path(gaps)
     stated = None if tracks.covariance is None else covariance
+    certainty = tracks.identity_certainty
+    if certainty is not None:
+        before = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
+        certainty = certainty[before]
     extra = None
     if tracks.extra is not None:
         extra = ExtraTracks(
@@ -189,6 +202,7 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
         joints[:, :, :JOINTS],
         covariance=None if stated is None else stated[:, :, :JOINTS],
         views=views[:, :, :JOINTS],
+        identity_certainty=certainty,
         extra=extra,
     )
 
@@ -198,8 +212,9 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
 
     Members: `frames` (frames,) int64, `person_ids` (persons,) int64, `joints` (frames, persons,
     17, 3) float64 [m, world], and where known `covariance` (frames, persons, 17, 3, 3) float64
-    [m^2] and `views` (frames, persons, 17) uint8. Points besides COCO-17 are in `points`, their
-    names as text, `extra_joints`, `extra_covariance` and `extra_views`.
+    [m^2], `views` (frames, persons, 17) uint8 and `identity_certainty` (frames, persons) float64.
+    Points besides COCO-17 are in `points`, their names as text, `extra_joints`,
+    `extra_covariance` and `extra_views`.
     """
     arrays: dict[str, NDArray[np.generic]] = {
         "frames": tracks.frames.astype(np.int64),
@@ -210,6 +225,8 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
         arrays["covariance"] = tracks.covariance.astype(np.float64)
     if tracks.views is not None:
         arrays["views"] = tracks.views.astype(np.uint8)
+    if tracks.identity_certainty is not None:
+        arrays["identity_certainty"] = tracks.identity_certainty.astype(np.float64)
     if tracks.extra is not None:
         arrays["points"] = np.array(tracks.extra.points, dtype=np.str_)
         arrays["extra_joints"] = tracks.extra.joints.astype(np.float64)

@@ -41,7 +41,8 @@ def coco_dataset(
     six digits>. One annotation per person with at least one joint in the image: `keypoints` are the
     reprojected 3D joints with v = 2 if this camera's own observation is an inlier of the joint, v =
     1 if the joint comes from other cameras only, and 0, 0, 0 if there is no joint or it is outside
-    the image. `bbox` and `area` are those of the keypoints; `track_id` is the person.
+    the image. `bbox` and `area` are those of the keypoints; `track_id` is the person, and
+    `identity_certainty` the probability of that, where it is known.
 
     Args:
         camera_id: prefix of the image names.
@@ -67,6 +68,7 @@ def coco_dataset(
             "image_id": own_frames[frame],
             "category_id": 1,
             "track_id": int(tracks.person_ids[person]),
+            **_certainty(tracks, frame, person),
             "iscrowd": 0,
             **_labels(pixels[frame, person], visible[frame, person]),
         }
@@ -100,6 +102,14 @@ def coco_dataset(
             }
         ],
     }
+
+
+def _certainty(tracks: JointTracks, frame: int, person: int) -> dict[str, float]:
+    """Return the probability of a person's identity in a frame, where it is known."""
+    stated = tracks.identity_certainty
+    if stated is None or np.isnan(stated[frame, person]):
+        return {}
+    return {"identity_certainty": round(float(stated[frame, person]), 4)}
 
 
 def write_coco(path: Path, dataset: Mapping[str, Any]) -> None:

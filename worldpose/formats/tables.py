@@ -29,6 +29,7 @@ POSITION_COLUMNS: Final = {
     **{"frame": "%d", "time_s": "%.4f", "person": "%d", "name": "%s", "kind": "%s"},
     **{"x_m": "%.3f", "y_m": "%.3f", "x_std_m": "%.3f", "y_std_m": "%.3f"},
     **{"xy_correlation": "%.3f", "speed_m_s": "%.2f", "height_m": "%.2f"},
+    "identity_certainty": "%.4f",
 }
 """Columns of a file of positions, of those of `people_table`, and the format of their cells."""
 SPEED_WINDOW_S: Final = 0.4
@@ -48,6 +49,7 @@ class Positions:
         xy: (frames, persons, 2) [m], world; NaN where missing.
         covariance: (frames, persons, 2, 2) [m^2].
         height: (persons,) [m]; NaN where not known.
+        identity_certainty: (frames, persons) probability of the identity, as in `JointTracks`.
     """
 
     frames: NDArray[np.integer]
@@ -57,6 +59,7 @@ class Positions:
     xy: Floats
     covariance: Floats
     height: Floats
+    identity_certainty: Floats
 
 
 def format_cells(values: NDArray[Any], form: str) -> NDArray[np.str_]:
@@ -96,7 +99,7 @@ def write_positions(path: Path, positions: Positions, fps: float) -> None:
     Columns: frame, time_s (frame / fps), person, name, kind in this frame (triangulated or plane),
     x_m and y_m (world), x_std_m, y_std_m and xy_correlation of their covariance (empty where it is
     not known), speed_m_s over `SPEED_WINDOW_S` (empty at a track's ends), height_m of people placed
-    by their feet.
+    by their feet, identity_certainty (the probability that this is still the person of the id).
     """
     table = people_table(positions, fps)
     cells = []
@@ -185,6 +188,7 @@ def people_table(positions: Positions, fps: float) -> pd.DataFrame:
             "speed_m_s": _speeds(positions.xy, fps)[there],
             "distance_m": np.nancumsum(steps, axis=0)[there],
             "height_m": positions.height[person],
+            "identity_certainty": positions.identity_certainty[there],
         }
     )
 

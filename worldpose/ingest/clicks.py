@@ -28,7 +28,7 @@ from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import read_pitch, refuse_unread_pitch
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
@@ -208,7 +208,7 @@ class _Labels:
     ) -> None:
         self._file, self._report = file, report
         self._pitch, self._template = pitch, PitchTemplate.from_spec(pitch)
-        above = {name for name, at in law_points(pitch.length, pitch.width).items() if at[2]}
+        above = {name for name, at in prescribed_points(pitch).items() if at[2]}
         self._known = {
             name: place[:2] for name, place in self._template.points.items() if name not in above
         }
@@ -268,11 +268,13 @@ class _Labels:
         return name
 
     def _line(self, image: MarkedImage, label: str) -> str:
-        known = _find_name(label, self._template.marking_names)
-        theirs = _find_name(label, SOCCERNET_MARKINGS)
-        if known is None and theirs is None:
-            raise self._unknown(image, label, self._template.marking_names)
-        return SOCCERNET_MARKINGS[theirs] if known is None and theirs is not None else str(known)
+        names = self._template.marking_names
+        known, theirs = _find_name(label, names), _find_name(label, SOCCERNET_MARKINGS)
+        if known is None and theirs is not None:
+            known = _find_name(SOCCERNET_MARKINGS[theirs], names)
+        if known is None:
+            raise self._unknown(image, label, names)
+        return known
 
     def _unknown(self, image: MarkedImage, label: str, known: Collection[str]) -> InputError:
         close = get_close_matches(label, known, n=3)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, TypeGuard
+
+from pydantic import ValidationError
 
 from data_contracts.conventions import OTHER_UNITS
 from data_contracts.match import MatchSpec
@@ -12,10 +15,13 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.files import read_json, read_yaml
 from worldpose.ingest.validation import existing_file, validate_record
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.laws import prescribed_points
+from worldpose.pitch.template import PitchTemplate
 
 SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
 """Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90."""
+OTHER_SIZES: Final = (0.6, 1.5)
+"""Allowed length and width of another game's pitch, relative to its template's [1]."""
 NO_PITCH: Final = "none"
 """Value of `pitch` in match.yaml for footage without a pitch."""
 
@@ -50,23 +56,39 @@ def read_pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
     if file is None:
         return PitchSpec()
     content = read_json(file)
-    _check_size(content, str(file))
-    _check_points(content, str(file))
-    return validate_record(PitchSpec, content, str(file))
+    if isinstance(content, dict) and content.get("any_size") is not True:
+        usual = _read_keys(content, ("template",))
+        if usual is not None:
+            _check_size(content, usual, str(file))
+        sized = _read_keys(content, ("template", "length", "width", "dimensions"))
+        if sized is not None:
+            _check_points(content.get("points"), sized, str(file))
+    pitch = validate_record(PitchSpec, content, str(file))
+    PitchTemplate.from_spec(pitch, where=str(file))
+    return pitch
 
 
-def _check_size(content: object, file: str) -> None:
+def _read_keys(content: Mapping[str, object], keys: Sequence[str]) -> PitchSpec | None:
+    """Return the pitch of these keys alone; None where the contract says what is wrong."""
+    try:
+        return PitchSpec.model_validate({key: content[key] for key in keys if key in content})
+    except ValidationError:
+        return None
+
+
+def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> None:
     """Raise InputError for an implausible pitch size in metres, with a guess of its unit.
 
     Raises:
         InputError: a number is out of bounds; the error names the key and the unit.
     """
-    if not isinstance(content, dict) or content.get("any_size") is True:
-        return
-    for key, (least, most) in SIZES.items():
-        value = content.get(key)
+    for key in SIZES:
+        value, nominal = content.get(key), float(getattr(usual, key))
         if not _is_number(value) or value <= 0:
             continue  # the contract says what is wrong with it
+        least, most = OTHER_SIZES[0] * nominal, OTHER_SIZES[1] * nominal
+        if usual.template == "football":
+            least, most = SIZES[key]
         if not least <= value <= most:
             units = [u for u, metres in OTHER_UNITS.items() if least <= value * metres <= most]
             guess = f", which looks like {units[0]}" if units else ""
@@ -74,27 +96,22 @@ def _check_size(content: object, file: str) -> None:
                 f"{file}: {key}",
                 expected=f"{least:g} to {most:g} metres",
                 found=f"{value:g}{guess}",
-                todo="Give all lengths and points in metres, or add "
+                todo="Give all lengths and points in metres, name the game as template, or add "
                 '"any_size": true where the pitch is of another size.',
             )
 
 
-def _check_points(content: object, file: str) -> None:
-    """Raise InputError for surveyed points far from their places in the Laws.
+def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
+    """Raise InputError for surveyed points far from their places in the rules of the game.
 
     Raises:
-        InputError: points are too far from the Laws; the error names the point of the largest
+        InputError: points are too far from there; the error names the point of the largest
             distance.
     """
-    from_laws = 2.0  # maximum distance of a surveyed point from its place in the Laws, in plan [m]
-    if not isinstance(content, dict) or content.get("any_size") is True:
-        return
-    given = {key: content.get(key, getattr(PitchSpec(), key)) for key in SIZES}
-    points = content.get("points")
-    if not isinstance(points, dict) or not all(map(_is_number, given.values())):
+    from_laws = 2.0  # maximum distance of a surveyed point from its place in the rules, in plan [m]
+    if not isinstance(points, dict):
         return  # the contract says what is wrong with them
-    length, width = (float(given[key]) for key in SIZES)
-    laws = law_points(length, width)
+    laws = prescribed_points(pitch)
     off = {
         name: math.dist(place[:2], laws[name][:2])
         for name, place in points.items()
@@ -114,7 +131,7 @@ def _check_points(content: object, file: str) -> None:
     raise InputError(
         f"{file}: points.{worst}",
         expected=f"a place within {from_laws:g} m of the Laws': {laws[worst][0]:.2f}, "
-        f"{laws[worst][1]:.2f} m on a pitch of {length:g} x {width:g} m",
+        f"{laws[worst][1]:.2f} m on a pitch of {pitch.length:g} x {pitch.width:g} m",
         found=f"{x:g}, {y:g}{guess}",
         todo="Correct the name, the place, or length and width; the origin is the centre spot, x "
         'runs along the touch line. "any_size": true switches this check off.',

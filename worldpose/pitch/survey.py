@@ -18,11 +18,11 @@ import numpy as np
 from pydantic import Field
 
 from data_contracts.arrays import Floats
-from data_contracts.pitch import PitchSpec
+from data_contracts.pitch import PitchSpec, TemplateName
 from data_contracts.records import Record
 from worldpose.errors import InputError
 from worldpose.parsing import read_cells
-from worldpose.pitch.laws import law_lines, law_points
+from worldpose.pitch.laws import prescribed_markings, prescribed_points
 
 COLUMNS: Final[Mapping[str, str]] = {
     "x": "x",
@@ -45,14 +45,21 @@ class Survey:
         where: the file, for messages.
         names: names of the pitch template's points, each once.
         places: (n, 3) [m]; z is up, NaN without a height.
+        template: the game whose markings they are.
     """
 
     where: str
     names: tuple[str, ...]
     places: Floats
+    template: TemplateName = "football"
+
+    @property
+    def usual(self) -> PitchSpec:
+        """The pitch with the dimensions of the template."""
+        return PitchSpec(template=self.template)
 
 
-def read_survey(path: Path) -> Survey:
+def read_survey(path: Path, template: TemplateName = "football") -> Survey:
     """Read the positions in a CSV file with the columns name, x, y and, if heights are known, z.
 
     A name is a point of the pitch template, or an end of a line as `<line>.start` or `<line>.end`.
@@ -80,8 +87,8 @@ def read_survey(path: Path) -> Survey:
             "the columns name, x, y and, where there are heights, z (or easting, northing, height)",
             ", ".join(rows[0][1]),
         )
-    ends = line_ends()
-    known = [*law_points(105.0, 68.0), *ends]
+    ends = line_ends(template)
+    known = [*prescribed_points(PitchSpec(template=template)), *ends]
     places: dict[str, list[float]] = {}
     for number, row in rows[1:]:
         where = f"{path}: row {number}"
@@ -100,12 +107,14 @@ def read_survey(path: Path) -> Survey:
             values = {title: text.replace(",", ".") for title, text in values.items()}
         place = {COLUMNS[title]: _number(f"{where}: {title}", title, values) for title in values}
         places[name] = [place["x"], place["y"], place.get("z", math.nan)]
-    return Survey(str(path), tuple(places), np.array(list(places.values())).reshape(-1, 3))
+    return Survey(
+        str(path), tuple(places), np.array(list(places.values())).reshape(-1, 3), template
+    )
 
 
-def line_ends() -> dict[str, str]:
+def line_ends(template: TemplateName) -> dict[str, str]:
     """Return the point for every `<line>.start` and `<line>.end`."""
-    lines = law_lines()
+    lines = prescribed_markings(PitchSpec(template=template)).lines
     starts = {f"{name}.start": line.start for name, line in lines.items()}
     return starts | {f"{name}.end": line.end for name, line in lines.items()}
 
@@ -145,17 +154,18 @@ class SurveySettings(Record):
     """Deviation of the scale from 1 beyond which lengths have another unit [1]: yards differ by 9
     %; a survey of the corners alone passes for pitches of 97 to 113 m by 63 to 73 m."""
     length_std_m: float = Field(default=5.0, ge=1e-6, le=1000)
-    """Standard deviation of pitch lengths around 105 m [m]: prior of a length not surveyed."""
+    """Standard deviation of lengths around the template's [m]: prior of a length not surveyed."""
     width_std_m: float = Field(default=4.0, ge=1e-6, le=1000)
-    """Standard deviation of pitch widths around 68 m [m]: as `length_std_m`."""
+    """Standard deviation of widths around the template's [m]: as `length_std_m`."""
     crown_std_m: float = Field(default=0.1, ge=1e-6, le=10)
-    """Standard deviation of crowns around 0.2 m [m]: as `length_std_m`."""
+    """Standard deviation of crowns around the template's [m]: as `length_std_m`."""
     slope_std: float = Field(default=0.01, ge=1e-6, le=1)
     """Standard deviation of the pitch's slope across it [1]: 1 %, the most on sport grounds."""
 
 
-_STANDARD_SIZE: Final = (105.0, 68.0)
-"""Initial length and width of a pitch [m]."""
+def _usual_size(survey: Survey) -> tuple[float, float]:
+    """Return the initial length and width of a pitch [m]."""
+    return survey.usual.length, survey.usual.width
 
 
 def _law_places(survey: Survey) -> tuple[Floats, Floats]:
@@ -164,16 +174,21 @@ def _law_places(survey: Survey) -> tuple[Floats, Floats]:
     On a pitch of no length and width, z above the surface; the change is of x by the length, and of
     y by the width.
     """
-    base, larger = law_points(0.0, 0.0), law_points(1.0, 1.0)
+    length, width = _usual_size(survey)
+    base, larger = (
+        prescribed_points(survey.usual, size)
+        for size in ((length, width), (length + 1.0, width + 1.0))
+    )
     at = np.array([base[name] for name in survey.names]).reshape(-1, 3)
     change = np.array([larger[name] for name in survey.names]).reshape(-1, 3) - at
+    at[:, :2] -= change[:, :2] * (length, width)
     return at, change[:, :2]
 
 
 def _nominal_places(survey: Survey) -> Floats:
-    """Return the points' positions in plan (n, 2) [m] on a pitch of 105 x 68 m."""
+    """Return the points' positions in plan (n, 2) [m] on a pitch of the usual size."""
     law, change = _law_places(survey)
-    return np.asarray(law[:, :2] + change * _STANDARD_SIZE)
+    return np.asarray(law[:, :2] + change * _usual_size(survey))
 
 
 def _best_rotation(centred: Floats, places: Floats) -> Floats:
@@ -270,7 +285,7 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
     The names determine the orientation: left and right, near and far are those of a person at the
     main camera, which stands at negative y. The frame is rotated, shifted and levelled, and scaled
     only with `fit_scale`. Length, width and crown are fitted by least squares; values that the
-    survey does not determine stay near 105 m, 68 m and 0.2 m.
+    survey does not determine stay near those of the template.
 
     Args:
         survey: named positions.
@@ -296,6 +311,7 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
     _require_names(survey, plan.places - plan.law, settings)
     world = np.column_stack([plan.places, heights.places])
     pitch = PitchSpec(
+        template=survey.template,
         length=round(plan.length, 4),
         width=round(plan.width, 4),
         crown=round(max(heights.crown, 0.0), 4),
@@ -364,7 +380,8 @@ def _fit_plan(
     law, change = _law_places(survey)
     middle = places.mean(axis=0)
     centred = places - middle
-    size = np.array(_STANDARD_SIZE)
+    usual = _usual_size(survey)
+    size = np.array(usual)
     turn = _best_rotation(centred, law[:, :2] + change * size)
     shift = (law[:, :2] + change * size).mean(axis=0)
     spreads = np.array([settings.length_std_m, settings.width_std_m])
@@ -373,7 +390,7 @@ def _fit_plan(
     for iteration in range(30):
         turned = centred @ turn.T
         residual = scale * turned + shift - law[:, :2] - change * size
-        # Wide at first: the start may be metres off if the pitch is not 105 x 68 m.
+        # Wide at first: the start may be metres off if the pitch has another size.
         loss = max(3.0 * settings.accuracy_m, 3.0 * 0.7**iteration)
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=-1) / loss**2)
         jacobian = np.zeros((len(places), 2, 6))
@@ -384,7 +401,7 @@ def _fit_plan(
         root = np.sqrt(weight)[:, None] / settings.accuracy_m
         rows = np.concatenate([(jacobian * root[..., None]).reshape(-1, 6), np.zeros((2, 6))])
         rows[[-2, -1], [3, 4]] = 1.0 / spreads
-        right = np.concatenate([(residual * root).ravel(), (size - _STANDARD_SIZE) / spreads])
+        right = np.concatenate([(residual * root).ravel(), (size - usual) / spreads])
         step = -np.linalg.lstsq(rows, right, rcond=None)[0]
         turn = _plane_rotation(step[0]) @ turn
         shift, size, scale = shift + step[1:3], size + step[3:5], scale + step[5]
@@ -410,7 +427,7 @@ def _fit_heights(
     ridge = -((plan.places[:, 1] / (0.5 * plan.width)) ** 2)
     taken = np.isfinite(heights)
     if not taken.any():
-        crown = PitchSpec().crown
+        crown = survey.usual.crown
         return _Heights(above + crown * ridge, heights, crown, np.zeros(2), False)
     base = float(heights[taken].mean())
     rows = np.column_stack([np.ones(len(ridge)), plan.places, ridge])[taken] / settings.accuracy_m
@@ -419,7 +436,7 @@ def _fit_heights(
         [settings.slope_std, settings.slope_std, settings.crown_std_m]
     )
     right = (heights - base - above)[taken] / settings.accuracy_m
-    right = np.concatenate([right, prior @ (0.0, 0.0, 0.0, PitchSpec().crown)])
+    right = np.concatenate([right, prior @ (0.0, 0.0, 0.0, survey.usual.crown)])
     rows = np.concatenate([rows, prior])
     level, *slope, crown = np.linalg.lstsq(rows, right, rcond=None)[0].tolist()
     spread = np.sqrt(np.linalg.pinv(rows.T @ rows)[3, 3])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -13,17 +13,7 @@ from numpy.typing import ArrayLike
 from data_contracts.arrays import Floats, Integers
 from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
 from worldpose.errors import InputError
-from worldpose.pitch.laws import (
-    CIRCLE_RADIUS,
-    ENDS,
-    PENALTY_AREA,
-    PENALTY_MARK_DISTANCE,
-    SIDES,
-    law_arcs,
-    law_goals,
-    law_lines,
-    law_points,
-)
+from worldpose.pitch.laws import ENDS, SIDES, least_size, prescribed_markings, prescribed_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +27,7 @@ class MarkingSamples:
 
 @dataclass(frozen=True, eq=False)
 class PitchTemplate:
-    """One stadium's pitch in the world frame: Law 1 of the Game, surveyed points, a crown.
+    """One pitch in the world frame: the markings of its game, surveyed points, a crown.
 
     Note:
         C1. The surface falls from the origin by one parabola across and another along, so that
@@ -54,7 +44,7 @@ class PitchTemplate:
     end_fall: float
     """Height of the halfway line above the goal lines [m]."""
     points: dict[str, Floats]
-    """(3,) [m], world, by name. Law 1 gives, for side in left (negative x), right and end in near
+    """(3,) [m], world, by name. Football has, for side in left (negative x), right and end in near
     (negative y), far: `center_mark`, `halfway_{end}`, `center_circle_{end}` (its crossings with
     the halfway line), `corner_{side}_{end}`, `penalty_mark_{side}`, `penalty_arc_{side}_{end}`
     (its ends on the penalty area's line), `penalty_area_{side}_{end}_back` (on the goal line) and
@@ -70,6 +60,8 @@ class PitchTemplate:
     on the surface."""
     unpainted: dict[str, LineSpec]
     """Lines on the surface without paint, such as edges of mowing stripes: `stripe_{side}_{n}`."""
+    spec: PitchSpec = field(default_factory=PitchSpec)
+    """pitch.json: its template, and dimensions without a surface that images have shown."""
     surveyed: frozenset[str] = frozenset()
     """Names of the points with a surveyed position; the others have that of the Laws."""
     leveled: frozenset[str] = frozenset()
@@ -84,18 +76,23 @@ class PitchTemplate:
         return cls.from_spec(PitchSpec())
 
     @classmethod
-    def from_spec(cls, spec: PitchSpec) -> PitchTemplate:
+    def from_spec(cls, spec: PitchSpec, where: str = "pitch") -> PitchTemplate:
         """Return the pitch of pitch.json.
 
+        Args:
+            spec: its content.
+            where: the file, for messages.
+
         Raises:
-            InputError: the penalty areas do not fit, a marking names an unknown point, or an arc
+            InputError: the markings do not fit, a marking names an unknown point, or an arc
                 does not run forward by at most a full circle.
         """
-        _check_size(spec)
+        _check_size(spec, where)
         size, shape = (spec.length, spec.width), (spec.crown, spec.end_fall)
+        prescribed = prescribed_markings(spec)
         points = {
             name: np.array([x, y, above + float(surface_shape(x, y, size) @ shape)])
-            for name, (x, y, above) in law_points(spec.length, spec.width).items()
+            for name, (x, y, above) in prescribed.points.items()
         }
         stripes = _stripe_edges(spec)
         given = {**stripes, **spec.points}
@@ -108,13 +105,14 @@ class PitchTemplate:
             near.removesuffix("_near"): LineSpec(start=near, end=far, painted=False)
             for near, far in zip(list(stripes)[::2], list(stripes)[1::2], strict=True)
         }
-        every = {**law_lines(), **edges, **spec.lines}
+        every = {**prescribed.lines, **edges, **spec.lines}
         lines = {name: line for name, line in every.items() if line.painted}
         unpainted = {name: line for name, line in every.items() if not line.painted}
-        arcs = {**law_arcs(), **spec.arcs}
-        _check_markings(points, every, arcs)
-        usual = PitchSpec()
-        sizes = ("length", "width", "crown", "end_fall")
+        arcs = {**prescribed.arcs, **spec.arcs}
+        _check_markings(points, every, arcs, where)
+        usual = PitchSpec(template=spec.template)
+        # Floors of halls are level.
+        sizes = ("length", "width", *(() if spec.is_level else ("crown", "end_fall")))
         assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
         return cls(
             length=spec.length,
@@ -124,8 +122,9 @@ class PitchTemplate:
             points=points,
             lines=lines,
             arcs=arcs,
-            goals=law_goals(),
+            goals=prescribed.goals,
             unpainted=unpainted,
+            spec=spec,
             surveyed=frozenset(spec.points),
             leveled=frozenset(name for name, place in spec.points.items() if len(place) == 3),
             assumed=frozenset(() if spec.points else assumed),
@@ -333,32 +332,48 @@ def _stripe_edges(spec: PitchSpec) -> dict[str, tuple[float, float]]:
     }
 
 
-def _check_size(spec: PitchSpec) -> None:
-    """Raise InputError unless the prescribed markings fit into the pitch."""
-    least_length = 2.0 * (PENALTY_MARK_DISTANCE + 2.0 * CIRCLE_RADIUS)
-    if spec.length <= least_length or spec.width <= PENALTY_AREA[1]:
+def _check_size(spec: PitchSpec, where: str) -> None:
+    """Raise InputError unless the prescribed markings fit into the pitch, and into each other."""
+    length, width = least_size(spec)
+    if spec.length <= length or spec.width <= width:
         raise InputError(
-            "pitch: length and width",
-            expected=f"more than {least_length:g} x {PENALTY_AREA[1]:g} m, room for the markings",
+            f"{where}: length and width",
+            expected=f"more than {length:g} x {width:g} m, room for the markings",
             found=f"{spec.length:g} x {spec.width:g}",
             todo="Give metres between the centres of the outer lines.",
         )
+    nested = (
+        ("goal_width", "goal_area_width", "penalty_area_width"),
+        (
+            "goal_area_depth",
+            "penalty_area_depth",
+        ),
+    )
+    for names in nested:
+        given = [(spec.sizes[name], name) for name in names if spec.sizes.get(name)]
+        if given != sorted(given):
+            raise InputError(
+                f"{where}: dimensions",
+                expected=f"{', '.join(name for _, name in given)} in rising order",
+                found=", ".join(f"{size:g}" for size, _ in given),
+                todo="Correct the dimensions, in metres; 0 is for what is not painted.",
+            )
 
 
 def _check_markings(
-    points: dict[str, Floats], lines: dict[str, LineSpec], arcs: dict[str, ArcSpec]
+    points: dict[str, Floats], lines: dict[str, LineSpec], arcs: dict[str, ArcSpec], where: str
 ) -> None:
     """Raise InputError unless markings name known points and arcs run once around at most."""
     for name, line in lines.items():
         for point in (line.start, line.end):
             if point not in points:
-                raise _unknown_point(f"pitch: lines.{name}", point, points)
+                raise _unknown_point(f"{where}: lines.{name}", point, points)
     for name, arc in arcs.items():
         if arc.center not in points:
-            raise _unknown_point(f"pitch: arcs.{name}", arc.center, points)
+            raise _unknown_point(f"{where}: arcs.{name}", arc.center, points)
         if not 0.0 < arc.end_angle - arc.start_angle <= 2.0 * math.pi + 1e-6:
             raise InputError(
-                f"pitch: arcs.{name}",
+                f"{where}: arcs.{name}",
                 expected="end_angle above start_angle by at most 2 pi",
                 found=f"{arc.start_angle:g} to {arc.end_angle:g} rad",
                 todo="Measure angles in radians from x towards y; add 2 pi to the end if needed.",
@@ -401,8 +416,9 @@ class Surface:
     def of(cls, pitch: PitchTemplate) -> Surface:
         """Return what is known of a pitch before any image: its template, and surveyed heights."""
         level_std_m = 0.02  # ground is uneven by 1 to 3 cm
-        stated, information = pitch.surface, np.diag(PRIOR_STD_M**-2.0)
-        laws = law_points(pitch.length, pitch.width)
+        level = 0.01 if pitch.spec.is_level else 1.0  # millimetres on the floor of a hall
+        stated, information = pitch.surface, np.diag((level * PRIOR_STD_M) ** -2.0)
+        laws = prescribed_points(pitch.spec)
         names = sorted(pitch.leveled & laws.keys())
         places = pitch.positions(names)
         rows = surface_shape(places[:, 0], places[:, 1], (pitch.length, pitch.width))

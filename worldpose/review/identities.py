@@ -272,8 +272,9 @@ def _merge(found: Identities, kept: int, merged: int) -> Identities:
     for join in found.joins:
         ends = [kept if n == merged else n for n in (join.before, join.after)]
         said = {join.before, join.after} == {kept, merged}
+        margin = None if said else join.margin
         update = {"before": ends[0], "after": ends[1], "decided": join.decided or said}
-        joins.append(join.model_copy(update=update))
+        joins.append(join.model_copy(update={**update, "margin": margin}))
     return replace(
         found,
         person=found.person[left],
@@ -299,14 +300,12 @@ def _split(found: Identities, person: int, first_frame_of_new: int) -> Identitie
         return np.moveaxis(np.concatenate([old, new[:, None]], axis=1), 1, axis)
 
     number = int(found.person.max()) + 1
-    # A join between the two halves of the person now leads to the new person.
-    joins = tuple(
-        join.model_copy(update={"after": number})
-        if join.before == join.after == person
-        and found.frame[join.last_frame] < first_frame_of_new <= found.frame[join.first_frame]
-        else join
-        for join in found.joins
-    )
+    # Ends of tracks from that frame on are the new person's.
+    joins = []
+    for join in found.joins:
+        ends = ((join.before, join.last_frame), (join.after, join.first_frame))
+        before, after = (number if n == person and later[frame] else n for n, frame in ends)
+        joins.append(join.model_copy(update={"before": before, "after": after}))
     return replace(
         found,
         person=np.append(found.person, np.int32(number)).astype(np.int32),
@@ -314,5 +313,5 @@ def _split(found: Identities, person: int, first_frame_of_new: int) -> Identitie
         ray_distance=halves(found.ray_distance, 2, np.nan),
         joints=halves(found.joints, 1, np.nan),
         on_plane=halves(found.on_plane, 1, False),
-        joins=joins,
+        joins=tuple(joins),
     )

@@ -14,7 +14,7 @@ from worldpose.simulation.gait import walk
 from worldpose.simulation.movements import play, run_through, take_corner, wander
 from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.recordings import clip_path
-from worldpose.simulation.settings import Scenario
+from worldpose.simulation.settings import CrowdSettings, Scenario
 from worldpose.simulation.skeletons import Body, PosedBody, draw_body, solve_body
 
 
@@ -27,6 +27,7 @@ class Crowd:
         paths: path of each person.
         action: (samples, 2) [m], world; the point that people and the broadcast camera follow.
         action_times: (samples,) [s].
+        away: (persons, 2) begin and end of the time in which nobody sees a person [s].
     """
 
     bodies: Sequence[Body]
@@ -35,12 +36,18 @@ class Crowd:
     action_times: Floats
     pitch: PitchTemplate
     gaits: Sequence[np.random.SeedSequence]
+    away: Floats
 
     def joints(self, times: Floats) -> Floats:
-        """Return joints (frames, persons, 17, 3) [m], world, at `times` [s]; repeatable."""
+        """Return joints (frames, persons, 17, 3) [m], world, at `times` [s]; repeatable.
+
+        NaN while a person is away.
+        """
         joints = np.empty((len(times), len(self.paths), 17, 3))
         for person in range(len(self.paths)):
             joints[:, person] = self._solve_person(person, times).keypoints()
+        gone = (times[:, None] >= self.away[:, 0]) & (times[:, None] < self.away[:, 1])
+        joints[gone] = np.nan
         return joints
 
     def poses(self, times: Floats) -> BodyParameters:
@@ -107,4 +114,18 @@ def gather(
         actor = min(2, len(paths) - 1)
         paths[actor] = clip_path(clip, paths[actor], bodies[actor])
     gaits = [each.spawn(1)[0] for each in person_seeds]
-    return Crowd(bodies, paths, action, times, pitch, gaits)
+    return Crowd(bodies, paths, action, times, pitch, gaits, _absences(settings, duration, paths))
+
+
+def _absences(settings: CrowdSettings, duration: float, paths: Sequence[GroundPath]) -> Floats:
+    """Return the time (persons, 2) [s] in which nobody sees a person; infinite = never."""
+    away = np.full((len(paths), 2), np.inf)
+    # Each leaves a second after the one before.
+    count, pairs = settings.leavers, settings.substitutes
+    begin = 0.5 * (duration - settings.away_s) + np.arange(count + pairs) - 0.5 * (count + pairs)
+    begin, last = np.maximum(begin, 0.0), count + 2 * pairs
+    away[:count, 0], away[:count, 1] = begin[:count], begin[:count] + settings.away_s
+    away[count : count + pairs, 0] = begin[count:]
+    away[count + pairs : last, 0] = -np.inf
+    away[count + pairs : last, 1] = begin[count:] + settings.away_s
+    return away

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from data_contracts.pitch import PitchSpec
 from worldpose.simulation.settings import (
     BroadcastSettings,
     CalibrationErrors,
@@ -199,6 +200,30 @@ SCENARIOS: Final = {
             ),
         ),
         _variant("long", "The match for two minutes.", _MATCH, duration=120.0),
+        _variant(
+            "youth-9v9",
+            "tiny on a youth pitch of 73 x 46 m, with smaller areas and goals.",
+            _TINY,
+            pitch=PitchSpec(template="football_9v9"),
+            crowd=CrowdSettings(area_center_m=(-25.0, 9.0), area_size_m=(16.0, 12.0)),
+        ),
+        _variant(
+            "basketball",
+            "tiny on a basketball court: cameras 3 to 8 m up in a hall.",
+            _TINY,
+            pitch=PitchSpec(template="basketball"),
+            crowd=CrowdSettings(area_center_m=(-6.0, 1.0), area_size_m=(12.0, 10.0)),
+            rig=RigSettings(distance_m=(2.0, 6.0), height_m=(3.0, 8.0), person_height_px=200.0),
+            broadcast=None,
+        ),
+        Scenario(
+            name="leaving",
+            about="14 people in one part of the pitch for 40 s; two leave for 10 s and come back, "
+            "and one is replaced by another.",
+            duration=40.0,
+            crowd=CrowdSettings(people=14, leavers=2, substitutes=1),
+            rig=RigSettings(cameras=8, person_height_px=95.0),
+        ),
         _variant(
             "broadcast-pan",
             "20 s of the match, the broadcast camera panning to and fro.",

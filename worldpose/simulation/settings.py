@@ -170,6 +170,13 @@ class CrowdSettings(Record):
     """Distance below which people avoid others [m]."""
     height_m: Range = (1.70, 1.95)
     """Shortest and tallest body height [m]: professional players."""
+    leavers: int = Field(default=0, ge=0, le=1000)
+    """Number of people, the first ones, whom no camera sees for `away_s` [1]; they come back."""
+    substitutes: int = Field(default=0, ge=0, le=500)
+    """Number of people after those who leave for good [1], each replaced after `away_s` by one of
+    as many people after them, whom no camera saw before."""
+    away_s: float = Field(default=10.0, ge=0, le=10000)
+    """Time without these people [s], in the middle of the match."""
 
 
 class Seat(Record):

@@ -15,12 +15,11 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.pitch import ArcSpec
 from worldpose.compiled import compile_kernel
+from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 
 LINE_WIDTH: Final = 0.12
 """Width of the painted markings, centred on the template's line [m] (Law 1)."""
-_SPOTS: Final = ("center_mark", "penalty_mark_left", "penalty_mark_right")
-
 _LINE, _ARC, _SPOT = 0.0, 1.0, 2.0
 _HALF = 0.5 * LINE_WIDTH
 
@@ -46,7 +45,7 @@ def paint_rows(pitch: PitchTemplate) -> Floats:
         length = math.hypot(x1 - x0, y1 - y0)
         rows.append((_LINE, x0, y0, (x1 - x0) / length, (y1 - y0) / length, length, h0, h1))
     rows += [_arc_row(arc, above(arc.center)) for arc in pitch.arcs.values()]
-    for name in _SPOTS:
+    for name in (name for name in prescribed_points(pitch.spec) if "mark" in name.split("_")):
         x, y, h = above(name)
         rows.append((_SPOT, x, y, spot_radius, 0.0, 0.0, h, 0.0))
     return np.array(rows, dtype=np.float64)

@@ -175,14 +175,9 @@ class Prop:
 
 
 def goals(pitch: PitchTemplate) -> Prop:
-    """Return posts and crossbars of both goals: tubes between their ends."""
-    ends = []
-    for side in ("left", "right"):
-        near, far = f"goal_post_{side}_near", f"goal_post_{side}_far"
-        names = (f"{near}_bottom", f"{near}_top", f"{far}_top", f"{far}_bottom")
-        a, b, c, d = pitch.positions(names)
-        ends += [(a, b), (b, c), (d, c)]
-    tubes = np.array(ends)
+    """Return posts, crossbars and the like: tubes between their ends."""
+    names = [name for line in pitch.goals.values() for name in (line.start, line.end)]
+    tubes = pitch.positions(names).reshape(-1, 2, 3)
     way = tubes[:, 1] - tubes[:, 0]
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     aside = np.cross(way, np.where(np.abs(way[:, 2:]) > 0.9, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))

@@ -57,6 +57,7 @@ def calibrate_camera(
         C1-C5; paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
+    stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec)})
     if lens is not None:
         stated = stated.model_copy(update={"distortion": "k1_k2_k3"})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)

@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Floats
+from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.click_outliers import (
     CLEAR_GAIN,
@@ -236,7 +237,7 @@ def check_unit(
     With lens distortion and one or two outliers, the clicks also fit a pitch that is 9 % too large.
     """
     size = _size_in_yards(pitch)
-    other = _start_on_pitch(problem, size, settings)
+    other = _start_on_pitch(problem, pitch, size, settings)
     # A score of points alone decides nothing where drawn markings also constrain the camera.
     if other is None or problem.evidence.markings:
         return
@@ -272,13 +273,15 @@ def _find_size(
     problem: CameraProblem, pitch: PitchTemplate, settings: StaticCalibrationSettings
 ) -> _PitchSize | None:
     """Return another size that explains the clicked points, if there is one."""
-    sizes = (_size_in_yards(pitch), _PitchSize(105.0, 68.0, "it seems to be another pitch's"))
+    usual = PitchSpec(template=pitch.spec.template)
+    another = _PitchSize(usual.length, usual.width, "it seems to be another pitch's")
+    sizes = (_size_in_yards(pitch), another)
     for size in sizes:
         other = abs(size.length - pitch.length), abs(size.width - pitch.width)
         # Clicks do not resolve half a metre.
         if max(other) < 0.5:
             continue
-        found = _start_on_pitch(problem, size, settings)
+        found = _start_on_pitch(problem, pitch, size, settings)
         if found is None:
             continue
         points, row = found
@@ -293,14 +296,17 @@ def _find_size(
 
 
 def _start_on_pitch(
-    problem: CameraProblem, size: _PitchSize, settings: StaticCalibrationSettings
+    problem: CameraProblem,
+    pitch: PitchTemplate,
+    size: _PitchSize,
+    settings: StaticCalibrationSettings,
 ) -> tuple[CameraProblem, Floats] | None:
     """Return the clicked points on a pitch of another size, and a camera (WIDTH,) near the answer.
 
     Returns:
         None if a point is not in the Laws, or the points determine no camera.
     """
-    evidence, laws = problem.evidence, law_points(size.length, size.width)
+    evidence, laws = problem.evidence, prescribed_points(pitch.spec, size[:2])
     if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
         return None
     world = np.array([laws[name] for name in evidence.points])

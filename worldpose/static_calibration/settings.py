@@ -6,6 +6,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 
 SURVEY_ERROR: Final = 0.006
@@ -83,6 +84,16 @@ class CameraPrior(Record):
     roll_std_rad: float = Field(default=0.03, ge=1e-6, le=10)
     """Standard deviation of the roll of the image horizon [rad]: 1.7 degrees, a level tripod or
     bracket."""
+
+    def beside(self, pitch: PitchSpec) -> CameraPrior:
+        """Return the prior of a camera beside another game's pitch: nearer and lower in proportion.
+
+        Its means are of football; halls are smaller.
+        """
+        football, own = (PitchSpec(template=name).length for name in ("football", pitch.template))
+        share = own / football
+        places = {"height_m": share * self.height_m, "distance_m": share * self.distance_m}
+        return self if share == 1.0 else self.model_copy(update=places)
 
 
 class ProposalSettings(Record):

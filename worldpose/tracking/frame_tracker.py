@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry.cameras import Camera
@@ -284,18 +285,21 @@ class FrameTracker:
         before = [self.track_ends(person)[1] for person in self.lost]
         now = np.array([frame])
         after = [
-            fit_track_ends(place, now, group.joints[None], self.fps, self.settings)[0]
+            fit_track_ends(
+                place, now, group.joints[None], _views(group.index[None]), self.fps, self.settings
+            )[0]
             for place, group in enumerate(groups)
         ]
         costs = join_costs(before, after, self.fps, self.area, self.settings)
-        return choose_joins(before, after, costs, self.settings)
+        return choose_joins(before, after, costs, self.fps, self.settings)
 
     def track_ends(self, person: Person) -> tuple[End, End]:
         """Return the start and the end of a person's track."""
-        frames, _, _, joints = person.sightings.stack()
+        frames, index, _, joints = person.sightings.stack()
         fixed = np.isfinite(joints).any(axis=(1, 2))
         places = joints[fixed].astype(np.float64)
-        return fit_track_ends(person.number, frames[fixed], places, self.fps, self.settings)
+        views = _views(index[fixed])
+        return fit_track_ends(person.number, frames[fixed], places, views, self.fps, self.settings)
 
     def _merge(self, frame: int) -> None:
         """End people whose track has coincided with another's for `merge_time_s`."""
@@ -338,6 +342,11 @@ def ray_distance(baseline: Floats, rays: Floats, others: Floats) -> float:
         apart = np.abs(normal @ baseline) / np.linalg.norm(normal, axis=-1)
     known = np.isfinite(apart)
     return float(apart[known].mean()) if known.any() else math.inf
+
+
+def _views(index: NDArray[np.integer]) -> Integers:
+    """Return the number of cameras (n,) with a detection among those of sightings (n, cameras)."""
+    return np.asarray(np.count_nonzero(index >= 0, axis=1))
 
 
 def _drop_matched(weights: Floats, index: Integers) -> Floats:

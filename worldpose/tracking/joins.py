@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Flags, Floats, Integers
@@ -65,6 +66,7 @@ def fit_track_ends(
     number: int,
     frames: Integers,
     joints: Floats,
+    views: Integers,
     fps: float,
     settings: TrackingSettings,
 ) -> tuple[End, End]:
@@ -74,12 +76,14 @@ def fit_track_ends(
         number: number of the track.
         frames: (n,) frames whose rays determined the position.
         joints: (n, 17, 3) [m], world; NaN where not determined.
+        views: (n,) cameras that see the person; the limbs of two are not used, as one of them may
+            show somebody else.
         fps: frames per second [1/s].
         settings: times.
     """
     torso, whole = _mean_known(joints[:, COCO17_TORSO]), _mean_known(joints)
     places = np.where(np.isfinite(torso), torso, whole)
-    limbs, variance = limb_lengths(joints, fps)
+    limbs, variance = limb_lengths(joints[views >= settings.birth_views], fps)
     out = []
     for edge in (0, -1):
         near = np.abs(frames - frames[edge]) <= settings.end_time_s * fps
@@ -157,18 +161,44 @@ def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSe
         if both:
             spread = velocity_noise**2 + agility**2 * short
             likelihood[-1] += _log_normal_density(change, spread)
-    cost = float(np.logaddexp.reduce(prior) - np.logaddexp.reduce(likelihood)) - math.log(area)
+    odds = float(np.logaddexp.reduce(likelihood) - np.logaddexp.reduce(prior)) + math.log(area)
     if both:
-        cost += _log_normal_density(change, velocity_noise**2 + 2.0 * settings.rms_speed_m_s**2)
+        odds -= _log_normal_density(change, velocity_noise**2 + 2.0 * settings.rms_speed_m_s**2)
+    # Who is out of sight for long may have walked anywhere.
+    fresh = _freshness(gap, settings)
+    odds = float(np.logaddexp(math.log(fresh) + odds, math.log1p(-fresh)))
+    return -odds - _shape_odds(old, new, settings)
+
+
+def _freshness(gap: float, settings: TrackingSettings) -> float:
+    """Return the share of people whose place after a time unseen [s] follows from their motion."""
+    return math.exp(-((gap / settings.place_memory_s) ** 2))
+
+
+def _shape_odds(old: End, new: End, settings: TrackingSettings) -> float:
+    """Return the log odds by limb lengths that two tracks are one person: by size and proportions.
+
+    People differ by size most: all limbs are longer or shorter. Errors of limbs are independent,
+    so that the mean difference is known far better than each.
+    """
     difference = new.limbs - old.limbs
     known = np.isfinite(difference)
-    own = settings.limb_noise_m**2 + old.limb_variance[known] + new.limb_variance[known]
-    other = own + 2.0 * settings.limb_std_m**2
-    evidence = _log_limb_density(difference[known], other) - _log_limb_density(
-        difference[known], own
-    )
-    # Limb errors and differences of one person are correlated: their mean is worth two limbs.
-    return cost + (2.0 * float(evidence.mean()) if known.any() else 0.0)
+    if not known.any():
+        return 0.0
+    difference, variance = difference[known], (old.limb_variance + new.limb_variance)[known]
+    # Difference of one limb from the others beyond which it is a gross error [m].
+    apart = (difference - np.median(difference)) / 0.05
+    weight = 1.0 / (1.0 + apart**2)
+    weight /= weight.sum()
+    size = float(weight @ difference)
+    own = settings.size_noise_m**2 + float(weight**2 @ variance)
+    other = own + 2.0 * settings.size_std_m**2
+    odds = 0.5 * (math.log(other / own) + size**2 / other - size**2 / own)
+    rest, noise = difference - size, settings.limb_noise_m**2 + variance
+    spread = noise + 2.0 * settings.limb_std_m**2
+    evidence = _log_limb_density(rest, noise) - _log_limb_density(rest, spread)
+    # The limbs of both sides are alike: their mean is worth four limbs.
+    return odds + 4.0 * float(evidence.mean())
 
 
 def _log_limb_density(difference: Floats, variance: Floats) -> Floats:
@@ -193,6 +223,7 @@ def choose_joins(
     before: list[End],
     after: list[End],
     costs: Floats,
+    fps: float,
     settings: TrackingSettings,
 ) -> list[Candidate]:
     """Return the joins of the likeliest assignment, each with its margin, cheapest first.
@@ -204,10 +235,14 @@ def choose_joins(
         before: n tracks that end.
         after: m tracks that begin.
         costs: (n, m) [nat].
+        fps: frames per second [1/s].
         settings: odds that decide.
     """
     sure = math.log(settings.join_odds)
-    gain = np.minimum(costs + math.log(settings.newcomer_odds), 0.0)
+    overrated = math.log(3.0)  # odds of motion in piles, where the people nearby are in reach [nat]
+    gaps = np.subtract.outer([-end.frame for end in before], [-end.frame for end in after]) / fps
+    newcomer = np.minimum(settings.newcomer_odds * np.maximum(gaps, 1.0) ** 2, 1.0)
+    gain = np.minimum(costs + np.log(newcomer), 0.0)
     row, column = np.flatnonzero((gain < 0.0).any(1)), np.flatnonzero((gain < 0.0).any(0))
     gain = gain[np.ix_(row, column)]
     chosen, best = _cheapest_assignment(gain)
@@ -218,10 +253,11 @@ def choose_joins(
         margin = _cheapest_assignment(gain)[1] - best
         gain[i, j] = kept
         old, new = before[row[i]], after[column[j]]
-        cost = float(costs[row[i], column[j]])
+        cost, gap = float(costs[row[i], column[j]]), float(gaps[row[i], column[j]])
+        needed = sure + overrated * _freshness(gap, settings)
         joins.append(
             Candidate(
-                old.number, new.number, old.frame, new.frame, cost, float(margin), margin >= sure
+                old.number, new.number, old.frame, new.frame, cost, float(margin), margin >= needed
             )
         )
     return sorted(joins, key=lambda join: (join.cost, join.before))
@@ -247,6 +283,28 @@ class Takeover:
     frame: int
     person: int
     other: int
+
+
+def identity_certainty(joins: Iterable[Join], person: NDArray[np.integer], frames: int) -> Floats:
+    """Return the probability (frames, people) that the tracked person is still the first one [1].
+
+    The tracks of a person are joined by odds: a stretch between two joins has the probability of
+    all joins before it, each against its best alternative. It is 1 up to the first join, and after
+    a join that a reviewer made.
+
+    Args:
+        joins: joins of the clip, decided or not.
+        person: (people,) ids.
+        frames: number of the clip's frames.
+    """
+    certainty = np.ones((frames, len(person)))
+    for join in joins:
+        if join.decided and join.before == join.after and join.margin is not None:
+            later = certainty[join.first_frame :, person == join.before]
+            certainty[join.first_frame :, person == join.before] = later / (
+                1.0 + math.exp(-join.margin)
+            )
+    return certainty
 
 
 def find_takeovers(

@@ -310,7 +310,7 @@ def join_tracks(
     starts, stops = [start for start, _ in ends], [stop for _, stop in ends]
     settings = tracker.settings
     costs = join_costs(stops, starts, tracker.fps, tracker.area, settings)
-    joins = choose_joins(stops, starts, costs, settings)
+    joins = choose_joins(stops, starts, costs, tracker.fps, settings)
     after = {join.before: join.after for join in joins if join.decided}
     people = {person.number: person for person in tracks}
     chains = []

@@ -99,14 +99,22 @@ class TrackingSettings(Record):
     play in the first mode, and stand or walk in the second, which is half of a match. With the
     first alone, people occluded for up to 8 s switch identity 98 times instead of 90, and 43 joins
     instead of 35 are undecided."""
-    limb_noise_m: float = Field(default=0.02, ge=1e-6, le=10)
-    """Standard deviation of a limb's length between two long tracks of one person [m]. Half or
-    twice this value changes one join of some 200; ignoring limbs also changes one."""
-    limb_std_m: float = Field(default=0.025, ge=1e-6, le=10)
-    """Standard deviation of a limb's length among people [m]: 6 % of 0.42 m."""
+    place_memory_s: float = Field(default=5.0, ge=1e-3, le=10000)
+    """Time after which 37 % of the lost people are still where their motion leads [s]; others may
+    be anywhere."""
+    size_noise_m: float = Field(default=0.005, ge=1e-6, le=10)
+    """Standard deviation of the mean limb length between two tracks of one person, besides the
+    scatter of their frames [m]: 3.8 mm with it on Shelf, 3 mm in simulation."""
+    size_std_m: float = Field(default=0.018, ge=1e-6, le=10)
+    """Standard deviation of the mean limb length among people [m]: 5 % of 0.36 m."""
+    limb_noise_m: float = Field(default=0.01, ge=1e-6, le=10)
+    """Standard deviation of a limb's length besides the size, between two tracks of one person
+    [m]: together with the scatter 14 mm on Shelf."""
+    limb_std_m: float = Field(default=0.013, ge=1e-6, le=10)
+    """Standard deviation of a limb's length among people of one size [m]."""
     newcomer_odds: float = Field(default=0.01, ge=1e-6, le=1)
-    """Prior odds that a person who appears on a pitch is new to the clip and not a lost one [1].
-    Half or twice this value changes nothing; if the roster is full, no other value does either."""
+    """Prior odds that a person who appears on a pitch is new to the clip and not one lost a second
+    ago [1]; they grow with the square of the time since, up to even odds."""
     visitor_odds: float = Field(default=0.1, ge=1e-6, le=1)
     """The same without a pitch, where people come and go [1]. At 0.01, a track that fits badly is
     joined where no other fits: in 26 subsets of Shelf's cameras 6 tracks show two people, 4 at

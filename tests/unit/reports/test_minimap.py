@@ -18,6 +18,7 @@ def test_people_are_drawn_at_their_places_and_in_the_way_of_their_kind():
         xy,
         np.zeros((2, 2, 2, 2)),
         np.full(2, np.nan),
+        np.ones((2, 2)),
     )
     first, second = minimap_frames(people, PitchSpec())
     assert first.shape == (780, 1150, 3) and first.dtype == np.uint8

@@ -265,7 +265,7 @@ def _find_grass(picture: Image, where: str) -> Flags:
             where,
             expected="grass in the lower three quarters of the image",
             found=f"{np.count_nonzero(lower) / lower.size:.1%} of green pixels",
-            todo="Use an image of the pitch in color.",
+            todo="Use an image of the pitch in color; on another floor, click its markings.",
         )
     counts = np.bincount(hue[lower], minlength=180).astype(np.float64)
     counts = np.convolve(counts, np.ones(7), mode="same")

@@ -229,7 +229,7 @@ def propose_from_paint(
     The paint is that under every lens that the image may have, the likely one first; `lens` is the
     known one. The camera stands on a side of the pitch.
     """
-    found = rank_under_lenses(paints, pitch, prior or CameraPrior(), lens)
+    found = rank_under_lenses(paints, pitch, (prior or CameraPrior()).beside(pitch.spec), lens)
     if found is None:
         return None
     paint, ranked, scores = found
