@@ -41,7 +41,7 @@ from worldpose.tracking.plane.tracker import (
 )
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.world import doubt_world
+from worldpose.triangulation.world import People, doubt_world
 
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""
@@ -167,8 +167,12 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     warnings: tuple[str, ...] = (said,) if said else ()
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
     # With many detections left over, people are rays that meet by chance.
-    doubted = doubt_world(clip.cameras, tracks.joints, clip.fps, sizes=unmatched < 0.3)
-    warnings += tuple(f"{name}: {each}" for each in doubted)
+    most = 1000  # frames; more tell no more of the world
+    people = People.of(tracks.joints[:most], clip.fps)
+    if people is not None:
+        figures["median_stature_m"] = people.stature
+        doubted = doubt_world(clip.cameras, people, sizes=unmatched < 0.3)
+        warnings += tuple(f"{name}: {each}" for each in doubted)
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )
