@@ -30,6 +30,8 @@ def write_recording(
 ) -> None:
     """Write a recording (.rrd) atomically, with timelines `frame` and `time`.
 
+    In the image of each static camera, the markings are where its lens shows them.
+
     Args:
         path: the file.
         tracks: joints of all people; missing joints are left out.
@@ -56,12 +58,20 @@ def write_recording(
         stream.save(draft)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if pitch is not None:
-            lines = [line.tolist() for line in markings(pitch)]
-            stream.log(
-                "world/pitch", rr.LineStrips3D(lines, colors=[white], radii=[0.06]), static=True
+            lines = markings(pitch)
+            painted = rr.LineStrips3D(
+                [line.tolist() for line in lines], colors=[white], radii=[0.06]
             )
+            stream.log("world/pitch", painted, static=True)
         for name, camera in (cameras or {}).items():
             _log_camera(rr, stream, f"world/cameras/{name}", camera, static=True)
+            if pitch is not None:
+                seen = [
+                    pixels[np.isfinite(pixels).all(-1)] for pixels in map(camera.project, lines)
+                ]
+                strips = [pixels.tolist() for pixels in seen if len(pixels) > 1]
+                place = f"world/cameras/{name}/markings"
+                stream.log(place, rr.LineStrips2D(strips, colors=[white]), static=True)
         for row, frame in enumerate(tracks.frames):
             stream.set_time("frame", sequence=int(frame))
             stream.set_time("time", duration=float(frame) / fps)
@@ -86,7 +96,7 @@ def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
 
 
 def _log_camera(rr: Any, stream: Any, place: str, camera: Camera, *, static: bool) -> None:  # noqa: ANN401
-    """Log one camera's pose and image plane; the viewer supports no distortion."""
+    """Log one camera's pose and image plane; rerun's own cameras have no distortion."""
     pose = camera.cam_from_world.inverse()
     transform = rr.Transform3D(translation=pose.translation, mat3x3=pose.rotation)
     pinhole = rr.Pinhole(
