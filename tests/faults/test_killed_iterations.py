@@ -46,7 +46,7 @@ def run_here(store, match, request):
     match = open_match(store, match.match_id)  # as the flow does: it may have been edited
     stages = selected_stages(request.from_stage, request.until_stage)
     log = RunLog.begin(store, match, stages, request.settings, "never", request.iteration)
-    return match_flow._run_stages(log, request.time_limits)
+    return match_flow.run_stages(log, request.time_limits)
 
 
 @contextmanager
