@@ -91,7 +91,7 @@ def widen_by_lenses(
     """
     # Spreads of k1, k2, k3 of wide lenses [1], such as those that bend back towards the corners.
     brown, fisheye = (0.3, 0.15, 0.05), (0.3, 0.3, 0.3)
-    as_well = 2.0  # difference of the costs, half of twice the log probability [1]
+    as_well = 2.0  # difference of the log probabilities [1]
     problem, fit, camera = found.problem, found.fit, found.estimate.camera
     if problem.lens is not None or stated.distortion != "k1_k2":
         return found
@@ -107,7 +107,7 @@ def widen_by_lenses(
         prior[15:18] = spreads
         wider = replace(kept, free=np.ones(STEP, np.bool_), lens_model=model, prior=prior)
         other = fit_cameras(wider, fit.row[None])
-        if not other.cost[0] <= cost + as_well:
+        if not other.cost[0] <= cost + as_well * fit.noise_scale**2:
             continue
         apart = Camera.from_numbers(other.rows[0], problem.image_size).project(places) - pixels
         known = seen & np.isfinite(apart).all(axis=1)
