@@ -72,8 +72,8 @@ class Board:
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
         corners = cv2.cornerSubPix(grey, corners, window, (-1, -1), criteria)
         places = np.asarray(board.getChessboardCorners())[ids.ravel(), :2]
-        corners = corners.reshape(-1, 2).astype(np.float64)
-        return BoardView(places.astype(np.float64), corners, note)
+        pixels = corners.reshape(-1, 2).astype(np.float64)
+        return BoardView(places.astype(np.float64), pixels, note)
 
     def others(self, image: Image) -> Iterator[tuple[Board, str]]:
         """Yield boards that are perhaps meant, each with a sentence about the difference.

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import dropwhile, islice, pairwise
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -137,7 +138,7 @@ def _shown_size(path: Path, packet: av.Packet[VideoStream]) -> tuple[int, int] |
 
 def _require_quarters(path: Path, picture: av.VideoFrame) -> None:
     """Raise InputError for a display matrix that mirrors, or turns by no multiple of 90 degrees."""
-    stored = picture.side_data.get("DISPLAYMATRIX")
+    stored: Any = picture.side_data.get("DISPLAYMATRIX")
     if stored is None:
         return
     matrix = np.frombuffer(bytes(stored), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
