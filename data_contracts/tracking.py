@@ -47,6 +47,7 @@ TRACKING = GroupLayout(
         "tracks": "one `track` record per person",
         "joins": "`join` records: undecided ones first, then by falling cost",
         "objections": "for each correction, in order: why it does not apply; null if it does",
+        "changes": "cameras whose people the tracker had lost, each a CameraChange",
     },
 )
 

@@ -33,12 +33,10 @@ class CameraChange(Record):
     frame_count: Count
     """Of the clip."""
     shift_px: tuple[Number, Number] = (0.0, 0.0)
-    """Displacement of the image [px]."""
+    """Displacement of the image at the principal point, by a turn of the camera [px]."""
     zoom: Number = 0.0
     """Growth of the image about the principal point [1]."""
     roll_rad: Number = 0.0
-    center_px: tuple[Number, Number] = (0.0, 0.0)
-    """Principal point."""
     late_frames: Number = 0.0
     """How much later its images are than before [frame]."""
     std: Amount | None

@@ -172,12 +172,11 @@ def open_detections(
     cameras: Sequence[xr.Dataset],
     frame: Integers,
     feedback: StoredFeedback,
-    camera_ids: Sequence[str] = (),
-    changes: Sequence[CameraChange] = (),
+    correct: Callable[[Singles, Integers], Singles] | None = None,
 ) -> KeypointDetections[ClipArray]:
     """Return the detections of all cameras, read in pages; NaN beyond a camera's number of them.
 
-    Views of the cameras (`camera_ids`) that change within the clip are corrected.
+    `correct` returns the keypoints of frames as cameras would show them that do not change.
     """
     aligned, points = align_points(cameras)
     most = max(1, *(camera.sizes["detection"] for camera in cameras))
@@ -193,9 +192,9 @@ def open_detections(
                 part = array[rows]
                 page[:, camera, : part.shape[1]] = part
             page = feedback.apply(name, page, rows)
-            if not changes or name not in ("keypoints", "extra_keypoints"):
+            if correct is None or name not in ("keypoints", "extra_keypoints"):
                 return page
-            return correct_views(page, frame[rows], camera_ids, changes).astype(np.float32)
+            return correct(page, frame[rows])
 
         return PagedArray(shape, read)
 
@@ -250,6 +249,7 @@ def open_clip(
     filtered: bool = True,
     shifted: bool = True,
     redetected: bool = True,
+    further: Sequence[CameraChange] = (),
 ) -> ClipInputs:
     """Open the unit's clip; its detections are read on access.
 
@@ -258,6 +258,7 @@ def open_clip(
         filtered: leave out keypoints that the previous iteration rejected.
         shifted: subtract the systematic errors of keypoints.
         redetected: include redetected people.
+        further: changes of cameras within the clip besides those that earlier stages found.
     """
     where = slice(int(inputs.frames[0]), int(inputs.frames[-1]))
     seen = _open_cameras(inputs, where)
@@ -266,17 +267,34 @@ def open_clip(
     feedback = StoredFeedback(
         seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
     )
-    names, changes = inputs.sources["cameras"], known_changes(inputs, inputs.unit, "view")
-    detections = open_detections(seen, inputs.frames, feedback, names, changes)
+    changes = [*known_changes(inputs, inputs.unit), *further]
+    correct = _view_corrector(inputs, changes)
+    detections = open_detections(seen, inputs.frames, feedback, correct)
     return _open_inputs(inputs, detections)
 
 
-def known_changes(inputs: UnitInputs, clip: str, kind: str | None = None) -> list[CameraChange]:
-    """Return the changes of cameras within a clip that a triangulation before this unit found."""
-    for name in (f"triangulation/{clip}", f"retriangulation/{clip}"):
+def _view_corrector(
+    inputs: UnitInputs, changes: Sequence[CameraChange]
+) -> Callable[[Singles, Integers], Singles] | None:
+    """Return the correction of cameras whose view changes; None if all stay as they are."""
+    views = [change for change in changes if change.kind == "view"]
+    if not views:
+        return None
+    names = tuple(inputs.sources["cameras"])
+    cameras, _, _ = _load_cameras(inputs, names)
+    known = {name: cameras[c] for c, name in enumerate(names)}
+
+    def correct(page: Singles, frame: Integers) -> Singles:
+        return correct_views(page, frame, known, views).astype(np.float32)
+
+    return correct
+
+
+def known_changes(inputs: UnitInputs, clip: str) -> list[CameraChange]:
+    """Return the changes of cameras within a clip that the stages before this unit found."""
+    for name in (f"triangulation/{clip}", f"retriangulation/{clip}", f"tracking/{clip}"):
         if name in inputs:
-            found = map(CameraChange.model_validate, inputs.open(name).attrs["changes"])
-            return [change for change in found if kind in (None, change.kind)]
+            return [CameraChange.model_validate(one) for one in inputs.open(name).attrs["changes"]]
     return []
 
 
@@ -362,9 +380,9 @@ def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> 
     ]
     feedback = StoredFeedback(seen, _concatenate_clips(filtering) if filtering else None)
     frame = np.concatenate(list(frames.values()))
-    changes = [each for clip in frames for each in known_changes(inputs, clip, "view")]
-    cameras = inputs.sources["cameras"]
-    detections = open_detections(seen, frame, feedback, cameras, changes)
+    changes = [each for clip in frames for each in known_changes(inputs, clip)]
+    correct = _view_corrector(inputs, changes)
+    detections = open_detections(seen, frame, feedback, correct)
     return _open_inputs(inputs, detections[: len(frame)])
 
 

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 from data_contracts.arrays import Singles
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import TRACKING
+from data_contracts.triangulation import CameraChange
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.compiled import map_in_threads
@@ -40,7 +41,14 @@ from worldpose.tracking.plane.tracker import (
     triangulated_places,
 )
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
+from worldpose.tracking.tracker import Tracking, track_people
+from worldpose.triangulation.camera_changes import (
+    change_record,
+    describe_change,
+    refine_change,
+)
+from worldpose.triangulation.lost_views import find_lost_views
+from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.world import People, doubt_world
 
 BLOCK: Final = 256
@@ -73,6 +81,7 @@ def tracking(inputs: UnitInputs, result: ResultWriter) -> None:
             "tracks": [track.model_dump(mode="json") for track in corrected.tracks],
             "joins": [join.model_dump(mode="json") for join in corrected.joins],
             "objections": list(replay.objections),
+            "changes": [change.model_dump(mode="json") for change in corrected.changes],
         },
     )
     result.figures.update(figures)
@@ -119,15 +128,37 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     clip, pitch = open_clip(inputs), _pitch(inputs)
     settings = inputs.settings(TrackingSettings)
     pitch_size = None if pitch is None else (pitch.length, pitch.width)
-    tracks = track_people(
-        clip.cameras,
-        clip.detections,
-        clip.fps,
-        settings,
-        pitch_size=pitch_size,
-        people=inputs.sources["people"],
-        camera_covariance=clip.camera_covariance,
-    )
+
+    def track(clip: ClipInputs) -> Tracking:
+        return track_people(
+            clip.cameras,
+            clip.detections,
+            clip.fps,
+            settings,
+            pitch_size=pitch_size,
+            people=inputs.sources["people"],
+            camera_covariance=clip.camera_covariance,
+        )
+
+    tracks = track(clip)
+    changes = _find_lost(clip, tracks)
+    if any(change.kind == "view" for change in changes):
+        clip = open_clip(inputs, further=changes)
+        tracks = track(clip)
+        people = clip.detections.assign_people(tracks.detection_index)
+        changes = tuple(
+            refine_change(
+                clip.cameras,
+                people,
+                clip.fps,
+                TriangulationSettings(),
+                clip.camera_ids.index(change.camera),
+                change,
+            )
+            if change.kind == "view"
+            else change
+            for change in changes
+        )
     found = Identities(
         frame=clip.detections.frame,
         cameras=tuple(clip.camera_ids),
@@ -138,6 +169,7 @@ def _track_people(inputs: UnitInputs) -> Tracked:
         on_plane=np.zeros(tracks.joints.shape[:2], dtype=np.bool_),
         names={},
         joins=tracks.joins,
+        changes=changes,
     )
     figures = figures_of(tracks.report, clip.camera_ids)
     said = ""
@@ -166,11 +198,11 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             figures |= {name: number for name, number in further.items() if "plane" in name}
     warnings: tuple[str, ...] = (said,) if said else ()
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
-    # With many detections left over, people are rays that meet by chance.
     most = 1000  # frames; more tell no more of the world
     people = People.of(tracks.joints[:most], clip.fps)
     if people is not None:
         figures["median_stature_m"] = people.stature
+        # With many detections left over, people are rays that meet by chance.
         doubted = doubt_world(clip.cameras, people, sizes=unmatched < 0.3)
         warnings += tuple(f"{name}: {each}" for each in doubted)
     doubts = describe_doubts(
@@ -178,7 +210,17 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     )
     if doubts is not None:
         warnings += (f"{name}: {doubts}.",)
+    warnings += tuple(f"{describe_change(change)}." for change in changes)
     return found, figures, warnings
+
+
+def _find_lost(clip: ClipInputs, tracks: Tracking) -> tuple[CameraChange, ...]:
+    """Return the changes of cameras by which the tracker lost their people."""
+    frame = np.asarray(clip.detections.frame, dtype=np.int64)
+    return tuple(
+        change_record(change, clip.camera_ids[change.found.camera], frame)
+        for change in find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
+    )
 
 
 def _pitch(inputs: UnitInputs) -> PitchTemplate | None:

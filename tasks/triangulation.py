@@ -31,6 +31,7 @@ from worldpose.triangulation.camera_changes import (
     change_record,
     describe_change,
     explain_changes,
+    is_same_change,
 )
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
@@ -87,7 +88,7 @@ def _write_joints(
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
         known = known_changes(inputs, inputs.unit)
-        found = _find_changes(clip, health, kinds, settings, rows, result)
+        found = _find_changes(clip, health, kinds, settings, rows, known, result)
         result.write(
             layout,
             arrays=spool.arrays()
@@ -96,7 +97,7 @@ def _write_joints(
             coordinates={"frame": detections.frame[::stride], "person": clip.person},
             attributes={
                 "camera": list(clip.camera_ids),
-                "changes": [change.model_dump(mode="json") for change in (*known, *found)],
+                "changes": [change.model_dump(mode="json") for change in found],
                 **clip.detections.labels(),
             },
         )
@@ -127,32 +128,34 @@ def _find_changes(
     kinds: tuple[Kind, ...],
     settings: TriangulationSettings,
     rows: NDArray[np.int64],
+    known: list[CameraChange],
     result: ResultWriter,
 ) -> list[CameraChange]:
-    """Return the clearest change of a camera within the clip, if there is one, and warn of it."""
+    """Return the known changes and the clearest further one of a camera, and warn of that."""
     fps = clip.fps * len(rows) / max(1, len(clip.detections.frame))
     found = [
         replace(change, row=int(rows[change.row])) for change in find_changes(health, fps, kinds)
     ]
     if not found:
-        return []
+        return known
     if len(clip.camera_ids) < 3:
         when = f"at frame {clip.detections.frame[found[0].row]}" if found[0].is_sudden else "slowly"
         result.warnings.append(
             f"cameras {' and '.join(clip.camera_ids)} cease to agree {when}: one of them moved, or "
             "its clock changed. Two cameras cannot tell which."
         )
-        return []
+        return known
     measured = explain_changes(clip.cameras, clip.detections, clip.fps, settings, found, kinds)
     if measured is None:
-        return []
-    center = clip.cameras[measured.found.camera].principal_point
+        return known
     camera = clip.camera_ids[measured.found.camera]
-    change = change_record(measured, camera, center, clip.detections.frame)
+    change = change_record(measured, camera, clip.detections.frame)
+    if any(is_same_change(other, change, clip.fps) for other in known):
+        return known
     result.warnings.append(f"{describe_change(change)}.")
     if change.kind == "clock":
         result.figures[CLOCK_CHANGE + camera] = change.late_frames
-    return [change]
+    return [*known, change]
 
 
 def camera_errors(inputs: UnitInputs, clip: ClipInputs) -> NDArray[np.float64] | None:

@@ -38,7 +38,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
-    from worldpose.triangulation.camera_changes import Course
+    from worldpose.triangulation.clock_courses import Course
     from worldpose.triangulation.synchronization import Synchronization
 
 MIN_OFFSET_FRAMES = 0.1
@@ -143,7 +143,7 @@ def _find_clocks(
     pitch: PitchTemplate | None,
 ) -> tuple[Synchronization, list[Course]]:
     """Return the constant offsets of all cameras, and their offsets over the clip."""
-    from worldpose.triangulation.camera_changes import shift_by_courses, trace_clocks
+    from worldpose.triangulation.clock_courses import shift_by_courses, trace_clocks
     from worldpose.triangulation.synchronization import synchronize as estimate
 
     size = None if pitch is None else (pitch.length, pitch.width)

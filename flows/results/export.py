@@ -121,6 +121,7 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
                 move=partial(
                     move_on,
                     frame=frames,
+                    camera=camera,
                     changes=[
                         each for each in changes if each.camera == camera_id and each.kind == "view"
                     ],

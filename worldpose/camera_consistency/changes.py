@@ -182,7 +182,8 @@ def measure_step(
     left = right - matrix @ constant - weights[:, None] * (matrix @ change)
     own = np.einsum("b,bij->ij", weights**2, matrix) - part @ np.linalg.solve(total, part)
     covariance = np.linalg.pinv(own[np.ix_(changing, changing)]) * _noise(matrix, left, 1)
-    std = float(np.sqrt(np.diagonal(covariance)[: 2 if len(changing) > 1 else 1].sum()))
+    variance = np.diagonal(covariance)[: 2 if len(changing) > 1 else 1]
+    std = float(np.sqrt(max(0.0, variance.sum())))
     return change, std, float(constant[4]) if found.kind == "clock" else 0.0
 
 

@@ -3,10 +3,11 @@
 A keypoint x of camera c at time t departs from the projection p of the triangulated joint, whose
 image moves by v per frame, as
 
-    x - p = s + z q + r q' + l v + noise,
+    x - p = s + q (q . s) / f^2 + z q + r q' + l v + noise,
 
-with q = p less the principal point, and q' = q turned by 90 degrees: a shift s [px] and a roll r
-[rad] of a camera that was knocked, a zoom z [1], and a clock offset l [frame]. Each bin of
+with q = p less the principal point, q' = q turned by 90 degrees, and f the focal length: a camera
+that was knocked turned by s / f, which shifts the principal point by s [px], and by the roll r
+[rad]; further a zoom z [1], and a clock offset l [frame]. Each bin of
 frames has the normal equations of (s, z, r, l); `changes` finds where the solution changes.
 """
 
@@ -86,11 +87,12 @@ class CameraHealth:
     ) -> None:
         """Add people (n,) of one camera, in rising bins, at points (3, n, 12, 3) over time."""
         joint_noise, pixel_noise = 0.03, 2.0  # of a detector [m], [px]
+        focal = camera.focal.mean()
         before, image, after = camera.project(points.reshape(-1, 3)).reshape(*points.shape[:-1], 2)
         speed, off = 0.5 * (after - before), pixels - image
         depth = camera.cam_from_world.apply(points[1].reshape(-1, 3))[:, 2].reshape(off.shape[:-1])
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = camera.focal.mean() / depth
+            scale = focal / depth
             variance = pixel_noise**2 + (joint_noise * scale) ** 2
             squared = (off**2).sum(axis=-1) / variance
             weight = cauchy_weight(squared, 5.0) / variance
@@ -99,7 +101,7 @@ class CameraHealth:
         self.cost[c] += cauchy_loss(squared[use], 5.0).sum()
         around = image - camera.principal_point
         columns = np.zeros((*off.shape, UNKNOWNS))
-        columns[..., 0, 0] = columns[..., 1, 1] = 1.0
+        columns[..., :2] = np.eye(2) + around[..., :, None] * around[..., None, :] / focal**2
         columns[..., 2] = around
         columns[..., 0, 3], columns[..., 1, 3] = -around[..., 1], around[..., 0]
         columns[..., 4] = speed

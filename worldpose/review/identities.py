@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.review import MergedTracks, NamedTrack, Sighting, SplitTrack
 from data_contracts.tracking import Join, Track
+from data_contracts.triangulation import CameraChange
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,6 +36,7 @@ class Identities:
             the feet.
         names: roster id by person, of named people.
         joins: certain and possible continuations of one track as another.
+        changes: cameras that changed so much within the clip that the tracker lost their people.
     """
 
     frame: NDArray[np.integer]
@@ -46,6 +48,7 @@ class Identities:
     on_plane: NDArray[np.bool_]
     names: dict[int, str]
     joins: tuple[Join, ...]
+    changes: tuple[CameraChange, ...] = ()
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -97,6 +100,7 @@ def stored_identities(result: xr.Dataset) -> Identities:
         on_plane=find_plane_frames(result),
         names={track.person: track.name for track in tracks if track.name is not None},
         joins=tuple(Join.model_validate(join) for join in result.attrs["joins"]),
+        changes=tuple(CameraChange.model_validate(each) for each in result.attrs["changes"]),
     )
 
 

@@ -8,11 +8,12 @@ until there is none.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
@@ -20,9 +21,8 @@ from data_contracts.triangulation import CameraChange
 from worldpose.camera_consistency.changes import Change, Kind, find_changes, measure_step
 from worldpose.camera_consistency.health import LIMBS, UNKNOWNS, CameraHealth
 from worldpose.geometry.cameras import Camera
-from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.clocks import move_to_match_time, read_frames
+from worldpose.geometry.rigid import Rigid
+from worldpose.triangulation.clocks import read_frames
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.residuals import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
@@ -77,10 +77,26 @@ def explain_changes(
     """
     loose = settings.model_copy(update={"max_deviation": 30.0})
     trial = _Trial(cameras, people, fps, loose)
-    windows = trial.choose_windows(found[0])
+    change = _leave_one_out(trial, found, kinds)
+    if change is not None and change.is_explained:
+        return change
+    # In a crowd, or where little changes, leaving out a camera tells less than a clear change.
+    if found[0].gain < 300.0:
+        return change
+    windows, direct = trial.choose_windows(found[0]), trial.measure(found[0])
+    before, after = trial.misfit(windows), trial.misfit(windows, direct)
+    possible = before - trial.misfit(windows, without=found[0].camera)
+    return direct if before - after > max(0.02 * before, 0.7 * possible) else change
+
+
+def _leave_one_out(
+    trial: _Trial, found: Sequence[Change], kinds: Sequence[Kind]
+) -> MeasuredChange | None:
+    """Return the change of the camera without which the others agree; None if there is none."""
+    people, windows = trial.people, trial.choose_windows(found[0])
     before = trial.misfit(windows)
     # In a small rig a camera that sways spoils the others so that theirs are the changes found.
-    count = len(cameras.focal)
+    count = len(trial.cameras.focal)
     suspects = range(count) if count <= 8 else {each.camera for each in found}
     without = {c: trial.misfit(windows, without=c) for c in suspects}
     culprit = min(without, key=lambda c: without[c])
@@ -109,6 +125,52 @@ def explain_changes(
     return replace(own[best], is_explained=bool(is_explained), is_left_out=is_left_out)
 
 
+def choose_change(
+    cameras: Camera,
+    people: KeypointDetections[ClipArray],
+    fps: float,
+    settings: TriangulationSettings,
+    found: Sequence[Change],
+) -> MeasuredChange | None:
+    """Return the change whose correction lets all cameras agree best; None if none helps.
+
+    It serves where several cameras change, so that no camera is the one without which the others
+    agree. Arguments are those of `explain_changes`.
+    """
+    trial = _Trial(cameras, people, fps, settings.model_copy(update={"max_deviation": 30.0}))
+    windows = trial.choose_windows(replace(found[0], is_sudden=False))
+    before, most = trial.misfit(windows), 6
+    measured = [trial.measure(each) for each in found[:most]]
+    after = [trial.misfit(windows, each) for each in measured]
+    best = int(np.argmin(after))
+    return measured[best] if after[best] < 0.98 * before else None
+
+
+def refine_change(
+    cameras: Camera,
+    people: KeypointDetections[ClipArray],
+    fps: float,
+    settings: TriangulationSettings,
+    camera: int,
+    known: CameraChange,
+) -> CameraChange:
+    """Return a known sudden change of a view with what people show who were tracked through it.
+
+    Args:
+        cameras: batch (cameras,), at least three.
+        people: detections of the tracked people of a clip, with the known change taken back.
+        fps: frames per second [1/s].
+        settings: noise of the keypoints.
+        camera: index of the camera.
+        known: its change.
+    """
+    row = int(np.searchsorted(people.frame, known.frame or 0))
+    found = Change(camera, "view", True, row, 0.0, 0.0)
+    measured = _Trial(cameras, people, fps, settings).measure(found)
+    frame = np.asarray(people.frame, dtype=np.int64)
+    return join_changes(known, change_record(measured, known.camera, frame))
+
+
 @dataclass(frozen=True, eq=False)
 class _Trial:
     """Windows of a clip, triangulated with a change corrected or without a camera."""
@@ -121,15 +183,22 @@ class _Trial:
     def choose_windows(self, found: Change) -> list[slice]:
         """Return intervals of a second that a change leaves whole, on both sides of it."""
         frames, length = len(self.people.detection_index), max(3, round(self.fps))
-        starts = np.arange(0, max(1, frames - length + 1), length)
         if not found.is_sudden:
-            chosen = starts[np.unique(np.linspace(0, len(starts) - 1, 16).astype(int))]
-            return [slice(int(start), int(start) + length) for start in chosen]
+            starts = range(0, max(1, frames - length + 1), length)
+            chosen = np.unique(np.linspace(0, len(starts) - 1, 16).astype(int))
+            return [slice(starts[k], starts[k] + length) for k in chosen]
         # Not at the step: its place is known to some frames, and a clock's correction reads there.
         gap = length // 2
-        before = starts[starts + length + gap <= found.row][-6:]
-        after = np.arange(found.row + gap, frames - length + 1, length)[:6]
-        return [slice(int(start), int(start) + length) for start in (*before, *after)]
+        ends = range(length, found.row - gap + 1, length)
+        before = [slice(end - length, end) for end in ends]
+        starts = range(found.row + gap, frames - length + 1, length)
+        after = [slice(start, start + length) for start in starts]
+        # Near an end of the clip, a part of a second has to do.
+        if not before:
+            before = [slice(0, max(3, found.row - gap // 2))]
+        if not after:
+            after = [slice(min(frames - 3, found.row + gap // 2), frames)]
+        return [*before[-6:], *after[:6]]
 
     def find_alone(
         self, camera: int, near: Change, kinds: Sequence[Kind]
@@ -227,52 +296,83 @@ def correct_window(
     late[c] = change.before + amount[4]
     seen = read_frames(people, window, late) if late[c] else people[window]
     keypoints = np.array(seen.keypoints, dtype=np.float64)
-    keypoints[:, c] = move_back(keypoints[:, c], cameras[c].principal_point, amount)
+    keypoints[:, c] = move_back(keypoints[:, c], cameras[c], amount)
     return replace(seen, keypoints=keypoints)
 
 
-def move_back(pixels: Floats, center: Floats, amount: Floats) -> Floats:
+def move_back(pixels: Floats, camera: Camera, amount: Floats) -> Floats:
     """Return the pixels (..., 2) that a camera had shown before its view changed."""
-    turn, shift = _view_motion(amount)
-    return np.asarray((pixels - center - shift) @ np.linalg.inv(turn).T + center)
+    back = np.asarray(np.linalg.inv(_view_motion(camera, amount)), dtype=np.float64)
+    return _turn_view(pixels, camera, back)
 
 
-def move_on(pixels: Floats, frame: Integers, changes: Sequence[CameraChange]) -> Floats:
+def move_on(
+    pixels: Floats, frame: Integers, camera: Camera, changes: Sequence[CameraChange]
+) -> Floats:
     """Return the pixels (frames, ..., 2) of the unchanged camera where the changed one shows them.
 
-    They are missing where nothing explains the camera's views.
+    They are missing where nothing explains the camera's views. Later changes were found in views
+    that the earlier ones had corrected.
     """
     moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
-    for change in changes:
-        for row, part in enumerate(_shares(change, frame)):
-            turn, shift = _view_motion(part * _view_amount(change))
-            center = np.array(change.center_px)
-            moved[row] = (moved[row] - center) @ turn.T + center + shift
+    for change in reversed(changes):
+        share = _shares(change, frame)
+        for part in np.unique(share[share > 0.0]):
+            motion = _view_motion(camera, np.asarray(part * _view_amount(change)))
+            moved[share == part] = _turn_view(np.asarray(moved[share == part]), camera, motion)
         if change.is_left_out:
             moved[_inside(change, frame)] = np.nan
     return moved
 
 
 def correct_views(
-    pixels: AnyFloats, frame: Integers, cameras: Sequence[str], changes: Sequence[CameraChange]
+    pixels: AnyFloats,
+    frame: Integers,
+    cameras: Mapping[str, Camera],
+    changes: Sequence[CameraChange],
 ) -> Floats:
     """Return keypoints (frames, cameras, detections, points, 2) as unchanged cameras show them."""
     moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
     for change in changes:
         c, share = list(cameras).index(change.camera), _shares(change, frame)
         for part in np.unique(share[share > 0.0]):
-            rows, center = share == part, np.array(change.center_px)
+            rows = share == part
             amount = part * _view_amount(change)
-            moved[rows, c] = move_back(np.asarray(moved[rows, c]), center, amount)
+            moved[rows, c] = move_back(np.asarray(moved[rows, c]), cameras[change.camera], amount)
         if change.is_left_out:
             moved[_inside(change, frame), c] = np.nan
     return moved
 
 
-def _view_motion(amount: Floats) -> tuple[Floats, Floats]:
-    """Return the matrix (2, 2) about the principal point and the shift (2,) of a view."""
-    x, y, zoom, roll = amount[:4]
-    return np.array([[1.0 + zoom, -roll], [roll, 1.0 + zoom]]), np.array([x, y])
+def _view_motion(camera: Camera, amount: Floats) -> Floats:
+    """Return the matrix (3, 3) of a turn and a zoom that change what a camera shows.
+
+    The shift [px] is that at the principal point.
+    """
+    x, y, zoom, roll = amount[:4] / [camera.focal[0], camera.focal[1], 1.0, 1.0]
+    turn = Rotation.from_rotvec([-y, x, roll]).as_matrix()
+    return np.asarray([[1.0 + zoom], [1.0 + zoom], [1.0]] * turn)
+
+
+def _turn_view(pixels: Floats, camera: Camera, motion: Floats) -> Floats:
+    """Return where pixels (..., 2) of a camera lie after a motion of its view."""
+    plane = camera.normalize(pixels.reshape(-1, 2))
+    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ motion.T
+    return replace(camera, cam_from_world=Rigid.identity()).project(rays).reshape(pixels.shape)
+
+
+def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:
+    """Return whether two explained changes are one move of a camera, found within a second."""
+    if one.frame is None or other.frame is None or not other.is_explained:
+        return False
+    same = (one.camera, one.kind) == (other.camera, "view") == (other.camera, other.kind)
+    return same and abs(one.frame - other.frame) <= fps
+
+
+def join_changes(first: CameraChange, then: CameraChange) -> CameraChange:
+    """Return a change of a view with the little that was found after its correction."""
+    x, y, zoom, roll = (_view_amount(first) + _view_amount(then)).tolist()
+    return then.model_copy(update={"shift_px": (x, y), "zoom": zoom, "roll_rad": roll})
 
 
 def _view_amount(change: CameraChange) -> Floats:
@@ -332,9 +432,7 @@ def describe_change(change: CameraChange) -> str:
     )
 
 
-def change_record(
-    change: MeasuredChange, camera: str, center: Floats, frame: Integers
-) -> CameraChange:
+def change_record(change: MeasuredChange, camera: str, frame: Integers) -> CameraChange:
     """Return a change as results store it; match frames (n,) of a clip."""
     x, y, zoom, roll, late = change.amount.tolist()
     found = change.found
@@ -347,106 +445,8 @@ def change_record(
         shift_px=(x, y),
         zoom=zoom,
         roll_rad=roll,
-        center_px=(float(center[0]), float(center[1])),
         late_frames=late,
         std=change.std if np.isfinite(change.std) else None,
         is_explained=change.is_explained,
         is_left_out=not change.is_explained and change.is_left_out and found.kind == "view",
     )
-
-
-Course = list[tuple[int, float]]
-"""Clock offset of a camera: rising rows of a clip with values [frame], linear between them."""
-
-
-def trace_clocks(
-    cameras: Camera,
-    detections: KeypointDetections,
-    fps: float,
-    late: Floats,
-    *,
-    pitch_size: tuple[float, float] | None = None,
-) -> list[Course]:
-    """Return the clock offset of each camera over a clip, with steps and drifts.
-
-    People are tracked and triangulated with the clocks so far; the clearest change is added, until
-    there is none.
-
-    Args:
-        cameras: batch (cameras,), at least three.
-        detections: (frames, cameras, detections) in memory, before tracking.
-        fps: frames per second [1/s].
-        late: (cameras,) constant offset to start from [frame].
-        pitch_size: length and width of the pitch that people stand on [m]; None = not known.
-    """
-    frames, count = detections.score.shape[:2]
-    courses: list[Course] = [[(0, float(value))] for value in late]
-    settings = TriangulationSettings()
-    for _ in range(2 * count + 4):
-        people = _track_on_time(cameras, detections, fps, courses, pitch_size)
-        health = CameraHealth.empty(frames, count, people.detection_index.shape[2], fps)
-        for start in range(0, frames, 512):
-            rows = slice(max(0, start - 1), min(frames, start + 513))
-            seen = people[rows]
-            health.add(cameras, seen, triangulate_views(cameras, seen, settings), rows.start)
-        found = find_changes(health, fps, ("clock",))
-        change = (
-            explain_changes(cameras, people, fps, settings, found, ("clock",)) if found else None
-        )
-        if change is None or not change.is_explained or abs(change.amount[4]) < 0.1:
-            break
-        c = change.found.camera
-        courses[c] = _add_change(courses[c], change, frames)
-    return courses
-
-
-def _track_on_time(
-    cameras: Camera,
-    detections: KeypointDetections,
-    fps: float,
-    courses: Sequence[Course],
-    pitch_size: tuple[float, float] | None,
-) -> KeypointDetections:
-    """Return tracked people on the common clock, by the clocks so far."""
-    shifted, rest = shift_by_courses(detections, courses)
-    tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
-    index = tracks.detection_index
-    moved = move_to_match_time(np.asarray(shifted.keypoints, np.float64), index, rest)
-    return replace(shifted, keypoints=moved, detection_index=index)
-
-
-def shift_by_courses(
-    detections: KeypointDetections, courses: Sequence[Course]
-) -> tuple[KeypointDetections, Floats]:
-    """Return the nearest frames on the common clock, and what is left of the offsets [frame].
-
-    Detections are (frames, cameras, detections), offsets that are left (frames, cameras).
-    """
-    frames, count = detections.score.shape[:2]
-    frame = np.arange(frames)
-    course = np.stack([np.interp(frame, *np.array(each).T) for each in courses], axis=1)
-    row = np.floor(frame[:, None] - course + 0.5).astype(np.int64)
-    outside = (row < 0) | (row >= frames)
-    row = np.clip(row, 0, frames - 1)
-    arrays = {}
-    for name, array in detections.arrays().items():
-        arrays[name] = array[row, np.arange(count)].astype(np.float64)
-        arrays[name][outside] = np.nan
-    rest = row + np.take_along_axis(course, row, axis=0) - frame[:, None]
-    rest = np.where(np.abs(rest) < 1.0, rest, 0.0)
-    return detections.with_arrays(arrays, frame), rest
-
-
-def _add_change(course: Course, change: MeasuredChange, frames: int) -> Course:
-    """Return a course with a change, measured in rows of the common clock."""
-    amount, row = float(change.amount[4]), change.found.row
-    course = [(a, b + change.before) for a, b in course]
-    at, there = np.array(course).T
-    if not change.found.is_sudden:
-        rows = np.unique([*at, 0, frames - 1])
-        values = np.interp(rows, at, there) + amount * rows / max(1, frames - 1)
-        return [(int(a), float(b)) for a, b in zip(rows, values, strict=True)]
-    before = [(int(a), float(b)) for a, b in course if a < row - 1]
-    after = [(int(a), float(b) + amount) for a, b in course if a > row]
-    ends = np.interp([row - 1, row], at, there)
-    return [*before, (row - 1, float(ends[0])), (row, float(ends[1]) + amount), *after]

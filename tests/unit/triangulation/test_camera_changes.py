@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from running_samples import FPS, detections, runner
@@ -10,14 +11,16 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
 from worldpose.camera_consistency.changes import find_changes
 from worldpose.camera_consistency.health import CameraHealth
+from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import (
     correct_views,
     describe_change,
     explain_changes,
     move_on,
-    trace_clocks,
     triangulate_views,
 )
+from worldpose.triangulation.clock_courses import trace_clocks
+from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
 
 FRAMES = 240
@@ -33,7 +36,8 @@ def cameras(ring):
 def view(cameras, spoil):
     """People as the cameras see them, with the pixels of one camera changed by `spoil`."""
     pixels, confidence, index = detections(cameras, runner(FRAMES + 10, 3), 1.0)
-    changed = spoil(pixels[:, BAD], np.arange(FRAMES + 10)[:, None, None])
+    frame = np.arange(FRAMES + 10)[:, None, None]
+    changed = spoil(pixels[:, BAD], frame, cameras[BAD])
     pixels = pixels[:FRAMES]
     pixels[:, BAD] = changed[:FRAMES]
     frame = np.arange(FRAMES)
@@ -47,12 +51,12 @@ def explain(cameras, people):
     return explain_changes(cameras, people, FPS, SETTINGS, found) if found else None
 
 
-def late(pixels, frame):
+def late(pixels, *_):
     """The recorder lost 5 frames after frame 119."""
     return np.concatenate([pixels[:120], pixels[125:]])
 
 
-def fast(pixels, frame):
+def fast(pixels, *_):
     """Each image shows a moment 2 % later than the one before."""
     at = np.arange(FRAMES) * 1.02
     low = at.astype(int)
@@ -61,22 +65,56 @@ def fast(pixels, frame):
 
 
 def test_healthy_cameras_do_not_change(cameras):
-    assert explain(cameras, view(cameras, lambda pixels, frame: pixels)) is None
+    assert explain(cameras, view(cameras, lambda pixels, *_: pixels)) is None
 
 
 CENTER = np.array([950.0, 545.0])
 
 
+def turn(camera, pixels, share, x, y):
+    """A camera that turns by shares (frames, 1, 1) of a shift at its centre, by OpenCV."""
+    matrix = np.array([[1500.0, 0.0, CENTER[0]], [0.0, 1500.0, CENTER[1]], [0.0, 0.0, 1.0]])
+    lens, turned = camera.distortion[:5], pixels.copy()
+    for k, part in enumerate(np.ravel(share)):
+        plane = cv2.undistortPoints(pixels[k].reshape(-1, 1, 2), matrix, lens)[:, 0]
+        rays = np.column_stack([plane, np.ones(len(plane))])
+        rotation = part * np.array([-y, x, 0.0]) / 1500.0
+        seen, _ = cv2.projectPoints(rays, rotation, np.zeros(3), matrix, lens)
+        turned[k] = seen.reshape(pixels[k].shape)
+    return turned
+
+
+def knock(x, y):
+    return lambda pixels, frame, camera: turn(camera, pixels, frame >= 120, x, y)
+
+
+def sink(pixels, frame, camera):
+    return turn(camera, pixels, frame / (FRAMES - 1), 0.0, 20.0)
+
+
 @pytest.mark.parametrize(
     ("spoil", "row", "amount"),
     [
-        (lambda x, f: x + (f[..., None] >= 120) * [12.0, -5.0], 120, (12.0, -5.0, 0.0, 0.0)),
-        (lambda x, f: x + f[..., None] / (FRAMES - 1) * [0.0, 20.0], None, (0.0, 20.0, 0.0, 0.0)),
-        (lambda x, f: x + (f[..., None] >= 90) * 0.05 * (x - CENTER), 90, (0.0, 0.0, 0.05, 0.0)),
+        (
+            knock(12.0, -5.0),
+            120,
+            (12.0, -5.0, 0.0, 0.0),
+        ),
+        (
+            knock(90.0, 40.0),
+            120,
+            (90.0, 40.0, 0.0, 0.0),
+        ),
+        (
+            sink,
+            None,
+            (0.0, 20.0, 0.0, 0.0),
+        ),
+        (lambda x, f, _: x + (f[..., None] >= 90) * 0.05 * (x - CENTER), 90, (0.0, 0.0, 0.05, 0.0)),
         (late, 120, 5.0),
         (fast, None, 0.0196 * (FRAMES - 1)),
     ],
-    ids=["knocked", "sinking", "zoomed", "lost frames", "fast clock"],
+    ids=["knocked", "knocked far", "sinking", "zoomed", "lost frames", "fast clock"],
 )
 def test_the_changed_camera_is_named_and_measured(cameras, spoil, row, amount):
     found = explain(cameras, view(cameras, spoil))
@@ -92,8 +130,32 @@ def test_the_changed_camera_is_named_and_measured(cameras, spoil, row, amount):
         assert found.amount[4] == pytest.approx(amount, abs=0.25)
 
 
+def skip(pixels, *_):
+    """The recorder lost 9 frames after frame 99."""
+    return np.concatenate([pixels[:100], pixels[109:]])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "row", "amount"),
+    [
+        (lambda pixels, *_: pixels, None, None),
+        (knock(90.0, 40.0), 120, (90.0, 40.0, 0.0, 0.0, 0.0)),
+        (skip, 100, (0.0, 0.0, 0.0, 0.0, 9.0)),
+    ],
+    ids=["healthy", "knocked", "lost frames"],
+)
+def test_a_camera_whose_people_meet_nobody_is_lost(cameras, spoil, row, amount):
+    people = view(cameras, spoil)
+    found = find_lost_views(cameras, people, runner(FRAMES, 3), FPS)
+    assert [each.found.camera for each in found] == [BAD] * (row is not None)
+    if found:
+        assert abs(found[0].found.row - row) <= 1
+        # What is left is measured when people are tracked again.
+        np.testing.assert_allclose(found[0].amount, amount, atol=4.0)
+
+
 def test_a_camera_that_sways_is_not_explained(cameras):
-    def sway(pixels, frame):
+    def sway(pixels, frame, _):
         phase = frame[..., None] / FRAMES * 2.0 * np.pi
         return pixels + np.concatenate([30.0 * np.sin(phase), 15.0 * np.cos(phase)], axis=-1)
 
@@ -112,6 +174,13 @@ def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
     np.testing.assert_allclose(values, [0.0, 0.0, 5.0], atol=0.15)
 
 
+CAMERA = Camera.from_matrices(
+    [[1500.0, 0.0, 950.0], [0.0, 1500.0, 545.0], [0.0, 0.0, 1.0]],
+    [-0.2, 0.05, 0.0, 0.0, 0.0],
+    np.eye(3),
+    np.zeros(3),
+    (1920, 1080),
+)
 KNOCK = CameraChange(
     camera="b", kind="view", frame=12, first_frame=10, frame_count=4, shift_px=(3.0, -1.0), std=0.1
 )
@@ -127,19 +196,20 @@ KNOCK = CameraChange(
     ],
 )
 def test_a_known_change_is_taken_back_within_its_clip(change, moved):
-    pixels = np.zeros((5, 2, 1, 1, 2))
+    pixels = np.full((5, 2, 1, 1, 2), CENTER)
     known = [KNOCK.model_copy(update=change)]
-    corrected = correct_views(pixels, np.arange(10, 15), ("a", "b"), known)
-    np.testing.assert_allclose(corrected[:, 1, 0, 0, 0], -np.array(moved), atol=1e-12)
-    assert not corrected[:, 0].any()
+    corrected = correct_views(pixels, np.arange(10, 15), {"a": CAMERA, "b": CAMERA}, known)
+    shift = corrected - pixels
+    np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
+    assert not shift[:, 0].any()
 
 
 def test_a_changed_view_shows_what_is_taken_back_again():
-    moving = {"zoom": 0.03, "roll_rad": 0.01, "frame": None, "center_px": (9.0, 5.0)}
+    moving = {"zoom": 0.03, "roll_rad": 0.01, "frame": None}
     known, frame = [KNOCK.model_copy(update=moving)], np.arange(10, 15)
     pixels = np.random.default_rng(1).uniform(0.0, 100.0, (5, 3, 17, 2))
-    shown = move_on(pixels, frame, known)
-    back = correct_views(shown[:, None], frame, ("b",), known)
+    shown = move_on(pixels, frame, CAMERA, known)
+    back = correct_views(shown[:, None], frame, {"b": CAMERA}, known)
     np.testing.assert_allclose(back[:, 0], pixels, atol=1e-9)
     assert np.linalg.norm(shown - pixels, axis=-1)[3].mean() > 1.0
     np.testing.assert_allclose(shown[4], pixels[4], atol=1e-12)

@@ -1,0 +1,199 @@
+"""Cameras whose people meet nobody from some frame on: knocked far, or many frames late.
+
+A detection meets a person where the middles of their torsos are nearer than a reach r in the image.
+If a change is too large for the tracker to follow, this share of a camera's detections falls at
+once. The change is the shift of the view, or of the clock, with which most of them meet again:
+
+    max_d sum_t #{i: min_p |x_i(t) - d - pi(X_p(t))| < r},
+    max_k sum_t #{i: min_p |x_i(t) - pi(X_p(t + k))| < r}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
+from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
+from worldpose.camera_consistency.changes import Change, Kind
+from worldpose.camera_consistency.health import UNKNOWNS
+from worldpose.geometry.cameras import Camera
+from worldpose.triangulation.camera_changes import MeasuredChange
+
+
+def find_lost_views(
+    cameras: Camera,
+    detections: KeypointDetections[ClipArray],
+    joints: AnyFloats,
+    fps: float,
+    kinds: Sequence[Kind] = ("clock", "view"),
+) -> list[MeasuredChange]:
+    """Return the sudden changes that keep a camera's people from meeting those of the others.
+
+    Args:
+        cameras: batch (cameras,); fewer than three never have any.
+        detections: all detections of a clip, (frames, cameras, detections).
+        joints: (frames, persons, 17, 3) of tracked people [m], world.
+        fps: frames per second [1/s].
+        kinds: what may change.
+    """
+    if len(cameras.focal) < 3 or not joints.shape[1]:
+        return []
+    seen = _middles(detections)
+    people = np.asarray(joints[:, :, _TORSO], dtype=np.float64).mean(axis=2)
+    each = (_Meetings(cameras[c], seen[:, c], people, fps) for c in range(len(cameras.focal)))
+    found = [camera.find_change(c, kinds) for c, camera in enumerate(each)]
+    return [change for change in found if change is not None]
+
+
+_TORSO = [COCO17.index(f"{side}_{at}") for side in ("left", "right") for at in ("shoulder", "hip")]
+
+
+def _middles(detections: KeypointDetections[ClipArray]) -> Floats:
+    """Return the middles of torsos (frames, cameras, detections, 2) [px], read in blocks."""
+    block, parts = 256, []
+    for start in range(0, len(detections.frame), block):
+        seen = detections[start : start + block]
+        middle = np.asarray(seen.keypoints[:, :, :, _TORSO], dtype=np.float64)
+        middle[~(seen.confidence[:, :, :, _TORSO] > 0.0)] = np.nan
+        parts.append(middle.mean(axis=3))
+    return np.concatenate(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Meetings:
+    """Detections of a camera and the people whom all cameras track.
+
+    Attributes:
+        camera: one camera.
+        seen: (frames, detections, 2) middles of torsos [px].
+        people: (frames, persons, 3) middles of torsos [m], world.
+        fps: frames per second [1/s].
+    """
+
+    camera: Camera
+    seen: Floats
+    people: Floats
+    fps: float
+
+    def find_change(self, number: int, kinds: Sequence[Kind]) -> MeasuredChange | None:
+        """Return the change of this camera, the given one of the rig; None if there is none."""
+        second = max(2, round(self.fps))
+        every = max(1, second // 10)
+        rows = np.arange(0, len(self.seen), every)
+        met, count = self._met(rows), self._count(rows)
+        place = _fall(met, count, max(5, second // every))
+        if place is None:
+            return None
+        chosen = rows[np.unique(np.linspace(place, len(rows) - 1, 100).astype(int))]
+        seen = self._count(chosen)
+        # One person always meets the others somewhere.
+        if seen[seen > 0].mean() < 1.2:
+            return None
+        late, shift = self._best_delay(chosen, 2 * second), self._best_shift(chosen)
+        changes: dict[Kind, tuple[int, Floats]] = {
+            "clock": (late, np.zeros(2)),
+            "view": (0, shift),
+        }
+        for wide in (1.0, 2.0):  # a turned view is not shifted everywhere alike
+            usual = self._met(rows[:place], wide).sum() / count[:place].sum()
+            now = self._met(chosen, wide).sum() / seen.sum()
+            by = {k: self._met(chosen, wide, *changes[k]).sum() / seen.sum() for k in kinds}
+            kind, *others = sorted(kinds, key=lambda each: -by[each])
+            # Where both may explain it, the people who are tracked tell more.
+            if by[kind] - max([now, *(by[k] for k in others)]) >= 0.4 * (usual - now):
+                break
+        else:
+            return None
+        late, shift = changes[kind]
+        # The tracker follows less: such a change is found from its people.
+        if abs(late) < 3 and np.linalg.norm(shift) < 0.5 * self._reach(chosen):
+            return None
+        amount = np.zeros(UNKNOWNS)
+        amount[:2], amount[4] = shift, late
+        near = np.arange(
+            max(0, rows[place] - 2 * second), min(len(self.seen), rows[place] + 2 * second)
+        )
+        gain = self._met(near) - self._met(near, late=late, shift=shift)
+        row = int(near[int(np.argmax(np.concatenate([[0], np.cumsum(gain)])[: len(near)]))])
+        size = float(late or np.linalg.norm(shift))
+        return MeasuredChange(Change(number, kind, True, row, size, np.inf), amount, np.inf)
+
+    def _count(self, rows: Integers) -> Integers:
+        """Return the number (n,) of detections."""
+        return np.asarray(np.isfinite(self.seen[rows, :, 0]).sum(axis=1))
+
+    def _met(
+        self, rows: Integers, wide: float = 1.0, late: int = 0, shift: Floats | float = 0.0
+    ) -> Integers:
+        """Return the number (n,) of detections that meet a person within reaches, with a change."""
+        image, reach, inside = self._project(rows + late)
+        off = np.linalg.norm((self.seen[rows] - shift)[:, :, None] - image[:, None], axis=-1)
+        return np.asarray((inside[:, None] & (off < wide * reach[:, None])).any(axis=2).sum(axis=1))
+
+    def _project(self, rows: Integers) -> tuple[Floats, Floats, Flags]:
+        """Return where people are seen (n, persons, 2), their reach [px], and who there is."""
+        reach_m = 0.3
+        there = (rows >= 0) & (rows < len(self.people))
+        people = self.people[np.clip(rows, 0, len(self.people) - 1)]
+        depth = self.camera.cam_from_world.apply(people.reshape(-1, 3))[:, 2].reshape(
+            people.shape[:2]
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            image = self.camera.project(people.reshape(-1, 3)).reshape(*people.shape[:2], 2)
+            reach = reach_m * self.camera.focal.mean() / depth
+            inside = there[:, None] & (depth > 0.0) & np.isfinite(image).all(axis=-1)
+        return image, reach, inside
+
+    def _reach(self, rows: Integers) -> float:
+        """Return the usual reach of people [px]."""
+        _, reach, inside = self._project(rows)
+        return float(np.median(reach[inside])) if inside.any() else np.inf
+
+    def _best_delay(self, rows: Integers, most: int) -> int:
+        """Return the delay [frame] by which most detections meet people."""
+        delays = np.arange(-most, most + 1)
+        met = np.array([self._met(rows, late=int(k)).sum() for k in delays])
+        # People who move little meet at several delays.
+        return int(np.median(delays[met >= 0.98 * met.max()]))
+
+    def _best_shift(self, rows: Integers) -> Floats:
+        """Return the shift (2,) [px] by which most detections meet people: six degrees at most."""
+        image, reach, inside = self._project(rows)
+        off = self.seen[rows][:, :, None] - image[:, None]
+        with np.errstate(invalid="ignore"):
+            near = inside[:, None] & (np.abs(off) < 0.1 * self.camera.focal.mean()).all(axis=-1)
+        votes = off[near]
+        if not len(votes):
+            return np.zeros(2)
+        radius = float(np.median(np.broadcast_to(reach[:, None], near.shape)[near]))
+        # Cells of half a radius; the true shift is spread over some of them.
+        cells = np.arange(votes.min() - radius, votes.max() + radius, 0.5 * radius)
+        counts = uniform_filter(
+            np.histogram2d(votes[:, 0], votes[:, 1], bins=[cells, cells])[0], 3, mode="constant"
+        )
+        best = np.unravel_index(np.argmax(counts), counts.shape)
+        shift = cells[np.array(best)] + 0.25 * radius
+        for _ in range(5):
+            shift = votes[np.linalg.norm(votes - shift, axis=1) < radius].mean(axis=0)
+        return np.asarray(shift)
+
+
+def _fall(met: Integers, count: Integers, margin: int) -> int | None:
+    """Return where the share of detections that meet people falls by a quarter or more."""
+    before, after = np.cumsum(met), met.sum() - np.cumsum(met)
+    seen_before, seen_after = np.cumsum(count), count.sum() - np.cumsum(count)
+    inner = np.arange(margin, len(met) - margin)
+    inner = inner[(seen_before[inner] >= 15) & (seen_after[inner] >= 15)]
+    if not len(inner):
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        high, low = before[inner] / seen_before[inner], after[inner] / seen_after[inner]
+        spread = seen_before[inner] * seen_after[inner] * (high - low) ** 2
+    place = int(np.argmax(np.where(high > low, spread, -1.0)))
+    is_fall = high[place] >= 0.3 and low[place] <= 0.75 * high[place]
+    return int(inner[place]) + 1 if is_fall else None
