@@ -199,11 +199,11 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     warnings: tuple[str, ...] = (said,) if said else ()
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
     most = 1000  # frames; more tell no more of the world
-    people = People.of(tracks.joints[:most], clip.fps)
-    if people is not None:
-        figures["median_stature_m"] = people.stature
+    tracked = People.of(tracks.joints[:most], clip.fps)
+    if tracked is not None:
+        figures["median_stature_m"] = tracked.stature
         # With many detections left over, people are rays that meet by chance.
-        doubted = doubt_world(clip.cameras, people, sizes=unmatched < 0.3)
+        doubted = doubt_world(clip.cameras, tracked, sizes=unmatched < 0.3)
         warnings += tuple(f"{name}: {each}" for each in doubted)
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
