@@ -142,7 +142,7 @@ def viewer_clip(
     folder; the viewer draws the surface that the run estimated.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
-    from worldpose.reports.drawing import describe_undrawn_distortion, markings, person_color
+    from worldpose.reports.drawing import markings, note_undrawn_distortion, person_color
 
     shown = estimated_pitch(origin.run, pitch, origin.spec, clip)
     tracks, positions = origin.tracks(clip), clip_positions(origin.run, clip)
@@ -175,9 +175,7 @@ def viewer_clip(
     if f"broadcast_calibration/{clip}" in origin.run:
         moving = camera_in_frames(origin.run, clip, tracks.frames)
     still = static_cameras(origin.run, origin.spec, origin.stage)
-    notes = describe_clip(origin, clip) | {"units": "metres, seconds"}
-    if distortion := describe_undrawn_distortion(still):
-        notes["distortion"] = distortion
+    notes = {"units": "metres, seconds"} | note_undrawn_distortion(still)
     return ViewerClip(
         clip=clip,
         fps=origin.spec.fps,
@@ -193,7 +191,7 @@ def viewer_clip(
         cameras=still,
         broadcast=moving,
         markings=[] if shown is None else markings(shown),
-        notes=notes,
+        notes=describe_clip(origin, clip) | notes,
         video=video,
     )
 

@@ -115,11 +115,8 @@ def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
     return lines
 
 
-def describe_undrawn_distortion(cameras: Mapping[str, Camera]) -> str:
-    """Return how far each camera's lens moves a pixel, which a view without distortion lacks.
-
-    It is empty if no lens moves one by a pixel.
-    """
+def note_undrawn_distortion(cameras: Mapping[str, Camera]) -> dict[str, str]:
+    """Return a note on how far lenses move pixels, for a view without it; none below a pixel."""
     found = {}
     for name, camera in cameras.items():
         columns, rows = (np.linspace(0.0, side - 1.0, 33) for side in camera.image_size)
@@ -128,7 +125,8 @@ def describe_undrawn_distortion(cameras: Mapping[str, Camera]) -> str:
         shift = np.linalg.norm(flat - pixels, axis=-1)
         found[name] = float(np.nanmax(shift, initial=0.0))
     shown = [f"{name} {shift:.0f} px" for name, shift in found.items() if shift >= 1.0]
-    return f"not drawn; it moves pixels by up to {', '.join(shown)}" if shown else ""
+    said = f"not drawn; it moves pixels by up to {', '.join(shown)}"
+    return {"distortion": said} if shown else {}
 
 
 def picture_panels(

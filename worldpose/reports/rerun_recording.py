@@ -59,19 +59,16 @@ def write_recording(
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if pitch is not None:
             lines = markings(pitch)
-            painted = rr.LineStrips3D(
-                [line.tolist() for line in lines], colors=[white], radii=[0.06]
-            )
+            strips = [line.tolist() for line in lines]
+            painted = rr.LineStrips3D(strips, colors=[white], radii=[0.06])
             stream.log("world/pitch", painted, static=True)
         for name, camera in (cameras or {}).items():
             _log_camera(rr, stream, f"world/cameras/{name}", camera, static=True)
             if pitch is not None:
-                seen = [
-                    pixels[np.isfinite(pixels).all(-1)] for pixels in map(camera.project, lines)
-                ]
-                strips = [pixels.tolist() for pixels in seen if len(pixels) > 1]
-                place = f"world/cameras/{name}/markings"
-                stream.log(place, rr.LineStrips2D(strips, colors=[white]), static=True)
+                seen = (line[np.isfinite(line).all(-1)] for line in map(camera.project, lines))
+                strips = [line.tolist() for line in seen if len(line) > 1]
+                shown = rr.LineStrips2D(strips, colors=[white])
+                stream.log(f"world/cameras/{name}/markings", shown, static=True)
         for row, frame in enumerate(tracks.frames):
             stream.set_time("frame", sequence=int(frame))
             stream.set_time("time", duration=float(frame) / fps)

@@ -62,10 +62,9 @@ def calibrate_camera(
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
-    if start is None:
-        near = find_start(problem, stated)
-    else:
-        near, _ = fit_from_starts(problem, start.numbers[None], stated.wrong_click)
+    near = find_start(problem, stated) if start is None else start.numbers
+    if start is not None:
+        near, _ = fit_from_starts(problem, near[None], stated.wrong_click)
     found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
@@ -73,11 +72,10 @@ def calibrate_camera(
     lines = None
     if picture is not None and stated.lines:
         found, lines = refine_and_judge(found, pitch, picture)
-    if lines is not None and lines.venue is not None:
-        estimate = lines.estimate.estimate
-        pitch = pitch.with_surface(lines.estimate.surface)
-    else:
+    if lines is None or lines.venue is None:
         found = widen_by_lenses(found, pitch, stated)
         estimate = found.estimate
+    else:
+        estimate, pitch = lines.estimate.estimate, pitch.with_surface(lines.estimate.surface)
     report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import (
     WIDTH,
-    describe_undrawn_distortion,
     figure_data,
+    note_undrawn_distortion,
     picture_panels,
     png,
     write_figure,
@@ -105,6 +105,6 @@ def test_distortion_that_a_view_lacks_is_stated():
         for each in (lens, 0.0 * lens)
     )
     corner = cv2.undistortPoints(np.zeros((1, 1, 2)), matrix, lens, P=matrix)[0, 0]
-    said = describe_undrawn_distortion({"a": bent, "b": plain})
+    said = note_undrawn_distortion({"a": bent, "b": plain})["distortion"]
     assert said.endswith(f"by up to a {np.hypot(*corner):.0f} px")
-    assert describe_undrawn_distortion({"b": plain}) == ""
+    assert note_undrawn_distortion({"b": plain}) == {}
