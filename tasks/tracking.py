@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -125,7 +126,7 @@ def _open_uncorrected(inputs: UnitInputs) -> Tracked:
 
 
 def _track_people(inputs: UnitInputs) -> Tracked:
-    clip, pitch = open_clip(inputs), _pitch(inputs)
+    pitch = _pitch(inputs)
     settings = inputs.settings(TrackingSettings)
     pitch_size = None if pitch is None else (pitch.length, pitch.width)
 
@@ -140,25 +141,7 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             camera_covariance=clip.camera_covariance,
         )
 
-    tracks = track(clip)
-    changes = _find_lost(clip, tracks)
-    if any(change.kind == "view" for change in changes):
-        clip = open_clip(inputs, further=changes)
-        tracks = track(clip)
-        people = clip.detections.assign_people(tracks.detection_index)
-        changes = tuple(
-            refine_change(
-                clip.cameras,
-                people,
-                clip.fps,
-                TriangulationSettings(),
-                clip.camera_ids.index(change.camera),
-                change,
-            )
-            if change.kind == "view"
-            else change
-            for change in changes
-        )
+    clip, tracks, changes = _follow_changes(inputs, track)
     found = Identities(
         frame=clip.detections.frame,
         cameras=tuple(clip.camera_ids),
@@ -214,13 +197,31 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     return found, figures, warnings
 
 
-def _find_lost(clip: ClipInputs, tracks: Tracking) -> tuple[CameraChange, ...]:
-    """Return the changes of cameras by which the tracker lost their people."""
+def _follow_changes(
+    inputs: UnitInputs, track: Callable[[ClipInputs], Tracking]
+) -> tuple[ClipInputs, Tracking, tuple[CameraChange, ...]]:
+    """Return the clip with far knocks of cameras taken back, its tracks, and cameras' changes.
+
+    One camera is corrected at a time: it spoils the people that the others meet.
+    """
+    clip, changes = open_clip(inputs), list[CameraChange]()
     frame = np.asarray(clip.detections.frame, dtype=np.int64)
-    return tuple(
-        change_record(change, clip.camera_ids[change.found.camera], frame)
-        for change in find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
-    )
+    while True:
+        tracks = track(clip)
+        if changes:
+            people = clip.detections.assign_people(tracks.detection_index)
+            camera = clip.camera_ids.index(changes[-1].camera)
+            given = clip.cameras, people, clip.fps, TriangulationSettings()
+            changes[-1] = refine_change(*given, camera, changes[-1])
+            clip = open_clip(inputs, further=changes)
+        lost = find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
+        found = [change_record(each, clip.camera_ids[each.found.camera], frame) for each in lost]
+        known = {change.camera for change in changes}
+        views = [each for each in found if each.kind == "view" and each.camera not in known]
+        if not views:
+            return clip, tracks, (*changes, *(each for each in found if each.kind == "clock"))
+        changes.append(views[0])
+        clip = open_clip(inputs, further=changes)
 
 
 def _pitch(inputs: UnitInputs) -> PitchTemplate | None:

@@ -147,6 +147,12 @@ def _find_changes(
         return known
     measured = explain_changes(clip.cameras, clip.detections, clip.fps, settings, found, kinds)
     if measured is None:
+        if np.median(health.misfit) > 3.0:
+            result.warnings.append(
+                "all cameras move within the clip, each in its own way, as electronic "
+                "stabilisation does: no person agrees with the views. Turn it off, or give the "
+                "videos without it."
+            )
         return known
     camera = clip.camera_ids[measured.found.camera]
     change = change_record(measured, camera, clip.detections.frame)

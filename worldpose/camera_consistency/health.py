@@ -59,6 +59,11 @@ class CameraHealth:
         matrix, right = np.zeros((*shape, UNKNOWNS, UNKNOWNS)), np.zeros((*shape, UNKNOWNS))
         return cls(length, every, matrix, right, np.zeros((cameras, 2)), np.zeros(cameras))
 
+    @property
+    def misfit(self) -> Floats:
+        """Mean robust loss of each camera's departures (cameras,) [1]; at most 2 if none moves."""
+        return np.asarray(self.cost / np.maximum(1.0, 2.0 * self.scale[:, 1]))
+
     def add(self, cameras: Camera, people: KeypointDetections, joints: Floats, start: int) -> None:
         """Add a chunk of a clip; its first and last frame give velocities only.
 

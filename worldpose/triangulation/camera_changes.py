@@ -219,7 +219,7 @@ class _Trial:
             for each in find_changes(health, self.fps, kinds)
             if each.camera == camera
         ]
-        return changes, float(health.cost[camera] / max(1.0, 2.0 * health.scale[camera, 1]))
+        return changes, float(health.misfit[camera])
 
     def measure(self, found: Change) -> MeasuredChange:
         """Return a change with its size."""

@@ -55,9 +55,8 @@ def trace_clocks(
         shifted, rest = shift_by_courses(detections, courses)
         tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
         if lost := find_lost_views(cameras, shifted, tracks.joints, fps, ("clock",)):
-            for each in lost:
-                c = each.found.camera
-                courses[c] = _add_change(courses[c], each, frames)
+            c = lost[0].found.camera
+            courses[c] = _add_change(courses[c], lost[0], frames)
             continue
         index = tracks.detection_index
         moved = move_to_match_time(np.asarray(shifted.keypoints, np.float64), index, rest)

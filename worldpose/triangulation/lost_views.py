@@ -34,6 +34,8 @@ def find_lost_views(
 ) -> list[MeasuredChange]:
     """Return the sudden changes that keep a camera's people from meeting those of the others.
 
+    The one by which most detections meet again is the first; it may be the cause of the others.
+
     Args:
         cameras: batch (cameras,); fewer than three never have any.
         detections: all detections of a clip, (frames, cameras, detections).
@@ -47,7 +49,8 @@ def find_lost_views(
     people = np.asarray(joints[:, :, _TORSO], dtype=np.float64).mean(axis=2)
     each = (_Meetings(cameras[c], seen[:, c], people, fps) for c in range(len(cameras.focal)))
     found = [camera.find_change(c, kinds) for c, camera in enumerate(each)]
-    return [change for change in found if change is not None]
+    lost = [change for change in found if change is not None]
+    return sorted(lost, key=lambda change: -change.found.gain)
 
 
 _TORSO = [COCO17.index(f"{side}_{at}") for side in ("left", "right") for at in ("shoulder", "hip")]
@@ -121,7 +124,8 @@ class _Meetings:
         gain = self._met(near) - self._met(near, late=late, shift=shift)
         row = int(near[int(np.argmax(np.concatenate([[0], np.cumsum(gain)])[: len(near)]))])
         size = float(late or np.linalg.norm(shift))
-        return MeasuredChange(Change(number, kind, True, row, size, np.inf), amount, np.inf)
+        again = (by[kind] - now) * seen.mean() * (len(rows) - place)
+        return MeasuredChange(Change(number, kind, True, row, size, again), amount, np.inf)
 
     def _count(self, rows: Integers) -> Integers:
         """Return the number (n,) of detections."""

@@ -181,6 +181,22 @@ CAMERA = Camera.from_matrices(
     np.zeros(3),
     (1920, 1080),
 )
+
+
+def test_cameras_that_all_sway_agree_with_nobody(cameras):
+    def misfit(size):
+        people = view(cameras, lambda pixels, *_: pixels)
+        phase = np.arange(FRAMES)[:, None] / FRAMES * 2.0 * np.pi + np.arange(4)
+        sway = size * np.stack([np.sin(phase), np.cos(1.3 * phase)], axis=-1)
+        people = replace(people, keypoints=people.keypoints + sway[:, :, None, None])
+        health = CameraHealth.empty(FRAMES, 4, people.detection_index.shape[2], FPS)
+        health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
+        return np.median(health.misfit)
+
+    assert misfit(0.0) < 1.0
+    assert misfit(30.0) > 3.0
+
+
 KNOCK = CameraChange(
     camera="b", kind="view", frame=12, first_frame=10, frame_count=4, shift_px=(3.0, -1.0), std=0.1
 )
