@@ -147,6 +147,7 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             "unreadable_share": len(report.unreadable) / report.frames,
             "empty_share": report.empty / report.frames,
             "stride": settings.stride,
+            "turned_deg": 90 * report.quarters,
             "crowd": report.crowd,
             "bridged_share": report.bridged / max(1, report.detections),
             "flicker_share": report.flickers / max(1, report.detections),
@@ -208,13 +209,12 @@ def footage_index(footage: xr.Dataset) -> FrameIndex:
 
 
 def _open_place(inputs: UnitInputs) -> Place | None:
-    """Return the camera on the pitch, if it is known and there is a pitch."""
-    pitch = inputs.pitch
-    if pitch is None:
+    """Return the camera, on the pitch if there is one; None if it is not known."""
+    pitch, name = inputs.pitch, f"static_calibration/{inputs.sources['camera']}"
+    if name not in inputs:
         return None
-    known = inputs.open(f"static_calibration/{inputs.sources['camera']}")
-    venue = join_cameras([known.data_vars])
-    if venue.surface is not None:
+    venue = join_cameras([inputs.open(name).data_vars])
+    if pitch is not None and venue.surface is not None:
         pitch = pitch.with_surface(venue.surface.shape)
     return Place(venue.cameras[0], pitch)
 

@@ -50,7 +50,7 @@ from worldpose.triangulation.camera_changes import (
 )
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.world import doubt_world
+from worldpose.triangulation.world import People, doubt_world
 
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""
@@ -181,9 +181,13 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             figures |= {name: number for name, number in further.items() if "plane" in name}
     warnings: tuple[str, ...] = (said,) if said else ()
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
-    # With many detections left over, people are rays that meet by chance.
-    doubted = doubt_world(clip.cameras, tracks.joints, clip.fps, sizes=unmatched < 0.3)
-    warnings += tuple(f"{name}: {each}" for each in doubted)
+    most = 1000  # frames; more tell no more of the world
+    tracked = People.of(tracks.joints[:most], clip.fps)
+    if tracked is not None:
+        figures["median_stature_m"] = tracked.stature
+        # With many detections left over, people are rays that meet by chance.
+        doubted = doubt_world(clip.cameras, tracked, sizes=unmatched < 0.3)
+        warnings += tuple(f"{name}: {each}" for each in doubted)
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )

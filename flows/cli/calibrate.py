@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -122,21 +121,32 @@ def _images(folder: Path) -> list[Path]:
 def _find_boards(
     name: str, place: Path, board: Board, every: float
 ) -> tuple[list[BoardView | None], tuple[int, int], list[str]]:
-    """Return what `_read_views` finds, where the numbers are perhaps those of the squares."""
+    """Return what `_read_views` finds of the board, or of another one that is perhaps meant."""
     from worldpose.static_calibration.boards import MIN_VIEWS
 
-    found = _read_views(place, board, every)
-    if board.dictionary is None and sum(view is not None for view in found[0]) < MIN_VIEWS:
-        inner = replace(board, columns=board.columns - 1, rows=board.rows - 1)
-        other = _read_views(place, inner, every) if min(board.columns, board.rows) > 3 else found
-        if sum(view is not None for view in other[0]) >= MIN_VIEWS:
-            line(
-                f"{name}: the board has {inner.columns} x {inner.rows} inner corners; "
-                f"{board.columns} x {board.rows} is its number of squares",
-                to=errors,
-            )
-            return other
+    found, said = _read_views(place, board, every), ""
+    if sum(view is not None for view in found[0]) < MIN_VIEWS:
+        for other, difference in board.others(_middle_image(place)):
+            views = _read_views(place, other, every)
+            if sum(view is not None for view in views[0]) >= MIN_VIEWS:
+                found, said = views, difference
+                break
+    for note in dict.fromkeys([said, *(view.note for view in found[0] if view is not None)]):
+        if note:
+            line(f"{name}: {note}", to=errors)
     return found
+
+
+def _middle_image(place: Path) -> Image:
+    """Return the middle image of a folder, or of a video."""
+    from worldpose.video.files import VideoReader, index_frames
+
+    if not place.is_file():
+        files = _images(place)
+        return _read_image(files[len(files) // 2])
+    index = index_frames(place)
+    with VideoReader(place, index) as video:
+        return video.frame(len(index) // 2)
 
 
 def _read_views(

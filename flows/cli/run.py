@@ -180,6 +180,11 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
         f"{len(record.failed)} failed{blocked}, gates {record.gates}, {seconds:.1f} s"
     )
     _print_waiting(record)
+    key = "median_stature_m"
+    statures = sorted(each[key] for each in record.figures.values() if key in each)
+    if statures:
+        clips = f" in {len(statures)} clips" if len(statures) > 1 else ""
+        line(f"median stature of the people: {statures[len(statures) // 2]:.2f} m{clips}")
     if not (record.executed or record.failed or record.waiting):
         line("Nothing to do: every result is current.")
     line(f"results: {project}/results/{record.match_id}")

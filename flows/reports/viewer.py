@@ -142,7 +142,7 @@ def viewer_clip(
     folder; the viewer draws the surface that the run estimated.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
-    from worldpose.reports.drawing import markings, person_color
+    from worldpose.reports.drawing import markings, note_undrawn_distortion, person_color
 
     shown = estimated_pitch(origin.run, pitch, origin.spec, clip)
     tracks, positions = origin.tracks(clip), clip_positions(origin.run, clip)
@@ -172,6 +172,7 @@ def viewer_clip(
         views[:, column] = tracks.views
     model, bodies = _bodies(origin, clip, tracks, positions)
     still = static_cameras(origin.run, origin.spec, origin.stage)
+    notes = {"units": "metres, seconds"} | note_undrawn_distortion(still)
     return ViewerClip(
         clip=clip,
         fps=origin.spec.fps,
@@ -187,7 +188,7 @@ def viewer_clip(
         cameras=still,
         moving=moving_cameras(origin.run, clip, tracks.frames),
         markings=[] if shown is None else markings(shown),
-        notes=describe_clip(origin, clip) | {"units": "metres, seconds"},
+        notes=describe_clip(origin, clip) | notes,
         video=video,
     )
 

@@ -60,9 +60,10 @@ def _units(match: Match) -> dict[str, tuple[str, str]]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the index of the video, and the camera, which separates players from the crowd."""
+    """Return the index of the video, and the camera, which tells what is up, and the crowd."""
     footage, _ = _units(match)[unit]
-    known = (f"static_calibration/{footage}",) if _is_on_pitch(match, footage) else ()
+    is_known = _is_on_pitch(match, footage) or footage in match.folder.calibrations
+    known = (f"static_calibration/{footage}",) if is_known else ()
     return (f"ingest/{footage}", *known)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, islice
 from typing import Final
 
 import numpy as np
@@ -29,6 +30,7 @@ from worldpose.detection.models import (
 )
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
+from worldpose.detection.turning import QuarterTurn
 from worldpose.detection.views import TiledDetector
 from worldpose.geometry.boxes import box_areas
 from worldpose.geometry.cameras import Camera
@@ -98,6 +100,7 @@ class DetectionReport:
         unsure: people without a single keypoint, or with the pose of a better box.
         beside: occluded people found next to others; later steps may drop some.
         is_given: whether the boxes were given, not detected.
+        quarters: turns of the images by 90 degrees, counterclockwise, for the nets.
     """
 
     frames: int = 0
@@ -111,6 +114,7 @@ class DetectionReport:
     unsure: int = 0
     beside: int = 0
     is_given: bool = False
+    quarters: int = 0
 
     def why_no_person(self) -> str | None:
         """Return the likely reason why a clip of 20 frames or more shows no person.
@@ -151,11 +155,11 @@ class Place:
 
     Attributes:
         camera: the calibrated camera.
-        pitch: the pitch in its view.
+        pitch: the pitch in its view; None = there is none, and everyone counts.
     """
 
     camera: Camera
-    pitch: PitchTemplate
+    pitch: PitchTemplate | None
 
 
 class PeopleFinder:
@@ -202,6 +206,9 @@ class PeopleFinder:
     ) -> Iterator[KeypointDetections]:
         """Yield the people of a video in chunks of frames.
 
+        Nets know people who stand: images of a camera that the calibration shows to be mounted on
+        its side or upside down are turned, if the nets then find more in some of them.
+
         Args:
             frames: numbers that rise by one, each with its image; None where there is none.
             place: camera and pitch; None keeps the crowd.
@@ -209,11 +216,53 @@ class PeopleFinder:
                 box is added, left out because of its score or its place, or tracked. None = detect.
         """
         self.report = DetectionReport(is_given=given is not None)
+        turn = None if place is None else QuarterTurn.of(place.camera)
+        if turn is None or place is None:
+            yield from self._find(frames, place, given)
+            return
+        frames = iter(frames)
+        first = list(islice(frames, 16))
+        frames = chain(first, frames)
+        if given is None and not self._are_upright([image for _, image in first], turn):
+            yield from self._find(frames, place, given)
+            return
+        self.report.quarters = turn.quarters
+        turned = ((number, turn.image(image)) for number, image in frames)
+        upright = Place(turn.camera(place.camera), place.pitch)
+        boxes = None if given is None else turn.people(given)
+        for chunk in self._find(turned, upright, boxes):
+            yield turn.turn_back(chunk)
+
+    def _are_upright(self, images: Sequence[Image | None], turn: QuarterTurn) -> bool:
+        """Return whether the detectors find more in some images after a turn than before it."""
+        some = [image for image in images if image is not None][::4]
+        turned = [image for image in map(turn.image, some) if image is not None]
+        before, after = (
+            sum(
+                float(people.scores[people.scores >= self._settings.high_score_threshold].sum())
+                for detector in self._detectors
+                for people in detector.detect(views)
+            )
+            for views in (some, turned)
+        )
+        return after > before
+
+    def _find(
+        self,
+        frames: Iterable[tuple[int, Image | None]],
+        place: Place | None,
+        given: Mapping[int, People] | None,
+    ) -> Iterator[KeypointDetections]:
+        """Yield the people of upright images as `find` does."""
         # Frames decoded while earlier ones are searched.
         frames = read_ahead(frames, 8)
         cleaner = BoxCleaner(self._settings)
         self._parts = None
-        if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
+        if (
+            place is not None
+            and place.pitch is not None
+            and any(isinstance(each, SeesParts) for each in self._detectors)
+        ):
             margin = self._settings.pitch_margin_m
             self._parts = expect_parts(place.camera, place.pitch, margin)
         if given is None:
@@ -264,7 +313,7 @@ class PeopleFinder:
             kept = (people.scores >= settings.low_score_threshold) & (box_areas(people.boxes) > 0.0)
             people = people.select(kept)
             self.report.boxes += len(people.scores)
-            if place is not None:
+            if place is not None and place.pitch is not None:
                 inside = self._inside(people, images[0], place)
                 self.report.crowd += int(np.count_nonzero(~inside))
                 people = people.select(inside)
@@ -273,6 +322,7 @@ class PeopleFinder:
 
     def _inside(self, people: People, image: Image, place: Place) -> Flags:
         """Return whether people's feet are on the pitch or near it (people,)."""
+        assert place.pitch is not None
         size = (image.shape[1], image.shape[0])
         margin = self._settings.pitch_margin_m
         return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
@@ -283,7 +333,7 @@ class PeopleFinder:
         detected = len(people.scores)
         found = find_poses(self._estimator, image, people, settings)
         self.report.beside += len(found.score) - detected
-        if place is not None:
+        if place is not None and place.pitch is not None:
             # Detected people are on the pitch; a person they occlude may be a bystander.
             inside = self._inside(People.from_detections(found), image, place)
             found = found.select(inside | (np.arange(len(found.score)) < detected))
@@ -335,7 +385,8 @@ def detect_people(
         images: (height, width, 3) RGB, in order; read once.
         settings: detectors, pose net and thresholds. The defaults are the bundled nets.
         detectors: own detectors in place of those that the settings name; scores stay theirs.
-        camera: calibrated camera; with `pitch`, people beside the pitch are left out.
+        camera: calibrated camera, whose images are turned upright for the nets; with `pitch`,
+            people beside the pitch are left out.
         pitch: pitch in the camera's view.
 
     Returns:
@@ -351,7 +402,7 @@ def detect_people(
         load_score_map(settings) if detectors is None else None,
         load_landmarks(settings),
     )
-    place = None if camera is None or pitch is None else Place(camera, pitch)
+    place = None if camera is None else Place(camera, pitch)
     chunks = list(finder.find(enumerate(images), place))
     if not chunks:
         return KeypointDetections.from_keypoints(np.empty((0, 0, 17, 2)), np.empty((0, 0, 17)))

@@ -159,7 +159,7 @@ def select_missing_people(
     shown = np.asarray(within.all(axis=-1))
     wanted &= shown.mean(axis=-1) >= settings.min_visible_share
     frame, person = np.nonzero(wanted)
-    if place is not None and len(frame):
+    if place is not None and place.pitch is not None and len(frame):
         cut = np.minimum(boxes[frame, person], np.array([*size, *size]) - 0.5)
         inside = on_pitch(cut, place.camera, size, place.pitch, margin)
         frame, person = frame[inside], person[inside]

@@ -18,7 +18,7 @@ import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,16 @@ FREEMOCAP: Final = (
 """Keys of `metadata` that FreeMoCap alone writes."""
 
 
-LeftOut: TypeAlias = dict[str, str]
-"""Reasons why cameras are left out, by camera."""
+class LeftOut(dict[str, str]):
+    """Reasons why cameras are left out, by camera.
+
+    Attributes:
+        notes: sentences about the others.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes: list[str] = []
 
 
 class Optics(NamedTuple):

@@ -31,6 +31,7 @@ from worldpose.formats.calibration_files import (
 )
 from worldpose.formats.calibration_programs import (
     is_openpose,
+    json_unit_m,
     read_camera_json,
     read_kalibr,
     read_openpose_cameras,
@@ -88,7 +89,7 @@ def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     """
     from worldpose.geometry.cameras import Camera  # late: most commands only check calibrations
 
-    left_out: LeftOut = {}
+    left_out = LeftOut()
     given = read_calibration(Path(path), left_out=left_out)
     for name, why in left_out.items():
         warnings.warn(f"{path}: camera {name} is left out: {why}", stacklevel=2)
@@ -126,6 +127,8 @@ def form_unit_m(path: Path) -> float:
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
     if form is TOML:
         return toml_unit_m(files[0])
+    if form is JSON:
+        return json_unit_m(files[0])
     return MILLIMETRE if form.unit.startswith("mm") else 1.0
 
 

@@ -27,6 +27,9 @@ from worldpose.formats.lens_files import kalibr_tables, read_file_storage
 
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """(3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y."""
+_JSON_BYTES: Final = 16 * SETTINGS_BYTES
+_CENTIMETRE: Final = 1e-2
+"""[m]"""
 
 
 def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
@@ -35,7 +38,7 @@ def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCa
     Raises:
         InputError: the file is of neither, or an entry is missing or invalid.
     """
-    content = read_json(path, 16 * SETTINGS_BYTES)
+    content = read_json(path, _JSON_BYTES)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(cameras, list) and all(isinstance(one, dict) for one in cameras):
         return _read_panoptic(path, cameras, left_out)
@@ -48,6 +51,13 @@ def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCa
     )
 
 
+def json_unit_m(path: Path) -> float:
+    """Return the unit of a file that `read_camera_json` reads [m]: Panoptic Studio's is cm."""
+    content = read_json(path, _JSON_BYTES)
+    is_panoptic = isinstance(content, dict) and isinstance(content.get("cameras"), list)
+    return _CENTIMETRE if is_panoptic else 1.0
+
+
 def _read_panoptic(
     path: Path, cameras: list[dict[str, Any]], left_out: LeftOut | None
 ) -> dict[str, CameraCalibration]:
@@ -55,7 +65,6 @@ def _read_panoptic(
 
     The many cameras of low resolution have a skew, and are left out.
     """
-    centimetre = 1e-2  # [m]
     keys = Keys("resolution", "K", "distCoef", "R", "t")
     skewed = [_has_skew(table.get("K")) for table in cameras]
     found = []
@@ -66,7 +75,7 @@ def _read_panoptic(
             left_out[camera_id(name)] = "its pixels are skew (K[0][1]), which no lens model has"
             continue
         camera = read_camera_table(
-            where, name, table, keys=keys, unit_m=centimetre, axes=Y_DOWN, where_pose=where
+            where, name, table, keys=keys, unit_m=_CENTIMETRE, axes=Y_DOWN, where_pose=where
         )
         found.append((where, camera))
     return index_by_name(path, found)

@@ -208,11 +208,13 @@ def _read_vicon(
             found=f"cameras for markers alone: {', '.join(sorted(others)):.80}",
             todo="Calibrate the video cameras with the others, and export again.",
         )
-    cameras = [(where, _read_vicon_camera(where, element)) for where, element in elements]
+    cameras = [(where, _read_vicon_camera(where, element, left_out)) for where, element in elements]
     return index_by_name(path, cameras)
 
 
-def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:
+def _read_vicon_camera(
+    where: str, element: ET.Element, left_out: LeftOut | None
+) -> CameraCalibration:
     """Return one `<Camera>` of an XCP file, in pixels of its sensor.
 
     The one `<KeyFrame>` of a static camera has the centre C (POSITION [mm]) and a quaternion
@@ -249,10 +251,14 @@ def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:
     from scipy.spatial.transform import Rotation  # late: it takes 0.1 s, and few files need it
 
     rotation = Rotation.from_quat(turn).as_matrix()
+    optics, error = _vicon_optics(where, frame, size, focal, middle)
+    if left_out is not None and error > 0.0:
+        how = f"{optics.lens_model} coefficients follow Vicon's lens within {error:.2g} px"
+        left_out.notes.append(f"camera {name}: {how}")
     return build_camera(
         where,
         name,
-        _vicon_optics(where, frame, size, focal, middle),
+        optics,
         rotation=rotation,
         translation=-rotation @ center,
     )
@@ -264,8 +270,8 @@ def _vicon_optics(
     size: NDArray[np.float64],
     focal: float,
     middle: NDArray[np.float64],
-) -> Optics:
-    """Return the optics with a lens of OpenCV's models that follows Vicon's.
+) -> tuple[Optics, float]:
+    """Return the optics with a lens of OpenCV's models that follows Vicon's, and its error [px].
 
     Vicon's model goes from the pixel in the image to that without distortion: the offset d from the
     center of distortion is scaled by 1 + w1 d^2 + w2 d^4 + w3 d^6 [px]. `VICON_RADIAL2` is
@@ -294,7 +300,7 @@ def _vicon_optics(
         terms = np.append(_parse(f"{where}.VICON_RADIAL", frame.get("VICON_RADIAL"), 2), 0.0)
     if not np.any(terms) or not np.all(size >= 1) or focal <= 0.0:
         # `build_camera` refuses an impossible size and focal length.
-        return Optics(size, np.full(2, focal), middle, np.zeros(5))
+        return Optics(size, np.full(2, focal), middle, np.zeros(5)), 0.0
     across = np.stack(
         np.meshgrid(*(np.linspace(-0.5, length - 0.5, 41) for length in size)), axis=-1
     ).reshape(-1, 2)
@@ -320,7 +326,8 @@ def _vicon_optics(
             if fit.error_px <= LENS_ERROR_PX:
                 lens = fit.camera
                 place = lens.principal_point
-                return Optics(size, lens.focal, place, lens.coefficients, kind.label)
+                optics = Optics(size, lens.focal, place, lens.coefficients, kind.label)
+                return optics, fit.error_px
     raise InputError(
         f"{where}.VICON_RADIAL2" if text is not None else f"{where}.VICON_RADIAL",
         expected=f"a lens that k1 to k6, p1 and p2 follow within {LENS_ERROR_PX:g} px",

@@ -25,7 +25,7 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
-from worldpose.formats.files import SETTINGS_BYTES, read_yaml, require_file
+from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml, require_file
 from worldpose.parsing import read_npy
 
 MATRIX_NAMES: Final = (
@@ -172,11 +172,11 @@ def _read_file(file: Path) -> dict[str, Any]:
         raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
-    if suffix in (".yml", ".yaml"):
-        return read_file_storage(file) if _is_storage(file) else _read_yaml(file)
+    if suffix in (".yml", ".yaml", ".json"):
+        return read_file_storage(file) if _is_storage(file) else _read_mapping(file)
     if suffix in (".pkl", ".pickle"):
         return _read_pickled_lens(file)
-    if suffix in (".xml", ".json"):
+    if suffix == ".xml":
         return read_file_storage(file)
     raise InputError(
         str(file),
@@ -273,21 +273,22 @@ def _chain(
 
 
 def _is_storage(file: Path) -> bool:
-    """Return whether a YAML file is one of OpenCV's FileStorage."""
+    """Return whether a YAML or JSON file is one of OpenCV's FileStorage."""
     require_file(file, SETTINGS_BYTES)
-    with file.open("rb") as stream:
-        return b"%YAML:" in stream.read(64) or b"!!opencv-matrix" in stream.read()
+    content = file.read_bytes()
+    return b"%YAML:" in content[:64] or b"opencv-matrix" in content
 
 
-def _read_yaml(file: Path) -> dict[str, Any]:
-    """Return numbers, arrays and texts of plain YAML, as ROS's camera_calibration writes it.
+def _read_mapping(file: Path) -> dict[str, Any]:
+    """Return numbers, arrays and texts of plain JSON or YAML, as ROS's camera_calibration has.
 
     A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
 
     Raises:
         InputError: the file is no mapping, or a matrix has other sizes than it says.
     """
-    content = read_yaml(file)
+    is_json = file.suffix.lower() == ".json"
+    content = read_json(file, SETTINGS_BYTES) if is_json else read_yaml(file)
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a mapping", type(content).__name__)
     found: dict[str, Any] = {}

@@ -23,7 +23,9 @@ _CHAPTER: Final = re.compile(r"(.*)(?:(G[HXLS]|GP)(\d\d)|GOPR)(\d{4})", re.IGNOR
 """GoPro's names: GX020017 is chapter 2 of recording 17, GP010017 that after GOPR0017."""
 
 
-def find_videos(folder: Path, workshop: Path | None = None) -> dict[str, Path]:
+def find_videos(
+    folder: Path, workshop: Path | None = None, *, named: bool = False
+) -> dict[str, Path]:
     """Return the video of each camera in a folder: a file, or a folder of numbered images.
 
     A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
@@ -32,13 +34,16 @@ def find_videos(folder: Path, workshop: Path | None = None) -> dict[str, Path]:
     Args:
         folder: holds them.
         workshop: where chapters of one recording are joined to one file; None = they are refused.
+        named: whether each file of the folder is the video of a camera, even if it is named as a
+            chapter.
 
     Raises:
         InputError: two videos have one name, or chapters are not to be joined.
     """
     there = sorted(folder.glob("[!.]*"))
     groups = [[place] for place in there if place.is_dir() and _has_images(place)]
-    groups += _recordings([file for file in there if is_video(file)])
+    videos = [file for file in there if is_video(file)]
+    groups += [[file] for file in videos] if named else _recordings(videos)
     for place in there:
         if place.is_dir() and not _has_images(place):
             groups += _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])

@@ -76,7 +76,7 @@ def import_match(
         InputError: a file is invalid, names do not match, there are no people, or `out` is not
             empty; nothing is written then.
     """
-    left_out: LeftOut = {}
+    left_out = LeftOut()
     cameras = read_calibration(calibration, left_out=left_out, any_unit=place is not None)
     files = detections_by_camera(detections, list(cameras), calibration, left_out)
     read = {name: read_people(file) for name, file in files.items()}
@@ -94,8 +94,8 @@ def import_match(
 
 
 def describe_left_out(left_out: LeftOut) -> list[str]:
-    """Return a sentence about the cameras that are left out for each reason."""
-    notes = []
+    """Return sentences about cameras that are left out for each reason, and about the others."""
+    notes = list(left_out.notes)
     for why in dict.fromkeys(left_out.values()):
         names = [name for name, reason in left_out.items() if reason == why]
         if len(names) == 1:
@@ -332,7 +332,9 @@ def import_videos(
             is written then.
     """
     with tempfile.TemporaryDirectory(prefix="worldpose-") as joined:
-        found = find_videos(videos, Path(joined) if join else None)
+        # A calibration may name its cameras after files that are named as chapters.
+        is_named = calibration is not None and not join
+        found = find_videos(videos, Path(joined) if join else None, named=is_named)
         return _import_found(calibration, videos, found, out, fps, match_id, boxes, place)
 
 
@@ -355,10 +357,13 @@ def _import_found(
     notes: list[str] = []
     files = dict(found)
     if calibration is not None:
-        left_out: LeftOut = {}
+        left_out = LeftOut()
         shown = {name: index.size for name, index in indices.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes += describe_left_out(left_out)
+        is_joined = any(not file.is_relative_to(folder) for file in found.values())
+        if found.keys() - left_out.keys() != cameras.keys() and not is_joined:
+            find_videos(folder)  # raises for chapters
         endings = VIDEO_SUFFIXES
         files = pick_cameras(folder, found, list(cameras), calibration, endings, left_out)
         indices = {name: indices[name] for name in files}

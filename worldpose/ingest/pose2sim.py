@@ -89,7 +89,7 @@ def import_pose2sim(
             todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
         )
     known = {file: index_video(file) for file in films}
-    left_out: LeftOut = {}
+    left_out = LeftOut()
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
         notes = [

@@ -115,6 +115,20 @@ def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
     return lines
 
 
+def note_undrawn_distortion(cameras: Mapping[str, Camera]) -> dict[str, str]:
+    """Return a note on how far lenses move pixels, for a view without it; none below a pixel."""
+    found = {}
+    for name, camera in cameras.items():
+        columns, rows = (np.linspace(0.0, side - 1.0, 33) for side in camera.image_size)
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        flat = camera.focal * camera.normalize(pixels) + camera.principal_point
+        shift = np.linalg.norm(flat - pixels, axis=-1)
+        found[name] = float(np.nanmax(shift, initial=0.0))
+    shown = [f"{name} {shift:.0f} px" for name, shift in found.items() if shift >= 1.0]
+    said = f"not drawn; it moves pixels by up to {', '.join(shown)}"
+    return {"distortion": said} if shown else {}
+
+
 def picture_panels(
     titles: Sequence[str],
     corner: ArrayLike,

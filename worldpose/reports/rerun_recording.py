@@ -29,6 +29,8 @@ def write_recording(
 ) -> None:
     """Write a recording (.rrd) atomically, with timelines `frame` and `time`.
 
+    In the image of each static camera, the markings are where its lens shows them.
+
     Args:
         path: the file.
         tracks: joints of all people; missing joints are left out.
@@ -53,15 +55,20 @@ def write_recording(
         stream = rr.RecordingStream(NAME, recording_id=path.stem)
         stream.save(draft)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        if pitch is not None:
-            lines = [line.tolist() for line in markings(pitch)]
-            stream.log(
-                "world/pitch", rr.LineStrips3D(lines, colors=[white], radii=[0.06]), static=True
-            )
+        lines = [] if pitch is None else markings(pitch)
+        if lines:
+            strips = [line.tolist() for line in lines]
+            painted = rr.LineStrips3D(strips, colors=[white], radii=[0.06])
+            stream.log("world/pitch", painted, static=True)
         cameras = cameras or {}
         moving = {name: camera for name, camera in cameras.items() if camera.batch_shape}
         for name in [name for name in cameras if name not in moving]:
             _log_camera(rr, stream, f"world/cameras/{name}", cameras[name], static=True)
+            seen = (line[np.isfinite(line).all(-1)] for line in map(cameras[name].project, lines))
+            shown = rr.LineStrips2D(
+                [each.tolist() for each in seen if len(each) > 1], colors=[white]
+            )
+            stream.log(f"world/cameras/{name}/markings", shown, static=True)
         for row, frame in enumerate(tracks.frames):
             stream.set_time("frame", sequence=int(frame))
             stream.set_time("time", duration=float(frame) / fps)
@@ -87,7 +94,7 @@ def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
 
 
 def _log_camera(rr: Any, stream: Any, place: str, camera: Camera, *, static: bool) -> None:  # noqa: ANN401
-    """Log one camera's pose and image plane; the viewer supports no distortion."""
+    """Log one camera's pose and image plane; rerun's own cameras have no distortion."""
     pose = camera.cam_from_world.inverse()
     transform = rr.Transform3D(translation=pose.translation, mat3x3=pose.rotation)
     pinhole = rr.Pinhole(

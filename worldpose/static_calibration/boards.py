@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
@@ -58,12 +58,13 @@ class Board:
     def _find_charuco(self, grey: Image) -> BoardView | None:
         import cv2
 
-        board = self._charuco()
+        board, note = self._charuco(), ""
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if ids is None or len(ids) < 8:
             # OpenCV before 4.6 began boards of an even number of rows with a white square.
             board.setLegacyPattern(True)
             corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+            note = "the board has the pattern that OpenCV printed before 4.6"
         if ids is None or len(ids) < 8:
             return None
         # The detector interpolates corners between markers.
@@ -71,13 +72,38 @@ class Board:
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
         corners = cv2.cornerSubPix(grey, corners, window, (-1, -1), criteria)
         places = np.asarray(board.getChessboardCorners())[ids.ravel(), :2]
-        return BoardView(places.astype(np.float64), corners.reshape(-1, 2).astype(np.float64))
+        pixels = corners.reshape(-1, 2).astype(np.float64)
+        return BoardView(places.astype(np.float64), pixels, note)
+
+    def others(self, image: Image) -> Iterator[tuple[Board, str]]:
+        """Yield boards that are perhaps meant, each with a sentence about the difference.
+
+        Args:
+            image: (height, width[, 3]), in which no board was found.
+        """
+        given = f"{self.columns} x {self.rows}"
+        if self.dictionary is None:
+            if min(self.columns, self.rows) > 3:
+                columns, rows = self.columns - 1, self.rows - 1
+                said = f"the board has {columns} x {rows} inner corners; {given} is its number of "
+                yield replace(self, columns=columns, rows=rows), said + "squares"
+            return
+        own = _count_markers(image, self.dictionary)
+        first, *_ = sorted(_dictionaries(), key=lambda name: -_count_markers(image, name))
+        known = self.dictionary
+        if _count_markers(image, first) > max(2 * own, 3):
+            known = first
+            yield replace(self, dictionary=known), f"the board's markers are of {known}"
+        if self.columns != self.rows:
+            turned = replace(self, columns=self.rows, rows=self.columns, dictionary=known)
+            said = f"the board has {self.rows} x {self.columns} squares, not {given}"
+            yield turned, said + (f", and markers of {known}" if known != self.dictionary else "")
 
     def _charuco(self) -> Any:  # noqa: ANN401
         """Return OpenCV's board."""
         import cv2
 
-        known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+        known = _dictionaries()
         if self.dictionary not in known:
             raise InputError(
                 "board: dictionary",
@@ -85,7 +111,7 @@ class Board:
                 found=repr(self.dictionary),
                 todo="Give the dictionary that the board was printed with.",
             )
-        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(self.dictionary)))
+        markers = _dictionary(str(self.dictionary))
         side = self.marker_m if self.marker_m is not None else 0.0
         if not 0.0 < side < self.square_m:
             raise InputError(
@@ -98,6 +124,28 @@ class Board:
         return cv2.aruco.CharucoBoard(size, self.square_m, side, markers)
 
 
+def _dictionaries() -> list[str]:
+    """Return the names of OpenCV's dictionaries of markers, each before larger ones of its kind."""
+    import cv2
+
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    return sorted(names, key=lambda name: int(getattr(cv2.aruco, name)))
+
+
+def _dictionary(name: str) -> Any:  # noqa: ANN401
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def _count_markers(image: Image, dictionary: str) -> int:
+    """Return the number of different markers of a dictionary in an image."""
+    import cv2
+
+    _, ids, _ = cv2.aruco.ArucoDetector(_dictionary(dictionary)).detectMarkers(image)
+    return 0 if ids is None else len(np.unique(ids))
+
+
 @dataclass(frozen=True, eq=False)
 class BoardView:
     """Corners of a board in one image.
@@ -105,10 +153,12 @@ class BoardView:
     Attributes:
         places: (n, 2) on the board [m].
         pixels: (n, 2) in the image [px].
+        note: a sentence about the board, for the user; empty if it is as stated.
     """
 
     places: Floats
     pixels: Floats
+    note: str = ""
 
     @property
     def bend(self) -> float:

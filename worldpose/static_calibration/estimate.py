@@ -12,7 +12,7 @@ from worldpose.static_calibration.evidence import check_amount, gather_evidence
 from worldpose.static_calibration.explanations import check_determined, find_explanation, try_k3
 from worldpose.static_calibration.fit import build_problem
 from worldpose.static_calibration.initialization import find_start, fit_from_starts
-from worldpose.static_calibration.lens_choice import choose_lens
+from worldpose.static_calibration.lens_choice import choose_lens, widen_by_lenses
 from worldpose.static_calibration.line_refinement import refine_and_judge
 from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
@@ -63,19 +63,20 @@ def calibrate_camera(
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
-    if start is None:
-        near = find_start(problem, stated)
-    else:
-        near, _ = fit_from_starts(problem, start.numbers[None], stated.wrong_click)
+    near = find_start(problem, stated) if start is None else start.numbers
+    if start is not None:
+        near, _ = fit_from_starts(problem, near[None], stated.wrong_click)
     found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = try_k3(found)
-    estimate, lines = found.estimate, None
+    lines = None
     if picture is not None and stated.lines:
         found, lines = refine_and_judge(found, pitch, picture)
-        if lines.venue is not None:
-            estimate = lines.estimate.estimate
-            pitch = pitch.with_surface(lines.estimate.surface)
+    if lines is None or lines.venue is None:
+        found = widen_by_lenses(found, pitch, stated)
+        estimate = found.estimate
+    else:
+        estimate, pitch = lines.estimate.estimate, pitch.with_surface(lines.estimate.surface)
     report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)

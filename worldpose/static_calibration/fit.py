@@ -191,12 +191,15 @@ def fit_cameras(
 def _with_model(rows: Floats, problem: CameraProblem) -> Floats:
     """Return cameras (b, WIDTH) with the problem's lens model, and what no fit changes of its lens.
 
-    A fisheye replaces Brown's lens up to the fifth power of the angle from the axis.
+    A fisheye and Brown's lens replace each other up to the fifth power of the angle from the axis.
     """
     rows = rows.copy()
     others = rows[:, 25] != problem.lens_model
     k1, k2 = rows[others, 4], rows[others, 5]
-    rows[others, 4], rows[others, 5] = k1 + 1.0 / 3.0, k2 + k1 + 2.0 / 15.0
+    if problem.lens_model == LensModel.FISHEYE:
+        rows[others, 4], rows[others, 5] = k1 + 1.0 / 3.0, k2 + k1 + 2.0 / 15.0
+    else:
+        rows[others, 4], rows[others, 5] = k1 - 1.0 / 3.0, k2 - k1 + 1.0 / 5.0
     rows[others, 25] = problem.lens_model
     if problem.lens is not None:
         known = Camera.from_lens(problem.lens).numbers

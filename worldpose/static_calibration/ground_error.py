@@ -61,6 +61,14 @@ def ground_error_map(estimate: CameraEstimate, pitch: PitchTemplate, step: float
     return GroundErrorMap(x, y, np.where(seen, expected, np.nan).reshape(across.shape))
 
 
+def pitch_places(pitch: PitchTemplate, spacing: float) -> Floats:
+    """Return the places (n, 3) [m] of a grid over the pitch with a spacing [m], world."""
+    x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, spacing)
+    y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, spacing)
+    along, across = (grid.ravel() for grid in np.meshgrid(x, y))
+    return np.stack([along, across, pitch.height(along, across)], axis=1)
+
+
 def expected_ground_error(estimate: CameraEstimate, pitch: PitchTemplate, places: Floats) -> Floats:
     """Return the expected ground error (n,) [m] at places (n, 3) [m] on the surface, world.
 
@@ -153,11 +161,7 @@ def points_off_line(pitch: PitchTemplate, points_world: Floats) -> tuple[str, ..
 
 def _visible_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> Floats:
     """Return derivatives (n, 2, 12) of visible places on the pitch by the camera's step [m]."""
-    spacing = 5.0  # of the grid [m]
-    x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, spacing)
-    y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, spacing)
-    along, across = (grid.ravel() for grid in np.meshgrid(x, y))
-    places = np.stack([along, across, pitch.height(along, across)], axis=1)
+    places = pitch_places(pitch, 5.0)
     seen = _inside(estimate, estimate.camera.project(places))
     motion = surface_motion(estimate.camera, pitch, places[seen])
     return motion[np.isfinite(motion).all(axis=(1, 2))]

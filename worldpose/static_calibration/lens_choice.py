@@ -10,7 +10,9 @@ from scipy.special import fdtrc
 
 from worldpose.errors import InputError
 from worldpose.geometry.camera_model import STEP
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.click_outliers import (
     CLEAR_GAIN,
     Explanation,
@@ -19,6 +21,8 @@ from worldpose.static_calibration.click_outliers import (
     scale_noise,
 )
 from worldpose.static_calibration.fit import compute_residuals, fit_cameras
+from worldpose.static_calibration.ground_error import pitch_places
+from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _CHOICES: Final = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
@@ -70,6 +74,55 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
             )
             best, lowest = replace(other, assumptions=(said,)), score
     return best
+
+
+def widen_by_lenses(
+    found: Explanation, pitch: PitchTemplate, stated: StaticCalibrationSettings
+) -> Explanation:
+    """Return the explanation whose region holds the other lenses that fit the clicks as well.
+
+    Few clicks do not tell how a lens bends the image between and beyond them: the covariance is
+    that of the chosen model. A lens with three free coefficients and loose priors, Brown's or a
+    fisheye, that fits the inliers as well shows the pitch elsewhere. The camera step that best
+    follows this displacement of the pitch in the image is an error of one standard deviation; the
+    larger one of the two models counts.
+
+    A lens that is given, or whose terms a setting restricts, stays.
+    """
+    # Spreads of k1, k2, k3 of wide lenses [1], such as those that bend back towards the corners.
+    brown, fisheye = (0.3, 0.15, 0.05), (0.3, 0.3, 0.3)
+    as_well = 2.0  # difference of the log probabilities [1]
+    problem, fit, camera = found.problem, found.fit, found.estimate.camera
+    if problem.lens is not None or stated.distortion != "k1_k2":
+        return found
+    kept = problem.select(fit.inliers, fit.markings)
+    cost = fit_cameras(kept, fit.row[None], iterations=0).cost[0]
+    places = pitch_places(pitch, 5.0)
+    pixels, by_step = project_with_jacobian(camera, places)
+    with np.errstate(invalid="ignore"):
+        seen = ((pixels >= 0.0) & (pixels <= camera.image_size - 1.0)).all(axis=1)
+    widest, largest = np.zeros(STEP), 0.0
+    for model, spreads in ((LensModel.BROWN, brown), (LensModel.FISHEYE, fisheye)):
+        prior = problem.prior.copy()
+        prior[15:18] = spreads
+        wider = replace(kept, free=np.ones(STEP, np.bool_), lens_model=model, prior=prior)
+        other = fit_cameras(wider, fit.row[None])
+        if not other.cost[0] <= cost + as_well * fit.noise_scale**2:
+            continue
+        apart = Camera.from_numbers(other.rows[0], problem.image_size).project(places) - pixels
+        known = seen & np.isfinite(apart).all(axis=1)
+        step = np.zeros(STEP)
+        rows = by_step[known][:, :, problem.free].reshape(-1, int(problem.free.sum()))
+        step[problem.free] = np.linalg.lstsq(rows, apart[known].ravel())[0]
+        size = float(np.sqrt(((by_step[known] @ step) ** 2).sum(axis=1).mean()))
+        if size > largest:
+            widest, largest = step, size
+    said = f"lenses that fit the clicks as well show the pitch up to {largest:.1f} px elsewhere"
+    return replace(
+        found,
+        fit=replace(fit, covariance=fit.covariance + np.outer(widest, widest)),
+        assumptions=(*found.assumptions, said),
+    )
 
 
 def lens_score(found: Explanation, stated: StaticCalibrationSettings) -> float:

@@ -252,21 +252,14 @@ def doubt_statures(statures: Floats) -> str:
     return f"the mean stature of {count} people is {mean:.2f} m; {said}"
 
 
-def doubt_world(
-    cameras: Camera, joints: NDArray[np.floating], fps: float, *, sizes: bool = True
-) -> list[str]:
+def doubt_world(cameras: Camera, people: People, *, sizes: bool = True) -> list[str]:
     """Return sentences about a world in which people do not stand along z, or are no adults.
 
     Args:
         cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], of tracked people; NaN where missing.
-        fps: frames per second [1/s].
+        people: tracked people, in metres.
         sizes: whether lengths can be judged.
     """
-    most = 1000  # frames; more tell no more
-    people = People.of(joints[:most], fps)
-    if people is None:
-        return []
     vertical, size = people.vertical, doubt_statures(people.statures) if sizes else ""
     said = [size] if size else []
     if vertical.is_clear and not vertical.is_z and people.stand_along(vertical.axis, cameras):
@@ -360,8 +353,8 @@ def place_cameras(
     notes = [doubt] if doubt else []
     if people is not None and (size := doubt_statures(scale * people.statures)):
         notes.append(f"warning: {size}")
-    if not unit and not turned:
-        return dict(cameras), notes
+    if scale == 1.0 and not turned:
+        return dict(cameras), [*([f"{calibration}: {unit}"] if unit else []), *notes]
     height = float(scale * people.ground @ up) if turned and people is not None else 0.0
     # The board of a calibration may lie on the ground, and tells it better than ankles.
     if not abs(height) > 0.15:  # also NaN
@@ -392,8 +385,9 @@ def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
 def _find_scale(
     calibration: Path, cameras: Camera, people: People | None, unit_m: float | None
 ) -> tuple[float, str]:
-    """Return the metres per unit that cameras were read in, and what tells them; empty if one."""
-    farthest_m = 300.0  # of a camera around a stadium from the middle of all: 200 m
+    """Return the metres per unit that cameras were read in, and what tells them."""
+    # Of a camera from the middle of all: 200 m around a stadium, and half of a stereo pair.
+    nearest_m, farthest_m = 0.02, 300.0
     names, read_as_m = dict(UNITS.values()), form_unit_m(calibration)
     tall, count = (0.0, 0) if people is None else (people.stature, len(people.statures))
     seen, stated = f"{count} people of {tall / read_as_m:.4g} units", unit_m is not None
@@ -401,8 +395,17 @@ def _find_scale(
     low, high = 0.9, 2.6  # children, and measured badly
     if unit_m is not None:
         metres, fits = unit_m, not tall or 0.3 <= unit_m / read_as_m * tall <= 4.0
-    elif low <= tall <= high or (not tall and distance <= farthest_m):
-        return 1.0, ""
+    elif low <= tall <= high:
+        yards = UNITS["yd"][0] * tall
+        # Nothing but their stature tells a camera's metres from its yards.
+        other = f"; in yards (--unit yd) they have {yards:.2f} m" if 1.62 < yards < 1.75 else ""
+        said = f"its unit is {names[read_as_m]}, by {count} people of {tall:.2f} m"
+        return 1.0, said + (other if read_as_m == 1.0 else "")
+    elif not tall and (len(cameras.center) == 1 or nearest_m <= distance <= farthest_m):
+        return 1.0, (
+            f"its unit is taken as {names[read_as_m]}, which no people confirm: cameras stand up "
+            f"to {distance:.3g} m from their middle; --unit states another"
+        )
     else:
         metres = min(names, key=lambda m: abs(np.log(m / read_as_m * (tall or 1e6) / STATURE[0])))
         fits = low <= metres / read_as_m * tall <= high
@@ -420,7 +423,7 @@ def _find_scale(
         )
     scale, by = metres / read_as_m, ", as stated" if stated else ""
     by += f", by {seen}, {metres / read_as_m * tall:.2f} m" if tall else ""
-    return scale, f"its unit is {name}{by}" if scale != 1.0 else ""
+    return scale, f"its unit is {name}{by}" if tall or scale != 1.0 else ""
 
 
 def _find_up(

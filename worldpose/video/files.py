@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import dropwhile, islice, pairwise
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -39,7 +40,7 @@ def index_frames(path: Path) -> FrameIndex:
             size: tuple[int, int] | None = None
             packets: list[tuple[int | None, bool]] = []
             for packet in read_packets(container, stream):
-                size = _shown_size(packet) if size is None else size
+                size = _shown_size(path, packet) if size is None else size
                 if packet.size and not packet.is_discard:
                     packets.append((packet.pts, packet.is_keyframe))
             size = (stream.width, stream.height) if size is None else size
@@ -125,13 +126,37 @@ def decode_packets(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.Vid
             yield picture
 
 
-def _shown_size(packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
+def _shown_size(path: Path, packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
     """Return width and height as displayed: an upright camera stores rotated frames."""
     for picture in decode_packets([packet]):
+        _require_quarters(path, picture)
         if picture.rotation % 180:
             return picture.height, picture.width
         return picture.width, picture.height
     return None
+
+
+def _require_quarters(path: Path, picture: av.VideoFrame) -> None:
+    """Raise InputError for a display matrix that mirrors, or turns by no multiple of 90 degrees."""
+    stored: Any = picture.side_data.get("DISPLAYMATRIX")
+    if stored is None:
+        return
+    matrix = np.frombuffer(bytes(stored), np.int32)[:9].reshape(3, 3)[:2, :2].astype(np.float64)
+    turn = float(np.degrees(np.arctan2(matrix[0, 1], matrix[0, 0])))
+    is_mirrored, off = np.linalg.det(matrix) < 0.0, abs((turn + 45.0) % 90.0 - 45.0)
+    if matrix[0].any() and not is_mirrored and off < 1.0:
+        return
+    raise InputError(
+        str(path),
+        expected="images that are shown upright, or turned by 90, 180 or 270 degrees",
+        found="a display matrix that mirrors them"
+        if is_mirrored
+        else f"a display matrix that turns them by {turn:.0f} degrees"
+        if matrix.any()
+        else "an empty display matrix",
+        todo="Convert the video, so that its images are stored as shown: ffmpeg -i IN -c:v libx264 "
+        "-crf 12 OUT.",
+    )
 
 
 def _require_square(path: Path, stream: VideoStream) -> None:

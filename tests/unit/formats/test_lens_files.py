@@ -1,5 +1,7 @@
 """Lenses without a pose, in the files of other tools."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -47,10 +49,17 @@ error = 0.4
     return [folder / "config.toml"]
 
 
+def write_plain_json(folder):
+    lens = {"camera_matrix": MATRIX.tolist(), "dist_coeffs": DISTORTION.tolist(), "rms": 0.3}
+    (folder / "lens.json").write_text(json.dumps(lens, indent="\t"))
+    return [folder / "lens.json"]
+
+
 WRITERS = {
     "xml": lambda folder: write_opencv(folder / "lens.xml"),
     "yml": lambda folder: write_opencv(folder / "lens.yml", image_width=1920, image_height=1080),
     "json": lambda folder: write_opencv(folder / "lens.json"),
+    "plain json": write_plain_json,
     "npy": write_npy,
     "npz": write_npz,
     "toml": write_toml,

@@ -1,6 +1,8 @@
+import pytest
 from line_sets import soccernet_markings
 
-from worldpose.formats.annotations.marked_images import SOCCERNET_MARKINGS
+from worldpose.errors import InputError
+from worldpose.formats.annotations.marked_images import SOCCERNET_MARKINGS, read_marked_images
 from worldpose.pitch.template import PitchTemplate
 
 
@@ -26,3 +28,10 @@ def test_shares_become_pixels_and_what_is_unknown_or_outside_is_left_out():
     (only,) = soccernet_markings(lines, (960, 540)).drawn
     assert only.name == "touch_line_far"
     assert only.xy == ((480.0, 135.0),)
+
+
+def test_lines_in_pixels_are_named(tmp_path):
+    file = tmp_path / "lines.json"
+    file.write_text('{"Middle line": [{"x": 480.0, "y": 270.0}, {"x": 470.0, "y": 10.0}]}')
+    with pytest.raises(InputError, match="Middle line: places in pixels"):
+        read_marked_images(file)

@@ -28,8 +28,10 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import FORMS, read_calibration, read_cameras
 from worldpose.formats.lens_files import read_lenses
+from worldpose.triangulation.world import place_cameras, read_stated_world
 
 
 def assert_same(found, known):
@@ -82,9 +84,22 @@ def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):
     content = json.loads(path.read_text())
     content["cameras"][1]["K"][0][1] = 0.403304
     path.write_text(json.dumps(content))
-    left_out = {}
+    left_out = LeftOut()
     assert list(read_calibration(path, left_out=left_out)) == ["a1", "c3"]
     assert "skew" in left_out["b2"]
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)])
+def test_a_list_of_cameras_as_panoptics_may_have_another_unit(tmp_path, unit, metres):
+    known = rig(lens=(0.0,) * 5)
+    path = WRITERS["Panoptic"](tmp_path, known)
+    content = json.loads(path.read_text())
+    for one in content["cameras"]:
+        one["t"] = (np.array(one["t"]) * 0.01 / metres).tolist()
+    path.write_text(json.dumps(content))
+    cameras = read_calibration(path, any_unit=True)
+    placed, _ = place_cameras(path, cameras, {}, 25.0, read_stated_world(unit, None))
+    assert_same(placed, known)
 
 
 def test_openposes_cameras_take_the_size_of_the_videos(tmp_path):
@@ -144,7 +159,9 @@ def test_vicons_lens_goes_the_other_way(tmp_path, shift):
     terms = np.array([3.1e-8, 2.0e-15, -1.0e-22])
     middle = np.array(known[0].principal_point_px) + shift
     radial = "Vicon3Parameter " + " ".join(map(repr, [*middle.tolist(), *terms.tolist()]))
-    found = read_calibration(write_vicon(tmp_path, known, radial))
+    found = read_calibration(write_vicon(tmp_path, known, radial), left_out=(told := LeftOut()))
+    assert len(told.notes) == 3
+    assert "coefficients follow Vicon's lens within 0.0" in told.notes[0]
     for one in known:
         expected = distort_by_vicon(one, middle, terms)
         inside = np.all((expected > 0) & (expected < SIZE), axis=-1)

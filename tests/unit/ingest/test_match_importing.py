@@ -134,6 +134,18 @@ def test_names_with_accents_and_spaces_become_ids_in_either_form(tmp_path, make_
     assert set(read_match(tmp_path / "m").videos) == {"Sudtribune", "Camera-1"}
 
 
+def test_a_calibration_may_name_cameras_as_chapters(tmp_path, make_camera):
+    names = ["GX010017", "GX020017"]
+    for name in names:
+        film(tmp_path / "videos" / f"{name}.MP4")
+    calibration = calibrate(tmp_path, make_camera, names)
+    spec, _ = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
+    assert [camera.id for camera in spec.cameras] == names
+    calibration = calibrate(tmp_path, make_camera, names[:1])
+    with pytest.raises(InputError, match="chapters of one recording"):
+        import_videos(calibration, tmp_path / "videos", tmp_path / "n")
+
+
 def test_a_calibration_is_scaled_to_videos_of_its_shape_and_no_others(tmp_path, make_camera):
     calibration = calibrate(tmp_path, make_camera, ["one", "two"])
     text = calibration.read_text().replace("[64, 48]", "[128, 96]")

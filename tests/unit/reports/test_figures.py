@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import (
     WIDTH,
     figure_data,
+    note_undrawn_distortion,
     picture_panels,
     png,
     write_figure,
@@ -93,3 +95,16 @@ def test_a_picture_is_shown_at_its_places_in_every_size(across):
     for x, y in [(20, 30), (770, 450), (1500, 880)]:
         u, v = (corner + (np.array([x, y]) + 0.5) * across / WIDTH).astype(int)
         np.testing.assert_allclose(shown[top + y, x], still[v, u], atol=2)
+
+
+def test_distortion_that_a_view_lacks_is_stated():
+    lens = np.array([-0.1, 0.02, 0.0, 0.0, 0.0])
+    matrix = np.array([[900.0, 0.0, 639.5], [0.0, 900.0, 359.5], [0.0, 0.0, 1.0]])
+    bent, plain = (
+        Camera.from_matrices(matrix, each, np.eye(3), np.zeros(3), (1280, 720))
+        for each in (lens, 0.0 * lens)
+    )
+    corner = cv2.undistortPoints(np.zeros((1, 1, 2)), matrix, lens, P=matrix)[0, 0]
+    said = note_undrawn_distortion({"a": bent, "b": plain})["distortion"]
+    assert said.endswith(f"by up to a {np.hypot(*corner):.0f} px")
+    assert note_undrawn_distortion({"b": plain}) == {}

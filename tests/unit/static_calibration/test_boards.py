@@ -85,16 +85,28 @@ def test_corners_are_found_where_they_were_drawn(charuco):
     assert (len(views), size) == (1, SIZE)
 
 
-def test_boards_of_the_pattern_before_opencv_4_6_are_found():
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        (Board(8, 6, 0.06, "DICT_4X4_50", 0.045), ""),
+        (Board(6, 8, 0.06, "DICT_4X4_50", 0.045), "the board has 8 x 6 squares, not 6 x 8"),
+        (Board(8, 6, 0.06, "DICT_5X5_50", 0.045), "the board's markers are of DICT_4X4_50"),
+        (Board(6, 8, 0.06, "DICT_5X5_50", 0.045), "8 x 6 squares, not 6 x 8, and markers of DICT"),
+    ],
+)
+def test_boards_of_the_pattern_before_opencv_4_6_and_exchanged_sides_are_found(stated, said):
     side, board = 60, Board(8, 6, 0.06, "DICT_4X4_50", 0.045)
     old = board._charuco()
     old.setLegacyPattern(True)
     print_ = old.generateImage((8 * side, 6 * side), marginSize=0)
     page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
     image, _ = drawn(page, np.random.default_rng(1))
-    found = board.find(image)
+    tried = [(stated, ""), *([] if stated.find(image) else stated.others(image))]
+    found, told = next((board.find(image), note) for board, note in tried if board.find(image))
     assert len(found.pixels) == 35
     assert found.bend < 0.02
+    assert said in told
+    assert "before 4.6" in found.note
 
 
 def test_a_wrong_dictionary_or_marker_is_told():

@@ -11,6 +11,7 @@ from worldpose.errors import InputError, UsageError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Similarity
 from worldpose.triangulation.world import (
+    People,
     StatedWorld,
     doubt_statures,
     doubt_world,
@@ -91,8 +92,8 @@ def test_people_tell_the_unit_the_vertical_and_the_ground(ring, people, seen, un
     assert tilt < (1.0 if arbitrary else 1e-5)
     assert height < (0.3 if arbitrary else 0.05 if turned else 1e-9)  # 30 m away
     assert scale == pytest.approx(1.0, abs=1e-9)
-    assert len(notes) == bool(said)
-    for text in said:
+    assert len(notes) == 1
+    for text in said or ("its unit is metres, by 3 people of 1.7",):
         assert text in notes[0]
 
 
@@ -119,13 +120,13 @@ def test_people_who_lie_before_cameras_that_stand_turn_no_world(ring, people, se
     given = records(true)
     found, notes = place_cameras(CALIBRATION, given, poses(*seen(true, joints)), FPS, NOTHING)
     assert found == given
-    assert "the cameras stand along z" in notes[0]
-    assert doubt_world(true, joints, FPS) == []
+    assert "the cameras stand along z" in notes[1]
+    assert doubt_world(true, People.of(joints, FPS)) == []
 
 
 def test_a_run_names_the_axis_of_a_turned_world(ring, people):
     turned = move_cameras(Similarity(np.array(1.0), LYING, np.zeros(3)), ring(4))
-    (said,) = doubt_world(turned, walk(people) @ LYING.T, FPS)
+    (said,) = doubt_world(turned, People.of(walk(people) @ LYING.T, FPS))
     assert "the upright axis of people is y, not z: 100% of 120 poses" in said
     assert "--up y" in said
 
@@ -135,7 +136,9 @@ def test_without_people_cameras_alone_decide(ring):
         records(move_cameras(Similarity(np.array(scale), np.eye(3), np.zeros(3)), ring(4)))
         for scale in (1.0, 20.0)
     )
-    assert place_cameras(CALIBRATION, near, {}, FPS, NOTHING) == (near, [])
+    found, (note,) = place_cameras(CALIBRATION, near, {}, FPS, NOTHING)
+    assert found == near
+    assert "taken as metres, which no people confirm: cameras stand up to 30 m" in note
     with pytest.raises(InputError, match=r"601 units from the middle.*--unit mm"):
         place_cameras(CALIBRATION, far, {}, FPS, NOTHING)
     assert place_cameras(CALIBRATION, far, {}, FPS, StatedWorld(1.0)) == (far, [])

@@ -1,5 +1,6 @@
 """Videos as recorders leave them: a number that is read is the number that was burnt in."""
 
+import struct
 from fractions import Fraction
 
 import av
@@ -69,6 +70,26 @@ def test_a_video_of_another_rate_is_refused(tmp_path):
     index = index_video(encode(tmp_path / "slow.mp4", 80 * np.arange(20)))
     with pytest.raises(InputError, match="25 frames per second"):
         index.on_clock(25.0, "slow")
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        ((-1, 0, 0, 1), "a display matrix that mirrors them"),
+        ((0, 1, 1, 0), "a display matrix that mirrors them"),
+        ((0.996, 0.087, -0.087, 0.996), "turns them by 5 degrees"),
+        ((0, 0, 0, 0), "an empty display matrix"),
+    ],
+)
+def test_a_display_matrix_that_is_no_quarter_turn_is_refused(tmp_path, matrix, said):
+    path = encode(tmp_path / "turned.mp4", 40 * np.arange(4), rotation=90)
+    content, one = bytearray(path.read_bytes()), 1 << 16
+    place = content.index(b"tkhd") + 44  # of the matrix in this box of version 0
+    a, b, c, d = (round(each * one) for each in matrix)
+    content[place : place + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        index_video(path)
 
 
 @pytest.mark.parametrize("rotation", [90, 180, 270])

@@ -317,6 +317,8 @@ def _read_soccernet(image: str, given: dict[str, Any]) -> MarkedImage:
         inside = [(at.x, at.y) for at in places if 0.0 <= at.x <= 1.0 and 0.0 <= at.y <= 1.0]
         if inside and "unknown" not in name.lower():  # SoccerNet's word for lines of no name
             lines.append((name, np.array(inside)))
+        elif not inside and any(max(at.x, at.y) > 2.0 for at in places):
+            raise ContentError(f"{name}: places in pixels; SoccerNet's are shares, from 0 to 1")
     return MarkedImage(image, None, (), tuple(lines))
 
 
