@@ -179,22 +179,29 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             )
         elif found.on_plane.any():
             figures |= {name: number for name, number in further.items() if "plane" in name}
-    warnings: tuple[str, ...] = (said,) if said else ()
+    more, doubts = _doubts(inputs, clip, tracks)
+    moved = [f"{describe_change(change)}." for change in changes]
+    return found, figures | more, (*filter(None, [said]), *doubts, *moved)
+
+
+def _doubts(
+    inputs: UnitInputs, clip: ClipInputs, tracks: Tracking
+) -> tuple[dict[str, float], list[str]]:
+    """Return metrics and warnings on the world's unit and axes, and on identities."""
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
+    figures, warnings = dict[str, float](), list[str]()
     most = 1000  # frames; more tell no more of the world
     tracked = People.of(tracks.joints[:most], clip.fps)
     if tracked is not None:
         figures["median_stature_m"] = tracked.stature
         # With many detections left over, people are rays that meet by chance.
         doubted = doubt_world(clip.cameras, tracked, sizes=unmatched < 0.3)
-        warnings += tuple(f"{name}: {each}" for each in doubted)
-    doubts = describe_doubts(
-        np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
-    )
+        warnings += [f"{name}: {each}" for each in doubted]
+    frame = np.asarray(clip.detections.frame, dtype=np.int64)
+    doubts = describe_doubts(frame, len(tracks.person), tracks.takeovers, tracks.joins)
     if doubts is not None:
-        warnings += (f"{name}: {doubts}.",)
-    warnings += tuple(f"{describe_change(change)}." for change in changes)
-    return found, figures, warnings
+        warnings.append(f"{name}: {doubts}.")
+    return figures, warnings
 
 
 def _follow_changes(

@@ -19,7 +19,7 @@ from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.ray_constraints import find_ray_constraints
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
-from worldpose.broadcast_calibration.players import People
+from worldpose.broadcast_calibration.players import People, boxes_of
 from worldpose.broadcast_calibration.report import BroadcastCalibration
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
@@ -138,9 +138,12 @@ def calibrate_moving_camera(
 
     seen = read_unit(match, view)[0] if view in match.detections else None
     keys, fps = list(match.key_frames[view].key_frames), match.spec.fps
-    people = None
+    people = boxes = None
     if seen is not None:
         keypoints = seen.keypoints.astype(np.float64)
         people = People.in_images(bodies.joints, keypoints, fps, clock)
-    clip = BroadcastClip(keys, pictures, fps * clock.rate, people=people, where=view, first=start)
+        boxes = boxes_of(keypoints)[clock.frame_of(clock.images)]
+    weight = match.spec.broadcast_views[view].clip.broadcast_smooth_weight
+    rate = fps * clock.rate
+    clip = BroadcastClip(keys, pictures, rate, people, boxes, view, start, smooth_weight=weight)
     return calibrate_broadcast(pitch, clip)

@@ -50,12 +50,13 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == unit
     ]
     pitch = match.folder.pitch
+    size = {"template", "length", "width", "crown", "end_fall"}
+    # Other sizes of markings than the template's allow a smaller pitch.
+    size |= {"dimensions"} if pitch is not None and pitch.dimensions else set()
     return {
         **({"identities": said} if said else {}),
         **clip_sources(match, unit),
-        "pitch": None
-        if pitch is None
-        else pitch.model_dump(include={"template", "length", "width", "crown", "end_fall"}),
+        "pitch": None if pitch is None else pitch.model_dump(include=size),
         "people": match.folder.spec.max_people,
     }
 

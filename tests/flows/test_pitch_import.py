@@ -1,11 +1,15 @@
 """`worldpose import` of a surveyed pitch and of clicks: match files, or a clear message."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from command_line import succeed, worldpose
 
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.pitch import PitchSpec
+from flows.stages import tracking
 from worldpose.pitch.template import PitchTemplate
 
 NAMES = (
@@ -97,3 +101,13 @@ def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
     assert "'halfway_far' is clicked at (10, 20) and at (30, 40). Which one is meant?" in done.err
     assert (folder / "annotations" / "static_calibration" / "east.json").is_file()
     assert worldpose(*command, "--fps", "25").code == 2
+
+
+def test_the_tracker_knows_the_areas_of_a_small_pitch():
+    camera, clip = CameraSpec(id="cam", width=1920, height=1080), ClipSpec(id="clip", frame_count=1)
+    spec = MatchSpec(match_id="m", fps=25, cameras=(camera,), clips=(clip,))
+    areas = {"penalty_area_depth": 10.0, "penalty_area_width": 24.0, "goal_area_depth": 0.0}
+    small = PitchSpec(length=60.0, width=40.0, any_size=True, dimensions=areas)
+    folder = SimpleNamespace(pitch=small, spec=spec, detections={}, videos={})
+    given = tracking.sources(SimpleNamespace(corrections=(), folder=folder), "clip")["pitch"]
+    assert PitchTemplate.from_spec(PitchSpec(any_size=True, **given)).length == 60.0

@@ -17,7 +17,7 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.evidence import PointEvidence
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.pitch.laws import prescribed_points
+from worldpose.pitch.laws import places_by_size
 from worldpose.pitch.template import PitchTemplate, surface_shape
 
 SIZES: Final = ("length", "width", "crown", "end_fall")
@@ -48,12 +48,7 @@ class PitchErrors:
     def of(cls, pitch: PitchTemplate, settings: BroadcastCalibrationSettings) -> PitchErrors:
         """Return the prior errors of a template."""
         size = (pitch.length, pitch.width)
-        base = prescribed_points(pitch.spec, size)
-        larger = prescribed_points(pitch.spec, (size[0] + 1.0, size[1] + 1.0))
-        nothing = (0.0, 0.0, 0.0)
-        change = [
-            np.subtract(larger.get(name, nothing), base.get(name, nothing)) for name in pitch.points
-        ]
+        _, change = places_by_size(pitch.spec, size, list(pitch.points))
         spread = {
             "length": settings.pitch_size_std_m,
             "width": settings.pitch_size_std_m,
@@ -67,7 +62,7 @@ class PitchErrors:
             size_m=np.array(
                 [each if name in pitch.assumed else 0.0 for name, each in spread.items()]
             ),
-            by_size=np.array(change)[:, :2],
+            by_size=change,
             size=size,
         )
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration, LensCalibration
-from data_contracts.match import MatchSpec
+from data_contracts.match import ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
@@ -332,11 +332,24 @@ def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
             videos[camera.id] = existing_file(folder, usual, str(folder))
     for name, view in spec.broadcast_views.items():
         usual = f"broadcast/{name}.mp4"
+        _require_own_video(folder, name, view.clip)
         if find_file(folder, usual).exists():
             videos[name] = existing_file(folder, usual, str(folder))
         elif view.camera.id in named:
             videos[name] = named[view.camera.id]
     return videos
+
+
+def _require_own_video(folder: Path, view: str, clip: ClipSpec) -> None:
+    """Raise InputError for a video of the clip where each of its cameras has its own."""
+    shared = f"broadcast/{clip.id}.mp4"
+    if view != clip.id and find_file(folder, shared).exists():
+        raise InputError(
+            f"{folder / shared}",
+            expected=f"a video of each of the clip's broadcast cameras, as broadcast/{view}.mp4",
+            found="one video of the clip",
+            todo="Rename it after the camera that recorded it.",
+        )
 
 
 def _require_one_view(folder: Path, spec: MatchSpec) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from data_contracts.arrays import Floats
 from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
 
 SIDES = {"left": -1.0, "right": 1.0}
@@ -42,7 +45,13 @@ class Markings:
             for kind in kinds
             if size == 0.0 and name.endswith(kind)
         ]
-        gone = [each for stem in gone for each in (("goal_post",) if stem == "goal" else (stem,))]
+        resting = {
+            "goal": ["goal_post"],
+            "attack_line": ["attack"],
+            "restricted_area": ["restricted_area", "free_throw"],
+            "basket": ["basket", "three_point", "no_charge"],
+        }
+        gone = [each for stem in gone for each in resting.get(stem, [stem])]
 
         def is_there(name: str) -> bool:
             return not any(name == stem or name.startswith(f"{stem}_") for stem in gone)
@@ -133,6 +142,26 @@ def prescribed_markings(spec: PitchSpec, size: tuple[float, float] | None = None
 def prescribed_points(spec: PitchSpec, size: tuple[float, float] | None = None) -> dict[str, Place]:
     """Return the points of `prescribed_markings`."""
     return prescribed_markings(spec, size).points
+
+
+def places_by_size(
+    spec: PitchSpec, size: tuple[float, float], names: Sequence[str]
+) -> tuple[Floats, Floats]:
+    """Return points (n, 3) [m] at a size, and the change (n, 2) of x by length and y by width [1].
+
+    Points that are not prescribed are at the origin, and do not change.
+    """
+    length, width = size
+    step, origin = 1e-4, (0.0, 0.0, 0.0)
+    at, longer, wider = (
+        np.array([points.get(name, origin) for name in names]).reshape(-1, 3)
+        for points in (
+            prescribed_points(spec, each)
+            for each in (size, (length + step, width), (length, width + step))
+        )
+    )
+    change = np.stack([longer[:, 0] - at[:, 0], wider[:, 1] - at[:, 1]], axis=1) / step
+    return at, change
 
 
 def _rank(name: str) -> tuple[int, int]:

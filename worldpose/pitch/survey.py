@@ -22,7 +22,7 @@ from data_contracts.pitch import PitchSpec, TemplateName
 from data_contracts.records import Record
 from worldpose.errors import InputError
 from worldpose.parsing import read_cells
-from worldpose.pitch.laws import prescribed_markings, prescribed_points
+from worldpose.pitch.laws import places_by_size, prescribed_markings, prescribed_points
 
 COLUMNS: Final[Mapping[str, str]] = {
     "x": "x",
@@ -168,27 +168,9 @@ def _usual_size(survey: Survey) -> tuple[float, float]:
     return survey.usual.length, survey.usual.width
 
 
-def _law_places(survey: Survey) -> tuple[Floats, Floats]:
-    """Return the survey's points in the Laws: positions (n, 3) [m] and their change (n, 2) [1].
-
-    On a pitch of no length and width, z above the surface; the change is of x by the length, and of
-    y by the width.
-    """
-    length, width = _usual_size(survey)
-    base, larger = (
-        prescribed_points(survey.usual, size)
-        for size in ((length, width), (length + 1.0, width + 1.0))
-    )
-    at = np.array([base[name] for name in survey.names]).reshape(-1, 3)
-    change = np.array([larger[name] for name in survey.names]).reshape(-1, 3) - at
-    at[:, :2] -= change[:, :2] * (length, width)
-    return at, change[:, :2]
-
-
 def _nominal_places(survey: Survey) -> Floats:
     """Return the points' positions in plan (n, 2) [m] on a pitch of the usual size."""
-    law, change = _law_places(survey)
-    return np.asarray(law[:, :2] + change * _usual_size(survey))
+    return places_by_size(survey.usual, _usual_size(survey), survey.names)[0][:, :2]
 
 
 def _best_rotation(centred: Floats, places: Floats) -> Floats:
@@ -377,19 +359,20 @@ def _fit_plan(
     survey: Survey, places: Floats, settings: SurveySettings, stretch: bool = False
 ) -> _Plan:
     """Fit rotation, shift, length and width by robust least squares, with `stretch` the scale."""
-    law, change = _law_places(survey)
     middle = places.mean(axis=0)
     centred = places - middle
     usual = _usual_size(survey)
     size = np.array(usual)
-    turn = _best_rotation(centred, law[:, :2] + change * size)
-    shift = (law[:, :2] + change * size).mean(axis=0)
+    law = _nominal_places(survey)
+    turn, shift = _best_rotation(centred, law), law.mean(axis=0)
     spreads = np.array([settings.length_std_m, settings.width_std_m])
     scale = 1.0
     # The loss has its final width after ten iterations.
     for iteration in range(30):
         turned = centred @ turn.T
-        residual = scale * turned + shift - law[:, :2] - change * size
+        given = float(size[0]), float(size[1])
+        law, change = places_by_size(survey.usual, given, survey.names)
+        residual = scale * turned + shift - law[:, :2]
         # Wide at first: the start may be metres off if the pitch has another size.
         loss = max(3.0 * settings.accuracy_m, 3.0 * 0.7**iteration)
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=-1) / loss**2)
@@ -409,7 +392,7 @@ def _fit_plan(
     known = np.sqrt(np.diagonal(covariance))[3:] < 0.5 * spreads
     return _Plan(
         places=scale * centred @ turn.T + shift,
-        law=law[:, :2] + change * size,
+        law=law[:, :2] + change * step[3:5],
         turn=scale * turn,
         length=float(size[0]),
         width=float(size[1]),
@@ -423,7 +406,7 @@ def _fit_heights(
     survey: Survey, plan: _Plan, heights: Floats, settings: SurveySettings
 ) -> _Heights:
     """Fit level, slope and crown by least squares to the points with a height."""
-    above = _law_places(survey)[0][:, 2]
+    above = places_by_size(survey.usual, _usual_size(survey), survey.names)[0][:, 2]
     ridge = -((plan.places[:, 1] / (0.5 * plan.width)) ** 2)
     taken = np.isfinite(heights)
     if not taken.any():

@@ -164,12 +164,11 @@ def move_broadcast_camera(
     zoomed = focal / (4200.0 * scale)
     k1 = np.clip(0.42 * glass[0] * zoomed**1.6, 0.0, 1.0)
     k2 = np.clip(1.6 * glass[1] * zoomed, 0.0, 4.3)
-    nothing = np.zeros_like(k1)
     offset = np.array([rng.uniform(-16.0, 12.0), rng.uniform(-60.0, -3.0)])
     return Camera(
         focal=np.stack([focal, focal], axis=-1),
         principal_point=np.broadcast_to((width - 1.0) / 2.0 + scale * offset, (len(times), 2)),
-        distortion=np.stack([k1, k2, nothing, nothing, nothing], axis=-1),
+        distortion=np.stack([k1, k2, *np.zeros((3, len(times)))], axis=-1),
         cam_from_world=Rigid(
             np.stack([pose.rotation for pose in poses]),
             np.stack([pose.translation for pose in poses]),

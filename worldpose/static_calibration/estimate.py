@@ -43,8 +43,7 @@ def calibrate_camera(
         picture: (height, width) or (height, width, 3); without it there is no stage 3.
         settings: noise, prior and thresholds; the defaults if None.
         where: file or camera, for messages.
-        lens: a lens that was calibrated before, the prior of focal length, principal point and
-            distortion; its k1, k2 and k3 are then all solved for. None = not known.
+        lens: a calibrated lens, the prior; k1, k2 and k3 are then solved for. None = not known.
         start: a camera near the answer, which replaces stage 1. Where the markings are their own
             image after half a turn, it decides the side.
 
@@ -57,9 +56,8 @@ def calibrate_camera(
         C1-C5; paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
-    stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec)})
-    if lens is not None:
-        stated = stated.model_copy(update={"distortion": "k1_k2_k3"})
+    own = {} if lens is None else {"distortion": "k1_k2_k3"}
+    stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec), **own})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)

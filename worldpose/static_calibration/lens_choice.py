@@ -111,13 +111,20 @@ def widen_by_lenses(
             continue
         apart = Camera.from_numbers(other.rows[0], problem.image_size).project(places) - pixels
         known = seen & np.isfinite(apart).all(axis=1)
+        if not known.any():
+            continue
         step = np.zeros(STEP)
         rows = by_step[known][:, :, problem.free].reshape(-1, int(problem.free.sum()))
         step[problem.free] = np.linalg.lstsq(rows, apart[known].ravel())[0]
         size = float(np.sqrt(((by_step[known] @ step) ** 2).sum(axis=1).mean()))
         if size > largest:
             widest, largest = step, size
-    said = f"lenses that fit the clicks as well show the pitch up to {largest:.1f} px elsewhere"
+    if largest == 0.0:
+        return found
+    said = (
+        "a lens that fits the clicks as well shows the pitch elsewhere by a root mean square of "
+        f"{largest:.1f} px"
+    )
     return replace(
         found,
         fit=replace(fit, covariance=fit.covariance + np.outer(widest, widest)),

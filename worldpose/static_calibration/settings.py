@@ -88,11 +88,13 @@ class CameraPrior(Record):
     def beside(self, pitch: PitchSpec) -> CameraPrior:
         """Return the prior of a camera beside another game's pitch: nearer and lower in proportion.
 
-        Its means are of football; halls are smaller.
+        The default means are of football; halls are smaller. Other means stay as they are given.
         """
         football, own = (PitchSpec(template=name).length for name in ("football", pitch.template))
         share = own / football
-        places = {"height_m": share * self.height_m, "distance_m": share * self.distance_m}
+        usual = CameraPrior()
+        means = {"height_m": usual.height_m, "distance_m": usual.distance_m}
+        places = {name: share * mean for name, mean in means.items() if getattr(self, name) == mean}
         return self if share == 1.0 else self.model_copy(update=places)
 
 

@@ -286,7 +286,8 @@ class FrameTracker:
         now = np.array([frame])
         after = [
             fit_track_ends(
-                place, now, group.joints[None], _views(group.index[None]), self.fps, self.settings
+                *(place, now, group.joints[None], _views(group.index[None])),
+                *(self.fps, self.settings, len(self.centers)),
             )[0]
             for place, group in enumerate(groups)
         ]
@@ -299,7 +300,8 @@ class FrameTracker:
         fixed = np.isfinite(joints).any(axis=(1, 2))
         places = joints[fixed].astype(np.float64)
         views = _views(index[fixed])
-        return fit_track_ends(person.number, frames[fixed], places, views, self.fps, self.settings)
+        given = person.number, frames[fixed], places, views, self.fps, self.settings
+        return fit_track_ends(*given, len(self.centers))
 
     def _merge(self, frame: int) -> None:
         """End people whose track has coincided with another's for `merge_time_s`."""

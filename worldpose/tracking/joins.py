@@ -69,6 +69,7 @@ def fit_track_ends(
     views: Integers,
     fps: float,
     settings: TrackingSettings,
+    cameras: int,
 ) -> tuple[End, End]:
     """Return the start and the end of a track.
 
@@ -76,14 +77,15 @@ def fit_track_ends(
         number: number of the track.
         frames: (n,) frames whose rays determined the position.
         joints: (n, 17, 3) [m], world; NaN where not determined.
-        views: (n,) cameras that see the person; the limbs of two are not used, as one of them may
-            show somebody else.
+        views: (n,) cameras that see the person; of more than two cameras, the limbs of two are not
+            used, as one of them may show somebody else.
         fps: frames per second [1/s].
         settings: times.
+        cameras: number of the rig's cameras.
     """
     torso, whole = _mean_known(joints[:, COCO17_TORSO]), _mean_known(joints)
     places = np.where(np.isfinite(torso), torso, whole)
-    limbs, variance = limb_lengths(joints[views >= settings.birth_views], fps)
+    limbs, variance = limb_lengths(joints[views >= min(settings.birth_views, cameras)], fps)
     out = []
     for edge in (0, -1):
         near = np.abs(frames - frames[edge]) <= settings.end_time_s * fps
@@ -165,8 +167,9 @@ def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSe
     if both:
         odds -= _log_normal_density(change, velocity_noise**2 + 2.0 * settings.rms_speed_m_s**2)
     # Who is out of sight for long may have walked anywhere.
-    fresh = _freshness(gap, settings)
-    odds = float(np.logaddexp(math.log(fresh) + odds, math.log1p(-fresh)))
+    stale = (gap / settings.place_memory_s) ** 2
+    anywhere = math.log(-math.expm1(-stale)) if stale > 0.0 else -math.inf
+    odds = float(np.logaddexp(odds - stale, anywhere))
     return -odds - _shape_odds(old, new, settings)
 
 

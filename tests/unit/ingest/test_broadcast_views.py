@@ -125,6 +125,9 @@ def test_files_of_several_cameras_are_named_after_clip_and_camera(two):
     read = read_match(two)
     assert [*read.detections][-1] == "goal.main"
     assert [*read.videos] == ["goal.tight"]
+    (two / "broadcast" / "goal.mp4").write_bytes(b"video")
+    with pytest.raises(InputError, match=r"goal\.mp4.*broadcast/goal\.main\.mp4"):
+        read_match(two)
 
 
 def test_several_broadcast_cameras_need_static_ones(two):

@@ -128,3 +128,22 @@ def test_a_survey_of_a_hall_is_of_its_game():
     fit = fit_survey(Survey("hall.csv", names, places + [7.0, 3.0, 0.5], "futsal"))
     assert fit.pitch.template == "futsal"
     assert (fit.pitch.length, fit.pitch.width) == pytest.approx((38.4, 18.7), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("template", "size"), [("basketball", (26.0, 14.0)), ("handball", (38.0, 18.0))]
+)
+def test_a_survey_of_round_areas_gives_another_size_back(template, size):
+    """Their lines meet the end lines at places that do not follow the width in proportion."""
+    true = PitchTemplate.from_spec(PitchSpec(template=template, length=size[0], width=size[1]))
+    names = tuple(name for name in true.points if not name.endswith(("_top", "_bottom")))
+    fit = fit_survey(Survey("hall.csv", names, true.positions(names), template))
+    assert (fit.pitch.length, fit.pitch.width) == pytest.approx(size, abs=0.002)
+
+
+def test_no_point_stays_without_its_marking():
+    assert not [
+        name for name in pitch("volleyball", attack_line_distance=0).points if "att" in name
+    ]
+    names = pitch("basketball", restricted_area_depth=0, basket_distance=0).points
+    assert not [name for name in names if "free_throw" in name or "three_point" in name]

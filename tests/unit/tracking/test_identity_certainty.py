@@ -31,6 +31,10 @@ def test_a_person_is_back_after_ten_seconds_only_with_the_own_size():
     # One has left, and one comes: that alone is no evidence.
     assert decided([gone], [unlike]) == []
     assert decided([gone], [end(4, 350, np.full(11, np.nan))]) == []
+    # After minutes, a place tells nothing.
+    patient = TrackingSettings(max_join_gap_s=200.0)
+    (cost,) = join_costs([gone], [end(6, 5000)], 25.0, 300.0, patient).ravel()
+    assert np.isfinite(cost)
     # A moment unseen needs no shape.
     assert decided([gone], [end(5, 110, np.full(11, np.nan))]) == [(0, 5)]
 
