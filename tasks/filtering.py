@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import AnyFloats, Floats, Image
 from data_contracts.conventions import COCO17
 from data_contracts.detection import REDETECTION
 from data_contracts.filtering import FILTERING
@@ -35,6 +35,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.detection.models import load_pose, load_score_map
 from worldpose.detection.pipeline import Place
 from worldpose.detection.settings import DetectionSettings, RedetectionSettings
+from worldpose.detection.turning import QuarterTurn
 from worldpose.filtering.held_out import measure_held_out
 from worldpose.filtering.judging import (
     BodyViews,
@@ -438,13 +439,15 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
         return KeypointDetections.empty()
     require_weights(settings, case.detection.sources["weights"])
     shown = _pictures(inputs, case, np.unique(sought.frame))
-    found = search_missing_people(
-        shown,
-        sought,
-        load_pose(settings),
-        settings.min_keypoint_confidence,
-        case.detected.boxes,
-    )
+    boxes: AnyFloats = case.detected.boxes
+    # As `detection` does: nets know people who stand upright.
+    turn = QuarterTurn.of(case.camera)
+    if turn is not None:
+        shown = ((place, turn.image(image)) for place, image in shown)
+        sought, boxes = replace(sought, boxes=turn.boxes(sought.boxes)), turn.boxes(boxes)
+    least = settings.min_keypoint_confidence
+    found = search_missing_people(shown, sought, load_pose(settings), least, boxes)
+    found = found if turn is None else turn.turn_back(found)
     case.detection.require_registered("video")
     score_map = load_score_map(settings)
     return found if score_map is None else replace(found, score=score_map.probability(found.score))

@@ -24,13 +24,20 @@ def units(match: Match) -> tuple[str, ...]:
 
 def uncalibrated_warnings(match: Match) -> tuple[str, ...]:
     """Return sentences about cameras of clips with several whose view is not used."""
-    folder = match.folder
-    return tuple(
-        f"broadcast camera {view.camera.id} of clip {view.clip.id} is not used: it needs "
-        f"broadcast/{name}.mp4, and clicks in {key_frames_file(name)} or a stated side."
-        for name, view in folder.spec.broadcast_views.items()
-        if name not in folder.calibrated_views and len(view.clip.moving_cameras) > 1
-    )
+    folder, said = match.folder, []
+    for name, view in folder.spec.broadcast_views.items():
+        if name in folder.calibrated_views or len(view.clip.moving_cameras) < 2:
+            continue
+        needed = [] if name in folder.videos else [f"broadcast/{name}.mp4"]
+        if folder.pitch is None:
+            needed.append("a pitch in place of `pitch: none`")
+        elif name not in folder.key_frames:
+            needed.append(f"clicks in {key_frames_file(name)} or a stated side")
+        said.append(
+            f"broadcast camera {view.camera.id} of clip {view.clip.id} is not used: it needs "
+            f"{', and '.join(needed)}."
+        )
+    return tuple(said)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
