@@ -122,8 +122,11 @@ class _Sparse(_Built):
         if math.prod(shape) > MAX_ELEMENTS:
             raise ValueError(f"a sparse matrix of shape {shape}")
         matrix = self.form(parts, shape=shape)
-        # scipy's own code writes wherever the indices point.
+        # scipy's own code writes wherever the indices point; its check leaves out the rows of a
+        # matrix whose last row ends at 0.
         matrix.check_format(full_check=True)
+        if (np.diff(matrix.indptr) < 0).any():
+            raise ValueError("a sparse matrix with rows that end before they begin")
         self.value = matrix.toarray()
 
 

@@ -205,6 +205,8 @@ def spoiled_contents():
     """Streams of arrays whose parts contradict each other, with what the error tells."""
     outside = scipy.sparse.csc_matrix(NUMBERS)
     outside.indices[-1] = 1_000_000
+    backwards = scipy.sparse.csc_matrix(NUMBERS)
+    backwards.indptr[1:-1], backwards.indptr[-1] = 1_000_000_000, 0
     endless = Ch(None)
     endless.x = endless
     short = pickled({"a": np.frombuffer(b"\x11" * 24)})
@@ -212,6 +214,7 @@ def spoiled_contents():
     return [
         (short.replace(b"K\x03\x85", b"K\x04\x85"), "24 bytes for the shape"),
         (pickled({"a": outside}), "indices"),
+        (pickled({"a": backwards}), "end before they begin"),
         (pickled({"a": scipy.sparse.csc_matrix((1_000_000, 1_000_000))}), "a sparse matrix of sh"),
         (pickled({"a": endless}), "contains itself"),
     ]
