@@ -35,7 +35,7 @@ def test_a_clip_is_drawn_with_the_pitch_that_its_broadcast_camera_shows():
         "points": {"corner_right_far": corner},
         "std_m": [0.1, 0.1, 0.01],
     }
-    run = StoredRun(broadcast_calibration__goal={"pitch": found})
+    run = StoredRun(broadcast_calibration__goal={"clip_id": "goal", "pitch": found})
     drawn = PitchTemplate.from_spec(estimated_pitch(run, GIVEN, SPEC, "goal"))
     np.testing.assert_allclose(drawn.surface, [0.15, 0.0])
     np.testing.assert_allclose(drawn.positions(["corner_right_far"])[0], corner)
@@ -47,7 +47,8 @@ def test_a_clip_is_drawn_with_the_pitch_that_its_broadcast_camera_shows():
 def test_static_cameras_draw_the_crown_and_the_end_fall_that_they_show():
     adjusted = {"surface": [-0.01, 0.25]}
     run = StoredRun(
-        bundle_adjustment__cameras=adjusted, broadcast_calibration__clip={"pitch": None}
+        bundle_adjustment__cameras=adjusted,
+        broadcast_calibration__clip={"clip_id": "clip", "pitch": None},
     )
     for clip in (None, "clip"):
         drawn = PitchTemplate.from_spec(estimated_pitch(run, GIVEN, SPEC, clip))

@@ -214,7 +214,7 @@ SCENARIOS: Final = {
             pitch=PitchSpec(template="basketball"),
             crowd=CrowdSettings(area_center_m=(-6.0, 1.0), area_size_m=(12.0, 10.0)),
             rig=RigSettings(distance_m=(2.0, 6.0), height_m=(3.0, 8.0), person_height_px=200.0),
-            broadcast=None,
+            broadcast=(),
         ),
         Scenario(
             name="leaving",

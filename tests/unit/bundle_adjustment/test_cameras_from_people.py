@@ -26,7 +26,7 @@ NAMES = ("north", "east", "south", "west")
 def walkers():
     """Joints (frames, 2, 17, 3) of the two people who walk farthest, near the origin."""
     tiny = SCENARIOS["tiny"]
-    scene = simulate_scene(tiny.model_copy(update={"duration": 10.0, "broadcast": None}), 3)
+    scene = simulate_scene(tiny.model_copy(update={"duration": 10.0, "broadcast": ()}), 3)
     joints = scene.truth.joints
     middle = joints[:, :, [11, 12]].mean(axis=2)
     way = np.linalg.norm(np.ptp(middle, axis=0)[:, :2], axis=1)

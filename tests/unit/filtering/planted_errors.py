@@ -41,7 +41,7 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
     wrong = {"displaced": displaced, "swapped": 0.0, "stolen": 0.0, "merged": 0.0}
     noise = base.noise.model_copy(update=wrong)
     scene = simulate_scene(
-        base.model_copy(update={"duration": duration, "noise": noise, "broadcast": None}), seed
+        base.model_copy(update={"duration": duration, "noise": noise, "broadcast": ()}), seed
     )
     seen = scene.static_views()
     index = seen.index(len(scene.truth.person_ids))

@@ -24,7 +24,7 @@ def simulated(seed, people=8):
     crowd = scenario.crowd.model_copy(update={"people": people})
     # The common bias of all views would hide whether the noise is honest.
     noise = scenario.noise.model_copy(update={"shared_bias_m": 0.0, "own_bias_m": 0.0})
-    changes = {"duration": 0.8, "crowd": crowd, "broadcast": None, "noise": noise}
+    changes = {"duration": 0.8, "crowd": crowd, "broadcast": (), "noise": noise}
     return arrays_of(simulate_scene(scenario.model_copy(update=changes), seed), people)
 
 
@@ -105,7 +105,7 @@ def test_regions_hold_the_truth_of_one_clip():
 def test_95_percent_of_clocks_lie_within_two_standard_errors(name, fewest):
     scenario, settings = SCENARIOS[name], TriangulationSettings()
     rig = scenario.rig.model_copy(update={"clock_std_frames": 0.7})
-    scenario = scenario.model_copy(update={"duration": 3.0, "broadcast": None, "rig": rig})
+    scenario = scenario.model_copy(update={"duration": 3.0, "broadcast": (), "rig": rig})
     deviations = []
     for seed in range(20, 30):
         scene = simulate_scene(scenario, seed)

@@ -28,7 +28,7 @@ def scene():
     tiny = SCENARIOS["tiny"]
     rig = tiny.rig.model_copy(update={"cameras": len(LATE)})
     seconds = (FRAMES + BEFORE + 25) / FPS
-    changes = {"fps": FINE * FPS, "duration": seconds, "rig": rig, "broadcast": None}
+    changes = {"fps": FINE * FPS, "duration": seconds, "rig": rig, "broadcast": ()}
     return simulate_scene(tiny.model_copy(update=changes), 4)
 
 
