@@ -440,13 +440,12 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
     require_weights(settings, case.detection.sources["weights"])
     shown = _pictures(inputs, case, np.unique(sought.frame))
     boxes: AnyFloats = case.detected.boxes
-    # As `detection` does: nets know people who stand upright.
     turn = QuarterTurn.of(case.camera)
-    if turn is not None:
+    if turn is not None:  # as in `detection`
         shown = ((place, turn.image(image)) for place, image in shown)
         sought, boxes = replace(sought, boxes=turn.boxes(sought.boxes)), turn.boxes(boxes)
-    least = settings.min_keypoint_confidence
-    found = search_missing_people(shown, sought, load_pose(settings), least, boxes)
+    pose, least = load_pose(settings), settings.min_keypoint_confidence
+    found = search_missing_people(shown, sought, pose, least, boxes)
     found = found if turn is None else turn.turn_back(found)
     case.detection.require_registered("video")
     score_map = load_score_map(settings)

@@ -20,10 +20,10 @@ from flows.results.best_results import (
     clip_positions,
     estimated_pitch,
     fitted_bodies,
-    moving_cameras,
     person_kinds,
     static_cameras,
 )
+from flows.results.broadcast_views import moving_cameras
 from flows.results.tool_exports import describe_clip
 from flows.stage import Match
 from worldpose.body.model import BodyModel, BodyParameters

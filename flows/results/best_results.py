@@ -369,22 +369,12 @@ def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
     Raises:
         InputError: the run has no such camera.
     """
-    todo = (
-        "This format is about the broadcast camera's picture: calibrate that camera first, or "
-        "choose another format."
-    )
+    todo = "This format is about the broadcast camera's picture: calibrate that camera first, or "
+    todo += "choose another format."
     views = broadcast_views(run, clip) or [require_result(run, f"{BROADCAST}{clip}", todo)]
     bodies = bodies_unit(run, clip)
     frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
     return {view: camera_in_frames(run, view, frames) for view in views}
-
-
-def moving_cameras(run: Run, clip: str, frames: NDArray[np.int64]) -> dict[str, Camera]:
-    """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone."""
-    views = broadcast_views(run, clip)
-    names = views if len(views) > 1 else ["broadcast"] * len(views)
-    found = (camera_in_frames(run, view, frames) for view in views)
-    return dict(zip(names, found, strict=True))
 
 
 def require_result(run: Run, unit: str, todo: str) -> str:

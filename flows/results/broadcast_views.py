@@ -40,3 +40,11 @@ def camera_in_frames(run: Run, view: str, frames: NDArray[np.int64]) -> Camera:
     by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
     arrays = by_frame.reindex(frame=frames).data_vars
     return camera_from_arrays({**arrays, "image_size": found["image_size"]})
+
+
+def moving_cameras(run: Run, clip: str, frames: NDArray[np.int64]) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone."""
+    views = broadcast_views(run, clip)
+    names = views if len(views) > 1 else ["broadcast"] * len(views)
+    found = (camera_in_frames(run, view, frames) for view in views)
+    return dict(zip(names, found, strict=True))

@@ -25,11 +25,10 @@ from flows.results.best_results import (
     estimated_pitch,
     filmed_cameras,
     fitted_bodies,
-    moving_cameras,
     person_kinds,
     placed_joints,
 )
-from flows.results.broadcast_views import broadcast_views
+from flows.results.broadcast_views import broadcast_views, moving_cameras
 from flows.results.outputs import (
     RELEASE,
     VIEWER_SUFFIX,

@@ -20,9 +20,9 @@ from flows.results.best_results import (
     clip_positions,
     estimated_pitch,
     fitted_bodies,
-    moving_cameras,
     person_kinds,
 )
+from flows.results.broadcast_views import moving_cameras
 from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
