@@ -86,7 +86,8 @@ class _Meetings:
     def find_change(self, number: int, kinds: Sequence[Kind]) -> MeasuredChange | None:
         """Return the change of this camera, the given one of the rig; None if there is none."""
         second = max(2, round(self.fps))
-        every = max(1, second // 10)
+        # Long clips need no more moments, and have many people.
+        every = max(1, second // 10, len(self.seen) // 3000)
         rows = np.arange(0, len(self.seen), every)
         met, count = self._met(rows), self._count(rows)
         place = _fall(met, count, max(5, second // every))
@@ -135,9 +136,15 @@ class _Meetings:
         self, rows: Integers, wide: float = 1.0, late: int = 0, shift: Floats | float = 0.0
     ) -> Integers:
         """Return the number (n,) of detections that meet a person within reaches, with a change."""
-        image, reach, inside = self._project(rows + late)
-        off = np.linalg.norm((self.seen[rows] - shift)[:, :, None] - image[:, None], axis=-1)
-        return np.asarray((inside[:, None] & (off < wide * reach[:, None])).any(axis=2).sum(axis=1))
+        met = np.zeros(len(rows), dtype=np.int64)
+        block = 256  # moments in memory
+        for start in range(0, len(rows), block):
+            some = rows[start : start + block]
+            image, reach, inside = self._project(some + late)
+            off = np.linalg.norm((self.seen[some] - shift)[:, :, None] - image[:, None], axis=-1)
+            near = inside[:, None] & (off < wide * reach[:, None])
+            met[start : start + block] = near.any(axis=2).sum(axis=1)
+        return met
 
     def _project(self, rows: Integers) -> tuple[Floats, Floats, Flags]:
         """Return where people are seen (n, persons, 2), their reach [px], and who there is."""
