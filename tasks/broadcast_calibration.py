@@ -23,6 +23,7 @@ from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
 from tasks.unit import UnitInputs, unit_task
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.given_camera import GivenCamera
 from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES
@@ -41,6 +42,7 @@ from worldpose.broadcast_calibration.uncertainty import (
     pool_centers,
     static_covariance,
 )
+from worldpose.formats.camera_data import read_camera_data
 from worldpose.ingest.clock import ImageClock, camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.writer import ResultWriter
@@ -81,8 +83,20 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         for frame, markings in clicked.items()
         if start <= int(frame) < stop
     ]
+    settings, given = inputs.settings(BroadcastCalibrationSettings), None
+    if "camera_data" in sources:
+        with open_video(inputs.file("video")) as video:
+            size = video.index.size
+        rate = float(sources["fps"]) * clock.rate
+        data = read_camera_data(inputs.file("camera_data"), rate, size)
+        inputs.require_registered("camera_data")
+        given = GivenCamera.of(data, clock.images)
     if "side" in sources:
         key_frames = _propose(inputs, pitch, clock, people, seen)
+    elif given is not None and not clicked:
+        file = sources["camera_data"]
+        found = given.propose_key_frames(pitch, size, settings.prior, file)
+        key_frames = [each.model_copy(update={"frame": start + each.frame}) for each in found]
     calibration = calibrate_broadcast(
         pitch,
         BroadcastClip(
@@ -93,10 +107,11 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
             boxes=boxes,
             where=file,
             first=start,
-            proposed="side" in sources,
+            proposed=not clicked,
             smooth_weight=sources.get("smooth", 1.0),
+            given=given,
         ),
-        inputs.settings(BroadcastCalibrationSettings),
+        settings,
     )
     inputs.require_registered("video")
     layout = BROADCAST_CALIBRATION

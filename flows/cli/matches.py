@@ -27,6 +27,7 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError, unknown_name
+from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import unclicked_clips
@@ -188,6 +189,10 @@ def import_command(
     clicks: Path | None = None,
     camera: str | None = None,
     lens: list[Path] | None = None,
+    camera_data: Annotated[Path | None, typer.Option("--camera-data")] = None,
+    first_frame: Annotated[int | None, typer.Option("--first-frame", min=0)] = None,
+    freed_camera: Annotated[int | None, typer.Option("--freed-camera", min=0, max=255)] = None,
+    zoom_table: Annotated[Path | None, typer.Option("--zoom-table")] = None,
     left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
     template: TemplateName | None = None,
     unit: str | None = None,
@@ -217,10 +222,15 @@ def import_command(
         pitch: Survey of the markings (CSV); writes only pitch.json.
         clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
             name of a point or marking of the pitch, or a position in metres.
-        camera: With --clicks or --lens: the camera, or the clip of the broadcast camera; by
-            default, images and lenses are named after cameras.
+        camera: With --clicks, --lens or --camera-data: the camera, or the clip of the broadcast
+            camera; by default, images and lenses are named after cameras.
         lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
             pickle, matrix and distortion as two .npy files, or TOML.
+        camera_data: Data of the broadcast camera in every frame: FreeD packets, or a table with
+            pan, tilt, roll [deg], x, y, z, and focal_px, fov, or focal_mm.
+        first_frame: With --camera-data: number in the video of its first frame.
+        freed_camera: With --camera-data: FreeD's number of the camera.
+        zoom_table: With --camera-data: focal lengths of the lens by FreeD's zoom counts (CSV).
         left_handed: The survey's x, y and height are left-handed.
         template: With --pitch: the game whose markings are surveyed, such as futsal; football by
             default.
@@ -241,6 +251,10 @@ def import_command(
         "--clicks": clicks,
         "--camera": camera,
         "--lens": lens,
+        "--camera-data": camera_data,
+        "--first-frame": first_frame is not None,
+        "--freed-camera": freed_camera is not None,
+        "--zoom-table": zoom_table,
         "--left-handed": left_handed,
         "--template": template,
         "--unit": unit,
@@ -264,6 +278,17 @@ def import_command(
         _import_lenses(lens, out, camera, as_json=as_json)
     elif kind == "--clicks" and clicks is not None:
         _import_clicks(clicks, out, camera, as_json=as_json)
+    elif kind == "--camera-data" and camera_data is not None:
+        target, data = import_camera_data(
+            camera_data,
+            out,
+            camera,
+            first=first_frame,
+            number=freed_camera,
+            zoom_table=zoom_table,
+        )
+        about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
+        answer(as_json, about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, template, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
@@ -303,7 +328,14 @@ ALONE: Final = {
     ),
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
     "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
-    "--camera": ("with --clicks or --lens", ()),
+    "--camera-data": (
+        "with --out, and --camera, --first-frame, --freed-camera or --zoom-table",
+        ("--camera", "--first-frame", "--freed-camera", "--zoom-table"),
+    ),
+    "--camera": ("with --clicks, --lens or --camera-data", ()),
+    "--first-frame": ("with --camera-data", ()),
+    "--freed-camera": ("with --camera-data", ()),
+    "--zoom-table": ("with --camera-data", ()),
     "--pitch": ("with --out alone", ("--left-handed", "--template")),
     "--template": ("with --pitch", ()),
 }
@@ -314,7 +346,7 @@ def _require_alone(kind: str, given: set[str]) -> None:
     """Refuse options of another import."""
     with_what, allowed = ALONE[kind]
     others = sorted(given - {kind, *allowed})
-    if others or kind in ("--camera", "--template"):
+    if others or with_what in ("with --pitch", ALONE["--camera"][0], ALONE["--zoom-table"][0]):
         raise UsageError(
             kind,
             expected=f"{kind} {with_what}",
@@ -376,6 +408,8 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
         line(f"wrote {out / name}")
     for owner, count in found.clicks.items():
         line(f"{owner}: {count} clicks and lines")
+    for note in found.notes:
+        line(note)
     if found.mirrored is not None:
         side = "near" if found.mirrored else "far"
         line(f"places: y points to the {side} side, as the clicks show")
