@@ -95,7 +95,7 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         key_frames = _propose(inputs, pitch, clock, people, seen)
     elif given is not None and not clicked:
         file = sources["camera_data"]
-        found = given.propose_key_frames(pitch, size, settings.prior, file)
+        found = given.propose_key_frames(pitch, size, settings.prior)
         key_frames = [each.model_copy(update={"frame": start + each.frame}) for each in found]
     calibration = calibrate_broadcast(
         pitch,

@@ -13,7 +13,6 @@ from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.priors import Prior, build_prior
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.errors import InputError
 from worldpose.formats.camera_data import COLUMNS, CameraData
 from worldpose.geometry.pan_tilt import camera_angles, rotation_of_angles
 from worldpose.pitch.template import PitchTemplate
@@ -75,36 +74,26 @@ class GivenCamera:
         )
 
     def propose_key_frames(
-        self, pitch: PitchTemplate, image_size: Sequence[int], settings: BroadcastPrior, where: str
+        self, pitch: PitchTemplate, image_size: Sequence[int], settings: BroadcastPrior
     ) -> list[KeyFrame]:
         """Return key frames with the markings as these data project them; frames count from 0.
 
-        Raises:
-            InputError: no frame has angles, place and focal length.
+        There are none without angles, place and focal length.
         """
         most, each = 8, 12  # key frames, spread over the clip, and pixels of a marking
-        camera = self.camera(image_size, settings)
+        camera, found = self.camera(image_size, settings), []
         known = np.flatnonzero(np.isfinite(camera.rows).all(axis=1))
-        if not len(known):
-            raise InputError(
-                where,
-                expected="key frames, or camera data with angles, place and focal length",
-                found="camera data without place or focal length",
-                todo="Click key frames, or import the data with --zoom-table.",
-            )
-        found = []
-        for frame in known[np.unique(np.linspace(0, len(known) - 1, most).astype(int))].tolist():
+        for frame in known[np.linspace(0, len(known) - 1, min(len(known), most)).astype(int)]:
             drawn = []
             for name in (*pitch.lines, *pitch.arcs):
                 pixels = camera.camera[frame].project(pitch.marking_points(name, 0.5))
                 with np.errstate(invalid="ignore"):
                     inside = ((pixels >= 0.0) & (pixels <= camera.image_size - 1.0)).all(axis=-1)
-                pixels = pixels[inside]
-                if len(pixels) > 1:
-                    some = np.unique(np.linspace(0, len(pixels) - 1, each).astype(int))
-                    xy = tuple((u, v) for u, v in pixels[some].tolist())
-                    drawn.append(DrawnMarking(name=name, xy=xy))
-            found.append(KeyFrame(frame=frame, markings=ClickedMarkings(drawn=tuple(drawn))))
+                xy = [(u, v) for u, v in pixels[inside].tolist()]
+                if len(xy) > 1:
+                    some = tuple(xy[:: max(1, len(xy) // each)])
+                    drawn.append(DrawnMarking(name=name, xy=some))
+            found.append(KeyFrame(frame=int(frame), markings=ClickedMarkings(drawn=tuple(drawn))))
         return found
 
     def compare(self, camera: MovingCamera) -> dict[str, Floats]:

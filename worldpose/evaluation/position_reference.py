@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,6 @@ from data_contracts.arrays import Floats
 from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
-
-_HIPS = (11, 12)  # of COCO-17: they stand for the person
 
 
 def read_positions(path: Path) -> tuple[NDArray[np.int64], tuple[str, ...], Floats]:
@@ -27,34 +26,30 @@ def read_positions(path: Path) -> tuple[NDArray[np.int64], tuple[str, ...], Floa
     """
     import pandas as pd  # late: it takes half a second
 
+    ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
     try:
-        table = pd.read_csv(path).rename(columns={"frame_id": "frame", "player_id": "person"})
-        table = table.rename(columns={"x_m": "x", "y_m": "y"}).set_index("frame")
+        table = pd.read_csv(path).rename(columns=ours).set_index("frame").sort_index()
         if {"person", "x", "y"} <= {*table}:
-            keys = ["name"] if "name" in table and table["name"].notna().all() else ["person"]
-            wide = table.pivot(columns=keys[0], values=["x", "y"]).sort_index()
-            names = tuple(map(str, wide["x"].columns))
-            x, y = (wide[axis].to_numpy(np.float64) for axis in "xy")
-            shown = np.array([name != "ball" for name in names])
-        else:
-            names = tuple(c[:-2] for c in table if c.endswith("_x") and f"{c[:-2]}_y" in table)
-            wide = table.sort_index()
-            x, y = (wide[[f"{n}_{axis}" for n in names]].to_numpy(np.float64) for axis in "xy")
-            shown = np.array([name != "ball" for name in names], dtype=np.bool_)
-        frames, xy = wide.index.to_numpy(np.int64), np.stack([x, y], axis=-1)[:, shown]
-        if not xy.size or not wide.index.is_unique:
-            raise ValueError("no people" if not xy.size else "frames that occur twice")
-        reach = float(np.nanmax(np.abs(xy)))
-        if not 1.5 < reach < 200.0:
-            raise ValueError(f"places up to {reach:g}")
+            named = "name" in table and table["name"].notna().all()
+            table = table.pivot(columns="name" if named else "person", values=["x", "y"])
+            table.columns = [f"{name}_{axis}" for axis, name in table.columns]
+        names = tuple(
+            name
+            for name in (column.removesuffix("_x") for column in table if column.endswith("_x"))
+            if f"{name}_y" in table and name != "ball"
+        )
+        x, y = (table[[f"{n}_{axis}" for n in names]].to_numpy(np.float64) for axis in "xy")
+        reach = float(np.nanmax(np.abs([x, y]), initial=0.0))
+        if not 1.5 < reach < 200.0 or not table.index.is_unique:
+            raise ValueError(f"{len(names)} people at places up to {reach:g} in {len(x)} rows")
+        return table.index.to_numpy(np.int64), names, np.stack([x, y], axis=-1)
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
             str(path),
-            expected="frame_id and places of people in metres from the centre spot",
+            expected="frame_id, each once, and places of people in metres from the centre spot",
             found=say_failure(error),
             todo="Save kloppy's table: dataset.transform(...).to_df().to_csv(FILE).",
         ) from error
-    return frames, tuple(np.array(names)[shown].tolist()), xy
 
 
 def align_positions(
@@ -73,27 +68,26 @@ def align_positions(
     Raises:
         InputError: the file is invalid, or no way of its axes clearly agrees.
     """
-    most = 1.0  # largest median distance of one person in both [m]
+    most, hips = 1.0, [11, 12]  # largest median distance of one person in both [m]
     frames, names, xy = read_positions(path)
     frames = frames if first is None else frames - frames[0] + first
 
     def on_ground(frames: NDArray[np.int64], places: Floats) -> JointTracks:
         joints = np.full((*places.shape[:2], 17, 3), np.nan)
-        joints[:, :, _HIPS, :2] = places[:, :, None]
-        joints[:, :, _HIPS, 2] = np.where(np.isfinite(places[..., :1]), 0.0, np.nan)
+        joints[:, :, hips, :2] = places[:, :, None]
+        joints[:, :, hips, 2] = np.where(np.isfinite(places[..., :1]), 0.0, np.nan)
         return JointTracks(frames, np.arange(places.shape[1]), joints)
 
-    middle = prediction.joints[:, :, _HIPS, :2].mean(axis=2)
-    mine = replace(on_ground(prediction.frames, middle), person_ids=prediction.person_ids)
+    mine = on_ground(prediction.frames, prediction.joints[:, :, hips, :2].mean(axis=2))
+    mine = replace(mine, person_ids=prediction.person_ids)
     seen = select_frames(mine.joints, mine.frames, frames)
     found = []
     for way in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
         turned = on_ground(frames, xy * way)
         apart = joint_distances(seen, turned.joints)
         nearest = apart.min(axis=1, initial=np.inf)
-        known = np.isfinite(nearest)
-        off = float(np.median(nearest[known])) if known.any() else np.inf
-        found.append((off, way, turned, apart))
+        known = nearest[np.isfinite(nearest)]
+        found.append((float(np.median(known)) if len(known) else np.inf, way, turned, apart))
     (best, way, turned, apart), (second, *_) = sorted(found, key=lambda each: each[0])[:2]
     if not best < min(most, 0.5 * second):
         raise InputError(
@@ -102,23 +96,15 @@ def align_positions(
             found=f"median distances of {best:.2f} and {second:.2f} m, the two best ways",
             todo="State the match frame of the first row: --first-frame NUMBER.",
         )
-    notes = (
-        []
-        if way == (1.0, 1.0)
-        else ["axes of the positions are turned: {:+g} x, {:+g} y".format(*way)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of people who share no frame
+        off = np.nanmedian(np.where(np.isfinite(apart), apart, np.nan), axis=0)
+    off = np.where(off < most, off, np.inf)
+    pairs = (
+        (person, int(row.argmin())) for person, row in zip(mine.person_ids, off.T, strict=True)
     )
-    apart[~np.isfinite(apart)] = np.nan
-    with np.errstate(invalid="ignore"):
-        middle_off = np.array([[_median(each) for each in row] for row in apart.transpose(2, 1, 0)])
-    players = {
-        int(person): names[int(np.nanargmin(off))]
-        for person, off in zip(mine.person_ids, middle_off, strict=True)
-        if np.nanmin(off, initial=np.inf) < most
-    }
-    said = ", ".join(f"{person}: {name}" for person, name in players.items())
-    return mine, turned, [*notes, f"people: {{{said}}}"]
-
-
-def _median(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else np.inf
+    said = (f"{person}: {names[n]}" for p, (person, n) in enumerate(pairs) if off[n, p] < most)
+    notes = [f"people: {{{', '.join(said)}}}"]
+    if way != (1.0, 1.0):
+        notes.insert(0, "axes of the positions: {:+g} x, {:+g} y".format(*way))
+    return mine, turned, notes

@@ -220,7 +220,7 @@ def camera_data(true, pan_off=0.0, focal=1.0):
 
 def calibrate_given(given, pictures, keys=None):
     size = pictures[0].shape[::-1]
-    proposed = given.propose_key_frames(clip.PITCH, size, SETTINGS.prior, "clip")
+    proposed = given.propose_key_frames(clip.PITCH, size, SETTINGS.prior)
     found = BroadcastClip(
         keys or proposed, lambda: iter(pictures), FPS, proposed=not keys, given=given
     )
@@ -245,7 +245,7 @@ def test_paint_refuses_camera_data_of_another_view(true, pictures):
 def test_key_frames_overrule_camera_data_that_contradict_them(calibrated, true, pictures):
     keys = [clicks(true, 3), clicks(true, 12)]
     given = camera_data(true, pan_off=20.0, focal=np.nan)
-    with pytest.raises(InputError, match="without place or focal length"):
+    with pytest.raises(InputError, match=r"found no key frame.*or import camera data"):
         calibrate_given(given, pictures)
     found = calibrate_broadcast(
         clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS, given=given), SETTINGS
