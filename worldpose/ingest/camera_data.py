@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,13 +63,17 @@ def import_camera_data(
     if zoom_table is not None:
         data = apply_zoom_table(data, zoom_table, footage_size(match.spec, view))
     images = image_clock(match.spec, view).images
-    if not np.isin(data.frame, images).any():
+    missing = int((~np.isin(images, data.frame)).sum())
+    if missing == len(images):
         raise InputError(
             str(file),
             expected=f"frames {images[0]} to {images[-1]} of the video of {view}",
             found=f"frames {data.frame[0]} to {data.frame[-1]}",
             todo="State the video's frame of the first row: --first-frame NUMBER.",
         )
+    if missing:
+        note = f"{missing} of {len(images)} images of {view} have no camera data"
+        data = replace(data, notes=(*data.notes, note))
     target.parent.mkdir(exist_ok=True)
     with whole_file(target) as draft:
         write_camera_data(draft, data)
