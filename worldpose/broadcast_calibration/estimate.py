@@ -132,6 +132,13 @@ def track(
             found=f"{sorted(key.frame for key in key_frames)}",
             todo="Put all clicks of a frame into one entry.",
         )
+    if not key_frames:
+        raise InputError(
+            where,
+            expected="a key frame in the clip, or camera data with angles, place and focal length",
+            found="none",
+            todo="Click points in a frame that shows an area's corners or the centre circle.",
+        )
     kept: dict[int, Image] = {}
     followed = follow(
         _keep_frames(clip.pictures(), wanted, kept), clip.moving_boxes, settings.flow_points

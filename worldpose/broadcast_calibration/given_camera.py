@@ -82,7 +82,7 @@ class GivenCamera:
         """
         most, each = 8, 12  # key frames, spread over the clip, and pixels of a marking
         camera, found = self.camera(image_size, settings), []
-        known = np.flatnonzero(np.isfinite(camera.rows).all(axis=1))
+        known = np.flatnonzero(~np.isnan(camera.rows).any(axis=1))
         for frame in known[np.linspace(0, len(known) - 1, min(len(known), most)).astype(int)]:
             drawn = []
             for name in (*pitch.lines, *pitch.arcs):
@@ -130,7 +130,7 @@ class GivenCamera:
         ]
         zoom, known = self.values[:, 9], np.isfinite(self.values[:, 9])
         if known.any() and np.ptp(zoom[known]) > 0.0:
-            ranks = (np.argsort(np.argsort(each[known])) for each in (zoom, camera.focal))
-            agree = float(np.corrcoef(*ranks)[0, 1])
+            ranks = [np.argsort(np.argsort(each[known])) for each in (zoom, camera.focal)]
+            agree = float(np.corrcoef(ranks[0], ranks[1])[0, 1])
             sentences.append(f"rank correlation of zoom counts and focal length: {agree:+.3f}")
         return sentences

@@ -277,8 +277,7 @@ def _calibrate_each(
             where,
             expected="a key frame that determines a camera",
             found="; ".join(refused.values()) or "no key frame",
-            todo="Click points in frames that show an area's corners or the centre circle, or "
-            "import camera data with place and focal length.",
+            todo="Click points in frames that show an area's corners or the centre circle.",
         )
     return found, refused
 

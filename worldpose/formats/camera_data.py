@@ -134,7 +134,7 @@ _TITLES: Final[Mapping[str, str]] = {
 _KNOWN: Final = {
     *("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y"),
 }
-_METRES: Final = {None: 1.0, **{unit: metres for unit, (metres, _) in UNITS.items()}}
+_METRES: Final[Mapping[str, float]] = {"": 1.0} | {unit: each[0] for unit, each in UNITS.items()}
 
 
 def _read_columns(
@@ -148,7 +148,7 @@ def _read_columns(
     for place, title in enumerate(rows[0][1] if rows else ()):
         text = re.sub(r"[^a-z0-9]+", "_", title.lower()).strip("_").removesuffix("_deg")
         axis = re.fullmatch(r"(?:pos_|position_)?([xyz])(?:_([a-z]+))?", text)
-        factor = _METRES.get(axis[2], 0.0) if axis else 1.0
+        factor = _METRES.get(axis[2] or "", 0.0) if axis else 1.0
         name = f"{axis[1]}_m" if axis and factor else _TITLES.get(text, text)
         cells = [row[place].strip() if place < len(row) else "" for _, row in rows[1:]]
         where = f"{path}: column {title}"
