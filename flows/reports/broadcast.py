@@ -102,7 +102,7 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
 
 
 def _given_curves(
-    match: Match, view: str, images: NDArray[np.integer]
+    match: Match, view: str, images: NDArray[np.int64]
 ) -> dict[str, NDArray[np.float64]] | None:
     """Return the curves of a view's camera data at images (frames,); None without data."""
     if view not in match.folder.camera_data:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.broadcast_calibration import KeyFrame
@@ -36,22 +36,23 @@ class GivenCamera:
         values[inside] = data.values[np.searchsorted(data.frame, images[inside])]
         return cls(values)
 
-    def camera(self, image_size: Sequence[int], settings: BroadcastPrior) -> MovingCamera:
+    def camera(self, image_size: ArrayLike, settings: BroadcastPrior) -> MovingCamera:
         """Return the camera, with roll 0, the median center and the usual lens if not stated."""
-        lens = build_prior(settings, self.values[:, 6], np.array(image_size)).distortion
+        size = np.asarray(image_size, dtype=np.int64)
+        lens = build_prior(settings, self.values[:, 6], size).distortion
         lens[:, :2] = np.where(np.isfinite(self.values[:, 7:9]), self.values[:, 7:9], lens[:, :2])
         center = self.values[np.isfinite(self.values[:, 3:6]).all(axis=1), 3:6]
         pan, tilt, roll = self.values[:, :3].T
         return MovingCamera(
             center=np.median(center, axis=0) if len(center) else np.full(3, np.nan),
-            principal_point=0.5 * (np.array(image_size) - 1.0),
+            principal_point=0.5 * (size - 1.0),
             rotation=rotation_of_angles(pan, tilt, np.nan_to_num(roll)),
             focal=self.values[:, 6],
             distortion=lens,
-            image_size=np.array(image_size),
+            image_size=size,
         )
 
-    def add_to(self, prior: Prior, image_size: Sequence[int], settings: BroadcastPrior) -> Prior:
+    def add_to(self, prior: Prior, image_size: ArrayLike, settings: BroadcastPrior) -> Prior:
         """Return a prior of the clip's frames with these data.
 
         Their errors last for the whole clip, so that its frames count as one together.
@@ -74,7 +75,7 @@ class GivenCamera:
         )
 
     def propose_key_frames(
-        self, pitch: PitchTemplate, image_size: Sequence[int], settings: BroadcastPrior
+        self, pitch: PitchTemplate, image_size: ArrayLike, settings: BroadcastPrior
     ) -> list[KeyFrame]:
         """Return key frames with the markings as these data project them; frames count from 0.
 
