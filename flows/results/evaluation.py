@@ -144,6 +144,9 @@ def score(
             fps=fps or (None if spec is None else spec.fps),
             camera=None if match_in is None else true_cameras[match_in],
         )
+    if placed:  # hips alone tell nothing of the challenge's joints
+        names = ("challenge_score", "challenge_global_m", "challenge_local_m")
+        evaluation = evaluation.model_copy(update=dict.fromkeys(names))
     errors, cameras = evaluate_cameras(estimate.cameras, true_cameras, _pitch(match))
     if not cameras and not people and evaluation.frames is None:
         raise UsageError(
