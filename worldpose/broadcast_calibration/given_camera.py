@@ -45,7 +45,7 @@ class GivenCamera:
         pan, tilt, roll = self.values[:, :3].T
         return MovingCamera(
             center=np.median(center, axis=0) if len(center) else np.full(3, np.nan),
-            principal_point=0.5 * (size - 1.0),
+            principal_point=np.asarray(0.5 * (size - 1.0), dtype=np.float64),
             rotation=rotation_of_angles(pan, tilt, np.nan_to_num(roll)),
             focal=self.values[:, 6],
             distortion=lens,
