@@ -90,6 +90,7 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         key_frames = _propose(inputs, pitch, clock, people, seen)
     elif given is not None and not clicked:
         file, key_frames = sources["camera_data"], projected
+        given = replace(given, leads=True)
     calibration = calibrate_broadcast(
         pitch,
         BroadcastClip(

@@ -252,6 +252,10 @@ def refine(
     )
     report = report_calibration(tracked, fit, pitch, settings, clip.first)
     if given is not None:
+        every = np.arange(len(solution.camera))
+        denied = (
+            given.contradiction(solution.camera, every, settings.prior) if given.leads else denied
+        )
         report = _report_given(clip, given, denied, report, solution.camera)
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
 
@@ -269,11 +273,12 @@ def _report_given(
         InputError: the camera rests on the data alone, and the paint does not confirm them.
     """
     confirmed = float(np.mean(report.marking_count >= 30))
-    if clip.proposed and confirmed < 0.5:
+    if given.leads and (confirmed < 0.5 or denied):
         raise InputError(
             clip.where,
             expected="painted lines where the camera data project them",
-            found=f"them in {100.0 * confirmed:.0f} % of the frames",
+            found=f"them in {100.0 * confirmed:.0f} % of the frames, and differences of the data "
+            f"from the paint of {denied or 'no weight'}",
             todo="Check axes, signs and first frame of the camera data, or click key frames.",
         )
     reason = f"camera data contradict the key frames, and are no prior: {denied}"

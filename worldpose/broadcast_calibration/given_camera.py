@@ -24,9 +24,11 @@ class GivenCamera:
 
     Attributes:
         values: (frames, 10) as `worldpose.formats.camera_data.COLUMNS`; NaN where not stated.
+        leads: whether the key frames of the clip come from these data.
     """
 
     values: Floats
+    leads: bool = False
 
     @classmethod
     def of(cls, data: CameraData, images: Integers) -> GivenCamera:
@@ -111,7 +113,7 @@ class GivenCamera:
         }
 
     def contradiction(self, keys: MovingCamera, frames: Integers, settings: BroadcastPrior) -> str:
-        """Return how these data contradict key frames, beyond three deviations; empty = not."""
+        """Return how these data contradict cameras of frames, beyond three deviations."""
         limits = [settings.given_rotation_std_deg] * 3
         limits += [100.0 * settings.given_log_focal_std, settings.given_center_std_m]
         compared = GivenCamera(self.values[frames]).compare(keys).items()

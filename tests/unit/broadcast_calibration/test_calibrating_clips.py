@@ -211,13 +211,13 @@ def test_without_any_paint_players_hold_the_camera(true, bare):
     assert np.median(place_errors(held.camera, true)) < np.median(place_errors(alone.camera, true))
 
 
-def camera_data(true, pan_off=0.0, focal=1.0):
+def camera_data(true, pan_off=0.0, focal=1.0, leads=False):
     """Camera data with an offset of the pan [deg], counts of the zoom, and no k1 and k2."""
     values = np.full((FRAMES, 10), np.nan)
     values[:, :3] = np.stack(camera_angles(true.camera), axis=1) + [pan_off, 0.0, 0.0]
     values[:, 3:6] = true.center + [0.2, -0.1, 0.1]
     values[:, 6], values[:, 9] = focal * true.focal, 9e4 - true.focal
-    return GivenCamera(values)
+    return GivenCamera(values, leads)
 
 
 def calibrate_given(given, pictures, keys=None):
@@ -230,7 +230,7 @@ def calibrate_given(given, pictures, keys=None):
 
 
 def test_camera_data_start_a_clip_without_clicks_and_are_compared(true, pictures):
-    found = calibrate_given(camera_data(true, pan_off=0.1, focal=1.005), pictures)
+    found = calibrate_given(camera_data(true, 0.1, 1.005, leads=True), pictures)
     errors = place_errors(found.camera, true)
     assert np.median(errors) < 0.7
     said = " ".join(found.report.decisions)
@@ -241,9 +241,10 @@ def test_camera_data_start_a_clip_without_clicks_and_are_compared(true, pictures
     assert not any("camera data" in reason for reason in found.report.reasons)
 
 
-def test_paint_refuses_camera_data_of_another_view(true, pictures):
+@pytest.mark.parametrize("pan_off", [2.0, 4.0])
+def test_paint_refuses_camera_data_of_another_view(true, pictures, pan_off):
     with pytest.raises(InputError, match=r"painted lines where the camera data project them"):
-        calibrate_given(camera_data(true, pan_off=4.0), pictures)
+        calibrate_given(camera_data(true, pan_off, leads=True), pictures)
 
 
 def test_key_frames_overrule_camera_data_that_contradict_them(calibrated, true, pictures):
