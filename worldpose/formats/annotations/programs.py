@@ -251,7 +251,7 @@ class Answer(Given):
 
     result: tuple[dict[str, Any], ...] = ()
     was_cancelled: bool = False
-    ground_truth: bool = False
+    ground_truth: bool | None = None
 
     @classmethod
     def choose(cls, given: Sequence[Answer]) -> Answer:
