@@ -59,7 +59,7 @@ def camera_table(run: Run, spec: MatchSpec) -> Table:
         rows.append(
             (
                 camera.id,
-                _origin(run[unit].attrs),
+                _origin(run[unit].attrs) if unit in run else _ORIGINS["none"],
                 format_scaled(figures.get("expected_ground_error_median_m"), 1000.0, 1),
                 format_scaled(figures.get("expected_ground_error_p95_m"), 1000.0, 1),
                 format_scaled(figures.get("reprojection_rms_px"), 1.0, 2),
@@ -82,8 +82,9 @@ def _origin(attributes: Mapping[Any, Any]) -> str:
 def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
     """Return why a person should check a camera: the reason it was left out, or why it is weak."""
     left_out = run.record.left_out.get(camera_id)
-    weak = run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ()
-    return tuple(weak) if left_out is None else (f"left out: {left_out}",)
+    if left_out is not None:
+        return (f"left out: {left_out}",)
+    return tuple(run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ())
 
 
 def health_picture(run: Run, match: Match, clip: str) -> list[CaptionedImage]:
@@ -235,8 +236,7 @@ def proposal_evidence(
 
 
 def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
-    result = run[unit]
-    if "point_inlier" not in result:
+    if unit not in run or "point_inlier" not in (result := run[unit]):
         return ()
     wrong = ~result["point_inlier"].values
     return tuple(str(name) for name in result["point"].values[wrong])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -55,6 +55,8 @@ class MatchFolder:
         lenses: given lenses without a pose, by id of a static camera; may lack some.
         estimates: monocular body estimates, by name of a broadcast view; may lack some.
         boxes: given boxes of people, by id or name of a video; may lack some.
+        camera_data: what a tracking system states about the camera, by name of a broadcast view;
+            may lack some.
     """
 
     folder: Path
@@ -69,6 +71,7 @@ class MatchFolder:
     lenses: Mapping[str, LensCalibration] = field(default_factory=dict)
     estimates: Mapping[str, Path] = field(default_factory=dict)
     boxes: Mapping[str, Path] = field(default_factory=dict)
+    camera_data: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def to_click(self) -> tuple[str, ...]:
@@ -102,16 +105,18 @@ class MatchFolder:
 
     @property
     def calibrated_views(self) -> tuple[str, ...]:
-        """Broadcast views with a video whose key frames are clicked or proposed."""
-        known = {*self.key_frames, *self.proposed_views} & self.videos.keys()
+        """Broadcast views with a video whose key frames are clicked, proposed or given."""
+        given = () if self.pitch is None else self.camera_data
+        known = {*self.key_frames, *self.proposed_views, *given} & self.videos.keys()
         return tuple(name for name in self.spec.broadcast_views if name in known)
 
 
-def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
+def read_match(folder: str | os.PathLike[str], known: Container[str] = ()) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
     Args:
         folder: contains match.yaml and the files that it names.
+        known: paths in the folder of videos that may be gone, as their results are at hand.
 
     Raises:
         InputError: the folder is unreadable (its disk is not mounted, or this user has no
@@ -120,7 +125,7 @@ def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
     """
     folder = Path(folder)
     with reachable(folder):
-        return _read_match(folder)
+        return _read_match(folder, known)
 
 
 def read_spec(folder: Path) -> MatchSpec:
@@ -141,7 +146,7 @@ def read_spec(folder: Path) -> MatchSpec:
     return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
-def _read_match(folder: Path) -> MatchFolder:
+def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
     spec = read_spec(folder)
     if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
@@ -151,7 +156,7 @@ def _read_match(folder: Path) -> MatchFolder:
             todo=f"Add the static cameras, or `broadcast: {spec.cameras[0].id}` to a clip.",
         )
     detections = _detections(folder, spec)
-    videos = _videos(folder, spec)
+    videos = _videos(folder, spec, known)
     _require_one_view(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
@@ -167,8 +172,9 @@ def _read_match(folder: Path) -> MatchFolder:
         stills=_stills(folder, spec),
         key_frames=read_key_frames(folder, spec, pitch),
         lenses=_lenses(folder, spec, calibrations),
-        estimates=_estimates(folder, spec),
+        estimates=_estimates(folder, spec, ".npz"),
         boxes=_boxes(folder, videos, detections),
+        camera_data=_estimates(folder, spec, CAMERA_DATA),
     )
 
 
@@ -305,8 +311,17 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     return files_by_unit(folder, "detections", (".json", ".npz"), known, units)
 
 
-def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    return files_by_unit(folder, "estimates", (".npz",), spec.broadcast_views, BROADCAST_FILES)
+CAMERA_DATA: Final = ".csv"
+"""Ending of files of camera data in `estimates/`."""
+
+
+def camera_data_file(view: str) -> str:
+    """Return the path of a broadcast view's camera data, relative to the match folder."""
+    return f"estimates/{view}{CAMERA_DATA}"
+
+
+def _estimates(folder: Path, spec: MatchSpec, suffix: str) -> dict[str, Path]:
+    return files_by_unit(folder, "estimates", (suffix,), spec.broadcast_views, BROADCAST_FILES)
 
 
 def _boxes(
@@ -317,24 +332,32 @@ def _boxes(
     return files_by_unit(folder, "boxes", (".txt",), known, units)
 
 
-def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
+def _videos(folder: Path, spec: MatchSpec, known: Container[str]) -> dict[str, Path]:
+    def is_there(usual: str) -> bool:
+        return usual in known or find_file(folder, usual).exists()
+
+    def path_of(name: str, where: str, *, folders: bool = False) -> Path:
+        if name in known and not find_file(folder, name).exists():
+            return folder / name
+        return existing_file(folder, name, where, folders=folders)
+
     videos: dict[str, Path] = {}
     named: dict[str, Path] = {}
     for index, camera in enumerate(spec.cameras):
         if camera.video is not None:
             where = f"{folder / 'match.yaml'}: cameras[{index}].video"
-            named[camera.id] = existing_file(folder, camera.video, where, folders=True)
+            named[camera.id] = path_of(camera.video, where, folders=True)
     for camera in spec.static_cameras:
         usual = f"videos/{camera.id}.mp4"
         if camera.id in named:
             videos[camera.id] = named[camera.id]
-        elif find_file(folder, usual).exists():
-            videos[camera.id] = existing_file(folder, usual, str(folder))
+        elif is_there(usual):
+            videos[camera.id] = path_of(usual, str(folder))
     for name, view in spec.broadcast_views.items():
         usual = f"broadcast/{name}.mp4"
         _require_own_video(folder, name, view.clip)
-        if find_file(folder, usual).exists():
-            videos[name] = existing_file(folder, usual, str(folder))
+        if is_there(usual):
+            videos[name] = path_of(usual, str(folder))
         elif view.camera.id in named:
             videos[name] = named[view.camera.id]
     return videos
