@@ -82,7 +82,7 @@ def write_recording(
 
 def split_at_gaps(line: Floats) -> list[Floats]:
     """Return the parts of a line (n, 2) of two points or more, none of which is missing."""
-    runs = find_runs(np.isfinite(line).all(-1))
+    runs = find_runs(np.asarray(np.isfinite(line).all(-1)))
     return [line[run] for run in runs if run.stop - run.start > 1]
 
 
