@@ -28,6 +28,7 @@ from registry import DATA, Table, Tables, benchmark, option
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrames
+from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.key_frames import propose_key_frames
 from worldpose.broadcast_calibration.report import BroadcastCalibration
@@ -355,8 +356,8 @@ def calibrate(data: Path, *, proposed: bool = False) -> BroadcastCalibration:
 
 def estimated_pitch(found: BroadcastCalibration) -> PitchTemplate:
     """Return the pitch with the size and the markings that the fit shows."""
-    spec = found.report.pitch.spec
-    return PitchTemplate.standard() if spec is None else PitchTemplate.from_spec(spec)
+    keys: dict[str, Any] = found.report.pitch.keys or {}
+    return PitchTemplate.from_spec(PitchSpec.model_validate({**keys, "any_size": True}))
 
 
 def estimated_surface(found: BroadcastCalibration) -> PitchTemplate:

@@ -35,6 +35,12 @@ class ClipArray(Protocol):
         """Return the values of some frames."""
 
 
+def find_runs(flags: NDArray[np.bool_]) -> list[slice]:
+    """Return the intervals in which flags (n,) are set."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
 Missing = Literal["nan", "-1", "0", "none"]
 
 CHUNK_BYTES = 1 << 20

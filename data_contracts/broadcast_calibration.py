@@ -130,7 +130,7 @@ BROADCAST_CALIBRATION = GroupLayout(
         "pitch": "the pitch that the fit shows: `length`, `width`, `crown`, `end_fall` and "
         "`points` as in pitch.json, and `std_m` of the first four, 0 where they are given; null if "
         "all is given",
-        "noise": "`paint_m`, the spread of markings without survey about the Laws, and the "
+        "noise": "`paint_m`, the spread of markings without survey about the rules, and the "
         "deviations of samples of `lines` and of `clicks` over their assumed ones",
         "decisions": "choices made, with the metrics that decided",
         "reasons": "reasons for a manual review; empty if none is needed",

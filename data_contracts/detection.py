@@ -12,11 +12,20 @@ from data_contracts.keypoints import (
     POINT_ATTRIBUTE,
 )
 
+IMAGE_ARRAYS = array_layouts(
+    """
+    brightness (*frame) float32 [1], missing nan:
+        mean of the image, of 255
+    sharpness (*frame) float32 [1], missing nan:
+        mean difference of neighbouring pixels of a row, of 255
+    """
+)
+
 DETECTION = GroupLayout(
     stage="detection",
     about="2D poses detected in one camera's video, by match frame, in the layout of `ingest`.",
     coordinates=(FRAME,),
-    arrays=(*KEYPOINT_ARRAYS, *EXTRA_ARRAYS),
+    arrays=(*KEYPOINT_ARRAYS, *EXTRA_ARRAYS, *IMAGE_ARRAYS),
     labels=KEYPOINT_LABELS,
     attributes={
         "camera_id": "camera of the match, or broadcast view",

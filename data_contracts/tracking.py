@@ -72,7 +72,7 @@ class Track(Record):
 
 
 class Join(Record):
-    """Two tracks that are, or may be, one person."""
+    """Two tracks that are, or may be, one person; or a track that may pass to another person."""
 
     before: PersonId
     """Person of the track that stops."""

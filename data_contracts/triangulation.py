@@ -18,6 +18,21 @@ EXCHANGED_PARTS = {
 """Parts of a body whose left and right sides a detector swaps together, and their joints."""
 
 
+HEALTH_MEASURES = (
+    "misfit",
+    "shift_px",
+    "clock_frames",
+    "unmatched",
+    "missing",
+    "brightness",
+    "sharpness",
+)
+"""Health of a camera: robust loss of its keypoints about the people whom all cameras place, 1 as
+expected; shift of its view and clock offset as these people show them, whom the camera itself
+displaces; share of its detections that no person has, of its frames without an image; brightness
+and contrast of edges [0 to 255]."""
+
+
 CLOCK_CHANGE = "clock_change_frames."
 """Metric of a camera whose clock changes within the clip."""
 
@@ -106,6 +121,10 @@ _ARRAYS = array_layouts(
         missing without enough motion
     clock_error (camera) float64 [frame]:
         standard error of `clock_late`
+    health (bin, camera, measure) float32 [1], missing nan:
+        health of each camera over time; a measure whose name ends in a unit is in that
+    health_frame (bin) int64 [frame]:
+        first match frame of each bin
     """
 )
 
@@ -118,6 +137,7 @@ TRIANGULATION = GroupLayout(
         "joint": COCO17,
         "part": tuple(EXCHANGED_PARTS),
         "axis": ("x", "y"),
+        "measure": HEALTH_MEASURES,
         "coordinate": ("x", "y", "z"),
         "coordinate_": ("x", "y", "z"),
     },

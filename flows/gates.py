@@ -157,6 +157,9 @@ class JointLimits(Record):
     equal errors along all axes, sqrt(3) times the standard deviation along one."""
     filled_share: float = Field(default=0.05, ge=0)
     """Share of joints filled by the motion model alone [1]."""
+    unhealthy_share: float = Field(default=0.05, ge=0)
+    """Share of the clip in which a camera's keypoints depart from people, its images are missing,
+    dark, bright or blurred; of the worst camera [1]."""
 
 
 class AdjustmentLimits(Record):
@@ -246,7 +249,7 @@ GATES: Final[Mapping[str, Gate]] = {
         ),
         Gate(
             "triangulation",
-            "Are the joints where the images show them?",
+            "Are the joints where the images show them, and are the cameras healthy?",
             JointLimits(),
             warned=("standard_deviation_m",),
         ),

@@ -237,7 +237,7 @@ def _figures(report: BroadcastReport, rate: float) -> dict[str, float]:
     }
     offset = report.feed_offset
     if offset is not None and offset.determined:
-        figures["feed_offset_frames"] = offset.frames / rate
+        figures["feed_offset_frames"] = offset.frames
     for name, value, std in zip(SIZES, report.pitch.size, report.pitch.size_std, strict=True):
         if std > 0.0:
             figures |= dict(zip(SIZE_METRICS[name], (float(value), float(std)), strict=True))

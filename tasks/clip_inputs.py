@@ -299,10 +299,14 @@ def known_changes(inputs: UnitInputs, clip: str) -> list[CameraChange]:
 
 
 def open_tracked_clip(
-    inputs: UnitInputs, *, filtered: bool = True, shifted: bool = True
+    inputs: UnitInputs,
+    *,
+    filtered: bool = True,
+    shifted: bool = True,
+    further: Sequence[CameraChange] = (),
 ) -> ClipInputs:
     """Open the unit's clip with its tracked people that are triangulated; as `open_clip`."""
-    clip = open_clip(inputs, filtered=filtered, shifted=shifted)
+    clip = open_clip(inputs, filtered=filtered, shifted=shifted, further=further)
     tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
     people = clip.detections.assign_people(tracks["detection_index"].values)
     if "clocks" in inputs.sources:

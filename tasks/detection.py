@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
-from data_contracts.arrays import Image
-from data_contracts.detection import DETECTION
+from data_contracts.arrays import Image, Singles
+from data_contracts.detection import DETECTION, IMAGE_ARRAYS
 from data_contracts.keypoints import KeypointDetections
 from tasks.unit import Spool, UnitInputs, unit_task
 from worldpose.detection.interfaces import People
@@ -53,7 +53,7 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
             result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
         result.write(
             DETECTION,
-            arrays=detections.arrays(),
+            arrays=detections.arrays() | found.images,
             coordinates={"frame": detections.frame},
             attributes={
                 "camera_id": inputs.sources["camera"],
@@ -69,12 +69,14 @@ class _Found:
 
     Attributes:
         detections: detected people.
+        images: `IMAGE_ARRAYS` of the frames, by name.
         unreadable: [first, last] of each interval of frames without an image.
         figures: metrics.
         warnings: sentences without the unit and the full stop.
     """
 
     detections: KeypointDetections
+    images: dict[str, Singles]
     unreadable: list[list[int]]
     figures: dict[str, float]
     warnings: tuple[str, ...]
@@ -121,7 +123,8 @@ def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
         return None
     stored, manifest = published
     detections = KeypointDetections.from_arrays(stored)
-    return _Found(detections, stored.attrs["unreadable"], dict(manifest.figures), ())
+    images = {array.name: stored[array.name].values for array in IMAGE_ARRAYS}
+    return _Found(detections, images, stored.attrs["unreadable"], dict(manifest.figures), ())
 
 
 def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
@@ -136,8 +139,8 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
         landmarks := load_landmarks(settings),
     )
     require_weights(settings, inputs.sources["weights"])
-    most = 0
-    for chunk in finder.find(_read_frames(inputs), _open_place(inputs), given):
+    most, quality = 0, list[tuple[float, float]]()
+    for chunk in finder.find(_read_frames(inputs, quality), _open_place(inputs), given):
         spool.add(chunk.arrays())
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     inputs.require_registered("video")
@@ -157,6 +160,10 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
                 **({} if landmarks is None else {"point": landmarks.points}),
             }
         ),
+        {
+            array.name: np.array(values, dtype=np.float32)
+            for array, values in zip(IMAGE_ARRAYS, zip(*quality, strict=True), strict=True)
+        },
         stretches(np.array(report.unreadable, dtype=np.int64)),
         {
             "frames": report.frames,
@@ -202,8 +209,13 @@ def _given_people(inputs: UnitInputs) -> dict[int, People]:
     }
 
 
-def _read_frames(inputs: UnitInputs) -> Iterator[tuple[int, Image | None]]:
-    """Yield every match frame of the clip with its image, decoded once and in order."""
+def _read_frames(
+    inputs: UnitInputs, quality: list[tuple[float, float]]
+) -> Iterator[tuple[int, Image | None]]:
+    """Yield every match frame of the clip with its image, decoded once and in order.
+
+    Brightness and sharpness of each are added to `quality`.
+    """
     footage, frames = inputs.open(f"ingest/{inputs.sources['camera']}"), inputs.frames
     numbers = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
     there = numbers[numbers >= 0]
@@ -215,7 +227,16 @@ def _read_frames(inputs: UnitInputs) -> Iterator[tuple[int, Image | None]]:
                 at, picture = next(shown)
                 if at == number:
                     break
+            quality.append(measure_image(picture))
             yield frame, picture
+
+
+def measure_image(picture: Image | None) -> tuple[float, float]:
+    """Return brightness and sharpness of an image (height, width, 3), as of `IMAGE_ARRAYS`."""
+    if picture is None:
+        return np.nan, np.nan
+    rows = picture[::16, :, 1].astype(np.float32)  # a few rows tell as much as all
+    return float(rows.mean()), float(np.abs(np.diff(rows, axis=1)).mean())
 
 
 def footage_index(footage: xr.Dataset) -> FrameIndex:

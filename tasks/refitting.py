@@ -160,10 +160,11 @@ class _BroadcastView:
         if self.estimates is None:
             return rays, None
         seen = place_monocular_poses(self.estimates, camera, clock.number, then)
-        orient, angles = (
-            clock.to_frames(each, self.late, whole=True) for each in (seen.orient, seen.angles)
+        orient, angles, height = (
+            clock.to_frames(each, self.late, whole=True)
+            for each in (seen.orient, seen.angles, seen.height)
         )
-        return rays, MonocularPoses(orient, angles)
+        return rays, MonocularPoses(orient, angles, height)
 
 
 def _known_shapes(

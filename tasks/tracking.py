@@ -46,6 +46,7 @@ from worldpose.tracking.tracker import Tracking, track_people
 from worldpose.triangulation.camera_changes import (
     change_record,
     describe_change,
+    is_same_change,
     refine_change,
 )
 from worldpose.triangulation.lost_views import find_lost_views
@@ -151,7 +152,7 @@ def _track_people(inputs: UnitInputs) -> Tracked:
         joints=tracks.joints,
         on_plane=np.zeros(tracks.joints.shape[:2], dtype=np.bool_),
         names={},
-        joins=tracks.joins,
+        joins=(*tracks.joins, *(each.join for each in tracks.takeovers)),
         changes=changes,
     )
     figures = figures_of(tracks.report, clip.camera_ids)
@@ -223,9 +224,13 @@ def _follow_changes(
             clip = open_clip(inputs, further=changes)
         lost = find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
         found = [change_record(each, clip.camera_ids[each.found.camera], frame) for each in lost]
-        known = {change.camera for change in changes}
-        views = [each for each in found if each.kind == "view" and each.camera not in known]
-        if not views:
+        views = [
+            each
+            for each in found
+            if each.kind == "view"
+            and not any(is_same_change(known, each, clip.fps) for known in changes)
+        ]
+        if not views or len(changes) >= 2 * len(clip.camera_ids):
             return clip, tracks, (*changes, *(each for each in found if each.kind == "clock"))
         changes.append(views[0])
         clip = open_clip(inputs, further=changes)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import GroupLayout
 from data_contracts.triangulation import (
     CLOCK_CHANGE,
+    HEALTH_MEASURES,
     RETRIANGULATION,
     TRIANGULATION,
     CameraChange,
@@ -21,21 +23,27 @@ from tasks.clip_inputs import (
     ClipInputs,
     known_changes,
     open_tracked_clip,
+    select_frames,
     triangulation_settings,
 )
 from tasks.unit import UnitInputs, figures_of, unit_task
-from worldpose.camera_consistency.changes import Kind, find_changes
-from worldpose.camera_consistency.health import CameraHealth
+from worldpose.camera_consistency.changes import Change, Kind, find_changes
+from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.camera_changes import (
     change_record,
     describe_change,
     explain_changes,
     is_same_change,
+    join_changes,
+    measure_departures,
 )
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
+
+UNHEALTHY: Final = "unhealthy_share"
+"""Metric: share of the clip in which a camera is not healthy, of the worst one [1]."""
 
 
 @unit_task
@@ -82,17 +90,17 @@ def _write_joints(
         )
         for part in chunks:
             spool.add(_part_arrays(part.triangulation, part.smoothing))
-            if kinds:
-                seen = detections[rows[part.frames]]
-                health.add(clip.cameras, seen, part.triangulation.joints, part.frames.start)
+            seen = detections[rows[part.frames]]
+            health.add(clip.cameras, seen, part.triangulation.joints, part.frames.start)
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
-        known = known_changes(inputs, inputs.unit)
-        found = _find_changes(clip, health, kinds, settings, rows, known, result)
+        measured = _health_arrays(inputs, clip, health, rows, result)
+        found = _find_changes(inputs, clip, health, kinds, settings, rows, result)
         result.write(
             layout,
             arrays=spool.arrays()
             | {"clock_late": model.clocks.late, "clock_error": model.clocks.standard_error}
+            | measured
             | _bias_arrays(model.detector, clip.detections.points, settings),
             coordinates={"frame": detections.frame[::stride], "person": clip.person},
             attributes={
@@ -103,17 +111,7 @@ def _write_joints(
         )
     agreement = reduce(add, agreements).report(model.detector.last_noise.factor)
     if agreement.joints == 0 and index.shape[2]:
-        most = int(np.count_nonzero(index >= 0, axis=1).max())
-        reason = (
-            f"no person is seen by more than {most} cameras at once and min_views asks for "
-            f"{settings.min_views}"
-            if most < settings.min_views
-            else f"no {settings.min_views} views agree within max_deviation="
-            f"{settings.max_deviation:g} at an angle of min_angle_rad={settings.min_angle_rad:g}"
-        )
-        result.warnings.append(
-            f"{inputs.recipe.name} placed no joint of {index.shape[2]} people: {reason}."
-        )
+        result.warnings.append(_explain_absence(inputs.recipe.name, index, settings))
     for report in (
         agreement,
         reduce(add, changes).report(model.motion.acceleration, model.motion.repeated),
@@ -122,46 +120,125 @@ def _write_joints(
         result.figures.update(figures_of(report, clip.camera_ids))
 
 
+def _explain_absence(
+    stage: str, index: NDArray[np.integer], settings: TriangulationSettings
+) -> str:
+    """Return why no joint of tracked people (frames, cameras, persons) is placed."""
+    most = int(np.count_nonzero(index >= 0, axis=1).max())
+    reason = (
+        f"no person is seen by more than {most} cameras at once and min_views asks for "
+        f"{settings.min_views}"
+        if most < settings.min_views
+        else f"no {settings.min_views} views agree within max_deviation="
+        f"{settings.max_deviation:g} at an angle of min_angle_rad={settings.min_angle_rad:g}"
+    )
+    return f"{stage} placed no joint of {index.shape[2]} people: {reason}."
+
+
+def _health_arrays(
+    inputs: UnitInputs,
+    clip: ClipInputs,
+    health: CameraHealth,
+    rows: NDArray[np.int64],
+    result: ResultWriter,
+) -> dict[str, NDArray[Any]]:
+    """Return the stored health of cameras over time, and write its metrics."""
+    frame, score = clip.detections.frame, clip.detections.score
+    index = inputs.open(f"tracking/{inputs.unit}")["detection_index"].values
+    count = np.concatenate(
+        [np.isfinite(score[rows[k : k + 512]]).sum(axis=2) for k in range(0, len(rows), 512)]
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unmatched = 1.0 - np.count_nonzero(index[rows] >= 0, axis=2) / count
+    measures = {"unmatched": np.where(count > 0, unmatched, np.nan)}
+    filmed = [select_frames(inputs.open(name), frame[rows]) for name in inputs.sources["seen"]]
+    unknown = np.full(len(rows), np.nan)
+    for name in ("brightness", "sharpness"):
+        measures[name] = np.stack([each.get(name, unknown) for each in filmed], axis=1)
+    has_images = ["brightness" in each for each in filmed]
+    measures["missing"] = np.where(has_images, np.isnan(measures["brightness"]), np.nan)
+    values = measure_health(health, measures)
+    if len(rows) < len(frame):
+        values[..., HEALTH_MEASURES.index("clock_frames")] = np.nan  # people move too far
+    shares = (judge_health(values) > 1.0).mean(axis=0).tolist()
+    each = {
+        f"{UNHEALTHY}.{name}": share for name, share in zip(clip.camera_ids, shares, strict=True)
+    }
+    result.figures |= {UNHEALTHY: max(shares, default=0.0), **each}
+    return {
+        "health": values.astype(np.float32),
+        "health_frame": np.asarray(frame[rows][:: health.length], dtype=np.int64),
+    }
+
+
 def _find_changes(
+    inputs: UnitInputs,
     clip: ClipInputs,
     health: CameraHealth,
     kinds: tuple[Kind, ...],
     settings: TriangulationSettings,
     rows: NDArray[np.int64],
-    known: list[CameraChange],
     result: ResultWriter,
 ) -> list[CameraChange]:
-    """Return the known changes and the clearest further one of a camera, and warn of that."""
-    fps = clip.fps * len(rows) / max(1, len(clip.detections.frame))
-    found = [
-        replace(change, row=int(rows[change.row])) for change in find_changes(health, fps, kinds)
-    ]
-    if not found:
-        return known
-    if len(clip.camera_ids) < 3:
-        when = f"at frame {clip.detections.frame[found[0].row]}" if found[0].is_sudden else "slowly"
-        result.warnings.append(
-            f"cameras {' and '.join(clip.camera_ids)} cease to agree {when}: one of them moved, or "
-            "its clock changed. Two cameras cannot tell which."
+    """Return the changes of cameras, the known ones and further ones; warn of these.
+
+    One is found at a time, with those before it taken back, or their cameras left out.
+    """
+    fps, names = clip.fps * len(rows) / max(1, len(clip.detections.frame)), clip.camera_ids
+    known, new, warnings = known_changes(inputs, inputs.unit), list[CameraChange](), result.warnings
+    spoilt = set[str]()
+    for _ in range(3 * len(names)):
+        found = [
+            replace(each, row=int(rows[each.row])) for each in find_changes(health, fps, kinds)
+        ]
+        if found and len(names) < 3:
+            warnings.append(_describe_pair(names, found[0], clip.detections.frame))
+            break
+        measured = found and explain_changes(
+            clip.cameras, clip.detections, clip.fps, settings, found, kinds
         )
-        return known
-    measured = explain_changes(clip.cameras, clip.detections, clip.fps, settings, found, kinds)
-    if measured is None:
-        if np.median(health.misfit) > 3.0:
-            result.warnings.append(
-                "all cameras move within the clip, each in its own way, as electronic "
-                "stabilisation does: no person agrees with the views. Turn it off, or give the "
-                "videos without it."
-            )
-        return known
-    camera = clip.camera_ids[measured.found.camera]
-    change = change_record(measured, camera, clip.detections.frame)
-    if any(is_same_change(other, change, clip.fps) for other in known):
-        return known
-    result.warnings.append(f"{describe_change(change)}.")
-    if change.kind == "clock":
-        result.figures[CLOCK_CHANGE + camera] = change.late_frames
-    return [*known, change]
+        if not measured:
+            if measured is None and not new and np.median(health.misfit) > 3.0:
+                warnings.append(
+                    "all cameras move within the clip, each in its own way, as electronic "
+                    "stabilisation does: no person agrees with the views. Turn it off, or give the "
+                    "videos without it."
+                )
+            break
+        camera = names[measured.found.camera]
+        change = change_record(measured, camera, clip.detections.frame)
+        same = [n for n, other in enumerate(new) if is_same_change(other, change, clip.fps)]
+        if camera in spoilt or any(is_same_change(one, change, clip.fps) for one in known):
+            break
+        if same:  # what other changes had hidden of it
+            frame = new[same[0]].frame
+            new[same[0]] = join_changes(new[same[0]], change).model_copy(update={"frame": frame})
+        else:
+            new.append(change)
+        spoilt = {each.camera for each in new if each.kind == "clock" or not each.is_explained}
+        aside = [
+            each.model_copy(update={"is_left_out": True}) if each.camera in spoilt else each
+            for each in new
+        ]
+        if len(names) - len(spoilt) < 3:
+            warnings.append("changes of other cameras can hide behind these.")
+            break
+        clip = open_tracked_clip(inputs, further=aside)
+        health = measure_departures(clip.cameras, clip.detections, fps, settings, rows)
+    for change in new:
+        warnings.append(f"{describe_change(change)}.")
+        if change.kind == "clock":
+            result.figures[CLOCK_CHANGE + change.camera] = change.late_frames
+    return [*known, *new]
+
+
+def _describe_pair(names: Sequence[str], found: Change, frame: NDArray[np.integer]) -> str:
+    """Return a sentence about a change of two cameras, which cannot tell whose it is."""
+    when = f"at frame {frame[found.row]}" if found.is_sudden else "slowly"
+    return (
+        f"cameras {' and '.join(names)} cease to agree {when}: one of them moved, or its clock "
+        "changed. Two cameras cannot tell which."
+    )
 
 
 def camera_errors(inputs: UnitInputs, clip: ClipInputs) -> NDArray[np.float64] | None:

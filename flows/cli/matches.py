@@ -272,7 +272,7 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
         side = "near" if found.mirrored else "far"
         line(f"places: y points to the {side} side, as the clicks show")
     if found.own_points:
-        line(f"{len(found.own_points)} points that the Laws do not name are in pitch.json")
+        line(f"{len(found.own_points)} points that the rules do not name are in pitch.json")
     for text in questions:
         line(f"warning: {text}", to=errors)
 
@@ -327,7 +327,7 @@ def import_pitch(
         (name, f"{1e3 * plan:.0f}", "-" if isnan(height) else f"{1e3 * height:+.0f}")
         for name, plan, height in rows
     ]
-    print_table("off the Laws of the Game", ("point", ">in plan mm", ">above surface mm"), shown)
+    print_table("off the rules of the game", ("point", ">in plan mm", ">above surface mm"), shown)
 
 
 def ingest(

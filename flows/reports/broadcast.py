@@ -79,8 +79,9 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
         pictures += _before_and_after(run, match, view, tracks)
         pictures += flow_pictures(run, match, view, camera)
         for video_number in result.attrs["pick_next"][:WORST_FRAMES]:
-            place = int(clock.frame_of(video_number))
-            number = int(frame[place])
+            # An image between two match frames has no camera: the nearest one that has is drawn.
+            place = clock.nearest_frame(video_number)
+            number, video_number = int(frame[place]), int(clock.number[place])
             with open_video(match.folder.videos[view]) as video:
                 still = video.frame(video_number)
             pictures.append(

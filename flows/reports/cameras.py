@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec
+from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from flows.reports.match_pictures import background_image, shown_pitch
+from flows.results.best_results import clip_title
 from flows.stage import Match
+from worldpose.camera_consistency.health import judge_health
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.reports.html_page import CaptionedImage, Failure, Table
 from worldpose.reports.run_report import format_scaled
@@ -19,10 +22,12 @@ from worldpose.reports.static_cameras import (
     Click,
     ErrorMap,
     plot_calibration,
+    plot_health,
     plot_paint,
 )
 from worldpose.static_calibration.from_paint.proposal import PROPOSED
 from worldpose.store.store import Run, Store
+from worldpose.triangulation.camera_changes import describe_change
 
 MAX_CAMERAS = 2
 """Number of cameras shown with their clicks, weakest first."""
@@ -80,6 +85,47 @@ def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
     if left_out is not None:
         return (f"left out: {left_out}",)
     return tuple(run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ())
+
+
+def health_picture(run: Run, match: Match, clip: str) -> list[CaptionedImage]:
+    """Draw the health of a clip's static cameras over time; none without triangulated people."""
+    units = [f"{stage}/{clip}" for stage in ("retriangulation", "triangulation")]
+    if not any(unit in run for unit in units):
+        return []
+    found = run[next(unit for unit in units if unit in run)]
+    changes = [CameraChange.model_validate(each) for each in found.attrs["changes"]]
+    names = [camera.id for camera in match.folder.spec.static_cameras]
+    used = found["camera"].values.tolist()
+    place = [names.index(name) for name in used]
+    starts = found["health_frame"].values
+    shape = (len(starts), len(names))
+    badness, missing = np.full(shape, np.nan), np.full(shape, np.nan)
+    values = found["health"].values.astype(np.float64)
+    badness[:, place] = judge_health(values)
+    missing[:, place] = values[..., HEALTH_MEASURES.index("missing")]
+    marks = [
+        *((change.camera, change.frame, _mark(change)) for change in changes),
+        *((name, None, "left out") for name in names if name not in used),
+    ]
+    frames = np.append(starts, found["frame"].values[-1] + 1)
+    said = "".join(f" {describe_change(change)}." for change in changes)
+    return [
+        CaptionedImage(
+            f"{clip_title(clip)}: the health of each static camera over time, by the distance of "
+            "its keypoints from the people whom all cameras place, and by its images. Grey: nobody "
+            f"is seen to compare; black: frames without an image; blue: a change.{said}",
+            plot_health(names, frames, badness, missing, marks),
+        )
+    ]
+
+
+def _mark(change: CameraChange) -> str:
+    """Return two or three words on a change."""
+    if not change.is_explained:
+        return "left out" if change.is_left_out else "unexplained"
+    if change.kind == "clock":
+        return f"{-change.late_frames:+.1f} frames" + ("" if change.frame is not None else " drift")
+    return f"{'moves' if change.frame is None else 'knock'} {np.hypot(*change.shift_px):.0f} px"
 
 
 def camera_pictures(

@@ -22,7 +22,12 @@ from data_contracts.review import (
     ReviewRequest,
     Withdrawal,
 )
-from flows.reports.cameras import camera_pictures, camera_table, paint_pictures
+from flows.reports.cameras import (
+    camera_pictures,
+    camera_table,
+    health_picture,
+    paint_pictures,
+)
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures, disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables, people_tables
@@ -210,6 +215,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             "Static cameras",
             (
                 camera_table(run, match.folder.spec),
+                *(p for clip in filmed for p in health_picture(run, match, clip)),
                 *camera_pictures(store, run, match, cameras),
                 *paint_pictures(store, run, match, cameras),
             ),

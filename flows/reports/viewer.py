@@ -186,7 +186,7 @@ def viewer_clip(
         bodies=bodies,
         model=model,
         cameras=still,
-        moving=moving_cameras(origin.run, clip, tracks.frames),
+        moving=moving_cameras(origin.run, clip, tracks.frames, still),
         markings=[] if shown is None else markings(shown),
         notes=describe_clip(origin, clip) | notes,
         video=video,

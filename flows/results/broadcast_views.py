@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,9 +44,15 @@ def camera_in_frames(run: Run, view: str, frames: NDArray[np.int64]) -> Camera:
     return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
 
-def moving_cameras(run: Run, clip: str, frames: NDArray[np.int64]) -> dict[str, Camera]:
-    """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone."""
+def moving_cameras(
+    run: Run, clip: str, frames: NDArray[np.int64], static: Collection[str] = ()
+) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone.
+
+    Where a static camera has that name, the moving one has that of its view.
+    """
     views = broadcast_views(run, clip)
-    names = views if len(views) > 1 else ["broadcast"] * len(views)
+    alone = len(views) == 1 and "broadcast" not in static
+    names = ["broadcast"] if alone else views
     found = (camera_in_frames(run, view, frames) for view in views)
     return dict(zip(names, found, strict=True))

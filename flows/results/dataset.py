@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from data_contracts.arrays import Floats
 from data_contracts.release import CheckReport, DataSetStatistics, Finding
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.dataset.check import check_clip
@@ -99,10 +102,10 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
     clips = {}
     for folder in folders:
         rates = stated_rates(folder, fps)
-        for name, rate in rates.items():
-            own, static = camera_files(folder, name, rates)
-            kind = most_moving(map(camera_kind, own))
-            if not own and static:
+        for name, views in _views_of_clips(folder, tuple(rates)).items():
+            files = [camera_files(folder, view, rates) for view, _ in views]
+            kind = most_moving(camera_kind(each) for own, _ in files for each in own)
+            if all(not own and static for own, static in files):
                 kind = "S"
             label = name if len(folders) == 1 else f"{folder.resolve().name}/{name}"
             if label in clips:
@@ -112,5 +115,22 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
                     found=f"{label} twice",
                     todo="Name each folder once, or rename one of them.",
                 )
-            clips[label] = clip_statistics(read_places(folder, name), rate or USUAL_FPS, kind)
+            places = np.concatenate([own for _, own in views], axis=1)
+            clips[label] = clip_statistics(places, rates[views[0][0]] or USUAL_FPS, kind)
     return data_set_statistics(clips)
+
+
+def _views_of_clips(folder: Path, names: tuple[str, ...]) -> dict[str, list[tuple[str, Floats]]]:
+    """Return the views of each clip, with the places of the people whom no earlier view has.
+
+    A submission has an entry `<clip>.<camera>` for each of several broadcast cameras of a clip:
+    some of their people are at the same places in the same frames.
+    """
+    views: dict[str, list[tuple[str, Floats]]] = {}
+    for name in names:
+        places, clip = read_places(folder, name), name.rpartition(".")[0]
+        known = {one.tobytes() for _, seen in views.get(clip, ()) for one in seen.swapaxes(0, 1)}
+        new = np.array([one.tobytes() not in known for one in places.swapaxes(0, 1)], np.bool_)
+        own = clip if clip and (clip not in views or not new.all()) else name
+        views.setdefault(own, []).append((name, places[:, new]))
+    return {own if len(seen) > 1 else seen[0][0]: seen for own, seen in views.items()}

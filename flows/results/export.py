@@ -239,7 +239,7 @@ def export_recording(origin: Origin, out: Path) -> Iterator[Path]:
 
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        moving = moving_cameras(origin.run, clip, tracks.frames)
+        moving = moving_cameras(origin.run, clip, tracks.frames, origin.static_cameras)
         path = out / "rerun" / f"{clip}.rrd"
         write_recording(
             path,

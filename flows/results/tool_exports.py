@@ -209,7 +209,9 @@ def export_scenes(
                 found="none",
                 todo="Give their text, which goes into the file, or export without --surface.",
             )
-        cameras = origin.static_cameras | moving_cameras(origin.run, clip, frames)
+        cameras = origin.static_cameras | moving_cameras(
+            origin.run, clip, frames, origin.static_cameras
+        )
         kinds = person_kinds(origin.run, clip)
         people = [
             AnimatedBody(

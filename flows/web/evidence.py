@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from data_contracts.conventions import COCO17
 from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint, ReviewRequest
 from flows.reports.broadcast import broadcast_pictures, broadcast_tables
-from flows.reports.cameras import camera_evidence, proposal_evidence
+from flows.reports.cameras import camera_evidence, health_picture, proposal_evidence
 from flows.reports.clip_video import clip_view
 from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.people import adjustment_tables, body_tables
@@ -198,6 +198,7 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     pictures = (
+        *health_picture(run, match, clip),
         *clip_pictures(store, run, match, clip),
         *detection_pictures(store, run, match, clip),
     )

@@ -9,7 +9,7 @@ from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Image, find_runs
 from flows.reports.match_pictures import frame_picture
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
@@ -81,17 +81,13 @@ def routes(context: PageContext) -> APIRouter:
 def _person(found: Identities, ways: NDArray[np.float64], person: int, step: int) -> dict[str, Any]:
     k = found.person.tolist().index(person)
     views = np.count_nonzero(found.detection_index[:, :, k] >= 0, axis=1)
-    bounds = np.flatnonzero(np.diff(np.concatenate([[0], views > 0, [0]])))
     first = int(found.frame[0])
     seen = find_sighting(found, person)
     return {
         "id": person,
         "name": found.names.get(person),
         "seen": None if seen is None else seen.model_dump(),
-        "segments": [
-            [first + int(begin), first + int(end) - 1]
-            for begin, end in zip(bounds[::2], bounds[1::2], strict=True)
-        ],
+        "segments": [[first + run.start, first + run.stop - 1] for run in find_runs(views > 0)],
         "views": round(float(views[views > 0].mean()), 1),
         "way": [
             None if np.isnan(place).any() else np.round(place, 2).tolist()

@@ -16,6 +16,7 @@ from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse, Response
 
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
+from flows.reports.cameras import health_picture
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
 from flows.reports.viewer import describe_video, viewer_clip
@@ -179,6 +180,14 @@ def routes(context: PageContext) -> APIRouter:
         if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
             raise HTTPException(404, "no camera of such a clip has a video")
         return files.clip_video(context.store, run, match, clip)
+
+    @router.get("/health/{clip}")
+    def health(match_id: str, clip: str) -> Response:
+        match, run = open_latest(match_id)
+        pictures = health_picture(run, match, clip)
+        if not pictures:
+            raise HTTPException(404, "no cameras of such a clip place people together")
+        return Response(pictures[0].png, media_type="image/png")
 
     @router.get("/exports/{form}")
     def export_zip(match_id: str, form: str) -> FileResponse:

@@ -8,8 +8,12 @@ import yaml
 from camera_builders import look_at_camera
 from command_line import succeed
 
+from flows.registering import open_match
+from flows.reports.cameras import health_picture
+from worldpose.camera_consistency.health import judge_health
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.joints_file import read_joints
+from worldpose.store.store import Store, open_run
 
 FRAMES, FPS, BAD = 125, 25, "cam2"
 KNOCK = np.array([25.0, -12.0])
@@ -79,6 +83,17 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
     said, error = run(match, joints)
     assert "camera cam2 moves at frame 60, by 27 px" in said
     assert error < 11.5  # 10.5 mm; 10.3 without the knock
+    opened = open_run(str(match.parent / "project"), "match")
+    figures = opened.record.figures["triangulation/clip"]
+    bad = {name: figures[f"unhealthy_share.cam{name}"] for name in range(4)}
+    assert 0.4 < bad[2] == figures["unhealthy_share"] < 0.6
+    assert max(bad[n] for n in (0, 1, 3)) < 0.05
+    after = judge_health(opened["retriangulation/clip"]["health"].values)
+    assert (after > 1.0).mean() < 0.02  # corrected
+    store = Store.open(match.parent / "project")
+    (picture,) = health_picture(opened, open_match(store, "match"), "clip")
+    assert "cam2 moves at frame 60, by 27 px" in picture.caption
+    assert picture.png.startswith(b"\x89PNG")
     given = json.loads((match.parent / "poses/cam2.json").read_text())
     written = json.loads((match.parent / "out/cam2.json").read_text())["annotations"]
     for frame in (30, 100):

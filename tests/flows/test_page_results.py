@@ -31,6 +31,10 @@ def test_a_complete_run_gives_its_report_and_its_exports(reader):
     assert found["purposes"]["bvh"].startswith("a skeleton in motion for Blender")
     clip = {"id": "clip", "video": None, "without_joints": None}
     assert found["clips"] == [clip]  # given keypoints: nothing is filmed
+    health = reader.get(f"{MATCH}/results/health/clip")
+    assert health.headers["content-type"] == "image/png"
+    assert health.content.startswith(b"\x89PNG")
+    assert reader.get(f"{MATCH}/results/health/other").status_code == 404
     page = reader.get(f"{MATCH}/results/report")
     assert page.headers["content-type"].startswith("text/html")
     assert "3D view" in page.text

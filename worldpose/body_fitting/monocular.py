@@ -154,25 +154,31 @@ class MonocularPoses:
     """(frames, persons, 3, 3), world from body; NaN without an estimate."""
     angles: Floats
     """(frames, persons, 30) [rad], of `pose_space`; NaN without an estimate."""
+    height: Floats
+    """(frames, persons), of the person in the image [px]; NaN without an estimate."""
 
     def __getitem__(self, frames: slice) -> MonocularPoses:
         """Return the poses in some frames."""
-        return MonocularPoses(self.orient[frames], self.angles[frames])
+        return MonocularPoses(self.orient[frames], self.angles[frames], self.height[frames])
 
 
 def join_poses(poses: Sequence[MonocularPoses]) -> MonocularPoses | None:
-    """Return the poses of several cameras: a person's in a frame by the first that has one."""
-    joined = None
-    for each in poses:
-        if joined is None:
-            joined = each
-            continue
-        known = np.asarray(np.isfinite(joined.orient).all((-1, -2)))
-        joined = MonocularPoses(
-            np.where(known[..., None, None], joined.orient, each.orient),
-            np.where(known[..., None], joined.angles, each.angles),
+    """Return the poses of several cameras: a person's in a frame by the one that shows most of it.
+
+    A person twice as tall in the image has four times the pixels.
+    """
+    if not poses:
+        return None
+    heights = np.stack([np.nan_to_num(each.height, nan=-1.0) for each in poses])
+    best = heights.argmax(axis=0)[None]
+    orient, angles, height = (
+        np.take_along_axis(stack, best.reshape(best.shape + (1,) * (stack.ndim - 3)), axis=0)[0]
+        for stack in (
+            np.stack([getattr(each, name) for each in poses])
+            for name in ("orient", "angles", "height")
         )
-    return joined
+    )
+    return MonocularPoses(orient, angles, height)
 
 
 def place_monocular_poses(
@@ -195,7 +201,7 @@ def place_monocular_poses(
     orient = np.full((frames, persons, 3, 3), np.nan)
     angles = np.full((frames, persons, GATHER.shape[0]), np.nan)
     if not persons:
-        return MonocularPoses(orient, angles)
+        return MonocularPoses(orient, angles, np.full((frames, persons), np.nan))
     full = np.stack([interpolate_gaps(joints[:, person]) for person in range(persons)], axis=1)
     image = camera.project(full.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
     known = np.isfinite(image)
@@ -222,7 +228,7 @@ def place_monocular_poses(
         angles[place, person] = bend.reshape(len(row), GATHER.shape[1]) @ GATHER.T
     bad = ~(np.isfinite(orient).all((-1, -2)) & np.isfinite(angles).all(-1))
     orient[bad], angles[bad] = np.nan, np.nan
-    return MonocularPoses(orient, angles)
+    return MonocularPoses(orient, angles, np.where(bad, np.nan, height))
 
 
 def _rotate_axis_to(plane: Floats) -> Floats:

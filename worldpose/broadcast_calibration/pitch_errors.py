@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
-from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.evidence import PointEvidence
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch.laws import places_by_size
@@ -126,7 +125,7 @@ class PitchFit:
             markings rest on.
         size: (4,) length, width, crown, end fall [m].
         size_std: (4,) standard deviations of `size` [m]; 0 = given.
-        paint_m: spread of markings without survey about the Laws, each axis [m]; 0 = all surveyed.
+        paint_m: spread of markings without survey about the rules, each axis [m]; 0 = all surveyed.
         line_noise: deviation of a line's sample over its assumed one [1].
         click_noise: the same ratio for clicks [1].
     """
@@ -144,20 +143,13 @@ class PitchFit:
         return self.size[2:]
 
     @property
-    def spec(self) -> PitchSpec | None:
-        """The pitch of the estimated size with the estimated markings; None if all is given."""
+    def keys(self) -> dict[str, float | dict[str, list[float]]] | None:
+        """Estimated sizes and points, by their keys in pitch.json; None if all is given."""
         if not (self.size_std.any() or self.points):
             return None
-        length, width, crown, end_fall = self.size.tolist()
-        points = {name: tuple(place.tolist()) for name, place in self.points.items()}
-        return PitchSpec(
-            length=length,
-            width=width,
-            crown=max(crown, 0.0),
-            end_fall=end_fall,
-            points=points,
-            any_size=True,
-        )
+        points = {name: place.tolist() for name, place in self.points.items()}
+        sizes = dict(zip(SIZES, self.size.tolist(), strict=True))
+        return {**sizes, "crown": max(sizes["crown"], 0.0), "points": points}
 
     @property
     def describe(self) -> tuple[str, ...]:
@@ -169,7 +161,7 @@ class PitchFit:
             if std > 0.0
         ]
         if self.paint_m > 0.0:
-            said.append(f"markings differ from the Laws by {self.paint_m:.3f} m per axis")
+            said.append(f"markings differ from the rules by {self.paint_m:.3f} m per axis")
         said.append(
             f"samples of lines err by {self.line_noise:.2f} and clicks by {self.click_noise:.2f} "
             "of their assumed deviation"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -34,6 +34,8 @@ class People:
         joints: (frames, persons, 17, 3) [m], world; NaN where missing.
         keypoints: (frames, detections, 17, 2) [px]; NaN where missing.
         fps: frames per second.
+        timeline: joints (match frames, persons, 17, 3) [m], and where among them `joints` are
+            (frames,) [match frame]; None = frames are match frames.
 
     Raises:
         InputError: the frame counts differ.
@@ -42,6 +44,7 @@ class People:
     joints: Floats
     keypoints: Floats
     fps: float
+    timeline: tuple[Floats, Floats] | None = None
 
     def __post_init__(self) -> None:
         if len(self.joints) != len(self.keypoints):
@@ -64,15 +67,24 @@ class People:
         """
         seen = np.full((len(clock.images), *keypoints.shape[1:]), np.nan)
         seen[clock.image_row] = keypoints
-        return cls(rows_at(joints, clock.frame_row), seen, fps * clock.rate)
+        timeline = joints, clock.frame_row
+        return cls(rows_at(*timeline), seen, fps * clock.rate, timeline)
 
-    def later(self, frames: float) -> People:
-        """Return these keypoints with joints of later frames, interpolated linearly.
+    def later(self, frames: float, some: Integers | None = None) -> People:
+        """Return these keypoints, or `some`, with joints of later match frames, linear in between.
 
-        Joints beyond the clip's ends are missing. A shift [frame] below zero = earlier.
+        Joints beyond the clip's ends are missing. A shift [match frame] below zero = earlier.
         """
-        rows = np.arange(len(self.joints), dtype=np.float64) + frames
-        return replace(self, joints=rows_at(self.joints, rows))
+        some = np.arange(len(self.joints)) if some is None else some
+        joints, row = self.timeline or (self.joints, np.arange(float(len(self.joints))))
+        row = row[some] + frames
+        return People(rows_at(joints, row), self.keypoints[some], self.fps, (joints, row))
+
+    @property
+    def rate(self) -> float:
+        """Frames per match frame."""
+        row = None if self.timeline is None else self.timeline[1]
+        return 1.0 if row is None or len(row) < 2 else float((len(row) - 1) / (row[-1] - row[0]))
 
     @property
     def boxes(self) -> Floats:
@@ -230,24 +242,26 @@ class FeedOffset:
     """Clock offset of a broadcast clip.
 
     Attributes:
-        frames: the clip's frame t corresponds to the static cameras' frame t + frames; NaN where
+        frames: the clip shows match frame t where the static cameras show t + frames; NaN where
             `determined` is false.
-        standard_error: standard error of the offset [frame]; infinite without motion.
+        standard_error: standard error of the offset [match frame]; infinite without motion.
         determined: whether the best offset lies inside the search range, with a standard error
             below half a frame.
         pairs: number of matched people, over all frames.
+        rate: images per match frame.
     """
 
     frames: float
     standard_error: float
     determined: bool
     pairs: int
+    rate: float = 1.0
 
 
 def estimate_feed_offset(
     camera: MovingCamera, people: People, *, reach: float = _MAX_OFFSET
 ) -> FeedOffset:
-    """Return the clock offset between the feed and the static cameras, up to a reach [frame].
+    """Return the clock offset between the feed and the static cameras, up to a reach [match frame].
 
     For every integer offset the function matches people again and evaluates the loss of their
     keypoint residuals; a parabola through the best offset and its neighbours gives the minimum. The
@@ -260,8 +274,8 @@ def estimate_feed_offset(
     if not np.isfinite(coarse).any():
         return FeedOffset(np.nan, np.inf, False, 0)
     best = float(whole[int(np.nanargmin(coarse))])
-    # Joints between integer frames would be means of two, with less noise: a parabola through
-    # integer offsets avoids this bias.
+    # Joints between match frames are means of two, with less noise: by whole match frames, all
+    # offsets have equally many of them, also where the camera has several images per frame.
     near = best + np.arange(-2.0, 3.0)
     results = [_mean_loss(camera, people, offset, every) for offset in near]
     fine = np.array([cost for cost, _ in results])
@@ -278,24 +292,19 @@ def estimate_feed_offset(
     independent = pairs / max(1.0, 0.3 * people.fps / stride)
     error = float(np.sqrt(1.0 / (0.5 * bend * independent)))
     determined = error < 0.5
-    return FeedOffset(offset if determined else np.nan, error, determined, pairs)
+    return FeedOffset(offset if determined else np.nan, error, determined, pairs, people.rate)
 
 
 def _mean_loss(
     camera: MovingCamera, people: People, offset: float, frames: Integers
 ) -> tuple[float, int]:
     """Return the mean loss of a keypoint at an offset, and the number of pairs."""
-    at = frames + int(offset)
-    inside = (at >= 0) & (at < len(people.joints))
-    frames, joints = frames[inside], people.joints[at[inside]]
-    if not len(frames):
-        return np.nan, 0
-    some = People(joints, people.keypoints[frames], people.fps)
+    some = people.later(offset, frames)
     seen = camera.frames(frames)
     pairs = match(seen, some)
     if not len(pairs.frame):
         return np.nan, 0
-    world = joints[pairs.frame, pairs.person]
+    world = some.joints[pairs.frame, pairs.person]
     image = some.keypoints[pairs.frame, pairs.detection]
     tall = np.ptp(np.nan_to_num(boxes_of(image)).reshape(-1, 2, 2)[..., 1], axis=-1)
     single = seen.camera[pairs.frame]

@@ -20,7 +20,7 @@ from worldpose.broadcast_calibration.evidence import (
 from worldpose.broadcast_calibration.key_frames import Keys
 from worldpose.broadcast_calibration.learned_noise import Weights
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
-from worldpose.broadcast_calibration.pitch_errors import SIZES, PitchFit
+from worldpose.broadcast_calibration.pitch_errors import PitchFit
 from worldpose.broadcast_calibration.players import FeedOffset, Matches
 from worldpose.broadcast_calibration.residuals import pixel_residuals
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
@@ -207,7 +207,7 @@ def _review_reasons(
     # No painter errs by 0.3 m.
     if pitch.paint_m > 0.3:
         reasons.append(
-            f"markings differ from the Laws by {pitch.paint_m:.2f} m per axis: the pitch has "
+            f"markings differ from the rules by {pitch.paint_m:.2f} m per axis: the pitch has "
             "another size, or clicks have wrong names"
         )
     for frame, why in keys.refused.items():
@@ -255,7 +255,7 @@ def _describe_offset(
         return f"{sentence}: corrected", False
     beyond = abs(offset.frames) - 2.0 * offset.standard_error > 0.5
     todo = (
-        f": lower the clip's broadcast_offset_frames by {offset.frames:.2f}, or set "
+        f": lower the clip's broadcast_offset_frames by {offset.frames * offset.rate:.2f}, or set "
         "broadcast_calibration.feed_offset=correct"
     )
     return sentence + (todo if beyond else ""), beyond
@@ -370,7 +370,7 @@ def broadcast_attributes(
         rate: frames of the video per match frame.
     """
     report, offset = calibration.report, calibration.report.feed_offset
-    spec = report.pitch.spec
+    keys = report.pitch.keys
     return {
         "clip_id": clip_id,
         "status_names": list(FRAME_STATUS),
@@ -380,20 +380,15 @@ def broadcast_attributes(
         "feed_offset": None
         if offset is None
         else {
-            "frames": offset.frames / rate if offset.determined else None,
-            "standard_error": offset.standard_error / rate if offset.determined else None,
+            "frames": offset.frames if offset.determined else None,
+            "standard_error": offset.standard_error if offset.determined else None,
             "pairs": offset.pairs,
         },
         "drift": [float(drift) for drift in report.drift],
         "pick_next": [first + frame for frame in report.pick_next],
         "markings_off": _finite_or_none(report.markings_off),
         "players_off": _finite_or_none(report.players_off),
-        "pitch": None
-        if spec is None
-        else {
-            **spec.model_dump(mode="json", include={*SIZES, "points"}),
-            "std_m": report.pitch.size_std.tolist(),
-        },
+        "pitch": None if keys is None else {**keys, "std_m": report.pitch.size_std.tolist()},
         "noise": {
             "paint_m": report.pitch.paint_m,
             "lines": report.pitch.line_noise,

@@ -68,7 +68,7 @@ class BroadcastCalibrationSettings(Record):
     """Standard deviation of a surveyed point of the template from the painted one, each axis
     [m]."""
     paint_error_m: float = Field(default=0.03, ge=1e-6, le=1)
-    """Standard deviation of a point that has its place from the Laws of the Game [m], in plan and
+    """Standard deviation of a point that has its place from the rules of the game [m], in plan and
     height. It is a prior, which the clip's own markings correct."""
     crown_std_m: float = Field(default=0.1, ge=0, le=1)
     """Standard deviation of an unmeasured crown from the standard 0.2 m [m]: prior. The pitches of

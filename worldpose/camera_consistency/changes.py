@@ -63,7 +63,8 @@ def _find(health: CameraHealth, c: int, kind: Kind, fps: float) -> Iterator[Chan
     min_gain = 30.0
     # Of the clock [frame]; of the view [px], 2 cm at people. The camera's own share in the people
     # hides up to a half of a change.
-    scale = health.scale[c, 0] / max(1.0, health.scale[c, 1])
+    total_scale, terms, _ = health.sums[:, c].sum(axis=0)
+    scale = total_scale / max(1.0, terms)
     min_size = 0.25 if kind == "clock" else max(1.5, 0.02 * scale)
     matrix, right = health.matrix[:, c], health.right[:, c]
     total = matrix.sum(axis=0)

@@ -9,22 +9,30 @@ with q = p less the principal point, q' = q turned by 90 degrees, and f the foca
 that was knocked turned by s / f, which shifts the principal point by s [px], and by the roll r
 [rad]; further a zoom z [1], and a clock offset l [frame]. Each bin of
 frames has the normal equations of (s, z, r, l); `changes` finds where the solution changes.
+
+`measure_health` joins this with what detections and images tell, as `HEALTH_MEASURES` of a clip.
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.keypoints import KeypointDetections
+from data_contracts.triangulation import HEALTH_MEASURES
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
 
 UNKNOWNS: Final = 5
 """Shift along x and y [px], zoom [1], roll [rad], clock offset [frame]."""
+MAX_MISFIT: Final = 3.0
+"""Misfit of a camera that somebody should look at, over the usual one of the rig [1]."""
 LIMBS: Final = slice(5, 17)
 """Joints that are compared: those of the face move little and are often hidden."""
 
@@ -38,16 +46,15 @@ class CameraHealth:
         every: of this many frames, one is compared.
         matrix: (bins, cameras, 5, 5) normal matrices.
         right: (bins, cameras, 5) right-hand sides.
-        scale: (cameras, 2) sum of the image scale at people [px/m], and number of terms.
-        cost: (cameras,) sum of the robust loss of departures [1].
+        sums: (bins, cameras, 3) sum of the image scale at people [px/m], number of terms, and sum
+            of the robust loss of departures [1].
     """
 
     length: int
     every: int
     matrix: Floats
     right: Floats
-    scale: Floats
-    cost: Floats
+    sums: Floats
 
     @classmethod
     def empty(cls, frames: int, cameras: int, persons: int, fps: float) -> CameraHealth:
@@ -57,12 +64,30 @@ class CameraHealth:
         every = length if frames * cameras * persons > 50_000 else 1
         shape = (-(-frames // length), cameras)
         matrix, right = np.zeros((*shape, UNKNOWNS, UNKNOWNS)), np.zeros((*shape, UNKNOWNS))
-        return cls(length, every, matrix, right, np.zeros((cameras, 2)), np.zeros(cameras))
+        return cls(length, every, matrix, right, np.zeros((*shape, 3)))
 
     @property
     def misfit(self) -> Floats:
         """Mean robust loss of each camera's departures (cameras,) [1]; at most 2 if none moves."""
-        return np.asarray(self.cost / np.maximum(1.0, 2.0 * self.scale[:, 1]))
+        _, terms, loss = self.sums.sum(axis=0).T
+        return np.asarray(loss / np.maximum(1.0, 2.0 * terms))
+
+    def over_time(self) -> Floats:
+        """Return misfit [1], shift of the view [px] and clock offset [frame] in each bin.
+
+        They are those of the second around it, (bins, cameras, 3); NaN with fewer than 20 terms.
+        Where people tell nothing of a shift or an offset, it is 0.
+        """
+        matrix, right, sums = (
+            convolve1d(each, np.ones(5), axis=0, mode="constant")
+            for each in (self.matrix, self.right, self.sums)
+        )
+        usual = np.diag(np.array([50.0, 50.0, 0.05, 0.05, 5.0]) ** -2)  # in the unknowns' units
+        solved = np.linalg.solve(matrix + usual, right[..., None])[..., 0]
+        misfit = sums[..., 2] / np.maximum(1.0, 2.0 * sums[..., 1])
+        found = np.stack([misfit, np.hypot(solved[..., 0], solved[..., 1]), solved[..., 4]], axis=2)
+        found[sums[..., 1] < 20.0] = np.nan
+        return found
 
     def add(self, cameras: Camera, people: KeypointDetections, joints: Floats, start: int) -> None:
         """Add a chunk of a clip; its first and last frame give velocities only.
@@ -102,8 +127,9 @@ class CameraHealth:
             squared = (off**2).sum(axis=-1) / variance
             weight = cauchy_weight(squared, 5.0) / variance
         use = np.isfinite(weight) & np.isfinite(speed).all(axis=-1) & (depth > 0.0)
-        self.scale[c] += scale[use].sum(), use.sum()
-        self.cost[c] += cauchy_loss(squared[use], 5.0).sum()
+        with np.errstate(invalid="ignore"):
+            terms = np.stack([scale, np.ones_like(scale), cauchy_loss(squared, 5.0)], axis=-1)
+        terms = np.where(use[..., None], terms, 0.0).sum(axis=1)
         around = image - camera.principal_point
         columns = np.zeros((*off.shape, UNKNOWNS))
         columns[..., :2] = np.eye(2) + around[..., :, None] * around[..., None, :] / focal**2
@@ -120,3 +146,44 @@ class CameraHealth:
         sums = np.add.reduceat(each, first, axis=0)
         self.matrix[bins[first], c] += sums[..., :UNKNOWNS]
         self.right[bins[first], c] += sums[..., UNKNOWNS]
+        self.sums[bins[first], c] += np.add.reduceat(terms, first, axis=0)
+
+
+def judge_health(values: Floats) -> Floats:
+    """Return how bad the health (bins, cameras, `HEALTH_MEASURES`) is, (bins, cameras) [1].
+
+    Above 1 somebody should look at the camera: its keypoints depart far more than those of the
+    rig usually do, frames have no image, or its image became dark, bright or blurred. NaN = there
+    is nothing to judge.
+    """
+    by = dict(zip(HEALTH_MEASURES, np.moveaxis(values, -1, 0), strict=True))
+    parts = [2.0 * by["missing"]]
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # means of nothing
+        usual = np.fmax(1.0, np.nanmedian(by["misfit"]))
+        apart = by["misfit"] / (MAX_MISFIT * usual)
+        # One bad camera displaces the people, and all others depart from them, too.
+        spoilt = by["misfit"] < 0.5 * np.nanmax(by["misfit"], axis=1, keepdims=True)
+        parts.append(np.where(spoilt, np.fmin(apart, 1.0), apart))
+        images = [by[name] for name in ("brightness", "sharpness")]
+        parts += [np.abs(np.log2(each / np.nanmedian(each, axis=0))) for each in images]  # by two
+        return np.asarray(np.nanmax(parts, axis=0))
+
+
+def measure_health(health: CameraHealth, frames: Mapping[str, Floats]) -> Floats:
+    """Return the health of each camera over time, (bins, cameras, `HEALTH_MEASURES`).
+
+    Args:
+        health: departures of the cameras.
+        frames: by name, measures (frames, cameras) of single frames; a bin has their mean.
+    """
+    bins = len(health.matrix)
+    out = np.full((bins, health.matrix.shape[1], len(HEALTH_MEASURES)), np.nan)
+    out[..., :3] = health.over_time()
+    for name, values in frames.items():
+        padded = np.full((bins * health.length, values.shape[1]), np.nan)
+        padded[: len(values)] = values
+        known = np.isfinite(padded).reshape(bins, health.length, -1)
+        total = np.nan_to_num(padded).reshape(known.shape).sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            out[..., HEALTH_MEASURES.index(name)] = total / known.sum(axis=1)
+    return out

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, find_runs
 from data_contracts.conventions import COCO17, COCO17_BONES
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyModel, BodyParameters
@@ -235,8 +235,7 @@ def stretches(poses: BodyParameters) -> list[slice]:
     """Return the uninterrupted intervals of frames in which a person (frames,) has a body."""
     parts = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
     there = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]])))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return find_runs(np.asarray(there))
 
 
 def _depth_first(parents: NDArray[np.int64], joint: int) -> Iterator[int]:

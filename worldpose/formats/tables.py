@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, find_runs
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
@@ -254,16 +254,14 @@ def _strides(
         middle = slice(half, -half)
         along = np.sum((ankle - hips)[middle] * direction, axis=-1)
         ahead[middle] = np.where(whole, along, np.nan)
-    there = np.isfinite(ahead)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]])))
     strides = []
-    for first, last in edges.reshape(-1, 2):
+    for run in find_runs(np.isfinite(ahead)):
         contacts, _ = find_peaks(
-            ahead[first:last],
+            ahead[run],
             distance=max(1, round(min_stride_s * fps)),
             prominence=min_swing_m,
         )
-        for a, b in pairwise((contacts + first).tolist()):
+        for a, b in pairwise((contacts + run.start).tolist()):
             if _is_stride(float(frames[b] - frames[a]) / fps, ankle[b] - ankle[a]):
                 strides.append((a, b))
     return strides

@@ -63,7 +63,7 @@ class ImportedClicks:
     Attributes:
         files: written, relative to the match folder.
         clicks: number of clicks and drawn lines, by camera or clip.
-        own_points: points that the Laws do not name, with their places (3,) [m, world].
+        own_points: points that the rules do not name, with their places (3,) [m, world].
         repeated: labels that were clicked more than once in one image.
         notes: sentences about what was left out.
         mirrored: whether the labels' y axis points towards the near side; None without coordinates.

@@ -130,7 +130,8 @@ def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
     guess = f", which looks like {units[0]}" if units else ""
     raise InputError(
         f"{file}: points.{worst}",
-        expected=f"a place within {from_laws:g} m of the Laws': {laws[worst][0]:.2f}, "
+        expected=f"a place within {from_laws:g} m of the {pitch.template} rules': "
+        f"{laws[worst][0]:.2f}, "
         f"{laws[worst][1]:.2f} m on a pitch of {pitch.length:g} x {pitch.width:g} m",
         found=f"{x:g}, {y:g}{guess}",
         todo="Correct the name, the place, or length and width; the origin is the centre spot, x "

@@ -147,7 +147,7 @@ class SurveySettings(Record):
     fit_scale: bool = False
     """Divide by the survey's scale, as of a map projection, instead of only reporting it."""
     accuracy_m: float = Field(default=0.03, ge=1e-6, le=10)
-    """Standard deviation of painted markings from the Laws of the Game [m]: a quarter of a line."""
+    """Standard deviation of painted markings from the rules [m]: a quarter of a line."""
     max_offset_m: float = Field(default=1.0, ge=1e-6, le=100)
     """Offset beyond which a point's name is wrong [m]: no painter errs by that much."""
     max_scale_error: float = Field(default=0.08, ge=1e-6, le=10)
@@ -240,7 +240,7 @@ def _require_names(survey: Survey, offsets: Floats, settings: SurveySettings) ->
 
 @dataclass(frozen=True, eq=False)
 class SurveyFit:
-    """A surveyed pitch, and its residuals from the Laws of the Game.
+    """A surveyed pitch, and its residuals from the rules of the game.
 
     Attributes:
         pitch: length, width, crown and the surveyed points in the world frame.

@@ -342,22 +342,52 @@ def _check_size(spec: PitchSpec, where: str) -> None:
             found=f"{spec.length:g} x {spec.width:g}",
             todo="Give metres between the centres of the outer lines.",
         )
-    nested = (
-        ("goal_width", "goal_area_width", "penalty_area_width"),
-        (
-            "goal_area_depth",
-            "penalty_area_depth",
-        ),
-    )
-    for names in nested:
-        given = [(spec.sizes[name], name) for name in names if spec.sizes.get(name)]
-        if given != sorted(given):
+    todo = "Correct the dimensions, in metres; 0 is for what is not painted."
+    for names in _RISING:
+        given = {name: spec.sizes[name] for name in names if spec.sizes.get(name)}
+        if [*given.values()] != sorted(given.values()):
             raise InputError(
                 f"{where}: dimensions",
-                expected=f"{', '.join(name for _, name in given)} in rising order",
-                found=", ".join(f"{size:g}" for size, _ in given),
-                todo="Correct the dimensions, in metres; 0 is for what is not painted.",
+                expected=f"{', '.join(given)} in rising order",
+                found=", ".join(f"{size:g}" for size in given.values()),
+                todo=todo,
             )
+    for name, most in _largest(spec).items():
+        if spec.sizes.get(name, 0.0) > most:
+            raise InputError(
+                f"{where}: dimensions.{name}",
+                expected=f"at most {most:g} m, where other markings begin",
+                found=f"{spec.sizes[name]:g}",
+                todo=todo,
+            )
+
+
+_RISING: Final = (
+    ("goal_width", "goal_area_width", "penalty_area_width"),
+    ("goal_width", "penalty_area_front"),
+    ("goal_width", "goal_area_front"),
+    ("goal_area_depth", "penalty_mark_distance", "penalty_area_depth"),
+    ("penalty_mark_distance", "second_penalty_mark_distance"),
+    ("goal_area_radius", "seven_meter_distance", "free_throw_radius"),
+    ("backboard_distance", "basket_distance", "restricted_area_depth"),
+    ("backboard_bottom", "backboard_top"),
+    ("no_charge_radius", "three_point_radius"),
+)
+"""Dimensions of which each is at least the one before, where both are painted."""
+
+
+def _largest(spec: PitchSpec) -> dict[str, float]:
+    """Return the dimensions [m] at which markings would meet others or the middle of the court."""
+    sizes, width = spec.sizes, spec.width
+    area = max(sizes.get(name, 0.0) for name in ("penalty_area_width", "goal_width"))
+    found = {"corner_arc_radius": 0.5 * (width - area)}
+    if "three_point_radius" in sizes:
+        inside = min(0.5 * width - sizes["three_point_margin"], sizes["three_point_radius"])
+        found["three_point_margin"] = 0.5 * width
+        found["three_point_radius"] = 0.5 * spec.length - sizes["basket_distance"]
+        if sizes["three_point_radius"]:
+            found["restricted_area_width"] = 2.0 * inside
+    return found
 
 
 def _check_markings(

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from data_contracts.arrays import Floats, find_runs
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
@@ -64,10 +65,9 @@ def write_recording(
         moving = {name: camera for name, camera in cameras.items() if camera.batch_shape}
         for name in [name for name in cameras if name not in moving]:
             _log_camera(rr, stream, f"world/cameras/{name}", cameras[name], static=True)
-            seen = (line[np.isfinite(line).all(-1)] for line in map(cameras[name].project, lines))
-            shown = rr.LineStrips2D(
-                [each.tolist() for each in seen if len(each) > 1], colors=[white]
-            )
+            seen = map(cameras[name].project, lines)
+            parts = [part for line in seen for part in split_at_gaps(line)]
+            shown = rr.LineStrips2D([part.tolist() for part in parts], colors=[white])
             stream.log(f"world/cameras/{name}/markings", shown, static=True)
         for row, frame in enumerate(tracks.frames):
             stream.set_time("frame", sequence=int(frame))
@@ -78,6 +78,12 @@ def write_recording(
             stream.log("world/people", _skeletons(rr, tracks, row))
         stream.flush()
         stream.disconnect()
+
+
+def split_at_gaps(line: Floats) -> list[Floats]:
+    """Return the parts of a line (n, 2) of two points or more, none of which is missing."""
+    runs = find_runs(np.asarray(np.isfinite(line).all(-1)))
+    return [line[run] for run in runs if run.stop - run.start > 1]
 
 
 def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401

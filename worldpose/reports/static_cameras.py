@@ -1,4 +1,4 @@
-"""Plots of a static camera's accuracy: clicks on its still, and expected ground error."""
+"""Plots of static cameras: clicks on a still, expected ground error, and health over time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Floats, Image
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import (
@@ -25,6 +25,7 @@ from worldpose.reports.drawing import (
     picture_panels,
     png,
     show_image,
+    style,
     style_ground,
 )
 
@@ -52,6 +53,47 @@ class ErrorMap(NamedTuple):
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     expected: NDArray[np.float64]
+
+
+def plot_health(
+    cameras: Sequence[str],
+    frame: NDArray[np.int64],
+    badness: Floats,
+    missing: Floats,
+    marks: Sequence[tuple[str, int | None, str]],
+) -> bytes:
+    """Return a PNG of the health of cameras over time, a row each.
+
+    Args:
+        cameras: (rows,) names.
+        frame: (bins + 1,) first match frame of each bin, and the frame after the last.
+        badness: (bins, rows), above 1 somebody should look; NaN where nothing is known.
+        missing: (bins, rows) share of frames without an image; NaN where not known.
+        marks: camera, match frame of a sudden change (None = it lasts), and what is written there.
+    """
+    height = 1.6 + 0.32 * len(cameras)
+    figure = Figure(figsize=(14.0, height), dpi=110, layout="constrained", facecolor="white")
+    axes = figure.subplots()
+    axes.set_facecolor("#d9d9d9")
+    rows = np.arange(len(cameras) + 1) - 0.5
+    shown = axes.pcolormesh(frame, rows, badness.T, cmap="YlOrRd", vmin=0.0, vmax=2.0)
+    gone = np.where(missing.T > 0.0, 1.0, np.nan)
+    axes.pcolormesh(frame, rows, gone, cmap="binary", vmin=0.0, vmax=1.0)
+    for camera, moment, said in marks:
+        row, at = cameras.index(camera), frame[0] if moment is None else moment
+        if moment is not None:
+            axes.plot([at, at], [row - 0.5, row + 0.5], color=ACCEPTED, linewidth=2.5)
+        side = "right" if at > 0.8 * frame[-1] + 0.2 * frame[0] else "left"
+        axes.text(
+            at, row, f" {said} ", color=INK, fontsize=9, va="center", ha=side, path_effects=HALO
+        )
+    axes.set_yticks(range(len(cameras)), cameras)
+    axes.invert_yaxis()
+    axes.set_xlabel("match frame", color=INK)
+    style(axes)
+    scale = figure.colorbar(shown, ax=axes, pad=0.01)
+    scale.set_label("health: above 1, look at it", color=INK)
+    return png(figure)
 
 
 def plot_calibration(

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, find_runs
 from data_contracts.cameras import LensCalibration
 from data_contracts.review import Acceptance
 from data_contracts.static_calibration import ClickedMarkings
@@ -366,9 +366,7 @@ def preview(
 
 def _runs(points: NDArray[np.float64], chosen: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
     """Return the runs of two or more chosen points in a row."""
-    bounds = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
-    runs = zip(bounds[::2], bounds[1::2], strict=True)
-    return [points[begin:end] for begin, end in runs if end - begin > 1]
+    return [points[run] for run in find_runs(chosen) if run.stop - run.start > 1]
 
 
 def _is_in_or_near(

@@ -287,13 +287,26 @@ class Takeover:
     person: int
     other: int
 
+    @property
+    def join(self) -> Join:
+        """The person's own track before and after, of which either is as likely the other's."""
+        return Join(
+            before=self.person,
+            after=self.person,
+            last_frame=self.frame - 1,
+            first_frame=self.frame,
+            cost=0.0,
+            margin=0.0,
+            decided=True,
+        )
+
 
 def identity_certainty(joins: Iterable[Join], person: NDArray[np.integer], frames: int) -> Floats:
     """Return the probability (frames, people) that the tracked person is still the first one [1].
 
     The tracks of a person are joined by odds: a stretch between two joins has the probability of
-    all joins before it, each against its best alternative. It is 1 up to the first join, and after
-    a join that a reviewer made.
+    all joins before it, each against its best alternative, and of a half after a takeover. It is 1
+    up to the first join, and after a join that a reviewer made.
 
     Args:
         joins: joins of the clip, decided or not.

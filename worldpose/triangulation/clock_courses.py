@@ -10,7 +10,6 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.changes import find_changes
-from worldpose.camera_consistency.health import CameraHealth
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.tracking.settings import TrackingSettings
@@ -19,7 +18,7 @@ from worldpose.triangulation.camera_changes import (
     MeasuredChange,
     choose_change,
     explain_changes,
-    triangulate_views,
+    measure_departures,
 )
 from worldpose.triangulation.clocks import move_to_match_time
 from worldpose.triangulation.lost_views import find_lost_views
@@ -63,11 +62,7 @@ def trace_clocks(
         index = tracks.detection_index
         moved = move_to_match_time(np.asarray(shifted.keypoints, np.float64), index, rest)
         people = replace(shifted, keypoints=moved, detection_index=index)
-        health = CameraHealth.empty(frames, count, index.shape[2], fps)
-        for start in range(0, frames, 512):
-            rows = slice(max(0, start - 1), min(frames, start + 513))
-            seen = people[rows]
-            health.add(cameras, seen, triangulate_views(cameras, seen, settings), rows.start)
+        health = measure_departures(cameras, people, fps, settings, np.arange(frames))
         found = find_changes(health, fps, ("clock",))
         if not found:
             break

@@ -12,6 +12,7 @@ from worldpose.body_fitting.monocular import (
     PRIOR_SPREAD,
     MonocularPoses,
     MonocularPrior,
+    join_poses,
     learn_precision,
     parse_monocular,
     place_monocular_poses,
@@ -25,6 +26,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
+ONE = np.ones((1, 1))
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))
 MATRICES = Rigid.from_rotvec(VECTORS, np.zeros(3)).rotation
 CROP = {"box_center": np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]])}
@@ -172,7 +174,7 @@ def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known():
     error = 0.6
     orient, angles = RNG.normal(0.0, 0.5, (400, 1, 3)), RNG.normal(0.0, 0.5, (400, 1, 30))
     off = error * RNG.standard_normal((400, 1, 33))
-    glimpses = MonocularPoses(rotation(off[..., :3]) @ rotation(orient), angles + off[..., 3:])
+    glimpses = MonocularPoses(rotation(off[..., :3]) @ rotation(orient), angles + off[..., 3:], ONE)
     sure = np.ones((400, 1), dtype=bool)
     spread = 1.0 / np.sqrt(np.diag(learn_precision(glimpses, orient, angles, sure, 1.0)))
     # Five of 0.25 rad are counted with 400: 56 mrad for 50; 1 / sqrt(800) is 4 %, three of these.
@@ -180,6 +182,19 @@ def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known():
     np.testing.assert_allclose(spread[3:], expected, rtol=0.12)
     none = learn_precision(glimpses, orient, angles, ~sure, 1.0)
     np.testing.assert_allclose(none, np.eye(33) / PRIOR_SPREAD**2)
+
+
+def test_a_person_has_the_pose_of_the_camera_that_shows_it_largest():
+    def seen(number, heights):
+        shape = np.array(heights)[None]
+        orient = np.where(np.isnan(shape)[..., None, None], np.nan, np.full((1, 3, 3, 3), number))
+        return MonocularPoses(orient, orient[..., 0, :1].repeat(30, -1), shape)
+
+    found = join_poses([seen(1.0, [90.0, 40.0, np.nan]), seen(2.0, [50.0, 80.0, np.nan])])
+    assert found.angles[0, :2, 0].tolist() == [1.0, 2.0]
+    assert found.orient[0, :2, 2, 2].tolist() == [1.0, 2.0]
+    assert np.isnan(found.orient[0, 2]).all()
+    assert join_poses([]) is None
 
 
 def people_in_a_gap(seed=5):
@@ -195,7 +210,7 @@ def people_in_a_gap(seed=5):
 def glimpsed(truth, error, rng):
     orient = rotation(truth.global_orient)[:, None]
     angles = (truth.body_pose @ GATHER.T)[:, None]
-    return MonocularPoses(orient, angles + error * rng.standard_normal(angles.shape))
+    return MonocularPoses(orient, angles + error * rng.standard_normal(angles.shape), ONE)
 
 
 def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():

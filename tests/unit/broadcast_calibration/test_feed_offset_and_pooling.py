@@ -1,5 +1,7 @@
 """The feed's clock seen in moving people, and one place for several clips."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import turning_clip as clip
@@ -8,6 +10,7 @@ from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.uncertainty import (
     pool_centers,
 )
+from worldpose.ingest.clock import ImageClock, rows_at
 
 FRAMES, FPS = 120, 50.0
 
@@ -38,6 +41,24 @@ def test_the_offset_is_found_within_half_a_frame(late):
     assert found.determined
     # A runner goes 0.1 m per frame, 2 px; 8 people of 17 joints at 1 px.
     assert found.frames == pytest.approx(late, abs=0.2)
+
+
+@pytest.mark.parametrize(("rate", "late"), [(2.0, 0.5), (2.0, -3.0), (1.2, 1.4)])
+def test_the_offset_of_a_faster_camera_is_in_match_frames(rate, late):
+    rng, frames = np.random.default_rng(2), np.arange(int(FRAMES / rate))
+    clock = ImageClock.of(frames, 0.0, rate, 0.0)
+    camera, exact = people(late * rate, 5.0, rng)
+    # What static cameras of this lower rate triangulate, with the noise of single frames.
+    joints = exact.joints[(frames * rate).astype(int)] if rate == 2.0 else None
+    if joints is None:
+        joints = rows_at(exact.joints, frames * rate)
+    joints = joints + 0.04 * rng.standard_normal(joints.shape)
+    moving = People.in_images(joints, exact.keypoints[clock.number], FPS / rate, clock)
+    images = np.arange(len(clock.images))
+    moving = replace(moving, keypoints=exact.keypoints[images])
+    found = estimate_feed_offset(camera.frames(images), moving, reach=10.0)
+    assert found.determined
+    assert (found.frames, found.rate) == pytest.approx((late, rate), abs=0.15)
 
 
 def test_clips_that_agree_give_their_weighted_mean():

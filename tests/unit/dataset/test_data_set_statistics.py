@@ -16,7 +16,7 @@ from flows.results.dataset import check, count
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import write_frame_rates
 from worldpose.dataset.statistics import clip_statistics
-from worldpose.formats.challenge import write_moving_camera
+from worldpose.formats.challenge import write_moving_camera, write_submission
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -42,6 +42,17 @@ def panning(frames, focal, angle):
         cam_from_world=turn,
         image_size=np.array([1920, 1080]),
     )
+
+
+def test_a_clip_that_two_cameras_film_is_one_clip_with_the_people_of_both(tmp_path):
+    people = np.random.default_rng(0).normal(size=(4, 20, 15, 3)).astype(np.float32)
+    seen = {"goal.fast": people[:3], "goal.main": people[1:], "half.a": people[:1] + 1.0}
+    write_submission(tmp_path / "submission.zip", seen)
+    for view, angle in (("goal.fast", 0.1), ("goal.main", 0.0), ("half.a", 0.0)):
+        write_moving_camera(tmp_path / "cameras" / f"{view}.npz", panning(20, 3000.0, angle))
+    found = count([tmp_path], fps=25.0)
+    assert {name: clip.persons for name, clip in found.clips.items()} == {"goal": 4, "half.a": 1}
+    assert (found.frames, found.poses, found.clips["goal"].camera) == (40, 100, "M")
 
 
 def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):

@@ -1,11 +1,14 @@
 """Broadcast cameras of a clip: their names, their files, and the images at match frames."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import yaml
 from pydantic import ValidationError
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from flows.results import broadcast_views
 from worldpose.errors import InputError
 from worldpose.ingest.clock import ImageClock, rows_at
 from worldpose.ingest.footage import footage_size, image_clock, unit_frames
@@ -140,3 +143,17 @@ def test_several_broadcast_cameras_need_static_ones(two):
     (two / "detections" / "goal.npz").rename(two / "detections" / "goal.main.npz")
     with pytest.raises(InputError, match=r"clip goal: broadcast.*one broadcast camera.*tight"):
         read_match(two)
+
+
+def test_an_image_between_match_frames_is_drawn_with_the_nearest_that_has_a_camera():
+    clock = ImageClock.of(np.arange(10), 0.0, 2.4, 0.0)
+    assert clock.number[:4].tolist() == [0, 2, 5, 7]
+    assert [clock.nearest_frame(number) for number in (0, 4, 5, 6, 7)] == [0, 2, 2, 2, 3]
+
+
+def test_a_static_camera_may_be_named_broadcast(monkeypatch):
+    monkeypatch.setattr(broadcast_views, "broadcast_views", lambda run, clip: ["goal"])
+    monkeypatch.setattr(broadcast_views, "camera_in_frames", lambda run, view, frames: view)
+    find = partial(broadcast_views.moving_cameras, None, "goal", np.arange(3))
+    assert find(["cam1"]) == {"broadcast": "goal"}
+    assert find(["cam1", "broadcast"]) == {"goal": "goal"}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_contracts.tracking import Join
-from worldpose.tracking.joins import End, choose_joins, identity_certainty, join_costs
+from worldpose.tracking.joins import End, Takeover, choose_joins, identity_certainty, join_costs
 from worldpose.tracking.settings import TrackingSettings
 
 SETTINGS = TrackingSettings()
@@ -48,4 +48,11 @@ def test_certainty_falls_at_every_return_and_not_at_a_confirmed_one():
     joins = [join(10, np.log(9.0)), join(20, None), join(30, np.log(4.0)), join(5, 1.0, 8, False)]
     found = identity_certainty(joins, np.array([7, 8]), 40)
     assert found[[0, 9, 10, 29, 30, 39], 0] == pytest.approx([1, 1, 0.9, 0.9, 0.72, 0.72])
+    assert (found[:, 1] == 1.0).all()
+
+
+def test_a_track_that_may_show_another_person_is_as_likely_either():
+    join = Takeover(frame=20, person=7, other=-1).join
+    found = identity_certainty([join], np.array([7, 8]), 40)
+    assert found[[0, 19, 20, 39], 0] == pytest.approx([1, 1, 0.5, 0.5])
     assert (found[:, 1] == 1.0).all()

@@ -9,9 +9,9 @@ import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.triangulation import CameraChange
+from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.changes import find_changes
-from worldpose.camera_consistency.health import CameraHealth
+from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import (
     correct_views,
@@ -50,6 +50,46 @@ def explain(cameras, people):
     health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
     found = find_changes(health, FPS)
     return explain_changes(cameras, people, FPS, SETTINGS, found) if found else None
+
+
+def measure(cameras, people, **frames):
+    """Health of the cameras over time, and in which share of it each one is bad."""
+    health = CameraHealth.empty(FRAMES, len(cameras.focal), people.detection_index.shape[2], FPS)
+    health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
+    values = measure_health(health, frames)
+    return dict(zip(HEALTH_MEASURES, np.moveaxis(values, -1, 0), strict=True)), (
+        judge_health(values) > 1.0
+    ).mean(axis=0)
+
+
+def test_health_over_time_shows_a_knock_and_lost_frames_and_no_healthy_camera(cameras):
+    healthy, bad = measure(cameras, view(cameras, lambda pixels, *_: pixels))
+    assert np.nanmax(healthy["misfit"]) < 2.0
+    assert np.nanmax(np.abs(healthy["clock_frames"])) < 0.3
+    assert (bad == 0.0).all()
+    knocked, bad = measure(cameras, view(cameras, knock(90.0, 40.0)))
+    half = len(knocked["misfit"]) // 2
+    assert 0.4 < bad[BAD] < 0.6
+    # Four cameras share what one of them is off: it shows between a half and the whole of it.
+    assert 45.0 < np.nanmedian(knocked["shift_px"][half + 3 :, BAD]) < 99.0
+    assert np.nanmedian(knocked["shift_px"][: half - 3, BAD]) < 2.0
+    # Of five frames: the camera itself displaces the people.
+    lost, _ = measure(cameras, view(cameras, late))
+    assert np.nanmedian(lost["clock_frames"][half + 3 :, BAD]) > 1.5
+
+
+def test_health_tells_images_that_are_missing_dark_or_blurred(cameras):
+    people = view(cameras, lambda pixels, *_: pixels)
+    frame = np.arange(FRAMES)[:, None] * np.ones(4)
+    frames = {
+        "missing": np.where((frame >= 180) & (np.arange(4) == 0), 1.0, 0.0),
+        "brightness": np.where((frame >= 120) & (frame < 144) & (np.arange(4) == 1), 30.0, 90.0),
+        "sharpness": np.where((frame < 60) & (np.arange(4) == 3), 3.0, 8.0),
+    }
+    found, bad = measure(cameras, people, **frames)
+    assert bad == pytest.approx([0.25, 0.1, 0.0, 0.25], abs=0.02)
+    assert found["brightness"][[0, 13], 1] == pytest.approx([90.0, 30.0])
+    assert np.isnan(found["unmatched"]).all()
 
 
 def late(pixels, *_):
