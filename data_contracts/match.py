@@ -36,7 +36,7 @@ TEAM_SIZE: Final = 11
 """Players of a team on the pitch (Laws of the Game, 3)."""
 
 
-def _one_error(kind: str, forms: str) -> WrapValidator:
+def one_error(kind: str, forms: str) -> WrapValidator:
     """Return a validator of values of two forms, whose error names both at once."""
 
     def validate(value: object, read: ValidatorFunctionWrapHandler) -> object:
@@ -52,20 +52,20 @@ def _one_error(kind: str, forms: str) -> WrapValidator:
 
 ClockOffset = Annotated[
     FrameOffset | tuple[tuple[Frame, FrameOffset], ...],
-    _one_error("clock_offset", "a number, or pairs [match frame, number]"),
+    one_error("clock_offset", "a number, or pairs [match frame, number]"),
 ]
 """A camera's frame minus the match frame; a number, or rising pairs of a match frame and a number,
 with linear change between them."""
 
 Cameras = Annotated[
     Name | tuple[Name, ...] | None,
-    _one_error("cameras", "the name of a camera, or a list of names"),
+    one_error("cameras", "the name of a camera, or a list of names"),
 ]
 """The name of a camera, or those of several."""
 
 CameraOffsets = Annotated[
     FrameOffset | dict[Name, FrameOffset],
-    _one_error("camera_offsets", "a number, or a number for each broadcast camera"),
+    one_error("camera_offsets", "a number, or a number for each broadcast camera"),
 ]
 """An offset of the only camera, or of each one by its name [frame]."""
 
@@ -198,6 +198,8 @@ class MatchSpec(Record):
     pitch: str | None = None
     """`none` for footage without a pitch, a file name, or absent for the standard pitch."""
     roster: tuple[PlayerSpec, ...] = ()
+    venue: Name | None = None
+    """The stadium or laboratory, whose settings the project keeps."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

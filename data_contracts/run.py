@@ -88,8 +88,6 @@ class Reservation(Record):
     """Name of the run's machine."""
     pid: ProcessId
     """Process id on that machine."""
-    overrides: dict[str, dict[str, JsonValue]] | None = None
-    """Stage to the requested settings; None if unknown."""
 
 
 class WaitingUnit(Record):

@@ -35,6 +35,7 @@ from data_contracts.release import (
 )
 from data_contracts.review import Correction, JournalEntry, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
+from data_contracts.settings import RunSettings
 from data_contracts.static_calibration import STATIC_CALIBRATION, ClickedMarkings
 from data_contracts.tracking import BROADCAST_TRACKING, TRACKING, Join, Track
 from data_contracts.triangulation import RETRIANGULATION, TRIANGULATION
@@ -57,6 +58,7 @@ RECORDS: dict[str, type[Record]] = {
     "reservation": Reservation,
     "result_manifest": ResultManifest,
     "run": RunRecord,
+    "run_settings": RunSettings,
     "pin": Pin,
     "evaluation": Evaluation,
     "method_score": MethodScore,

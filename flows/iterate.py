@@ -19,9 +19,8 @@ from flows.registering import open_match
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead
 from flows.run_record import latest_run
-from flows.running import RunRequest, keep_settings, run_match, shared_machines
+from flows.running import RunRequest, require_whole, run_match, settle, shared_machines
 from flows.stage import Match
-from worldpose.errors import UsageError
 from worldpose.store.store import Store
 
 GAIN: Final = 0.01
@@ -79,15 +78,8 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
     Raises:
         UsageError: only a part of the method was requested.
     """
-    if request.from_stage is not None or request.until_stage is not None:
-        raise UsageError(
-            "--iterations",
-            expected="the whole method",
-            found="--from or --until",
-            todo="Omit --from and --until, or omit --iterations.",
-        )
-    latest = latest_run(store, match.match_id)
-    request = keep_settings(store, match.match_id, latest, request)
+    require_whole(request)
+    match, request = settle(store, match, request)
     while True:
         try:
             return _iterate(store, match, request, most)

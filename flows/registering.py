@@ -210,9 +210,9 @@ def _read_videos(match: MatchFolder, new: Container[str]) -> None:
 
 
 def _of_footage(spec: MatchSpec) -> MatchSpec:
-    """Return match.yaml's camera and clip entries: identities do not affect file checks."""
+    """Return match.yaml's camera and clip entries: names do not affect file checks."""
     clips = tuple(clip.model_copy(update={"people": {}}) for clip in spec.clips)
-    return spec.model_copy(update={"clips": clips, "roster": ()})
+    return spec.model_copy(update={"clips": clips, "roster": (), "venue": None})
 
 
 def _changes(before: tuple[SourceFile, ...], after: tuple[SourceFile, ...]) -> str:

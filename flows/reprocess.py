@@ -9,9 +9,10 @@ from typing import Literal
 from data_contracts.run import RunRecord
 from flows.iterate import iterate_match
 from flows.progress import reporter
+from flows.results.automatic_exports import export_after_run
 from flows.run_plan import PlannedUnit
 from flows.run_status import RunStatus, run_status
-from flows.running import RunRequest, run_match, shared_machines
+from flows.running import RunRequest, run_match, settle, shared_machines
 from worldpose.errors import InternalError, WorldposeError
 from worldpose.store.store import Store
 
@@ -48,8 +49,8 @@ def reprocess_matches(
 ) -> list[Reprocessed]:
     """Run every match with stale results, up to the last stage of its latest run.
 
-    A match is run with the settings, gates and iterations of its latest run. A failure is reported
-    for its match, and does not stop the others. No id means all matches. `retry` also retries
+    A match is run with the settings that its layers give. A failure is reported for its match, and
+    does not stop the others. No id means all matches. `retry` also retries
     failed units without an edit; a rehearsal only determines what would be done.
     """
     with shared_machines(store, request) as machines_for:
@@ -88,13 +89,11 @@ def _reprocess(
 
 
 def _run(store: Store, status: RunStatus, request: RunRequest) -> RunRecord:
-    latest = status.latest
-    request = replace(
-        request,
-        settings=status.settings,
-        until_stage=status.until_stage,
-        gates=latest.gates,
-    )
-    if latest.iteration == 1:
-        return run_match(store, status.match, request)
-    return iterate_match(store, status.match, request, latest.iteration).record
+    request = replace(request, until_stage=status.until_stage, gates=status.gates)
+    match, request = settle(store, status.match, request)
+    if request.most_iterations == 1:
+        record = run_match(store, match, request)
+    else:
+        record = iterate_match(store, match, request, request.most_iterations).record
+    export_after_run(store, match, record)
+    return record

@@ -18,7 +18,6 @@ from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from worldpose.body.body_file import given_body_folder
 from worldpose.errors import StoreError, UsageError
 from worldpose.sources import code_version
 from worldpose.store.recipes import libraries, recipe_key
@@ -55,7 +54,7 @@ class PlannedUnit:
             key=self.key,
             run_id=run_id,
             seconds=seconds,
-            body_folder=given_body_folder(),
+            body_folder=None if match.body_folder is None else str(match.body_folder),
         )
 
 
@@ -179,7 +178,7 @@ class RunPlan:
         """Plan the units of a stage for a match without the cameras that are left out."""
         before = self.before
         settings = settings_of(stage, self.overrides)
-        outside = stage.external_inputs(settings)
+        outside = stage.external_inputs(match, settings)
         units = []
         for unit in stage.units(match):
             inputs = {name: results.get(name) for name in stage.inputs(match, unit)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import time
@@ -13,7 +12,6 @@ from types import MappingProxyType
 from typing import Any, Final, Self
 
 import psutil
-from pydantic import JsonValue
 
 from data_contracts.match import CameraSpec, ClipSpec
 from data_contracts.run import (
@@ -35,11 +33,9 @@ from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
 from tasks.tracing import add_unit_span, stage_span
-from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.recipes import libraries
-from worldpose.store.runs import run_order
 from worldpose.store.store import Store
 
 ComputeUnits = Callable[
@@ -65,37 +61,6 @@ def describe_end(record: RunRecord) -> str:
     if record.state == "partial" and not record.failed:
         said = [f"partial, not all stages have results. {' '.join(record.warnings)}", *said]
     return f"run {record.run_id} of {record.match_id}: {', '.join(said)}"
-
-
-def resolve_settings(
-    store: Store, match_id: str, latest: RunRecord | None, requested: Overrides
-) -> tuple[dict[str, dict[str, JsonValue]], str | None]:
-    """Return the settings of a match's next run: the requested ones over those of its latest run.
-
-    A run that was killed counts too: the next run continues it.
-
-    Returns:
-        The settings that differ from their defaults, and one line that names the kept ones; None
-        if all of these are requested or defaults.
-    """
-    run_id, before = ("", {}) if latest is None else (latest.run_id, latest.overrides)
-    for run in store.unfinished_runs(match_id):
-        if run.overrides is not None and run_order(run.run_id) > run_order(run_id):
-            run_id, before = run.run_id, run.overrides
-    settings = {
-        stage: {**before.get(stage, {}), **requested.get(stage, {})}
-        for stage in sorted(before.keys() | requested.keys())
-    }
-    defaults = {stage.name: stage.settings().model_dump(mode="json") for stage in METHOD}
-    kept = [
-        f"{stage}.{name}={value if isinstance(value, str) else json.dumps(value)}"
-        for stage, values in before.items()
-        for name, value in values.items()
-        if name not in requested.get(stage, {})
-        and (stage not in defaults or defaults[stage].get(name) != value)
-    ]
-    line = f"settings of run {run_id}: {', '.join(kept)}; without them: --default-settings"
-    return {stage: values for stage, values in settings.items() if values}, line if kept else None
 
 
 CLOCK_SECONDS: Final = 5.0
@@ -252,9 +217,7 @@ class RunLog:
         plan = RunPlan.begin(gatekeeper, stages, overrides, latest, iteration)
         if plan.before is not None:
             _require_inputs(store, match, stages, plan.before)
-        run_id = store.reserve_run(
-            match.match_id, {stage: dict(values) for stage, values in overrides.items()}
-        )
+        run_id = store.reserve_run(match.match_id)
         for unit in plan.waiting:
             reporter().unit_waits(unit.unit, unit.reasons)
         return cls(plan, gatekeeper, run_id, latest, reused=list(plan.results))
@@ -334,7 +297,7 @@ class RunLog:
             results=dict(sorted(self.plan.results.items())),
             settings=settings,
             overrides=overrides,
-            body_folder=given_body_folder(),
+            body_folder=None if self.match.body_folder is None else str(self.match.body_folder),
             executed=tuple(sorted(self.executed)),
             reused=tuple(sorted(self.reused)),
             failed=tuple(sorted(self.failed, key=lambda failure: failure.unit)),

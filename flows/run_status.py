@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from data_contracts.run import RunRecord
+from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Recipe
 from flows.gates import Gatekeeper
 from flows.method import METHOD, unit_order
 from flows.registering import open_match
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
-from flows.run_record import latest_run, resolve_settings
-from flows.settings import Overrides, selected_stages
+from flows.run_record import latest_run
+from flows.settings import Overrides, resolve, selected_stages
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.store.recipes import RecipeDifference, recipe_differences
@@ -146,9 +146,11 @@ def list_unit_states(
 def _plan_as_latest(
     store: Store, match: Match, latest: RunRecord | None, overrides: Overrides
 ) -> list[PlannedUnit]:
-    """Plan the whole method with the settings and the iteration of the latest run."""
-    asked, _ = resolve_settings(store, match.match_id, latest, overrides)
-    return plan_run(store, match, asked, iteration=1 if latest is None else latest.iteration)
+    """Plan the whole method with the settings of the next run and the iteration of the latest."""
+    found = resolve(match.layers, overrides)
+    most, iteration = found.general.iterations, 1 if latest is None else latest.iteration
+    iteration = iteration if most == "auto" else min(iteration, most)
+    return plan_run(store, match, found.overrides, iteration=iteration)
 
 
 def recorded_differences(
@@ -176,7 +178,7 @@ class RunStatus:
     Attributes:
         match: match with all current corrections and verdicts.
         latest: the current run.
-        settings: settings of that run, and further requested ones.
+        gates: when results of the next run need review.
         until_stage: last stage of that run; None = the method's last.
         units: units that differ from the run, in order.
         is_stale: whether there is anything to do, even only to apply a verdict.
@@ -184,7 +186,7 @@ class RunStatus:
 
     match: Match
     latest: RunRecord
-    settings: Overrides
+    gates: GatePolicy
     until_stage: str | None
     units: tuple[UnitStatus, ...]
     is_stale: bool
@@ -202,8 +204,8 @@ def run_status(
     """Return what a match's latest run would recompute; None if the match never had a run.
 
     A failed unit with an unchanged recipe is skipped, and so are the units that depend on it,
-    unless a disk or a network failed. `settings` go beyond those of the latest run; `retry` retries
-    all failed units.
+    unless a disk or a network failed. `settings` go beyond those of the layers; `retry` retries all
+    failed units.
 
     Raises:
         InputError: the match folder is invalid.
@@ -212,28 +214,32 @@ def run_status(
     if latest is None:
         return None
     match = open_match(store, match_id)
-    requested, _ = resolve_settings(store, match_id, latest, settings or {})
     until = _last_stage(match, latest)
-    stages = selected_stages(None, until)
-    gatekeeper = Gatekeeper(store, match, latest.gates)
+    found = resolve(match.layers, settings)
+    most = found.general.iterations if until is None else 1  # a part of the method has one
+    passes = latest.iteration if most == "auto" else most
+    stages, gates = selected_stages(None, until), found.general.gates or latest.gates
+    gatekeeper = Gatekeeper(store, match, gates)
     units: list[UnitStatus] = []
     lasting = (each for each in latest.failed if each.error not in TEMPORARY_ERRORS)
     hopeless = {} if retry else {each.unit: each.key for each in lasting}
-    for number in range(1, latest.iteration + 1):
-        plan = plan_ahead(gatekeeper, stages, requested, latest, number)
-        is_last = number == latest.iteration
-        record = latest if is_last else _run_of_iteration(store, latest, number)
-        found = _stale_units(store, plan, record, hopeless)
-        # Only the results of earlier iterations count: their records can have other settings.
-        units += [unit for unit in found if is_last or unit.state != UnitState.READY]
+    is_recorded = False
+    for number in range(1, passes + 1):
+        plan = plan_ahead(gatekeeper, stages, found.overrides, latest, number)
+        is_kept = number == latest.iteration
+        record = latest if is_kept else _run_of_iteration(store, latest, number)
+        is_recorded = is_recorded or plan.is_recorded_by(latest)
+        stale = _stale_units(store, plan, record, hopeless)
+        # Only the results of other iterations count: their records can have other settings.
+        units += [unit for unit in stale if is_kept or unit.state != UnitState.READY]
     is_settled = latest.state in ("complete", "waiting")
     return RunStatus(
         match=match,
         latest=latest,
-        settings=requested,
+        gates=gates,
         until_stage=until,
         units=tuple(units),
-        is_stale=bool(units) or (is_settled and not plan.is_recorded_by(latest)),
+        is_stale=bool(units) or (is_settled and not is_recorded),
     )
 
 
@@ -339,7 +345,7 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
 def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     """Return a unit's state and the reasons for it.
 
-    The unit is `match/stage/unit`; the overrides go beyond the settings of the latest run.
+    The unit is `match/stage/unit`; the overrides go beyond the settings of the layers.
 
     Raises:
         InputError: no such unit.

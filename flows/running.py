@@ -6,7 +6,7 @@ import importlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.resource_tracker import ensure_running
@@ -14,7 +14,9 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
+from data_contracts.settings import IterationCount
 from flows.gates import Gatekeeper
+from flows.layers import ENVIRONMENT, write_layer
 from flows.method import task_modules
 from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
@@ -27,11 +29,12 @@ from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
-from flows.run_record import RunLog, expected_work, latest_run, resolve_settings
-from flows.settings import Overrides, selected_stages
+from flows.run_record import RunLog, expected_work, latest_run
+from flows.settings import Overrides, ResolvedSettings, as_text, flatten, resolve, selected_stages
 from flows.stage import Match
 from tasks.tracing import flush_spans, start_tracing
-from worldpose.errors import InputError, WorldposeError
+from worldpose.body.body_file import is_open_body
+from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.store.store import Store
 
 if TYPE_CHECKING:
@@ -49,20 +52,23 @@ class RunRequest:
     """Options of a run.
 
     Attributes:
-        settings: stage to the settings that the run states; the others are those of the latest run
-            of the match (`keep_settings`).
+        settings: stage to the settings that the run states, which its match keeps; all settings
+            of the run once it is settled (`settle`).
         from_stage: first stage; the latest run supplies earlier results.
         until_stage: last stage.
         dask: address of a running Dask scheduler; None starts workers on this machine.
         workers: number of worker processes on this machine; None = one per core, as far as there is
             work for them.
-        gates: when results need review; None = as in the latest run while that waits, else never.
+        gates: when results need review; None = as the layers say, or as in the latest run while
+            that waits, or never.
         iteration: iteration number, unless `from_stage` continues the latest run's; the previous
             iterations have their results.
         time_limits: stage to the time limit of a unit [min], if not the default.
         security: TLS certificate for the scheduler at `dask`; None = Dask's configuration.
-        default_settings: whether settings that are not stated have their defaults, whatever the
-            latest run had.
+        default_settings: whether the match forgets what earlier runs stated.
+        iterations: number of iterations, which its match keeps; None = as the layers say.
+        body_folder: folder of installed bodies, which its match keeps; None = as the layers say.
+        is_settled: whether the request has all settings of the run.
     """
 
     settings: Overrides
@@ -75,6 +81,14 @@ class RunRequest:
     time_limits: TimeLimits = field(default_factory=dict)
     security: Security | None = None
     default_settings: bool = False
+    iterations: IterationCount | None = None
+    body_folder: str | None = None
+    is_settled: bool = False
+
+    @property
+    def most_iterations(self) -> int | None:
+        """Maximum number of iterations of a settled request; None = until one is no better."""
+        return self.iterations if isinstance(self.iterations, int) else None
 
     def gate_policy(self, latest: RunRecord | None) -> GatePolicy:
         """Return when results need review, for a match with this latest run."""
@@ -82,33 +96,86 @@ class RunRequest:
         return self.gates or (latest.gates if latest is not None and waits else "never")
 
 
-def keep_settings(
-    store: Store, match_id: str, latest: RunRecord | None, request: RunRequest
-) -> RunRequest:
-    """Return the request with all settings of the run, and report the kept ones.
+def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunRequest]:
+    """Return the match and the request with all settings of the run, and report those not stated.
 
-    Every way to start a run calls this: none may change a setting of the latest run silently.
+    Every door calls this, and only this decides the settings of a run: a value is that of the last
+    of the layers built in, project, venue and match which states it. What the request states
+    becomes the layer of the match, so that later runs keep it.
+
+    Raises:
+        InputError: a layer is invalid.
+        UsageError: the request is.
     """
-    if request.default_settings:
-        return request
-    settings, kept = resolve_settings(store, match_id, latest, request.settings)
-    if kept is not None:
-        reporter().tell_kept_settings(kept)
-    return replace(request, settings=settings)
-
-
-def kept_iterations(latest: RunRecord | None, request: RunRequest) -> int:
-    """Return the number of iterations of a run that states none: that of the latest run.
-
-    A part of the method, or a run with default settings, has one.
-    """
+    if request.is_settled:
+        return match, request
     is_part = request.from_stage is not None or request.until_stage is not None
-    if latest is None or latest.iteration == 1 or is_part or request.default_settings:
-        return 1
-    reporter().tell_kept_settings(
-        f"iterations of run {latest.run_id}: {latest.iteration}; for one: --iterations 1"
+    if request.iterations not in (None, 1):
+        require_whole(request)
+    before = match.layers
+    if request.default_settings:
+        own = {name: value for name, value in before[-1].values.items() if name == "venue"}
+        before = (*before[:-1], replace(before[-1], values=own))
+    stated = flatten(request.settings)
+    stated |= {} if request.iterations is None else {"iterations": request.iterations}
+    stated |= {} if request.body_folder is None else {"body_folder": request.body_folder}
+    layers = (*before[:-1], replace(before[-1], values={**before[-1].values, **stated}))
+    found = resolve(layers)
+    folder = found.origins.get("body_folder")
+    if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
+        # Another shell, or the service, may not have the variable.
+        values = {**layers[-1].values, "body_folder": folder.values["body_folder"]}
+        layers = (*layers[:-1], replace(layers[-1], values=values))
+    if layers[-1].values != match.layers[-1].values:
+        write_layer(store, layers[-1].name, layers[-1].values)
+    _report_settings(found, {*stated}, latest_run(store, match.match_id))
+    return replace(match, layers=layers), replace(
+        request,
+        settings=found.overrides,
+        gates=request.gates or found.general.gates,
+        iterations=request.iterations or (1 if is_part else found.general.iterations),
+        is_settled=True,
     )
-    return latest.iteration
+
+
+def require_whole(request: RunRequest) -> None:
+    """Refuse iterations of a part of the method.
+
+    Raises:
+        UsageError: only a part of the method was requested.
+    """
+    if request.from_stage is not None or request.until_stage is not None:
+        raise UsageError(
+            "--iterations",
+            expected="the whole method",
+            found="--from or --until",
+            todo="Omit --from and --until, or omit --iterations.",
+        )
+
+
+def _needs_bodies(found: ResolvedSettings) -> bool:
+    """Return whether a run needs an installed body."""
+    models = (values.get("body_model") for values in found.overrides.values())
+    return any(isinstance(name, str) and not is_open_body(name) for name in models)
+
+
+def _report_settings(
+    found: ResolvedSettings, stated: Container[str], latest: RunRecord | None
+) -> None:
+    """Report the settings that the command does not state, and those that the latest run had."""
+    kept = [
+        f"{name}={as_text(each['value'])} ({each['from']})"
+        for name, each in found.differences().items()
+        if name not in stated
+    ]
+    if kept:
+        reporter().tell_kept_settings(f"settings: {', '.join(kept)}; see worldpose settings")
+    before = {} if latest is None else flatten(latest.overrides)
+    gone = [f"{name}={as_text(it)}" for name, it in before.items() if name not in found.values]
+    if latest is not None and gone:
+        reporter().tell_kept_settings(
+            f"settings of run {latest.run_id} that no layer states now: {', '.join(gone)}"
+        )
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
@@ -123,8 +190,8 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
         LostWorkersError: the Prefect server or Dask scheduler stopped answering during the run.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
+    match, request = settle(store, match, request)
     latest = latest_run(store, match.match_id)
-    request = keep_settings(store, match.match_id, latest, request)
     policy = request.gate_policy(latest)
     gatekeeper = Gatekeeper(store, match, policy)
     plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)

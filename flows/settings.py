@@ -1,19 +1,171 @@
-"""Run options: stages and settings, validated before anything starts."""
+"""Settings of runs: stages and values, validated before anything starts."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from functools import cache
 
 from pydantic import JsonValue, ValidationError
 
-from data_contracts.records import Record
+from data_contracts.records import Record, field_docstrings
+from data_contracts.settings import RunSettings
+from flows.layers import VENUES, Layer, check_general, merge_general, read_layer, write_layer
 from flows.method import METHOD
 from flows.stage import Stage
-from worldpose.errors import UsageError, unknown_name
+from worldpose.errors import InputError, UsageError, unknown_name
+from worldpose.store.store import Store
 
 Overrides = Mapping[str, Mapping[str, JsonValue]]
 """Stage to the settings that differ from their defaults."""
+
+
+def known_settings() -> dict[str, dict[str, JsonValue]]:
+    """Return the `default` of all settings and what they are `about`, by name."""
+    told = {
+        f"{prefix}{name}": " ".join(text.split())
+        for prefix, record in _records().items()
+        for name, text in field_docstrings(record).items()
+    }
+    return {n: {"default": value, "about": told.get(n, "")} for n, value in _built_in().items()}
+
+
+def _records() -> dict[str, type[Record]]:
+    """Return the records of settings by the beginning of their names."""
+    return {"": RunSettings, **{f"{stage.name}.": stage.settings for stage in METHOD}}
+
+
+@cache
+def _built_in() -> Mapping[str, JsonValue]:
+    return {
+        f"{prefix}{name}": value
+        for prefix, record in _records().items()
+        for name, value in record().model_dump(mode="json").items()
+    }
+
+
+@dataclass(frozen=True)
+class ResolvedSettings:
+    """Settings of a match's next run.
+
+    Attributes:
+        values: name to value of everything that a layer states.
+        origins: name to the layer that states the value.
+        general: the settings that are not of a stage.
+    """
+
+    values: Mapping[str, JsonValue]
+    origins: Mapping[str, Layer]
+    general: RunSettings
+
+    @property
+    def overrides(self) -> dict[str, dict[str, JsonValue]]:
+        """Stage to its stated settings."""
+        return by_stage(self.values)
+
+    def differences(self) -> dict[str, dict[str, JsonValue]]:
+        """Return value, default and origin of each setting that differs from its default."""
+        return {
+            name: {"value": value, "default": default, "from": self.origins[name].origin}
+            for name, value in sorted(self.values.items())
+            for default in [_built_in()[name]]
+            if value != default
+        }
+
+
+def resolve(layers: Iterable[Layer], stated: Overrides | None = None) -> ResolvedSettings:
+    """Return the settings that layers, and over them a command line, give to a run.
+
+    Every door (command, page, inbox, schedule, reprocess) and every question about a next run takes
+    its settings from here.
+
+    Raises:
+        InputError: a file states an unknown name or an invalid value, or a venue has no file.
+        UsageError: the command line does.
+    """
+    command = Layer("command line", "--set", flatten(stated or {}))
+    given = [*layers, command]
+    for layer in given:
+        if layer.name.startswith(VENUES) and not layer.revision:
+            name = layer.name.partition("/")[2]
+            raise InputError(
+                f"venue {name}",
+                expected=f"its settings in {layer.file}",
+                found="nothing",
+                todo=f"Correct the name, or add it: worldpose settings --venue {name} --add.",
+            )
+        for name in layer.values:
+            require_known(name, f"{layer.file}: {name}")
+    origins = {name: layer for layer in given for name in layer.values}
+    values = {name: layer.values[name] for name, layer in origins.items()}
+    overrides = by_stage(values)
+    for stage in METHOD:
+        try:
+            settings_of(stage, overrides)
+        except UsageError as error:
+            name = ".".join(error.where.removeprefix("--set ").split(".")[:2])
+            of_stage = (it for each, it in origins.items() if each.startswith(f"{stage.name}."))
+            layer = origins.get(name) or next(of_stage)
+            if layer is command:
+                raise
+            raise InputError(
+                f"{layer.file}: {name}", expected=error.expected, found=error.found, todo=LIST
+            ) from None
+    return ResolvedSettings(values, origins, merge_general(given))
+
+
+def require_known(name: str, where: str) -> None:
+    """Check the name of a setting; the error suggests a similar one, not all 190.
+
+    Raises:
+        UsageError: there is no such setting.
+    """
+    if name not in _built_in():
+        close = get_close_matches(name, _built_in(), n=1)
+        raise UsageError(
+            where,
+            expected="the name of a setting",
+            found=repr(name),
+            todo=" ".join([*(f"Did you mean {each!r}?" for each in close), LIST]),
+        )
+
+
+def save_layer(
+    store: Store, layers: Iterable[Layer], name: str, values: Mapping[str, JsonValue]
+) -> None:
+    """Write a layer, if it is valid over those before it.
+
+    Raises:
+        InputError: a name is unknown, or a value is invalid; nothing is written.
+    """
+    layer = replace(read_layer(store, name), values=values, revision="new")
+    check_general(name, layer.file, values)
+    resolve([*(each for each in layers if each.name != name), layer])
+    write_layer(store, name, values)
+
+
+def flatten(overrides: Overrides) -> dict[str, JsonValue]:
+    """Return settings of stages by `stage.setting`."""
+    return {
+        f"{stage}.{name}": value
+        for stage, values in overrides.items()
+        for name, value in values.items()
+    }
+
+
+def by_stage(values: Mapping[str, JsonValue]) -> dict[str, dict[str, JsonValue]]:
+    """Return the settings of stages among named values, by stage."""
+    found: dict[str, dict[str, JsonValue]] = {}
+    for name in sorted(values):
+        stage, dot, setting = name.partition(".")
+        if dot:
+            found.setdefault(stage, {})[setting] = values[name]
+    return found
+
+
+LIST = "List all settings: worldpose settings --list."
 
 
 def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[Stage, ...]:
@@ -73,6 +225,11 @@ def parse_value(text: str) -> JsonValue:
     return value
 
 
+def as_text(value: JsonValue) -> str:
+    """Return a value as `parse_value` reads it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
 def settings_of(stage: Stage, overrides: Overrides) -> Record:
     """Return the stage's settings with `overrides` applied.
 
@@ -87,7 +244,7 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             f"--set {stage.name}.{'.'.join(map(str, first['loc']))}",
             expected=first["msg"],
             found=repr(first["input"]),
-            todo="List all settings: worldpose run MATCH --set list.",
+            todo=LIST,
         ) from None
 
 

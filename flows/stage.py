@@ -13,6 +13,7 @@ from pydantic import JsonValue
 from data_contracts.match import Registration
 from data_contracts.records import Record
 from data_contracts.review import Correction
+from flows.layers import Layer, merge_general
 from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.journal import Journal
@@ -30,6 +31,7 @@ class Match:
         journal: verdicts and corrections.
         corrections: the corrections applied in `folder`.
         stale: corrections that no longer apply, each with the reason.
+        layers: layers of settings, the first with the least precedence (`flows.layers`).
     """
 
     folder: MatchFolder
@@ -37,6 +39,7 @@ class Match:
     journal: Journal
     corrections: tuple[Correction, ...] = ()
     stale: tuple[tuple[Correction, str], ...] = ()
+    layers: tuple[Layer, ...] = ()
     _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Cache of `once_a_match`."""
 
@@ -44,6 +47,12 @@ class Match:
     def match_id(self) -> str:
         """The match's id."""
         return self.registration.spec.match_id
+
+    @property
+    def body_folder(self) -> Path | None:
+        """Folder of installed bodies that a layer states; None = the user's."""
+        folder = self.once("body_folder", lambda: merge_general(self.layers).body_folder)
+        return None if folder is None else Path(folder).expanduser()
 
     @property
     def has_static_cameras(self) -> bool:
@@ -123,7 +132,8 @@ class Stage:
         previous_pass_inputs: returns a unit's further inputs from the previous iteration.
         late_inputs: returns a unit's further inputs from its own iteration, from the second on.
         first_pass: the first iteration that includes the stage.
-        external_inputs: returns the digests of the external files that its settings name.
+        external_inputs: returns the digests of the external files that its settings name, for a
+            match.
         worker_tag: tag of the workers that compute it, if the cluster has any.
         leaves_out: whether its results can leave static cameras out of all later stages.
         min_cameras: static cameras that it needs after some are left out.
@@ -140,7 +150,7 @@ class Stage:
     previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
     late_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
     first_pass: Literal[1, 2] = 1
-    external_inputs: Callable[[Any], dict[str, JsonValue]] = lambda settings: {}
+    external_inputs: Callable[[Match, Any], dict[str, JsonValue]] = lambda match, settings: {}
     worker_tag: str | None = None
     leaves_out: bool = False
     min_cameras: int = 0

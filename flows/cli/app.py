@@ -37,6 +37,7 @@ GROUPS: Final = {
     },
     "Process matches": {
         "run": "run:run",
+        "settings": "settings:settings",
         "reprocess": "reprocess:reprocess",
         "serve": "serve:serve",
         "review": "review",

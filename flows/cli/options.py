@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -32,25 +31,16 @@ MoreSettingsOption = Annotated[
     typer.Option(
         "--set",
         metavar="STAGE.NAME=VALUE",
-        help="A setting beyond those of a match's latest run; repeatable.",
+        help="A setting beyond those that worldpose settings MATCH shows; repeatable.",
     ),
 ]
 BodyFolderOption = Annotated[
     Path | None,
     typer.Option(
-        envvar="WORLDPOSE_BODY_FOLDER",
-        show_envvar=True,
-        help="Folder of installed bodies (worldpose body install); by default "
-        "~/.local/share/worldpose/bodies.",
+        help="Folder of installed bodies (worldpose body install); by default that of "
+        "WORLDPOSE_BODY_FOLDER, or else ~/.local/share/worldpose/bodies.",
     ),
 ]
-
-
-def set_body_folder(folder: Path | None) -> None:
-    """Look for installed bodies in a folder, in this process and in workers that it starts."""
-    if folder is not None:
-        os.environ["WORLDPOSE_BODY_FOLDER"] = str(folder.expanduser().absolute())
-
 
 PAGES_PORT = 8571
 

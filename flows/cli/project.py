@@ -21,8 +21,9 @@ from flows.cli.console import (
 )
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
-from flows.run_record import latest_run, resolve_settings
+from flows.run_record import latest_run
 from flows.run_status import UnitState, find_run, list_unit_states
+from flows.settings import resolve
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair
@@ -103,7 +104,7 @@ def status(
         for name, run_id in row["pins"].items():
             line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
-            line(f"{row['match']}: judged with the settings of run {row['run']}: {row['settings']}")
+            line(f"{row['match']}: judged with the settings of its next run: {row['settings']}")
 
 
 STATES = tuple(state.value for state in UnitState)
@@ -129,6 +130,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     try:
         status |= _recorded_status(store, match_id)
         latest, match = latest_run(store, match_id), open_match(store, match_id)
+        status["settings"] = resolve(match.layers).overrides
         found = list_unit_states(store, match, latest)
         status["units"] = {state.value: names for state, names in found.items()}
         status["waiting"] = [unit.unit for unit in still_waiting(store, match, latest)]
@@ -140,7 +142,6 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
 def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
     """Return what the records of a match's runs tell, without its folder."""
     latest = latest_run(store, match_id)
-    settings, _ = resolve_settings(store, match_id, latest, {})
     told: dict[str, Any] = {"state": "not run"}
     if latest is not None:
         told = {
@@ -152,7 +153,6 @@ def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
         }
     return {
         **told,
-        "settings": settings,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
         "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
     }

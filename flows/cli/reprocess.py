@@ -48,9 +48,8 @@ def reprocess(
 ) -> None:
     """Recompute results that an edit, a setting, a detector or new code made stale.
 
-    Each match is run with the settings, gates and iterations of its latest run, up to the last
-    stage of that run. Exit code 0: all matches are current; 1: none could be run; 3: some wait for
-    review; 4: some failed.
+    Each match is run as worldpose settings MATCH says, up to the last stage of its latest run. Exit
+    code 0: all matches are current; 1: none could be run; 3: some wait for review; 4: some failed.
 
     Example: worldpose reprocess --dry-run
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from itertools import pairwise
+from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pydantic import JsonValue
 
-from data_contracts.records import field_docstrings
 from data_contracts.run import EXIT_CODES, GatePolicy, RunRecord
 from flows.cli.console import (
     DEFAULT_PROJECT,
@@ -31,19 +30,20 @@ from flows.cli.options import (
     DaskOption,
     TimeLimitOption,
     WorkersOption,
-    set_body_folder,
 )
+from flows.cli.settings import print_known
 from flows.iterate import Iteration, Iterations, iterate_match
-from flows.method import METHOD
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
+from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
-from flows.run_record import latest_run, require_no_other_run
-from flows.running import RunRequest, kept_iterations, run_match
+from flows.run_record import require_no_other_run
+from flows.running import RunRequest, run_match, settle
 from flows.settings import parse_overrides, selected_stages
-from worldpose.errors import UsageError
+from flows.stage import Match
+from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.store import Store
 
 if TYPE_CHECKING:
@@ -78,24 +78,22 @@ def run(
     Options:
         from_stage: First stage; earlier results come from the latest run.
         until_stage: Last stage.
-        assignments: A setting for this run and later ones; repeatable; `list` shows all
-            settings. A run keeps the settings of the match's latest run that it does not state.
-        default_settings: Keep no setting of the latest run: what --set does not state has its
-            default.
+        assignments: A setting for this run and later ones of the match; repeatable; `list` shows
+            all settings. All others are as worldpose settings MATCH says.
+        default_settings: Forget what earlier runs of the match stated with --set, --iterations
+            and --body-folder; settings of the project and the venue stay.
         gates: When results need review: never (default), auto (metrics beyond limits) or
             always. While the latest run waits for review, its policy is the default.
         iterations: Number of iterations. Each one leaves out the keypoints that the bodies of
             the previous one contradict. With auto, the run iterates until the error in held-out
-            cameras stops decreasing. By default as many as the latest run.
+            cameras stops decreasing. Later runs of the match keep the number.
     """
     started = time.monotonic()
     if assignments == ["list"]:
-        _print_settings(as_json)
+        print_known(as_json=as_json)
         return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
-    stated = None if iterations is None else parse_iterations(iterations)
-    set_body_folder(body_folder)
     request = RunRequest(
         overrides,
         from_stage,
@@ -105,17 +103,19 @@ def run(
         gates,
         time_limits=parse_time_limits(time_limits or ()),
         default_settings=default_settings,
+        iterations=None if iterations is None else parse_iterations(iterations),
+        body_folder=None if body_folder is None else str(body_folder.expanduser().absolute()),
     )
     with progress(verbose=verbose):
         opened = find_match(store, match)
         require_no_other_run(store, opened.match_id)
         for text in warnings_of(opened):
             line(f"warning: {text}", to=errors)
-        most = stated
-        if iterations is None:
-            most = kept_iterations(latest_run(store, opened.match_id), request)
+        opened, request = settle(store, opened, request)
+        most = request.most_iterations
         passes = None if most == 1 else iterate_match(store, opened, request, most)
         record = run_match(store, opened, request) if passes is None else passes.record
+        exported, problem = _export(store, opened, record)
     seconds = time.monotonic() - started
     warned = [
         *record.warnings,
@@ -137,6 +137,7 @@ def run(
                 "reviews": [unit.model_dump() for unit in record.waiting],
                 "left_out": record.left_out,
                 "warnings": warned,
+                **({"exports": [str(path) for path in exported]} if exported else {}),
                 **({} if passes is None else _iterations_json(store, passes)),
             }
         )
@@ -144,31 +145,23 @@ def run(
         if passes is not None:
             print_iterations(store, passes)
         _print(record, store.url, seconds)
+        for path in exported:
+            line(f"exported {path}")
     for text in warned:
         line(f"warning: {text}", to=errors)
-    raise typer.Exit(EXIT_CODES[record.state])
+    if problem is not None:
+        line(f"error: the run is kept, and its exports failed: {problem}", to=errors)
+    raise typer.Exit(EXIT_CODES[record.state] if problem is None else 1)
 
 
-def _print_settings(as_json: bool) -> None:
-    rows = [
-        (
-            f"{stage.name}.{name}",
-            json.dumps(stage.settings().model_dump(mode="json")[name]),
-            " ".join(described.get(name, "").split()),
-        )
-        for stage in METHOD
-        for described in [field_docstrings(stage.settings)]
-        for name in stage.settings.model_fields
-    ]
-    if as_json:
-        print_json(
-            {
-                name: {"default": json.loads(default), "about": about}
-                for name, default, about in rows
-            }
-        )
-    else:
-        print_table("settings", ("setting", "default", "what it says"), rows)
+def _export(
+    store: Store, match: Match, record: RunRecord
+) -> tuple[list[Path], WorldposeError | OSError | None]:
+    """Write the exports that settings ask for; return their files, or why there are none."""
+    try:
+        return export_after_run(store, match, record), None
+    except (WorldposeError, OSError) as error:
+        return [], error
 
 
 def _print(record: RunRecord, project: str, seconds: float) -> None:
@@ -216,17 +209,14 @@ def _print_waiting(record: RunRecord) -> None:
         line(f"  and {len(record.waiting) - MAX_LISTED} more")
 
 
-UNTIL_BEST = "auto"
-
-
-def parse_iterations(text: str) -> int | None:
-    """Return the number of iterations; None = iterate until an iteration brings no improvement.
+def parse_iterations(text: str) -> int | Literal["auto"]:
+    """Return the number of iterations, or `auto`.
 
     Raises:
         UsageError: the text is neither a number from 1 nor `auto`.
     """
-    if text == UNTIL_BEST:
-        return None
+    if text == "auto":
+        return "auto"
     if text.isascii() and text.isdigit() and int(text) > 0:
         return int(text)
     raise UsageError(

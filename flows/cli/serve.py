@@ -51,6 +51,7 @@ def serve(
     key: KeyOption = None,
     settle_time: Annotated[float, typer.Option(min=0)] = 30.0,
     poll_interval: Annotated[float, typer.Option(min=0.1)] = 15.0,
+    schedule: Annotated[list[str] | None, typer.Option(metavar="FLOW=CRON")] = None,
     gate_hours: Annotated[float, typer.Option(min=0.001)] = 24.0,
     disk_gb: Annotated[float, typer.Option(min=0)] = 10.0,
     state: Path | None = None,
@@ -82,6 +83,8 @@ def serve(
         metrics_port: Port of the metrics for Prometheus.
         settle_time: Time without changes until a match counts as complete [s].
         poll_interval: Interval between scans of the inbox [min].
+        schedule: When a deployment also runs, as reprocess="0 3 * * *", in this machine's time zone
+            or one that follows; repeatable. It stays until it is removed in Prefect's dashboard.
         gate_hours: Age of a pending review that triggers an alert [h].
         disk_gb: Free disk space below which an alert is sent [GB].
         state: Folder of logs and Prefect's database; PROJECT/operations by default.
@@ -100,6 +103,7 @@ def serve(
         _test_alerts(folder, as_json=as_json)
         return
     from flows.service.channels import channels_of
+    from flows.service.schedules import parse_schedules
     from flows.service.service_secrets import PAGES_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
@@ -135,6 +139,7 @@ def serve(
         key=key,
         settle_seconds=settle_time,
         poll_minutes=poll_interval,
+        schedules=parse_schedules(schedule) if schedule else {},
         gate_hours=gate_hours,
         disk_gb=disk_gb,
         users=None if users is None else users.resolve(),

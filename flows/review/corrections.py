@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
+from flows.layers import add_venue, read_layers
 from flows.review.detections import require_seen
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import require_fitting
@@ -28,10 +29,12 @@ def owner_of(edit: Edit) -> str:
 
 
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:
-    """Return the match with its corrections applied; no file of its folder changes."""
+    """Return the match as layers of settings and corrections complete it; no file changes."""
+    layers = read_layers(store, registration.spec)
+    folder = add_venue(folder, layers)
     journal = read_journal(store, registration.spec.match_id)
     replay = _replay_corrections(store, folder, tuple(journal.standing.values()))
-    return Match(replay.folder, registration, journal, replay.applied, replay.stale)
+    return Match(replay.folder, registration, journal, replay.applied, replay.stale, layers)
 
 
 _REPLAYED: WeakKeyDictionary[

@@ -19,6 +19,7 @@ from data_contracts.finetune import NetKind
 from data_contracts.operations import Arrival
 from data_contracts.records import Name
 from data_contracts.run import GatePolicy, RunRecord
+from data_contracts.settings import IterationCount
 from flows.gates import Gatekeeper, waiting_for_verdicts
 from flows.iterate import iterate_match
 from flows.match import require_complete, run_stages
@@ -27,9 +28,10 @@ from flows.orchestration.suspension import take_verdict
 from flows.progress import reporter
 from flows.registering import open_match
 from flows.reprocess import reprocess_matches
+from flows.results.automatic_exports import export_after_run
 from flows.run_plan import plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
-from flows.running import RunRequest, keep_settings, kept_iterations
+from flows.running import RunRequest, settle
 from flows.service.artifacts import link_pages, show_at_prefect
 from flows.service.inbox import take_in
 from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name, title_of
@@ -61,8 +63,8 @@ def match(
     settings: dict[str, dict[str, JsonValue]] | None = None,
     from_stage: str | None = None,
     until_stage: str | None = None,
-    gates: GatePolicy = "auto",
-    iterations: int | None = None,
+    gates: GatePolicy | None = None,
+    iterations: IterationCount | None = None,
     time_limits: dict[str, float] | None = None,
 ) -> str:
     """Process a match and return the number of its run; suspended while results need review.
@@ -72,12 +74,12 @@ def match(
     Args:
         project: folder or URL of the store.
         match_id: a registered match.
-        settings: stage to the settings that this run changes; it keeps the others of the latest
-            run of the match.
+        settings: stage to the settings that this run changes, and that the match keeps; the
+            others are as its layers of settings say.
         from_stage: first stage to run; the latest run supplies earlier results.
         until_stage: last stage to run.
-        gates: when results need review.
-        iterations: number of iterations, the best of which is kept; as in the latest run if None.
+        gates: when results need review; as the layers say if None, else auto.
+        iterations: number of iterations, the best of which is kept; as the layers say if None.
         time_limits: stage to the time limit of a unit [min], if not the default.
 
     Raises:
@@ -91,29 +93,27 @@ def match(
         from_stage,
         until_stage,
         gates=gates,
-        iteration=1,
+        iterations=iterations,
         time_limits=time_limits or {},
     )
     runs = match_runs_of(store.url)
     if runs is not None:
         link_pages(runs.pages, match_id)
     with alone_with(store, match_id):
-        latest = latest_run(store, match_id)
-        request = keep_settings(store, match_id, latest, request)
-        iterations = iterations or kept_iterations(latest, request)
-        if iterations == 1:
-            return require_complete(_run_until_decided(store, match_id, request))
-        return require_complete(_iterate_until_decided(store, match_id, request, iterations))
+        opened, request = settle(store, open_match(store, match_id), request)
+        request = replace(request, gates=request.gates or "auto")
+        compute = _run_until_decided if request.most_iterations == 1 else _iterate_until_decided
+        record = compute(store, match_id, request)
+        export_after_run(store, opened, record)
+        return require_complete(record)
 
 
-def _iterate_until_decided(
-    store: Store, match_id: str, request: RunRequest, iterations: int
-) -> RunRecord:
+def _iterate_until_decided(store: Store, match_id: str, request: RunRequest) -> RunRecord:
     """Iterate a match now and after each verdict."""
-    request = _on_own_workers(request)
+    request, most = _on_own_workers(request), request.most_iterations
     while True:
         with show_at_prefect(match_id):
-            record = iterate_match(store, open_match(store, match_id), request, iterations).record
+            record = iterate_match(store, open_match(store, match_id), request, most).record
         open_questions = waiting_for_verdicts(record.waiting)
         if record.failed or not open_questions:
             return record
@@ -199,7 +199,7 @@ def reprocess(
     Args:
         project: folder or URL of the store.
         matches: ids of registered matches; none = all.
-        settings: stage to settings that override those of each match's latest run.
+        settings: stage to settings that override those of each match, and that it keeps.
         retry: retry failed units, even without an edit.
         time_limits: stage to the time limit of a unit [min], if not those of the service.
 
@@ -220,14 +220,12 @@ def reprocess(
         if each.match_id in active:
             states[each.match_id] = "has a run"
             continue
-        latest = each.status.latest
         runs.start(
             each.match_id,
             priority="background",
-            settings={stage: dict(values) for stage, values in each.status.settings.items()},
+            settings=None if settings is None else dict(settings),
             until_stage=each.status.until_stage,
-            gates=latest.gates,
-            iterations=None if latest.iteration == 1 else latest.iteration,
+            gates=each.status.gates,
             time_limits=None if time_limits is None else dict(time_limits),
         )
         states[each.match_id] = "started"

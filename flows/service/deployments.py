@@ -14,7 +14,8 @@ from prefect.utilities.callables import parameter_schema
 from flows.orchestration.prefect_api import PrefectApi
 from flows.service.layout import PRIORITIES
 from flows.service.match_runs import MatchRuns
-from flows.service.plan import ServePlan, deployment_name
+from flows.service.plan import Schedule, ServePlan, deployment_name, deployment_names
+from flows.service.schedules import list_missed, restore_missed, set_schedule
 from flows.service.worker import JOB_TEMPLATE, Installed, ServedWorker
 from worldpose.errors import InputError
 
@@ -97,10 +98,19 @@ def install(plan: ServePlan) -> dict[str, Installed]:
         _install(prefect, "work_pools/", pool, values, type=ServedWorker.type, description=about)
     for rank, queue in enumerate(PRIORITIES, 1):
         _install(prefect, f"work_pools/{matches}/queues", queue, {"priority": rank})
-    return dict(_deploy(prefect, plan, deployed) for deployed in DEPLOYED)
+    missed = list_missed(prefect, deployment_names(plan.name))
+    polled = prefect.deployment(deployment_name(plan.name, "ingest"))
+    before = {} if polled is None else polled["parameters"].get("plan") or {}
+    # The polled one last: it keeps the options that all others were installed with.
+    order = sorted(DEPLOYED, key=lambda each: each.is_polled)
+    installed = dict(_deploy(prefect, plan, deployed, before) for deployed in order)
+    restore_missed(prefect, missed, {name: [*each.fixed] for name, each in installed.items()})
+    return installed
 
 
-def _deploy(prefect: PrefectApi, plan: ServePlan, deployed: Deployed) -> tuple[str, Installed]:
+def _deploy(
+    prefect: PrefectApi, plan: ServePlan, deployed: Deployed, before: Mapping[str, Any]
+) -> tuple[str, Installed]:
     flow: Flow[..., Any] = getattr(importlib.import_module(MODULE), deployed.flow)
     matches, arrivals = pools(plan)
     parameters = json.loads(json.dumps(deployed.parameters(plan)))
@@ -123,8 +133,12 @@ def _deploy(prefect: PrefectApi, plan: ServePlan, deployed: Deployed) -> tuple[s
         polling = [{"schedule": _polling(plan), "slug": POLL}] if deployed.is_polled else []
         new = {"name": name.partition("/")[2], "flow_id": of_flow, "schedules": polling}
         there = prefect.ask("/deployments/", {**new, **wanted})
+        before = {}
     else:
         _update(prefect, plan, deployed, there, wanted)
+    known = (before.get("schedules") or {}).get(deployed.flow)
+    schedule = None if known is None else Schedule.model_validate(known)
+    set_schedule(prefect, there, plan.schedules.get(deployed.flow), schedule)
     fixed = {name: parameters[name] for name in deployed.fixed}
     return there["id"], Installed(flow, fixed)
 

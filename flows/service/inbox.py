@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from data_contracts.operations import Arrival, ArrivalState, Priority
+from flows.layers import PROJECT, read_layer
 from flows.registering import register
 from flows.service.layout import PRIORITIES, StateFolder
 from flows.stage import Match
@@ -194,6 +195,7 @@ def take_in(
     after `MAX_DEATHS`. `begin` starts a match's run.
     """
     decided = []
+    read_layer(store, PROJECT)  # the project is at fault, and no arrival is refused for it
     with state.only_one("arrivals", wait=True):
         ready = _scan(state, inbox, quiet)
         for entry, arrival in sorted(ready, key=lambda each: each[1].deaths):

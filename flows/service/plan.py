@@ -25,6 +25,15 @@ def deployment_names(name: str) -> list[str]:
     return [deployment_name(name, flow).partition("/")[2] for flow in FLOWS]
 
 
+class Schedule(Record):
+    """When a deployment runs."""
+
+    cron: str
+    """Minute, hour, day, month, day of the week."""
+    timezone: str
+    """IANA name of the time zone of these times."""
+
+
 class ServePlan(Record):
     """Options of a served project; contains no secret."""
 
@@ -73,6 +82,8 @@ class ServePlan(Record):
     """A result that waits longer for review raises an alert [h]."""
     disk_gb: float = Field(default=10.0, ge=0)
     """Less free space than this raises an alert [GB]."""
+    schedules: dict[str, Schedule] = Field(default_factory=dict)
+    """Flow to its schedule, beside those that people make at the Prefect server."""
     users: Path | None = None
     """TOML file of the people who may log in to the pages; None: every user with the token."""
 

@@ -16,6 +16,7 @@ from flows.orchestration.prefect_api import PrefectApi, of_types, parse_time
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan, deployment_names
+from flows.service.schedules import list_missed
 
 SILENT: Final = timedelta(seconds=90)
 """Without a heartbeat for so long, a run is checked; heartbeats come every 30 s."""
@@ -47,6 +48,7 @@ def restart_lost_runs(
     call.
     """
     prefect, deployments = MatchRuns.of_plan(plan), deployment_names(plan.name)
+    list_missed(prefect, deployments)  # of a machine that slept: each schedule runs once
     if at_start and plan.owns_prefect:
         for run in prefect.runs(deployments, state=of_types("RUNNING", "PENDING", "CANCELLING")):
             if run["state_type"] == "RUNNING":

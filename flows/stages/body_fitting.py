@@ -28,13 +28,16 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     return {**tracking.clip_sources(match, unit), "pitch": match.pitch_source}
 
 
-def body_model_digest(settings: BodyFittingSettings | RefittingSettings) -> dict[str, JsonValue]:
+def body_model_digest(
+    match: Match, settings: BodyFittingSettings | RefittingSettings
+) -> dict[str, JsonValue]:
     """Return the digest of an installed body model.
 
     It is None for the open body, which is part of the code and so of the code's digest.
     """
     name = settings.body_model
-    return {"body_model_sha256": None if is_open_body(name) else digest_of_body(name)}
+    digest = None if is_open_body(name) else digest_of_body(name, match.body_folder)
+    return {"body_model_sha256": digest}
 
 
 STAGE = Stage(

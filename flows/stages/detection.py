@@ -88,7 +88,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     }
 
 
-def outside(settings: DetectionSettings) -> dict[str, JsonValue]:
+def outside(match: Match, settings: DetectionSettings) -> dict[str, JsonValue]:
     """Return digests of the named weights, and versions of the libraries that run them."""
     return {"weights": dict(weights_of(settings))}
 

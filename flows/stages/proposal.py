@@ -54,9 +54,9 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     }
 
 
-def external_inputs(settings: ProposalSettings) -> dict[str, JsonValue]:
+def external_inputs(match: Match, settings: ProposalSettings) -> dict[str, JsonValue]:
     """Return the versions of the libraries that run the bundled detector."""
-    return detection.outside(DetectionSettings())
+    return detection.outside(match, DetectionSettings())
 
 
 def needed_proposals(match: Match, unit: str) -> tuple[str, ...]:

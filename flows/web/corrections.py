@@ -13,6 +13,7 @@ from pydantic import Field
 from data_contracts.records import Count, Name, Record
 from data_contracts.review import Correction, Edit
 from data_contracts.run import GatePolicy
+from flows.layers import merge_general
 from flows.review.corrections import keep_edits, owner_of
 from flows.review.descriptions import in_words, is_first_click
 from flows.review.verdicts import decide, still_waiting, withdraw
@@ -65,7 +66,8 @@ class GoingOn(Record):
     """Options for continuing a run."""
 
     gates: GatePolicy | None = None
-    """When results need review; None = the default of `worldpose run`."""
+    """When results need review if no layer of settings says it; None = the default of
+    `worldpose run`."""
 
 
 class Withdrawing(Record):
@@ -158,8 +160,8 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.post("/runs")
     def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:
-        context.match(match_id)
-        return context.continuing.go_on(match_id, given.gates)
+        stated = merge_general(context.match(match_id).layers).gates
+        return context.continuing.go_on(match_id, given.gates if stated is None else None)
 
     @router.post("/corrections")
     def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from data_contracts.review import ReviewRequest
 from data_contracts.run import RunRecord
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
+from flows.layers import read_layer
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
@@ -94,6 +95,7 @@ class _Glances:
     context: PageContext
     _known: dict[str, tuple[Hashable, dict[str, Any]]] = field(default_factory=dict)
     _folders: dict[str, Path] = field(default_factory=dict)
+    _layers: dict[str, list[str]] = field(default_factory=dict)
     _checked: dict[str, float] = field(default_factory=dict)
     _opened: dict[str, float] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
@@ -134,6 +136,7 @@ class _Glances:
             stamp = None
         else:
             self._folders[name] = match.folder.folder
+            self._layers[name] = [each.name for each in match.layers if each.is_stored]
             stamp = stamp or self._stamp(name)
         glance["elsewhere"] = _elsewhere(self.context.store, name)
         self._known[name] = (stamp, glance)
@@ -148,10 +151,11 @@ class _Glances:
             files = sorted((folder / "annotations").rglob("*.json"))
             times = [file.stat().st_mtime_ns for file in (folder / "match.yaml", *files)]
             listed = folder.stat().st_mtime_ns
+            layers = [read_layer(store, each).revision for each in self._layers[name]]
         except (OSError, WorldposeError):
             return None
         at_work = tuple(each.run_id for each in store.unfinished_runs(name))
-        return (journal.last, store.runs(name), at_work, listed, tuple(times))
+        return (journal.last, store.runs(name), at_work, listed, *times, *layers)
 
 
 def _unseen(name: str) -> dict[str, Any]:

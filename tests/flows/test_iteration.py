@@ -143,7 +143,7 @@ def looped(monkeypatch):
         monkeypatch.setattr(iterate, "Gatekeeper", lambda *_: None)
         monkeypatch.setattr(iterate, "plan_ahead", lambda *_: SimpleNamespace(missing=[]))
         monkeypatch.setattr(iterate, "_recorded_run", lambda *_: None)
-        monkeypatch.setattr(iterate, "keep_settings", lambda *given: given[-1])
+        monkeypatch.setattr(iterate, "settle", lambda store, *given: given)
         monkeypatch.setattr(
             iterate, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1]) if ran else None
         )
@@ -196,7 +196,7 @@ def test_clips_count_by_their_keypoints():
 
 def test_the_number_of_iterations_is_checked():
     assert parse_iterations("3") == 3
-    assert parse_iterations("auto") is None
+    assert parse_iterations("auto") == "auto"
     for text in ("0", "-1", "x", "1.5"):
         with pytest.raises(UsageError):
             parse_iterations(text)

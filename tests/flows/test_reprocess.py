@@ -14,6 +14,7 @@ from data_contracts.run import UnitFailure
 from flows import reprocess, run_plan
 from flows.cli.app import app
 from flows.cli.reprocess import exit_code
+from flows.layers import PROJECT, write_layer
 from flows.method import METHOD
 from flows.registering import open_match, register
 from flows.reprocess import Reprocessed, reprocess_matches
@@ -141,6 +142,7 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
 
 
 def test_a_later_iteration_is_stale_in_every_pass(store):
+    write_layer(store, PROJECT, {"iterations": 2})
     finish(store, iteration=2)
     found = run_status(store, TINY)
     # Nothing of the second pass is there; the first pass stands in the run before.
@@ -153,7 +155,7 @@ def test_a_later_iteration_is_stale_in_every_pass(store):
 
 def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
     gone = tmp_path / "gone.onnx"
-    finish(store, overrides={"detection": {"pose": f"onnx:{gone}"}})
+    write_layer(store, PROJECT, {"detection.pose": f"onnx:{gone}"})
     status = json.loads(
         CliRunner().invoke(app, ["status", "--project", store.url, "--json"]).stdout
     )
@@ -230,16 +232,15 @@ def test_the_deployment_starts_a_run_of_each_stale_match_in_the_background(store
     monkeypatch.setattr(deployed, "match_runs_of", lambda url: runs)
     assert deployed.reprocess.fn(store.url) == {TINY: "current"}
     edit_box(store)
-    finish(store, gates="auto", overrides={"tracking": {"gate_m": 0.5}}, iteration=2)
+    write_layer(store, PROJECT, {"tracking.gate_m": 0.5, "gates": "always"})
     assert deployed.reprocess.fn(store.url) == {TINY: "started"}
     ((match_id, given),) = runs.started
     assert match_id == TINY
     assert given == {
         "priority": "background",
-        "settings": {"tracking": {"gate_m": 0.5}},
+        "settings": None,
         "until_stage": None,
-        "gates": "auto",
-        "iterations": 2,
+        "gates": "always",
         "time_limits": None,
     }
     runs.at_work = (TINY,)

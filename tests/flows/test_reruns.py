@@ -13,8 +13,7 @@ from flows.iterate import iterate_match
 from flows.registering import open_match
 from flows.reprocess import reprocess_matches
 from flows.results.best_results import joint_tracks
-from flows.run_record import latest_run, resolve_settings
-from flows.running import RunRequest, kept_iterations, run_match
+from flows.running import RunRequest, run_match, settle
 from flows.service import deployed
 from worldpose import open_run
 from worldpose.body.body_file import load_open_body, save_body
@@ -95,7 +94,7 @@ def test_a_triangulation_setting_leaves_tracking_alone(tiny, stricter_copy):
 
 def test_every_way_to_start_a_run_keeps_the_settings_of_the_latest(tiny, stricter_copy):
     again = succeed("run", tiny, "--project", stricter_copy, environment=NO_ORCHESTRATOR)
-    assert "settings of run 0002: triangulation.min_views=3; without them: --d" in again.err
+    assert "settings: triangulation.min_views=3 (match); see worldpose settings" in again.err
     store = Store.open(str(stricter_copy))
     match, plain = open_match(store, TINY), RunRequest({})
     assert run_match(store, match, plain).run_id == "0002"
@@ -104,23 +103,18 @@ def test_every_way_to_start_a_run_keeps_the_settings_of_the_latest(tiny, stricte
     assert [each.state for each in reprocess_matches(store, [TINY], plain)] == ["current"]
     assert store.runs(TINY) == ("0001", "0002")
 
-    # A run that states another setting keeps this one, too; so does one after a killed run.
-    store.reserve_run(TINY, {"tracking": {"gate_m": 0.4}, "triangulation": {"min_views": 4}})
-    latest = latest_run(store, TINY)
-    found, line = resolve_settings(store, TINY, latest, {"tracking": {"gate_m": 0.6}})
-    assert found == {"tracking": {"gate_m": 0.6}, "triangulation": {"min_views": 4}}
-    assert line is not None and line.startswith("settings of run 0003: triangulation.min_views=4;")
-
-
-def test_a_run_keeps_the_number_of_iterations_of_the_latest(stricter_run):
-    latest = latest_run(Store.open(str(stricter_run)), TINY).model_copy(update={"iteration": 2})
-    assert kept_iterations(latest, RunRequest({})) == 2
-    assert kept_iterations(None, RunRequest({})) == 1
+    # A run that states another setting keeps this one, too, even if it is killed at once.
+    settle(store, match, RunRequest({"tracking": {"gate_m": 0.6}}, iterations=2))
+    _, request = settle(store, open_match(store, TINY), plain)
+    assert request.settings == {"tracking": {"gate_m": 0.6}, "triangulation": {"min_views": 3}}
+    assert request.iterations == 2
     for part in ({"until_stage": "tracking"}, {"default_settings": True}):
-        assert kept_iterations(latest, RunRequest({}, **part)) == 1
+        _, request = settle(store, open_match(store, TINY), RunRequest({}, **part))
+        assert request.iterations == 1
+    assert request.settings == {}
 
 
-def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path, monkeypatch):
+def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path):
     folder = tmp_path / "bodies"
     folder.mkdir()
     save_body(folder / "smpl-neutral.npz", replace(load_open_body(), name="smpl-neutral"))
@@ -134,7 +128,9 @@ def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path
     where = {"WORLDPOSE_BODY_FOLDER": str(folder)}
     again = run_json(*asked, environment={**NO_ORCHESTRATOR, **where})
     assert (again["run"], again["executed"]) == (answer["run"], 0)
-    monkeypatch.setenv(*where.popitem())
+    # The match has kept both: a run in another shell, without the variable, has the same body.
+    again = run_json(*asked, environment=NO_ORCHESTRATOR)
+    assert (again["run"], again["executed"]) == (answer["run"], 0)
     bodies = open_run(project_copy, TINY).bodies("clip")
     assert open_run(project_copy, TINY)["body_fitting/clip"].attrs["body_model"] == "smpl-neutral"
     assert bodies is not None

@@ -26,6 +26,7 @@ from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import FLOWS, ServePlan, deployment_name
 from flows.service.recovery import restart_lost_runs
+from flows.service.schedules import parse_schedules
 from flows.service.watching import failed_runs
 from flows.service.worker import RefusedRunError, ServedWorker, require_installed
 from flows.web import app_context
@@ -138,6 +139,82 @@ def test_a_restart_keeps_what_an_operator_set(plan, prefect):
     for flow in ("ingest", "release", "reprocess"):  # as other tests expect them
         prefect.ask(f"/deployments/{found[flow]['id']}", method="DELETE")
     install(plan)
+
+
+def test_a_schedule_of_serve_is_made_changed_by_the_option_alone_and_never_removed(plan, prefect):
+    def start(text=None, **changes):
+        schedules = {} if text is None else parse_schedules([text])
+        install(plan.model_copy(update={"schedules": schedules, **changes}))
+        return prefect.deployment("reprocess/ops-reprocess")["schedules"]
+
+    night, morning = "reprocess=0 3 * * * Europe/Vienna", "reprocess=30 7 * * 1 Asia/Tokyo"
+    (made,) = start(night)
+    assert (made["schedule"]["cron"], made["schedule"]["timezone"]) == (
+        "0 3 * * *",
+        "Europe/Vienna",
+    )
+    assert start(night) == start(night) == [made]
+    # A person pauses it, and adds another one: both stay, whatever the service is started with.
+    place = f"/deployments/{made['deployment_id']}/schedules"
+    prefect.ask(f"{place}/{made['id']}", {"active": False}, method="PATCH")
+    prefect.ask(place, [{"schedule": {"interval": 7200}, "active": True}])
+    after = start(night)
+    assert len(after) == 2 and not next(it for it in after if it["id"] == made["id"])["active"]
+    assert start() == after
+    own = next(it for it in start(morning, poll_minutes=7) if it["id"] == made["id"])
+    assert (own["schedule"]["cron"], own["schedule"]["timezone"]) == ("30 7 * * 1", "Asia/Tokyo")
+    # Removed by a person, it comes back with another option only.
+    prefect.ask(f"{place}/{made['id']}", method="DELETE")
+    assert len(start(morning)) == 1
+    assert len(start(night)) == 2
+    for flow in ("ingest", "reprocess"):
+        found = prefect.deployment(deployment_name("ops", flow))
+        prefect.ask(f"/deployments/{found['id']}", method="DELETE")
+    install(plan)
+
+
+@pytest.mark.parametrize("is_updated", [False, True])
+def test_what_schedules_missed_runs_once_after_a_start(plan, prefect, is_updated):
+    found = prefect.deployment("reprocess/ops-reprocess")
+    tags, due = ["auto-scheduled"], datetime.now(UTC) - timedelta(days=3)
+    for day in range(3):
+        for retry in (False, True):  # two schedules with other parameters are two
+            at = (due + timedelta(days=day)).isoformat()
+            state = {"type": "SCHEDULED", "state_details": {"scheduled_time": at}}
+            given = {"parameters": {"retry": retry}, "tags": tags, "state": state}
+            prefect.create_run("reprocess", name=f"missed {day} {retry}", **given)
+    if is_updated:  # as by another version, whose update removes planned runs
+        changed = {"description": "older"}
+        prefect.ask(f"/deployments/{found['id']}", changed, method="PATCH")
+    install(plan)
+    named = {"name": {"like_": "missed "}}
+    runs = prefect.runs(["ops-reprocess"], **named)
+    left = [run for run in runs if run["state_type"] == "SCHEDULED"]
+    assert sorted(run["parameters"]["retry"] for run in left) == [False, True]
+    assert {run["parameters"]["project"] for run in left} == {plan.project}
+    restart_lost_runs(plan)
+    assert (
+        len(prefect.runs(["ops-reprocess"], state={"type": {"any_": ["SCHEDULED"]}}, **named)) == 2
+    )
+    for run in left:
+        prefect.set_state(run["id"], "CANCELLED", "")
+        prefect.ask(f"/flow_runs/{run['id']}", method="DELETE")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("reprocess=0 3 * *", "Invalid cron string"),
+        ("reprocess=0 3 * * * Mars/X", "Invalid timezone"),
+        ("match=0 3 * * *", "'match'"),
+        ("0 3 * * *", "'0 3"),
+    ],
+)
+def test_a_schedule_that_cannot_be_is_refused_before_anything_starts(text, said):
+    with pytest.raises(UsageError, match=re.escape(said)):
+        parse_schedules([text])
+    with pytest.raises(UsageError, match="twice"):
+        parse_schedules(["reprocess=0 3 * * * UTC", "reprocess=0 4 * * * UTC"])
 
 
 def planned_runs(prefect, deployment):

@@ -75,8 +75,12 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
     Raises:
         InputError: no such file, too large, not YAML, nested too deep, an alias or a repeated key.
     """
-    text = _read_text(path, SETTINGS_BYTES)
-    return _parse(path, "YAML", _load_yaml, text)
+    return parse_yaml(str(path), _read_text(path, SETTINGS_BYTES))
+
+
+def parse_yaml(where: str, text: str) -> Any:  # noqa: ANN401
+    """Return the only document of a YAML text, as `read_yaml`; `where` names it in errors."""
+    return _parse(where, "YAML", _load_yaml, text)
 
 
 def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
@@ -85,7 +89,7 @@ def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
     Raises:
         InputError: no such file, too large or not JSON.
     """
-    return _parse(path, "JSON", json.loads, _read_text(path, limit))
+    return _parse(str(path), "JSON", json.loads, _read_text(path, limit))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -106,7 +110,7 @@ def read_toml(path: Path) -> dict[str, Any]:
             found=f"one of {longest}",
             todo="Break the line.",
         )
-    tables: dict[str, Any] = _parse(path, "TOML", tomllib.loads, text)
+    tables: dict[str, Any] = _parse(str(path), "TOML", tomllib.loads, text)
     return tables
 
 
@@ -156,19 +160,19 @@ def _read_text(path: Path, limit: int) -> str:
         ) from error
 
 
-def _parse(path: Path, form: str, parse: Callable[[str], Any], text: str) -> Any:  # noqa: ANN401
+def _parse(where: str, form: str, parse: Callable[[str], Any], text: str) -> Any:  # noqa: ANN401
     try:
         return parse(text)
     except RecursionError as error:
         raise InputError(
-            str(path), expected=form, found="nesting without end", todo="Write the file again."
+            where, expected=form, found="nesting without end", todo="Write the file again."
         ) from error
     # ValueError: json and tomllib, and numbers or dates that Python's constructors reject.
     # The others: PyYAML, where a tag such as !!int or !!bool precedes text of another type.
     except (yaml.YAMLError, ValueError, OverflowError, LookupError, AttributeError) as error:
         found = " ".join(str(error).replace('"<unicode string>", ', "").split())
         raise InputError(
-            str(path), expected=form, found=found, todo="Correct the place that is named."
+            where, expected=form, found=found, todo="Correct the place that is named."
         ) from error
 
 

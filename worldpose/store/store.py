@@ -12,8 +12,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import JsonValue
-
 from data_contracts.match import Registration
 from data_contracts.run import (
     BODY_STAGES,
@@ -240,13 +238,8 @@ class Store:
         """Remove a result, manifest first, so that the next run recomputes it."""
         self.blobs.delete_tree(result.path, MANIFEST)
 
-    def reserve_run(
-        self, match_id: str, overrides: dict[str, dict[str, JsonValue]] | None = None
-    ) -> str:
-        """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ...
-
-        `overrides` are the requested settings by stage, which outlast a killed run.
-        """
+    def reserve_run(self, match_id: str) -> str:
+        """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ..."""
         number = 0
         while True:
             # A record that was set aside keeps its number: reviews may name the run. A number that
@@ -261,7 +254,6 @@ class Store:
                 started_at=datetime.now(UTC),
                 host=platform.node(),
                 pid=os.getpid(),
-                overrides=overrides,
             )
             if not self.blobs.put_new(path, seal(reservation)):
                 continue

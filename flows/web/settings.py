@@ -1,0 +1,102 @@
+"""Settings page: the layers of the project, its venues and one match."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from fastapi import APIRouter, HTTPException
+from pydantic import JsonValue
+
+from data_contracts.records import Name, Record
+from flows.layers import (
+    MATCHES,
+    PROJECT,
+    VENUES,
+    Layer,
+    list_venues,
+    match_layer,
+    project_layers,
+    read_layer,
+    read_layers,
+)
+from flows.settings import known_settings, resolve, save_layer
+from flows.web.app_context import PageContext
+from worldpose.errors import InputError
+from worldpose.store.paths import is_name
+
+
+class SavedLayer(Record):
+    """All values of a layer as a person changed them, and the revision that the person saw."""
+
+    layer: str
+    values: dict[str, JsonValue]
+    revision: str
+
+
+def routes(context: PageContext) -> APIRouter:
+    """Create the routes of the settings page."""
+    router = APIRouter(prefix="/api/settings")
+    store = context.store
+
+    def layers_of(match: str | None) -> tuple[Layer, ...]:
+        if match is None:
+            return project_layers(store)
+        registered = store.registration(match) if match in store.matches() else None
+        if registered is None:
+            raise HTTPException(404, "no such match")
+        return read_layers(store, registered.spec)
+
+    @router.get("")
+    def settings(match: Name | None = None) -> dict[str, Any]:
+        layers, problem = layers_of(match), ""
+        in_force: dict[str, dict[str, JsonValue]] = {}
+        try:
+            in_force = resolve(layers).differences()
+        except InputError as error:  # the page is where it is corrected
+            problem = str(error)
+        names = [PROJECT, *(f"{VENUES}/{each}" for each in list_venues(store))]
+        names += [] if match is None else [match_layer(match)]
+        return {
+            "layers": [
+                {"layer": name, "values": layer.values, "revision": layer.revision}
+                for name in names
+                for layer in [read_layer(store, name)]
+            ],
+            "in_force": [{"name": each, **in_force[each]} for each in in_force],
+            "problem": problem,
+            "known": known_settings(),
+        }
+
+    @router.post("")
+    def save(given: SavedLayer, match: Name | None = None) -> dict[str, Any]:
+        kind, _, name = given.layer.partition("/")
+        is_match = kind == MATCHES and name in store.matches()
+        is_venue = kind == VENUES and is_name(name)
+        if not (given.layer == PROJECT or is_match or is_venue):
+            raise HTTPException(404, "no such layer of settings")
+        before = read_layer(store, given.layer)
+        if before.revision != given.revision:
+            raise HTTPException(409, "another person changed these settings: load the page again")
+        changed = {n: it for n, it in given.values.items() if it != before.values.get(n)}
+        for key in filter(lambda key: _names_file(key, changed[key]), changed):
+            raise InputError(
+                f"{before.file}: {key}",
+                expected="a value that names no file: pages cannot choose files of the server",
+                found=repr(changed[key]),
+                todo=f"On the server: worldpose settings --set {key}=...",
+            )
+        layers = layers_of(name if is_match else None)
+        save_layer(store, layers, given.layer, given.values)
+        return settings(match)
+
+    return router
+
+
+def _names_file(key: str, value: JsonValue) -> bool:
+    """Return whether a value can name a file or folder: code in it could run."""
+    if isinstance(value, list | dict):
+        inner = value if isinstance(value, list) else [*value, *value.values()]
+        return any(_names_file(key, each) for each in inner)
+    is_path = key.endswith("folder") or not re.fullmatch(r"(model:)?[^/\\:~]*", str(value))
+    return isinstance(value, str) and is_path

@@ -1,0 +1,331 @@
+"""Layers of settings: one resolution for every door, origins, and errors that name file and key."""
+
+import json
+import shutil
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from command_line import TINY
+from typer.testing import CliRunner
+
+from flows import layers, reprocess
+from flows.cli import run as run_command
+from flows.cli.app import app as worldpose
+from flows.layers import read_layer, write_layer
+from flows.registering import open_match, register
+from flows.run_plan import plan_run
+from flows.running import RunRequest, settle
+from flows.service import deployed
+from flows.service.plan import ServePlan
+from flows.settings import resolve
+from flows.web import app_context
+from worldpose.body.body_file import load_open_body, save_body
+from worldpose.errors import InputError
+from worldpose.store.store import Store
+
+BODY = "smpl-test"
+
+
+@pytest.fixture
+def store(project_copy):
+    return Store.open(project_copy)
+
+
+def command(*arguments, code=0):
+    answer = CliRunner().invoke(worldpose, list(map(str, arguments)))
+    assert answer.exit_code == code, answer.output + repr(answer.exception)
+    return answer.stdout
+
+
+def shown(store, *arguments):
+    told = json.loads(command("settings", *arguments, "--project", store.url, "--json"))
+    return {name: (each["value"], each["from"]) for name, each in told["settings"].items()}
+
+
+class CapturedError(BaseException):
+    """A door has come to where it would compute; it handles this as little as a kill."""
+
+
+@pytest.fixture
+def keys_of_run(store, monkeypatch):
+    """The content keys that a door computes, captured where it would begin to."""
+    found = []
+
+    def capture(store, match, request, *_):
+        if isinstance(match, str):  # a flow has only the id
+            match = open_match(store, match)
+        assert request.is_settled
+        for number in range(1, request.most_iterations + 1):
+            planned = plan_run(store, match, request.settings, iteration=number)
+            found.append({unit.name: unit.key for unit in planned})
+        assert str(match.body_folder) == found_folder
+        raise CapturedError
+
+    found_folder = ""
+    for place, name in (
+        (run_command, "iterate_match"),
+        (run_command, "run_match"),
+        (reprocess, "iterate_match"),
+        (reprocess, "run_match"),
+        (deployed, "_iterate_until_decided"),
+        (deployed, "_run_until_decided"),
+    ):
+        monkeypatch.setattr(place, name, capture)
+
+    def take(door, folder):
+        nonlocal found_folder
+        found_folder = str(folder)
+        found.clear()
+        with suppress(CapturedError):
+            door()
+        return list(found)
+
+    return take
+
+
+@pytest.fixture
+def smpl(store, tmp_path):
+    """A project with a body of its own, two iterations and another setting of a stage."""
+    folder = tmp_path / "bodies"
+    folder.mkdir()
+    save_body(folder / f"{BODY}.npz", replace(load_open_body(), name=BODY))
+    stated = {
+        "body_folder": str(folder),
+        "body_fitting.body_model": BODY,
+        "iterations": 2,
+        "detection.stride": 2,
+        "tracking.gate_m": 0.6,
+    }
+    write_layer(store, "project", stated)
+    return folder
+
+
+class Runs:
+    """The runs of a service: parameters of the deployment that processes matches."""
+
+    def __init__(self, url):
+        self.url, self.started = url, []
+
+    def start(self, match_id, *, priority="normal", key=None, **given):
+        self.started.append({"match_id": match_id, **{n: it for n, it in given.items() if it}})
+        return SimpleNamespace(id="run", link="")
+
+    def active(self):
+        return []
+
+    def run_all(self):
+        for given in self.started:
+            deployed.match.fn(self.url, **given)
+
+
+def test_every_door_computes_the_same_keys(store, smpl, tiny, keys_of_run, tmp_path, monkeypatch):
+    runs = Runs(store.url)
+    machines = nullcontext(lambda missing: RunRequest({}))
+    monkeypatch.setattr(reprocess, "shared_machines", lambda *_: machines)
+    monkeypatch.setattr(deployed, "match_runs_of", lambda url: None)
+    monkeypatch.setattr(app_context, "match_runs_of", lambda url: runs)
+    monkeypatch.setattr(deployed.MatchRuns, "of_plan", lambda plan: runs)
+
+    def by_command():
+        CliRunner().invoke(worldpose, ["run", TINY, "--project", store.url])
+
+    def by_page():
+        app_context.Continuing(store).go_on(TINY)
+        runs.run_all()
+
+    def from_inbox():
+        inbox = tmp_path / "inbox"
+        shutil.copytree(tiny, inbox / "arrived")
+        moved = store.registration(TINY).model_copy(update={"folder": str(tmp_path / "gone")})
+        store.register(moved)  # it arrives as a match whose folder has moved
+        plan = ServePlan(
+            project=store.url, inbox=inbox, state=tmp_path, prefect="", settle_seconds=0.0
+        )
+        for _ in range(2):
+            deployed.ingest.fn(plan.model_dump(mode="json"))
+        runs.run_all()
+
+    def by_schedule():
+        deployed.match.fn(store.url, TINY)
+
+    def by_reprocess():
+        reprocess.reprocess_matches(store, [TINY], RunRequest({}))
+
+    first = keys_of_run(by_command, smpl)
+    assert len(first) == 2 and first[0] != first[1]
+    for door in (by_page, from_inbox, by_schedule, by_reprocess):
+        runs.started.clear()
+        assert keys_of_run(door, smpl) == first, door
+    write_layer(store, "project", {})
+    assert keys_of_run(by_schedule, None)[0] != first[0]
+
+
+def test_each_value_is_from_the_last_layer_that_states_it(store, tiny):
+    project = ("--project", store.url)
+    command("settings", "--set", "tracking.gate_m=0.45", "--set", "iterations=3", *project)
+    command("settings", "--venue", "hall", "--set", "tracking.gate_m=0.6", *project)
+    command("settings", TINY, "--set", "venue=hall", *project)
+    venue = {"tracking.gate_m": (0.6, "venue hall"), "venue": ("hall", "match")}
+    assert shown(store, TINY) == {**venue, "iterations": (3, "project")}
+    assert shown(store) == {"tracking.gate_m": (0.45, "project"), "iterations": (3, "project")}
+    settle(store, open_match(store, TINY), RunRequest({"tracking": {"gate_m": 0.7}}, iterations=1))
+    assert shown(store, TINY)["tracking.gate_m"] == (0.7, "match")
+    # One iteration, as built in, replaces three of the project.
+    assert "iterations" not in shown(store, TINY)
+    _, request = settle(store, open_match(store, TINY), RunRequest({}))
+    assert (request.iterations, request.settings) == (1, {"tracking": {"gate_m": 0.7}})
+    # To forget what runs stated leaves the venue, and what it and the project state.
+    _, request = settle(store, open_match(store, TINY), RunRequest({}, default_settings=True))
+    assert (request.iterations, request.settings) == (3, {"tracking": {"gate_m": 0.6}})
+    command("settings", TINY, "--unset", "venue", *project)
+    assert shown(store, TINY)["tracking.gate_m"] == (0.45, "project")
+
+
+def test_a_question_about_settings_changes_nothing(store):
+    match = open_match(store, TINY)
+    found = resolve(match.layers, {"tracking": {"gate_m": 0.4}})
+    assert found.origins["tracking.gate_m"].origin == "command line"
+    assert store.blobs.entries("settings") == []
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "found"),
+    [
+        (
+            "detection.strid: 2",
+            "detection.strid",
+            "Did you mean 'detection.stride'.*settings --list",
+        ),
+        ("detection.stride: none", "detection.stride", "'none'"),
+        ("tracking.gate_m: -1", "tracking.gate_m", "-1"),
+        ("iterations: many", "iterations", "many"),
+        ("iterations: 0", "iterations", "0"),
+        ("body_folder: bodies", "body_folder", "relative path 'bodies'"),
+        ("exports: [joints, docx]", "exports", "docx"),
+        ("venue: hall", "venue", "project"),
+        ("- 1", "", "1"),
+        ("gates: [auto]", "gates", "auto"),
+        ("pitch: {length: -4}", "pitch", "-4"),
+    ],
+)
+def test_a_layer_that_is_wrong_is_refused_with_file_and_key(store, text, key, found):
+    store.blobs.put("settings/project.yaml", text.encode())
+    with pytest.raises(InputError, match=found) as refused:
+        resolve(open_match(store, TINY).layers)
+    assert refused.value.where.startswith(f"{store.url}/settings/project.yaml")
+    assert key in refused.value.where
+
+
+def test_a_venue_without_a_file_is_refused_by_name_and_can_be_added(store):
+    write_layer(store, f"matches/{TINY}", {"venue": "hal"})
+    with pytest.raises(InputError, match=r"venue hal.*--venue hal --add"):
+        resolve(open_match(store, TINY).layers)
+    command("settings", "--venue", "hal", "--add", "--project", store.url)
+    assert resolve(open_match(store, TINY).layers).overrides == {}
+
+
+def test_a_refused_change_writes_nothing(store):
+    for text in ("detection.strid=2", "detection.stride=x", "iterations=0", "no"):
+        command("settings", "--set", text, "--project", store.url, code=1)
+    assert store.blobs.entries("settings") == []
+
+
+def test_match_yaml_names_its_venue_and_the_venue_gives_pitch_and_side(store, tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "at_parken")
+    (folder / "pitch.json").unlink()
+    text = yaml.safe_load((folder / "match.yaml").read_text())
+    named = {"match_id": "final", "venue": "parken"}
+    (folder / "match.yaml").write_text(yaml.safe_dump({**text, **named}))
+    camera = text["cameras"][0]["id"]
+    venue = {"pitch": {"length": 101.0}, "sides": {camera: "near"}, "tracking.gate_m": 0.6}
+    write_layer(store, "venues/parken", venue)
+    match, _ = register(store, folder)
+    assert match.folder.pitch.length == 101.0
+    assert match.folder.spec.camera(camera).side == "near"
+    assert resolve(match.layers).overrides == {"tracking": {"gate_m": 0.6}}
+    assert match.pitch_source["length"] == 101.0
+
+
+def test_the_list_has_one_short_line_per_setting_and_the_rest_by_name():
+    lines = command("settings", "--list").splitlines()
+    assert max(map(len, lines)) <= 100
+    assert any(line.startswith("  min_views = 2  ") for line in lines)
+    assert command("run", "any", "--set", "list").splitlines() == lines
+    about = command("settings", "--describe", "triangulation.min_views")
+    assert about.startswith("triangulation.min_views = 2, built in\n")
+
+
+def test_a_page_shows_and_saves_the_layers(store, ada, bob):
+    found = ada.get(f"/api/settings?match={TINY}").json()
+    names = ["project", f"matches/{TINY}"]
+    assert [each["layer"] for each in found["layers"]] == names
+    path, sent = f"/api/settings?match={TINY}", {"layer": "project", "revision": ""}
+    saved = ada.post(path, json={**sent, "values": {"tracking.gate_m": 0.45}}).json()
+    (row,) = saved["in_force"]
+    assert (row["name"], row["value"], row["from"]) == ("tracking.gate_m", 0.45, "project")
+    # Another person, who saw the page before, replaces nothing.
+    late = bob.post(path, json={**sent, "values": {}})
+    assert late.status_code == 409
+    assert read_layer(store, "project").values == {"tracking.gate_m": 0.45}
+    sent["revision"] = saved["layers"][0]["revision"]
+    wrong = ada.post(path, json={**sent, "values": {"tracking.gate_m": -1}})
+    assert wrong.status_code == 422 and "tracking.gate_m" in wrong.json()["error"]
+    for layer in ("matches/none", "venues/../x", "elsewhere"):
+        answer = ada.post(path, json={"layer": layer, "values": {}, "revision": ""})
+        assert answer.status_code == 404
+    assert ada.get("/api/settings?match=none").status_code == 404
+    assert layers.list_venues(store) == ()
+
+
+def test_a_page_names_no_file_of_the_server_and_keeps_those_that_are_named(store, ada):
+    stated = {"body_folder": "/data/bodies", "detection.detector": "onnx:/nets/x.onnx"}
+    write_layer(store, "project", stated)
+
+    def save(**values):
+        revision = read_layer(store, "project").revision
+        sent = {"layer": "project", "values": values, "revision": revision}
+        return ada.post("/api/settings", json=sent).status_code
+
+    assert save(**stated, iterations=2) == 200
+    for name, value in (
+        ("body_folder", "/etc"),
+        ("exports_folder", "/etc"),
+        ("detection.detector", ["embedded", "mmdet:upload.py"]),
+        ("detection.pose", "embedded:../x"),
+    ):
+        assert save(**{**stated, name: value}) == 422
+    assert read_layer(store, "project").values == {**stated, "iterations": 2}
+    assert save(**{"detection.detector": "model:rtdetr-v2-r18", "detection.stride": 3}) == 200
+
+
+def test_a_broken_layer_is_shown_on_the_page_that_corrects_it(store, ada):
+    write_layer(store, "project", {"detection.strid": 2})
+    found = ada.get("/api/settings").json()
+    assert "detection.strid" in found["problem"]
+    given = {"layer": "project", "values": {}, "revision": found["layers"][0]["revision"]}
+    assert ada.post("/api/settings", json=given).json()["problem"] == ""
+
+
+def test_layers_are_kept_in_object_storage_too(bucket):
+    store = Store.create(f"{bucket}/layers")
+    write_layer(store, "venues/hall", {"lenses": [], "tracking.gate_m": 0.6})
+    write_layer(store, "project", {"iterations": "auto"})
+    assert layers.list_venues(store) == ("hall",)
+    assert resolve(layers.project_layers(store)).general.iterations == "auto"
+    write_layer(store, "project", {})
+    (entry,) = store.blobs.entries("settings")
+    assert entry.path == "settings/venues/hall.yaml"
+
+
+@pytest.mark.usefixtures("server")
+def test_exports_follow_each_run_and_a_failed_one_says_that_the_run_is_kept(store):
+    write_layer(store, "project", {"exports": ["joints"]})
+    told = json.loads(command("run", TINY, "--project", store.url, "--json"))
+    (file,) = [each for each in told["exports"] if each.endswith("joints.npz")]
+    assert file == f"{store.url}/exports/{TINY}/joints.npz"
+    write_layer(store, "project", {"exports": ["joints"], "exports_folder": "/dev/null/x"})
+    command("run", TINY, "--project", store.url, code=1)
+    assert store.runs(TINY) == ("0001",)
