@@ -129,24 +129,14 @@ def unit_state(unit: PlannedUnit, record: RunRecord | None) -> UnitState:
     return UnitState.MISSING if recorded in (None, unit.key) else UnitState.STALE
 
 
-def list_unit_states(
-    store: Store, match: Match, latest: RunRecord | None
-) -> dict[UnitState, list[str]]:
-    """Return all units of a match, as `stage/unit`, by their state relative to its latest run.
+def plan_as_latest(
+    store: Store, match: Match, latest: RunRecord | None, overrides: Overrides
+) -> list[PlannedUnit]:
+    """Plan the whole method with the settings and the iteration of the latest run.
 
     Raises:
         InputError: a setting of that run names a missing file.
     """
-    units: dict[UnitState, list[str]] = {state: [] for state in UnitState}
-    for unit in _plan_as_latest(store, match, latest, {}):
-        units[unit_state(unit, latest)].append(unit.name)
-    return units
-
-
-def _plan_as_latest(
-    store: Store, match: Match, latest: RunRecord | None, overrides: Overrides
-) -> list[PlannedUnit]:
-    """Plan the whole method with the settings and the iteration of the latest run."""
     asked, _ = resolve_settings(store, match.match_id, latest, overrides)
     return plan_run(store, match, asked, iteration=1 if latest is None else latest.iteration)
 
@@ -347,7 +337,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     match_id, _, unit_name = name.partition("/")
     match = open_match(store, match_id)
     latest = latest_run(store, match_id)
-    planned = {unit.name: unit for unit in _plan_as_latest(store, match, latest, overrides)}
+    planned = {unit.name: unit for unit in plan_as_latest(store, match, latest, overrides)}
     if unit_name not in planned:
         raise InputError(
             name,

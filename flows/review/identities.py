@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from data_contracts.review import Edit
+from data_contracts.review import Edit, NamedTrack
 from flows.review.edit_conflicts import (
     StaleEditError,
     edits_since,
@@ -14,13 +14,15 @@ from flows.review.edit_conflicts import (
 from flows.stage import Match
 from worldpose.review.identities import (
     IDENTITY_EDITS,
+    TRACK_EDITS,
     Identities,
     IdentityReplay,
     find_objection,
     replay_identities,
     stored_identities,
 )
-from worldpose.store.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Run, Store
 
 
 def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
@@ -38,9 +40,36 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     name, match_id = f"tracking/{clip}", match.match_id
     results = store.run(match_id).results if store.runs(match_id) else {}
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
-    stored = open_stored(store, match_id, name, "identities")
-    later = edits_since(said, stored.edits, f"clip {clip}", match_id)
-    return replay_identities(stored_identities(stored.result), later)
+    stored = open_stored(store, store.run(match_id), name, "identities")
+    moved = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
+    later = edits_since(moved, stored.edits, f"clip {clip}", match_id)
+    edits = [edit for edit in said if isinstance(edit, NamedTrack) or edit in later]
+    return replay_identities(stored_identities(stored.result), edits)
+
+
+def names_of(run: Run, clip: str) -> dict[int, str]:
+    """Return the newest names of a run's people by id.
+
+    A name belongs to no result: the journal's names are replayed over the tracks of the run, in
+    order with the merges and splits that these contain.
+    """
+    match_id, unit = run.record.match_id, f"tracking/{clip}"
+    journal = read_journal(run.store, match_id)
+    said = [
+        (each.id, each.edit)
+        for each in journal.corrections.values()
+        if isinstance(each.edit, IDENTITY_EDITS) and each.edit.clip == clip
+    ]
+    named = {n for n, edit in said if isinstance(edit, NamedTrack) and n in journal.standing}
+    if unit not in run or not named:
+        return {}
+    stored = open_stored(run.store, run.record, unit, "identities")
+    moves = run.manifest(unit).recipe.sources.get("identities") or []
+    assert isinstance(moves, list)
+    contained = moves if not stored.edits else []
+    edits = [edit for n, edit in said if n in named or edit.model_dump(mode="json") in contained]
+    tracks = stored_identities(stored.result, with_joints=False)
+    return replay_identities(tracks, edits).identities.names
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:

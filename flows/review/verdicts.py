@@ -29,7 +29,7 @@ from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.review.detections import DETECTION_EDITS
-from worldpose.review.identities import IDENTITY_EDITS
+from worldpose.review.identities import TRACK_EDITS
 from worldpose.review.journal import Journal, last_decision, requests_by_id, say
 from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Run, Store
@@ -69,6 +69,19 @@ class Review:
         """The decision for the reviewer."""
         gate = GATES.get(self.request.gate)
         return "Is it good enough to be built upon?" if gate is None else gate.question
+
+    @property
+    def consequences(self) -> dict[str, str]:
+        """What approving and rejecting will do."""
+        gate = GATES.get(self.request.gate)
+        fix = "its input" if gate is None else gate.to_correct
+        uses = "uses it as it is"
+        if self.request.gate == "camera_consistency":
+            uses = "leaves these cameras out"
+        return {
+            "approve": f"Approve: the run goes on and {uses}.",
+            "reject": f"Reject: nothing later uses it. Correct {fix}; then it is computed again.",
+        }
 
 
 def reviews_of(store: Store, match: Match, latest: RunRecord | None) -> list[Review]:
@@ -308,7 +321,7 @@ def unit_origins(
         if isinstance(edit, MovedPoint | RedrawnMarking):
             stage = "static_calibration" if edit.frame is None else "broadcast_calibration"
             corrected.add(f"{stage}/{edit.camera}")
-        elif isinstance(edit, IDENTITY_EDITS):
+        elif isinstance(edit, TRACK_EDITS):
             corrected.add(f"tracking/{edit.clip}")
         elif isinstance(edit, DETECTION_EDITS):
             found = f"detection/{edit.camera}"

@@ -14,7 +14,9 @@ from typing import Final, Literal
 from data_contracts.review import ReviewRecord, ReviewRequest
 from data_contracts.run import RunRecord
 from flows.gates import GATES
+from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
+from flows.registering import open_for_review
 from flows.results.timings import Cost
 from flows.review.metric_words import all_reasons
 from flows.run_record import latest_run
@@ -66,6 +68,7 @@ class MatchStatus:
         latest: its latest finished run.
         at_work_since: start of a run that has not ended.
         stages: stage to its units, in the order of the method.
+        now: the state with what to do; None if it was not read.
         problem: why its status is not readable.
         is_unseen: whether it was not read yet.
     """
@@ -74,6 +77,7 @@ class MatchStatus:
     latest: RunRecord | None = None
     at_work_since: datetime | None = None
     stages: Mapping[str, tuple[UnitSummary, ...]] = field(default_factory=dict)
+    now: MatchState | None = None
     problem: str = ""
     is_unseen: bool = False
 
@@ -159,7 +163,8 @@ class Overview:
         last = "" if latest is None else latest.run_id
         at_work = [each.started_at for each in begun if each.run_id > last]
         stages = {} if latest is None else self._stages(latest)
-        return MatchStatus(match_id, latest, at_work[-1] if at_work else None, stages)
+        begun_at = at_work[-1] if at_work else None
+        return MatchStatus(match_id, latest, begun_at, stages, state_now(self.store, match_id))
 
     def _stages(self, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:
         records = read_journal(self.store, run.match_id).questions
@@ -207,6 +212,14 @@ class Overview:
         request = asked.get(waits.request)
         since = run.finished_at if request is None else request.created_at
         return replace(done, state="waiting", waiting_since=since, why=all_reasons(waits.reasons))
+
+
+def state_now(store: Store, match_id: str) -> MatchState:
+    """Return the state of a match; of one that cannot be opened, the reason."""
+    try:
+        return match_state(store, open_for_review(store, match_id))
+    except (OSError, WorldposeError) as error:
+        return describe_problem(error)
 
 
 def age(since: datetime | None) -> float:

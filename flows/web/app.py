@@ -23,7 +23,16 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from data_contracts.records import Record
 from flows.review.edit_conflicts import StaleEditError
 from flows.service import status_page
-from flows.web import calibration, corrections, detections, evidence, identities, queue, results
+from flows.web import (
+    calibration,
+    corrections,
+    detections,
+    evidence,
+    history,
+    identities,
+    queue,
+    results,
+)
 from flows.web.access import LOOPBACK, SESSION_SECONDS, Access
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import describe_error
@@ -84,8 +93,8 @@ def create_app(project: str, access: Access, intake: Intake | None = None) -> Fa
     )
     add_answers(app)
     app.include_router(_sessions(context))
-    pages = queue, corrections, evidence, calibration, detections, identities, results, status_page
-    for module in pages:
+    tools = corrections, evidence, calibration, detections, identities
+    for module in (queue, history, *tools, results, status_page):
         app.include_router(module.routes(context))
     app.include_router(routes_of_intake(context, intake))
     app.include_router(_files())

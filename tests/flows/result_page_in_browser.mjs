@@ -6,7 +6,6 @@ const seen = { errors: [], outside: [] };
 const page = await open(seen, 900);
 await logIn(page, task.base, "Ada");
 await page.goto(`${task.base}/#/match/${encodeURIComponent(task.match)}`);
-await page.click("text=in 3D");
 await page.waitForSelector('[data-scene="ready"]');
 const canvas = page.locator("[data-scene]");
 await page.waitForTimeout(1500);

@@ -274,7 +274,7 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     )
     assert (poor.alert, poor.text) == (
         "quality",
-        "m/body_fitting/clip: offset rms: 0.05 m, limit 0.03 m",
+        "m/body_fitting/clip: distance of bodies from the seen joints: 5 cm, limit 3 cm",
     )
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
