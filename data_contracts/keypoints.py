@@ -118,14 +118,15 @@ class KeypointDetections(Generic[Array]):
         """
         points = tuple(dict.fromkeys(point for each in cameras for point in each.points))
         cameras = [each.with_points(points) for each in cameras]
-        frame = np.unique(np.concatenate([each.frame for each in cameras]))
+        frames = [each.frame if len(each.frame) else np.arange(len(each.score)) for each in cameras]
+        frame = np.unique(np.concatenate(frames))
         most = max(each.score.shape[1] for each in cameras)
         stacked = {}
         for name, array in cameras[0].arrays().items():
             shape = (len(frame), len(cameras), most, *array.shape[2:])
             stacked[name] = np.full(shape, np.nan, dtype=array.dtype)
             for c, each in enumerate(cameras):
-                rows = np.searchsorted(frame, each.frame)
+                rows = np.searchsorted(frame, frames[c])
                 stacked[name][rows, c, : each.score.shape[1]] = each.arrays()[name]
         return cameras[0].with_arrays(stacked, frame)
 

@@ -2,7 +2,8 @@
 
 All take and return plain arrays and frozen records, and need neither Prefect, Dask nor a store:
 
-- the whole method: `reconstruct` a match folder, see worldpose/pipeline.py;
+- the whole method: `reconstruct` a match folder, see worldpose/pipeline.py, or
+  `reconstruct_bodies` from 2D poses and calibrated cameras;
 - read: `read_match` a match folder, `read_unit` one camera's 2D poses of it, `read_cameras` a
   calibration file, `read_observations` a file of 2D poses, `read_still` an image, `open_video`;
 - calibrate: `calibrate_camera` from clicks on pitch markings, `calibrate_broadcast` a moving
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from data_contracts.static_calibration import ClickedMarkings as ClickedMarkings
     from worldpose.body.body_file import find_body as find_body
     from worldpose.body_fitting.estimate import fit_bodies as fit_bodies
+    from worldpose.body_fitting.from_poses import reconstruct_bodies as reconstruct_bodies
     from worldpose.body_fitting.ray_constraints import find_ray_constraints as find_ray_constraints
     from worldpose.body_fitting.results import ClipEvidence as ClipEvidence
     from worldpose.body_fitting.settings import BodyFittingSettings as BodyFittingSettings
@@ -118,6 +120,7 @@ _MODULES: Final = {
     "read_still": "worldpose.ingest.footage",
     "read_unit": "worldpose.ingest.footage",
     "reconstruct": "worldpose.pipeline",
+    "reconstruct_bodies": "worldpose.body_fitting.from_poses",
     "reconstruct_joints": "worldpose.triangulation.estimate",
     "track_people": "worldpose.tracking.tracker",
     "triangulate_joints": "worldpose.triangulation.estimate",

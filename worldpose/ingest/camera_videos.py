@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -138,13 +138,22 @@ def describe_videos(
         if gaps := describe_gaps(clock):
             notes.append(f"{name}: {gaps}")
     counts = {name: len(clock) for name, clock in clocks.items()}
-    if max(counts.values()) > min(counts.values()):
-        shortest = min(counts, key=lambda name: counts[name])
+    length = shared_length(counts.values())
+    if early := [f"{name} after {count}" for name, count in counts.items() if count < length]:
+        notes.append(f"the clip has {length} frames; videos end earlier: {', '.join(early)}")
+    if max(counts.values()) > length:
+        longest = max(counts, key=lambda name: counts[name])
         notes.append(
-            f"the clip ends after {counts[shortest]} frames with the video of {shortest}; the "
-            f"longest has {max(counts.values())}"
+            f"the clip ends after {length} frames, the last that two videos show; {longest} has "
+            f"{counts[longest]}"
         )
     return notes
+
+
+def shared_length(counts: Iterable[int]) -> int:
+    """Return the number of frames up to the last one that two videos show, or the only one."""
+    longest = sorted(counts)[-2:]
+    return longest[0] if longest else 0
 
 
 def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:

@@ -28,6 +28,7 @@ from worldpose.ingest.camera_videos import (
     describe_videos,
     find_videos,
     require_cameras,
+    shared_length,
 )
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.registration import file_state, require_settled
@@ -79,6 +80,7 @@ def import_match(
     left_out = LeftOut()
     cameras = read_calibration(calibration, left_out=left_out, any_unit=place is not None)
     files = detections_by_camera(detections, list(cameras), calibration, left_out)
+    cameras = {name: cameras[name] for name in files}
     read = {name: read_people(file) for name, file in files.items()}
     people = {name: found.people for name, found in read.items()}
     first, stop = find_people(detections, people)
@@ -143,7 +145,7 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
 
 
 def detections_by_camera(
-    folder: Path, cameras: Sequence[str], calibration: Path, left_out: Collection[str] = ()
+    folder: Path, cameras: Sequence[str], calibration: Path, left_out: LeftOut
 ) -> dict[str, Path]:
     """Return each camera's file of 2D poses, or its folder `<camera>` or `<camera>_json`.
 
@@ -151,10 +153,10 @@ def detections_by_camera(
         folder: holds them.
         cameras: the cameras.
         calibration: file of the cameras, for messages.
-        left_out: further cameras, whose files are ignored.
+        left_out: as in `pick_cameras`.
 
     Raises:
-        InputError: a camera lacks its file, or a file its camera.
+        InputError: fewer than two cameras have a file.
     """
     places = [each for each in sorted(folder.glob("[!.]*")) if each.is_dir()]
     folders = {camera_of(each): each for each in places if camera_of(each) not in left_out}
@@ -213,9 +215,9 @@ def pick_cameras(
     cameras: Sequence[str],
     calibration: Path,
     suffixes: Collection[str],
-    left_out: Collection[str] = (),
+    left_out: LeftOut,
 ) -> dict[str, Path]:
-    """Return the file of each camera.
+    """Return the file of each camera that has one.
 
     Args:
         folder: holds them, for messages.
@@ -223,22 +225,29 @@ def pick_cameras(
         cameras: the cameras.
         calibration: file of the cameras, for messages.
         suffixes: endings of such files, for messages.
-        left_out: further cameras, whose files are ignored.
+        left_out: further cameras, whose files are ignored; cameras without a file are added, and a
+            sentence about files without a camera.
 
     Raises:
-        InputError: a camera lacks its file, or a file its camera.
+        InputError: fewer than two cameras have a file, or than all of fewer cameras.
     """
     files = {name: file for name, file in found.items() if name not in left_out}
-    if sorted(files) != sorted(cameras):
+    both = [name for name in cameras if name in files]
+    if len(both) < max(1, min(2, len(cameras))):
         there = files.values() or sorted(folder.glob("[!.]*"))
         raise InputError(
             str(folder),
             expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
             + ", ".join(cameras),
             found=", ".join(file.name for file in there) or "no such file",
-            todo="Rename the files as the cameras, and leave neither over.",
+            todo="Rename the files as the cameras.",
         )
-    return {name: files[name] for name in cameras}
+    left_out.update({name: f"{folder} has no file of it" for name in cameras if name not in files})
+    if others := [file.name for name, file in files.items() if name not in both]:
+        left_out.notes.append(
+            f"{', '.join(others)}: {calibration.name} has no camera of this name; left out"
+        )
+    return {name: files[name] for name in both}
 
 
 def build_spec(
@@ -310,7 +319,8 @@ def import_videos(
     Without a calibration each video is a camera, to be located by clicks or by people. A camera
     that was calibrated in larger or smaller images of the same shape is scaled to its video.
 
-    The only clip, `clip`, is as long as the shortest video; `offset_frames` can shift videos later.
+    The only clip, `clip`, ends with the last frame that two videos show; `offset_frames` can shift
+    videos later. Cameras without a video are left out, and videos without a camera.
 
     Args:
         calibration: a file or folder that `read_calibration` reads; None = not known.
@@ -360,20 +370,21 @@ def _import_found(
         left_out = LeftOut()
         shown = {name: index.size for name, index in indices.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
-        notes += describe_left_out(left_out)
         is_joined = any(not file.is_relative_to(folder) for file in found.values())
         if found.keys() - left_out.keys() != cameras.keys() and not is_joined:
             find_videos(folder)  # raises for chapters
         endings = VIDEO_SUFFIXES
         files = pick_cameras(folder, found, list(cameras), calibration, endings, left_out)
+        notes += describe_left_out(left_out)
         indices = {name: indices[name] for name in files}
+        cameras = {name: cameras[name] for name in files}
         for name, file in files.items():
             cameras[name] = fit_to_video(file, cameras[name], indices[name], notes)
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)
     sizes = {name: index.size for name, index in indices.items()}
-    count = min(map(len, clocks.values()))
+    count = shared_length(map(len, clocks.values()))
     spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)
     if place is not None:
         cameras, notes[:0] = place(calibration or folder, cameras, {}, rate)

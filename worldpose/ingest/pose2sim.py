@@ -26,6 +26,7 @@ from worldpose.ingest.camera_videos import (
     describe_videos,
     find_videos,
     require_cameras,
+    shared_length,
 )
 from worldpose.ingest.importing import (
     Placing,
@@ -109,6 +110,9 @@ def import_pose2sim(
     is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
     poses = _assign(places, names, source, notes) if places else {}
     videos = _assign(films, names, source, notes) if films else {}
+    names = [name for name in names if name in (poses or videos)]
+    cameras = {name: camera for name, camera in cameras.items() if name in names}
+    videos = {name: file for name, file in videos.items() if name in names}
     indices = {name: known[file] for name, file in videos.items()}
     for name, file in videos.items():
         if name in cameras:
@@ -119,11 +123,11 @@ def import_pose2sim(
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
     notes += describe_videos(videos, indices, clocks) if clocks else []
-    counts = map(len, clocks.values())
+    length = shared_length(map(len, clocks.values()))
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
-    first, stop = find_people(folder, people) if people else (0, min(counts, default=0))
+    first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     spec = build_spec(
         out, match_id, rate, {name: sizes[name] for name in names}, (first, stop), videos=videos
@@ -255,16 +259,21 @@ def _assign(
     places: list[Path], cameras: list[str], calibration: Path, notes: list[str]
 ) -> dict[str, Path]:
     """Return the folder or file of each camera: by name, or else by alphabetical order."""
+    named = {camera_of(place): place for place in places}
+    both = [camera for camera in cameras if camera in named]
+    if len(both) > 1 or len(both) == len(cameras):
+        if lacking := [camera for camera in cameras if camera not in named]:
+            notes.append(f"{places[0].parent.name} lacks {', '.join(lacking)}")
+        if others := [place.name for name, place in named.items() if name not in both]:
+            notes.append(f"{calibration.name} lacks {', '.join(others)}")
+        return {camera: named[camera] for camera in both}
     if len(places) != len(cameras):
         raise InputError(
             str(places[0].parent),
             expected=f"one for each camera in {calibration.name}: {', '.join(cameras)}",
             found=", ".join(place.name for place in places),
-            todo="Add the missing ones, or take the camera out of the calibration.",
+            todo="Name them after the cameras.",
         )
-    named = {camera_of(place): place for place in places}
-    if set(named) == set(cameras):
-        return {camera: named[camera] for camera in cameras}
     pairs = dict(zip(cameras, places, strict=True))
     listed = ", ".join(f"{place.name} is {camera}" for camera, place in pairs.items())
     notes.append(f"{places[0].parent.name}: in alphabetical order, {listed}")

@@ -183,9 +183,11 @@ class _Trial:
     def choose_windows(self, found: Change) -> list[slice]:
         """Return intervals of a second that a change leaves whole, on both sides of it."""
         frames, length = len(self.people.detection_index), max(3, round(self.fps))
+        # Half as many seconds of a large rig show as much, and take as long.
+        share = 1 if length * self.people.detection_index[0].size < 10_000 else 2
         if not found.is_sudden:
             starts = range(0, max(1, frames - length + 1), length)
-            chosen = np.unique(np.linspace(0, len(starts) - 1, 16).astype(int))
+            chosen = np.unique(np.linspace(0, len(starts) - 1, 16 // share).astype(int))
             return [slice(starts[k], starts[k] + length) for k in chosen]
         # Not at the step: its place is known to some frames, and a clock's correction reads there.
         gap = length // 2
@@ -198,7 +200,7 @@ class _Trial:
             before = [slice(0, max(3, found.row - gap // 2))]
         if not after:
             after = [slice(min(frames - 3, found.row + gap // 2), frames)]
-        return [*before[-6:], *after[:6]]
+        return [*before[-6 // share :], *after[: 6 // share]]
 
     def find_alone(
         self, camera: int, near: Change, kinds: Sequence[Kind]

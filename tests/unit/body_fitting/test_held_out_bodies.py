@@ -10,9 +10,11 @@ from walking_bodies import KEYPOINTS, MODEL, walker
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.from_poses import reconstruct_bodies
 from worldpose.body_fitting.held_out import SeenClip, compare_held_out
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
@@ -30,6 +32,11 @@ def ring(count):
 
 def filmed(cameras, noise_px, seed, people=3, frames=60):
     """People who walk past each other, seen by all cameras with noise."""
+    return filmed_with_truth(cameras, noise_px, seed, people, frames)[0]
+
+
+def filmed_with_truth(cameras, noise_px, seed, people=3, frames=60):
+    """People of `filmed`, and their joints."""
     rng = np.random.default_rng(seed)
     joints = []
     for person in range(people):
@@ -41,7 +48,8 @@ def filmed(cameras, noise_px, seed, people=3, frames=60):
     image = cameras.project(truth.reshape(frames, 1, -1, 3)).reshape(frames, count, people, 17, 2)
     image = image + noise_px * rng.standard_normal(image.shape)
     index = np.tile(np.arange(people, dtype=np.int16), (frames, count, 1))
-    return KeypointDetections.from_keypoints(image, np.full(image.shape[:-1], 0.8), index)
+    seen = KeypointDetections.from_keypoints(image, np.full(image.shape[:-1], 0.8), index)
+    return seen, truth
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +87,36 @@ def test_a_body_whose_shanks_are_wrong_is_named_at_knees_or_ankles(clip, fit):
     assert not named & {"head", "shoulder", "elbow", "wrist"}
     # Half of the 8 cm goes into the pose, at most, and image planes show two axes of three.
     assert 0.01 < wrong.certain_excess[GROUPS.index("ankle")] < 0.08
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_one_call_places_bodies_better_than_triangulation(known):
+    """Three cameras, 1.5 px noise; in frame 20 nobody is seen, and the files do not have it."""
+    cameras = {f"cam{n}": each for n, each in enumerate(ring(3))}
+    seen, truth = filmed_with_truth(ring(3), 1.5, 7, people=2, frames=30)
+    rows = np.delete(np.arange(30), 20)
+    if known:
+        given = replace(seen, frame=np.arange(30))[rows]
+    else:
+        given = [
+            KeypointDetections.from_keypoints(
+                seen.keypoints[rows, c], seen.confidence[rows, c], frame=rows
+            )
+            for c in range(3)
+        ]
+    found = reconstruct_bodies(cameras, given, 50.0)
+    assert found.frame.tolist() == list(range(30))
+    order = np.argsort(np.nanmedian(found.bodies.joints[..., 0, 1], axis=0))
+    errors = [
+        np.nanmean(np.linalg.norm((joints[:, order] - truth)[rows], axis=-1))
+        for joints in (found.joints.triangulation.joints, found.joints.joints, found.bodies.joints)
+    ]
+    assert len(order) == 2
+    assert errors[2] < errors[1] < errors[0]
+    assert errors[2] < 0.02
+
+
+def test_one_call_refuses_cameras_without_detections():
+    seen = filmed(ring(3), 1.5, 7, frames=3)
+    with pytest.raises(InputError, match="detections of each of them"):
+        reconstruct_bodies(ring(4), seen, 50.0)

@@ -78,9 +78,9 @@ def test_a_broken_source_leaves_nothing(tmp_path, source, change, where):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
 
 
-def film(path):
+def film(path, frames=3):
     path.parent.mkdir(exist_ok=True)
-    write_video(path.with_suffix(".mp4"), [np.full((48, 64), 9, np.uint8)] * 3, 25.0)
+    write_video(path.with_suffix(".mp4"), [np.full((48, 64), 9, np.uint8)] * frames, 25.0)
     path.with_suffix(".mp4").rename(path)
 
 
@@ -201,3 +201,30 @@ def test_a_camera_without_a_pose_is_left_out_by_name(tmp_path, source, nothing):
     ]
     (source / "detections" / f"third_{spec.cameras[0].id}.json").write_text("[]")
     assert len(run(source, tmp_path / "n").cameras) == 2
+
+
+def test_cameras_and_videos_without_each_other_are_left_out_by_name(tmp_path, source, make_camera):
+    calibration = calibrate(tmp_path, make_camera, ["one", "two", "three"])
+    for name in ("one", "two", "four"):
+        film(tmp_path / "videos" / f"{name}.mp4")
+    spec, notes = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
+    assert [camera.id for camera in spec.cameras] == ["one", "two"]
+    assert list(read_calibration(tmp_path / "m" / "calibration.toml")) == ["one", "two"]
+    assert notes == [
+        "four.mp4: calibration.toml has no camera of this name; left out",
+        f"camera three is left out: {tmp_path / 'videos'} has no file of it",
+    ]
+    (source / "detections" / "middle.json").write_text(json.dumps(results(300)))
+    assert [camera.id for camera in run(source, tmp_path / "n").cameras] == ["right", "left"]
+
+
+def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):
+    calibration = calibrate(tmp_path, make_camera, ["one", "two", "three"])
+    for name, frames in (("one", 9), ("two", 3), ("three", 7)):
+        film(tmp_path / "videos" / f"{name}.mp4", frames)
+    spec, notes = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
+    assert spec.clips[0].frame_count == 7
+    assert notes == [
+        "the clip has 7 frames; videos end earlier: two after 3",
+        "the clip ends after 7 frames, the last that two videos show; one has 9",
+    ]

@@ -1,0 +1,118 @@
+"""Bodies of all people from 2D poses of calibrated cameras, in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.keypoints import KeypointDetections
+from worldpose.body.body_file import find_body
+from worldpose.body.model import BodyModel
+from worldpose.body_fitting.estimate import fit_bodies
+from worldpose.body_fitting.evidence import Ground
+from worldpose.body_fitting.ray_constraints import find_ray_constraints
+from worldpose.body_fitting.results import BodyFit, ClipEvidence
+from worldpose.errors import InputError
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.estimate import Reconstruction, reconstruct_joints
+from worldpose.triangulation.limb_lengths import undo_swaps
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructedBodies:
+    """People of a clip.
+
+    Attributes:
+        frame: (frames,) number of each frame.
+        person: (persons,) identity of each person.
+        joints: triangulated joints, smoothed over time, and the clock offsets of the cameras.
+        bodies: (frames, persons) bodies and their joints.
+    """
+
+    frame: NDArray[np.int64]
+    person: NDArray[np.int64]
+    joints: Reconstruction
+    bodies: BodyFit
+
+    @property
+    def tracks(self) -> JointTracks:
+        """The bodies' joints, as `write_joints` and `evaluate_joints` take them."""
+        return JointTracks(self.frame, self.person, self.bodies.joints, self.bodies.covariance)
+
+
+def reconstruct_bodies(
+    cameras: Camera | Mapping[str, Camera],
+    detections: KeypointDetections | Sequence[KeypointDetections],
+    fps: float,
+    *,
+    body: BodyModel | None = None,
+    ground: Ground | None = None,
+    camera_covariance: NDArray[np.float64] | None = None,
+) -> ReconstructedBodies:
+    """Return the bodies of all people whom calibrated, static cameras see.
+
+    People are tracked over all cameras, unless the detections say who they are; their joints are
+    triangulated, and a body is fitted to every person in every frame.
+
+    Args:
+        cameras: batch (cameras,), or the cameras of `read_cameras`; at least two.
+        detections: of all cameras (frames, cameras, detections), or of each camera in this order;
+            frames that are missing between others show nobody.
+        fps: frames per second [1/s].
+        body: None = the body of `find_body`.
+        ground: height [m] of the ground at x, y (n,) [m]; None where unknown.
+        camera_covariance: (cameras, 12, 12) of the calibration on a pitch; None = unknown.
+
+    Raises:
+        InputError: numbers of cameras differ, or the shapes do not fit together.
+    """
+    if isinstance(cameras, Mapping):
+        cameras = Camera.stack(list(cameras.values()))
+    if not isinstance(detections, KeypointDetections):
+        detections = KeypointDetections.stack(detections)
+    if cameras.batch_shape != detections.score.shape[1:2] or len(cameras.focal) < 2:
+        raise InputError(
+            "reconstruct_bodies",
+            expected="at least two cameras, and detections of each of them",
+            found=f"cameras {cameras.batch_shape}, detections {detections.score.shape}",
+            todo="Give the detections of all cameras in the order of the cameras.",
+        )
+    detections = _fill_frames(detections)
+    person = np.arange(detections.detection_index.shape[2])
+    if not len(person):
+        tracks = track_people(cameras, detections, fps, camera_covariance=camera_covariance)
+        person, detections = tracks.person, detections.assign_people(tracks.detection_index)
+    joints = reconstruct_joints(cameras, detections, fps, camera_covariance=camera_covariance)
+    placed = joints.triangulation
+    rays = find_ray_constraints(cameras, undo_swaps(detections, placed.exchanged), placed.joints)
+    evidence = ClipEvidence(
+        placed.joints,
+        placed.covariance,
+        fps,
+        placed.common_bias,
+        [rays],
+        shared_covariance=placed.shared_covariance,
+    )
+    bodies = fit_bodies(body or find_body(), evidence, ground=ground)
+    return ReconstructedBodies(detections.frame, person, joints, bodies)
+
+
+def _fill_frames(detections: KeypointDetections) -> KeypointDetections:
+    """Return the detections with the frames between others, in which nobody was seen."""
+    frame, index = detections.frame, detections.detection_index
+    if len(frame) < 2:
+        return detections
+    every = np.arange(frame[0], frame[-1] + 1, np.gcd.reduce(np.diff(frame)))
+    if len(every) == len(frame):
+        return detections
+    filled = detections.reindex(every)
+    if not len(index):
+        return filled
+    people = np.full((len(every), *index.shape[1:]), -1, dtype=index.dtype)
+    people[np.isin(every, frame)] = index
+    return filled.assign_people(people)
