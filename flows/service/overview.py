@@ -27,7 +27,9 @@ from worldpose.store.store import Store
 UnitState = Literal["done", "waiting", "failed", "blocked"]
 
 ALWAYS_READ: Final = 4
-"""Matches that every look reads."""
+"""Matches that every look reads, unless there are `MANY`."""
+MANY: Final = 100
+"""Of more matches, a look reads no more than its time allows."""
 REREAD_SECONDS: Final = 60.0
 """Age at which a status is read again without a change: a file can be damaged."""
 BODIES = "body_fitting"
@@ -106,10 +108,13 @@ class MatchStatus:
 
 
 class Overview:
-    """Repeated reads of a project's status; immutable data is read once."""
+    """Repeated reads of a project's status; immutable data is read once.
 
-    def __init__(self, store: Store) -> None:
-        self.store = store
+    Only with states it opens match folders and plans their next runs, which takes longer.
+    """
+
+    def __init__(self, store: Store, *, with_states: bool = False) -> None:
+        self.store, self.with_states = store, with_states
         self._manifest = cache(store.manifest)
         self._poses = cache(lambda match_id, run_id: _poses_of(store.run(match_id, run_id)))
         self._known: dict[str, tuple[object, MatchStatus]] = {}
@@ -126,7 +131,8 @@ class Overview:
         begun = time.monotonic()
         oldest = sorted(names, key=lambda name: self._seen_at.get(name, 0.0))
         for number, match_id in enumerate(oldest):
-            if number >= ALWAYS_READ and time.monotonic() - begun > budget:
+            is_late = time.monotonic() - begun > budget
+            if is_late and number and (number >= ALWAYS_READ or len(names) > MANY):
                 break
             try:
                 self._match(match_id)
@@ -163,8 +169,8 @@ class Overview:
         last = "" if latest is None else latest.run_id
         at_work = [each.started_at for each in begun if each.run_id > last]
         stages = {} if latest is None else self._stages(latest)
-        begun_at = at_work[-1] if at_work else None
-        return MatchStatus(match_id, latest, begun_at, stages, state_now(self.store, match_id))
+        now = state_now(self.store, match_id) if self.with_states else None
+        return MatchStatus(match_id, latest, at_work[-1] if at_work else None, stages, now)
 
     def _stages(self, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:
         records = read_journal(self.store, run.match_id).questions

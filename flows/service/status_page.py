@@ -44,7 +44,7 @@ FILES: Final = Path(__file__).with_name("status")
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the status page, and of its JSON."""
     router = APIRouter()
-    overview = Overview(context.store)
+    overview = Overview(context.store, with_states=True)
 
     @router.get("/api/status")
     def status() -> dict[str, Any]:

@@ -97,7 +97,7 @@ def routes(context: PageContext) -> APIRouter:
             raise HTTPException(404, "no camera has an image")
         height = round(THUMBNAIL_WIDTH * picture.shape[0] / picture.shape[1])
         small = cv2.resize(picture, (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
-        answer = image_response(small, "jpeg")
+        answer = image_response(np.asarray(small, dtype=np.uint8), "jpeg")
         answer.headers["cache-control"] = "private, max-age=3600"
         return answer
 

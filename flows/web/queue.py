@@ -20,6 +20,7 @@ from flows.method import METHOD
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
+from flows.service.overview import MANY
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
@@ -35,8 +36,6 @@ REREAD_SECONDS: Final = 60.0
 """Age at which a summary is made again without a change: a video can be removed."""
 ALWAYS_CHECKED: Final = 8
 """Matches that every request checks, unless there are `MANY`."""
-MANY: Final = 100
-"""Of more matches, a request checks no more than its time allows."""
 
 
 def routes(context: PageContext) -> APIRouter:

@@ -120,7 +120,7 @@ def test_a_suspended_run_outlives_its_process_and_goes_on_when_people_have_decid
     kill()
     first = store.run(TINY)
     assert (first.run_id, first.state, first.gates) == ("0001", "waiting", "always")
-    assert len(first.waiting) == 2
+    assert len(first.waiting) == 6
     # An answer without a verdict is none.
     with pytest.raises(RuntimeError, match="required property"):
         resume_flow_run(run, run_input={"who": "Ada"})

@@ -87,7 +87,6 @@ def glance(monkeypatch):
     monkeypatch.setattr(overview, "latest_run", lambda store, match: store.latest)
     journal = lambda store, match: SimpleNamespace(last=0, questions=store.journal)  # noqa: E731
     monkeypatch.setattr(overview, "read_journal", journal)
-    monkeypatch.setattr(overview, "state_now", lambda store, match: None)
 
     def look(*told):
         (match,) = Overview(Told(*told)).look()
