@@ -104,7 +104,11 @@ def _find(
         return MatchState("new", "not run yet", todo="Run it.")
     why = _why_outdated(store, match, latest, units, plan)
     if why:
-        return MatchState("outdated", f"out of date {why}", todo="Run it again.")
+        before = ""
+        if latest.failed:
+            words, reason, _ = _describe_failure(latest)
+            before = f"The last run {words.replace(':', ' in')}. {reason}"
+        return MatchState("outdated", f"out of date {why}", before, "Run it again.")
     if latest.failed and latest.state == "failed":
         return MatchState("failed", *_describe_failure(latest))
     if latest.state == "partial":
@@ -152,9 +156,8 @@ def _why_outdated(
     differing = {*units[UnitState.STALE], *units[UnitState.READY]}
     if latest.state == "waiting":  # every question has its answer
         differing |= {*units[UnitState.MISSING]}
-    failed = {(each.unit, each.key) for each in latest.failed}
-    repaired = {unit.name for unit in plan if any(unit.name == name for name, _ in failed)}
-    repaired -= {unit.name for unit in plan if (unit.name, unit.key) in failed}
+    keys = {unit.name: unit.key for unit in plan}
+    repaired = {each.unit for each in latest.failed if keys.get(each.unit) not in (None, each.key)}
     withdrawn = {name for name in units[UnitState.MISSING] if name in latest.results}
     if not differing | repaired | withdrawn:
         return ""
@@ -165,6 +168,8 @@ def _why_outdated(
         return "because its questions are answered"
     if withdrawn and not differing:
         return "because results were removed"
+    if repaired and not differing:
+        return "because the input of the failed step has changed"
     return f"because {_first_cause(store, latest, plan)}"
 
 

@@ -25,6 +25,13 @@ await shoot(page, "through_cam00");
 await page.click(".people button >> nth=0");
 await page.waitForTimeout(500);
 await shoot(page, "follow");
+// A download that cannot be written says why on this page.
+await page.route("**/exports/usd", (route) => route.fulfill({ status: 422, json: { error: "needs the extra usd" } }));
+await page.click("[data-downloads] a >> text=/^usd$/");
+seen.refused = await page.locator("[role=alert] >> text=needs the extra").innerText();
+seen.pages = page.context().pages().length;
+await page.click("text=Dismiss");
+seen.errors = seen.errors.filter((text) => !text.includes("422"));
 await page.click("text=Metrics per camera");
 await page.waitForSelector('[data-metrics="player"] td');
 seen.cameras = await page.locator('[data-metrics="camera"] tbody tr').count();
