@@ -97,6 +97,11 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
     """
     if latest is None or not latest.waiting:
         return frozenset()
+    once = ("corrected_units", latest.run_id)  # a page asks several times
+    return match.once(once, lambda: _find_corrected(store, match, latest))
+
+
+def _find_corrected(store: Store, match: Match, latest: RunRecord) -> frozenset[str]:
     results = latest.results
     held = {unit.unit for unit in latest.waiting}
     usable = {name: key for name, key in results.items() if name not in held}

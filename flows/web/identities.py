@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from data_contracts.review import SplitTrack
+from data_contracts.review import Correction, SplitTrack
 from flows.reports.match_pictures import frame_picture
 from flows.review.descriptions import in_words
 from flows.review.detections import detections_now
@@ -95,13 +95,17 @@ def _list_events(match: Match, clip: str, found: Identities) -> list[dict[str, A
         }
         for change in found.changes
     ]
+    corrected: dict[int, list[Correction]] = {}
     for each in match.corrections:
         edit = each.edit
         frame = edit.frame if isinstance(edit, DETECTION_EDITS) else None
         if isinstance(edit, SplitTrack) and edit.clip == clip:
             frame = edit.first_frame_of_new
         if frame is not None and first <= frame <= last:
-            events.append({"kind": "correction", "frame": frame, "words": in_words(each)})
+            corrected.setdefault(frame, []).append(each)
+    for frame, made in corrected.items():
+        words = in_words(made[-1]) + (f", and {len(made) - 1} more" if len(made) > 1 else "")
+        events.append({"kind": "correction", "frame": frame, "words": words})
     return events
 
 
