@@ -34,6 +34,7 @@ from flows.service.match_runs import (
 from flows.stage import Match
 from flows.web.access import Access
 from worldpose.review.journal import requests_by_id
+from worldpose.store.paths import is_name
 from worldpose.store.store import Store
 
 
@@ -61,7 +62,7 @@ class PageContext:
         Raises:
             HTTPException: 404; a name from outside never becomes a path.
         """
-        if name not in self.store.matches():
+        if not is_name(name) or self.store.registration(name) is None:
             raise HTTPException(404, "no such match")
         return open_for_review(self.store, name)
 
