@@ -188,7 +188,8 @@ def _first_cause(store: Store, latest: RunRecord, plan: list[PlannedUnit]) -> st
             continue
         for reason in unit_status(store, unit, latest).own_reasons:
             if isinstance(reason, RecipeDifference) and reason.kind in _CAUSES:
-                return _CAUSES[reason.kind]
+                is_edit = reason.name.startswith(("edits", "identities"))
+                return "corrections have changed" if is_edit else _CAUSES[reason.kind]
             if isinstance(reason, Cause) and reason != Cause.NOT_COMPUTED:
                 return "results were removed"
     return "results of an earlier run fit better"

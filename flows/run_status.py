@@ -86,7 +86,8 @@ class UnitStatus:
     @property
     def own_reasons(self) -> tuple[Reason, ...]:
         """Causes in this unit itself; empty if only its inputs changed."""
-        return tuple(each for each in self.reasons if each not in self._input_changes)
+        inputs = {id(each) for each in self._input_changes}  # a source can have many differences
+        return tuple(each for each in self.reasons if id(each) not in inputs)
 
     @property
     def changed_inputs(self) -> tuple[str, ...]:

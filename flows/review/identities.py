@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from data_contracts.review import Edit, NamedTrack
+from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
     StaleEditError,
+    StoredResult,
     edits_since,
     open_stored,
     require_results,
@@ -16,6 +17,7 @@ from worldpose.review.identities import (
     IDENTITY_EDITS,
     TRACK_EDITS,
     Identities,
+    IdentityEdit,
     IdentityReplay,
     find_objection,
     replay_identities,
@@ -41,10 +43,9 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     results = store.run(match_id).results if store.runs(match_id) else {}
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
     stored = open_stored(store, store.run(match_id), name, "identities")
-    moved = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
-    later = edits_since(moved, stored.edits, f"clip {clip}", match_id)
-    edits = [edit for edit in said if isinstance(edit, NamedTrack) or edit in later]
-    return replay_identities(stored_identities(stored.result), edits)
+    moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
+    later = edits_since(moves, stored.edits, f"clip {clip}", match_id)
+    return _replay(stored, said, moves[: len(moves) - len(later)])
 
 
 def names_of(run: Run, clip: str) -> dict[int, str]:
@@ -55,21 +56,49 @@ def names_of(run: Run, clip: str) -> dict[int, str]:
     """
     match_id, unit = run.record.match_id, f"tracking/{clip}"
     journal = read_journal(run.store, match_id)
-    said = [
-        (each.id, each.edit)
-        for each in journal.corrections.values()
-        if isinstance(each.edit, IDENTITY_EDITS) and each.edit.clip == clip
-    ]
-    named = {n for n, edit in said if isinstance(edit, NamedTrack) and n in journal.standing}
-    if unit not in run or not named:
+    if unit not in run or not any(
+        isinstance(each.edit, NamedTrack) and each.edit.clip == clip
+        for each in journal.standing.values()
+    ):
         return {}
-    stored = open_stored(run.store, run.record, unit, "identities")
     moves = run.manifest(unit).recipe.sources.get("identities") or []
     assert isinstance(moves, list)
-    contained = moves if not stored.edits else []
-    edits = [edit for n, edit in said if n in named or edit.model_dump(mode="json") in contained]
-    tracks = stored_identities(stored.result, with_joints=False)
-    return replay_identities(tracks, edits).identities.names
+    said = []
+    for name, each in journal.corrections.items():
+        edit = each.edit
+        if not isinstance(edit, IDENTITY_EDITS) or edit.clip != clip:
+            continue
+        is_name = isinstance(edit, NamedTrack)
+        if name in journal.standing if is_name else edit.model_dump(mode="json") in moves:
+            said.append(edit)
+    stored = open_stored(run.store, run.record, unit, "identities")
+    taken = [edit for edit in said if isinstance(edit, TRACK_EDITS)] if stored.edits else []
+    return _replay(stored, said, taken, with_joints=False).identities.names
+
+
+def _replay(
+    stored: StoredResult,
+    said: Sequence[IdentityEdit],
+    taken: Sequence[IdentityEdit],
+    *,
+    with_joints: bool = True,
+) -> IdentityReplay:
+    """Replay corrections over a result that contains the merges and splits `taken` already."""
+    merged, others = list[IdentityEdit](), list[IdentityEdit]()
+    for number, edit in enumerate(said):
+        if isinstance(edit, NamedTrack):
+            person, seen = edit.person, edit.seen
+            for move in said[number + 1 :]:
+                if move in taken and isinstance(move, MergedTracks) and move.merged == person:
+                    person = move.kept
+                elif move in taken and isinstance(move, SplitTrack) and move.person == person:
+                    seen = None  # it can belong to the new person, and the name does not
+            after = edit.model_copy(update={"person": person, "seen": seen})
+            (others if person == edit.person else merged).append(after)
+        elif edit not in taken:
+            others.append(edit)
+    tracks = stored_identities(stored.result, with_joints=with_joints)
+    return replay_identities(tracks, [*merged, *others])  # a person's own name counts more
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
