@@ -114,8 +114,8 @@ def test_a_name_recomputes_nothing_and_is_in_the_tables_at_once(store):
     results = {**run.record.results, f"tracking/{clip}": unit.key}
     after = Run(store, run.record.model_copy(update={"results": results}))
     assert names_of(after, clip) == now
+    say(store, none=NamedTrack(clip=clip, person=0, name=None))
+    assert names_of(after, clip) == {1: names[1], new: "late"}
     # Later iterations have no tracks without corrections.
     store.withdraw(ResultId(TINY, "tracking", clip, run.record.results[f"tracking/{clip}"]))
-    assert names_of(after, clip) == now
-    say(store, none=NamedTrack(clip=clip, person=0, name=None))
     assert names_of(after, clip) == {1: names[1], new: "late"}
