@@ -34,6 +34,7 @@ INGEST = GroupLayout(
         "camera_id": "camera of the match, or broadcast view",
         "video": "null, or a video's time_base [1, units per second], size [px], missing_frames, "
         "and is_counted if frames are known only by counting from the first",
+        "left_out": "why the video cannot be read; null if it can",
         **POINT_ATTRIBUTE,
     },
     optional=(*(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)), *OPTIONAL_POINTS),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from concurrent.futures import ThreadPoolExecutor
 from difflib import get_close_matches
 from pathlib import Path
@@ -12,7 +13,7 @@ from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
 from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import read_still, read_unit, require_footage
-from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
+from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec, require_calibrated
 from worldpose.ingest.registration import READERS, register_match
 from worldpose.store.paths import is_name
 from worldpose.store.store import Store
@@ -28,9 +29,11 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
     Raises:
         InputError: the folder is not a valid match, or its id or content is already registered.
     """
-    match_folder = read_match(folder)
-    match_id = match_folder.spec.match_id
+    match_id = read_spec(folder).match_id
     previous = store.registration(match_id)
+    at_home = previous is not None and previous.folder == str(folder.resolve())
+    known = [file.path for file in previous.files] if previous is not None and at_home else ()
+    match_folder = read_match(folder, known)
     registration = register_match(match_folder, previous)
     match = corrected_match(store, match_folder, registration)
     if not unfinished:
@@ -76,7 +79,7 @@ def find_registration(store: Store, name: str) -> Registration:
         InputError: there is no such match.
     """
     folder = Path(name)
-    match_id = read_match(folder).spec.match_id if (folder / "match.yaml").is_file() else name
+    match_id = read_spec(folder).match_id if (folder / "match.yaml").is_file() else name
     registration = store.registration(match_id) if is_name(match_id) else None
     if registration is None:
         known = store.matches()
@@ -154,9 +157,7 @@ def _read_new_files(
         new = [unit for unit, path in match.detections.items() if is_new(path)]
         for _ in threads.map(check_detections, new):
             pass  # an error is raised here, that of the first file
-    for unit, path in match.videos.items():
-        if unit not in match.detections and (path.is_dir() or is_new(path)):
-            require_footage(match.spec, unit, path)
+    _read_videos(match, [unit for unit, path in match.videos.items() if is_new(path)])
     for unit, path in match.boxes.items():
         if is_new(path):
             from worldpose.video.folder import index_video  # late: few matches have such files
@@ -173,6 +174,30 @@ def _read_new_files(
         camera = match.spec.camera(name)
         if is_new(path):
             read_still(path, (camera.width, camera.height))
+
+
+def _read_videos(match: MatchFolder, new: Container[str]) -> None:
+    """Refuse videos that contradict match.yaml, and broken ones unless two cameras remain.
+
+    Stage `ingest` leaves out the static cameras of broken videos.
+    """
+    from worldpose.video.folder import index_video  # late: few matches have new videos
+
+    static = {camera.id for camera in match.spec.static_cameras}
+    broken: dict[str, InputError] = {}
+    for unit, path in match.videos.items():
+        if unit in match.detections or not (path.is_dir() or unit in new):
+            continue
+        try:
+            index = index_video(path)
+        except InputError as error:
+            if unit not in static:
+                raise
+            broken[unit] = error
+            continue
+        require_footage(match.spec, unit, path, index)
+    if broken and len(static) - len(broken) < 2:
+        raise next(iter(broken.values()))
 
 
 def _of_footage(spec: MatchSpec) -> MatchSpec:

@@ -83,6 +83,11 @@ class Match:
         name = ("without", *names)
         return self.once(name, lambda: replace(self, folder=replace(self.folder, spec=fewer)))
 
+    def at_hand(self) -> Match:
+        """Return the match without the videos that are gone, whose results a report still shows."""
+        there = {name: file for name, file in self.folder.videos.items() if file.exists()}
+        return replace(self, folder=replace(self.folder, videos=there))
+
     def once(self, name: Hashable, find: Callable[[], T]) -> T:
         """Return the cached result of `find`, which is called on the first request for `name`."""
         if name not in self._kept:

@@ -7,12 +7,14 @@ from pydantic import TypeAdapter
 
 from data_contracts.ingest import INGEST
 from tasks.unit import UnitInputs, unit_task
+from worldpose.errors import InputError
 from worldpose.formats.keypoint_files import read_people
 from worldpose.ingest.camera_videos import describe_gaps
 from worldpose.ingest.footage import UnitFrames, read_footage
 from worldpose.ingest.importing import describe_changes
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.store.writer import ResultWriter
+from worldpose.video.folder import index_video
 from worldpose.video.recordings import describe_video
 
 
@@ -42,24 +44,43 @@ def _write_observations(inputs: UnitInputs, result: ResultWriter) -> None:
         INGEST,
         arrays=observations.arrays(),
         coordinates={"frame": observations.frame},
-        attributes={"camera_id": inputs.unit, "video": None, **observations.labels()},
+        attributes={
+            "camera_id": inputs.unit,
+            "video": None,
+            "left_out": None,
+            **observations.labels(),
+        },
     )
     result.figures["frames"] = observations.frame.size
     result.figures["detections"] = int(np.isfinite(observations.score).sum())
 
 
 def _write_footage(inputs: UnitInputs, result: ResultWriter) -> None:
-    """Write the index of the unit's video on match frames."""
-    sources = inputs.sources
+    """Write the index of the unit's video on match frames, or that it cannot be read."""
+    sources, file = inputs.sources, inputs.file("video")
     width, height = sources["image_size"]
+    try:
+        index = index_video(file)
+    except InputError as error:  # one broken video must not end the match
+        inputs.require_registered("video")
+        reason = str(error).replace(str(file), file.name)
+        result.write(
+            INGEST,
+            arrays={},
+            coordinates={"frame": np.empty(0, dtype=np.int64)},
+            attributes={"camera_id": inputs.unit, "video": None, "left_out": reason},
+        )
+        result.left_out[inputs.unit] = reason
+        return
     footage = read_footage(
-        inputs.file("video"),
+        file,
         float(sources["fps"]),
         (width, height),
         _unit_frames(inputs),
         [(clip, first, count) for clip, (first, count) in sources["clips"].items()],
+        index,
     )
-    result.warnings += describe_video(inputs.file("video"), footage.index)
+    result.warnings += describe_video(file, footage.index)
     if gaps := describe_gaps(footage.picture, footage.frame):
         result.warnings.append(f"{inputs.unit}: {gaps}")
     inputs.require_registered("video")
@@ -74,6 +95,7 @@ def _write_footage(inputs: UnitInputs, result: ResultWriter) -> None:
         coordinates={"frame": footage.frame},
         attributes={
             "camera_id": inputs.unit,
+            "left_out": None,
             "video": {
                 "time_base": None if base is None else [base.numerator, base.denominator],
                 "size": list(footage.index.size),

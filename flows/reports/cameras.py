@@ -54,7 +54,7 @@ def camera_table(run: Run, spec: MatchSpec) -> Table:
         rows.append(
             (
                 camera.id,
-                _origin(run[unit].attrs),
+                _origin(run[unit].attrs) if unit in run else _ORIGINS["none"],
                 format_scaled(figures.get("expected_ground_error_median_m"), 1000.0, 1),
                 format_scaled(figures.get("expected_ground_error_p95_m"), 1000.0, 1),
                 format_scaled(figures.get("reprojection_rms_px"), 1.0, 2),
@@ -77,8 +77,9 @@ def _origin(attributes: Mapping[Any, Any]) -> str:
 def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
     """Return why a person should check a camera: the reason it was left out, or why it is weak."""
     left_out = run.record.left_out.get(camera_id)
-    weak = run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ()
-    return tuple(weak) if left_out is None else (f"left out: {left_out}",)
+    if left_out is not None:
+        return (f"left out: {left_out}",)
+    return tuple(run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ())
 
 
 def camera_pictures(
@@ -189,7 +190,7 @@ def proposal_evidence(
 
 
 def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
-    result = run[unit]
+    result = run[unit] if unit in run else {}  # none of a camera whose video cannot be read
     if "point_inlier" not in result:
         return ()
     wrong = ~result["point_inlier"].values

@@ -79,6 +79,7 @@ def write_report(
     Raises:
         UsageError: there is no such static camera with a video.
     """
+    match = match.at_hand()
     if camera is not None:
         _check_film(match, camera)
     run = open_results(store, match.match_id, run_id)
@@ -90,8 +91,13 @@ def write_report(
     with ThreadPoolExecutor(1) as painter:
         # Painting and encoding leave the interpreter to the figures for much of their time.
         filming = painter.submit(_write_videos, store, run, match, out, camera) if videos else None
-        with nullcontext(None) if figures is None else keep_figures() as kept:
-            first, *others = _sections(store, run, match, source)
+        try:
+            with nullcontext(None) if figures is None else keep_figures() as kept:
+                first, *others = _sections(store, run, match, source)
+        except BaseException:
+            for film in [] if filming is None else filming.result():
+                film.unlink()  # without its page, the next report would take it for another's
+            raise
     films = [] if filming is None else filming.result()
     beside = [LinkedFile(film.stem.removeprefix(f"{out.stem}-"), film.name) for film in films]
     shown = Section(

@@ -31,7 +31,7 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.ingest.match_folder import read_match
+from worldpose.ingest.pitch_file import read_pitch
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store, open_run
@@ -345,7 +345,7 @@ class Origin:
     @property
     def pitch(self) -> PitchSpec | None:
         """Return the pitch of the match folder; None without one."""
-        return read_match(Path(self.registration.folder)).pitch
+        return read_pitch(Path(self.registration.folder), self.registration.spec)
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""

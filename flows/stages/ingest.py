@@ -86,4 +86,5 @@ STAGE = Stage(
     units=units,
     inputs=lambda match, unit: (),
     sources=sources,
+    leaves_out=True,
 )

@@ -4,7 +4,10 @@ import json
 import shutil
 
 from command_line import TINY, succeed, worldpose
+from filmed import write_filmed
 
+from flows.reports.cameras import camera_table
+from worldpose.ingest.match_folder import read_spec
 from worldpose.store.store import open_run
 
 
@@ -67,3 +70,34 @@ def test_a_match_with_one_usable_camera_is_partial_and_gates_ask_first(tiny, tmp
     assert done.json["blocked"] > 0
     assert sorted(done.json["left_out"]) == names[1:]
     assert f"1 of {len(names)} static cameras can be used ({names[0]})" in done.json["warnings"][-1]
+
+
+def test_a_broken_video_leaves_its_camera_out_and_a_lost_one_hides_no_results(tmp_path):
+    folder, project = tmp_path / "match", tmp_path / "project"
+    dark = [9, 9, 9, 9]
+    write_filmed(folder, {"a": dark, "b": dark, "c": dark}, [("clip", 0, 4)])
+    file = folder / "videos" / "b.mp4"
+    file.write_bytes(file.read_bytes()[:40])
+    first = ("run", folder, "--project", project, "--until", "static_calibration", "--json")
+    done = worldpose(*first)
+    assert done.code == 0, done.err
+    assert list(done.json["left_out"]) == ["b"]
+    assert done.json["left_out"]["b"].startswith("b.mp4: expected a video file")
+
+    keys = open_run(project, "filmed").record.results
+    (folder / "videos" / "c.mp4").unlink()
+    again = succeed(*first).json
+    assert (again["executed"], open_run(project, "filmed").record.results) == (0, keys)
+    assert succeed("status", folder, "--project", project, "--json").json["matches"]
+    run = open_run(project, "filmed")
+    rows = {row[0]: row[-1] for row in camera_table(run, read_spec(folder)).rows}
+    assert rows["b"].startswith("left out: b.mp4")
+
+
+def test_a_broken_video_of_one_of_two_cameras_is_refused(tmp_path):
+    folder = tmp_path / "match"
+    write_filmed(folder, {"a": [9] * 4, "b": [9] * 4}, [("clip", 0, 4)])
+    (folder / "videos" / "b.mp4").write_bytes(b"no video")
+    refused = worldpose("run", folder, "--project", tmp_path / "project")
+    assert refused.code == 1
+    assert "b.mp4: expected a video file" in refused.err

@@ -19,8 +19,9 @@ from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.estimate import Reconstruction, reconstruct_joints
+from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.results import Reconstruction
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +84,11 @@ def reconstruct_bodies(
             todo="Give the detections of all cameras in the order of the cameras.",
         )
     detections = _fill_frames(detections)
-    person = np.arange(detections.detection_index.shape[2])
+    person = np.arange(detections.detection_index.shape[2], dtype=np.int64)
     if not len(person):
         tracks = track_people(cameras, detections, fps, camera_covariance=camera_covariance)
-        person, detections = tracks.person, detections.assign_people(tracks.detection_index)
+        person = tracks.person.astype(np.int64)
+        detections = detections.assign_people(tracks.detection_index)
     joints = reconstruct_joints(cameras, detections, fps, camera_covariance=camera_covariance)
     placed = joints.triangulation
     rays = find_ray_constraints(cameras, undo_swaps(detections, placed.exchanged), placed.joints)

@@ -157,7 +157,9 @@ def shared_length(counts: Iterable[int]) -> int:
 
 
 def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
-    """Return a sentence about the frames that a video lacks between others; empty if none.
+    """Return a sentence about the frames that a video lacks; empty if there are none.
+
+    A start or end up to a hundredth of the frames early or late is usual.
 
     Args:
         clock: (frames,) number of the video frame; -1 = missing.
@@ -173,7 +175,13 @@ def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
     listed = ", ".join(f"{a} to {b}" if a < b else f"{a}" for a, b in sorted(longest))
     count = sum(last - first + 1 for first, last in gaps)
     more = f" and {len(gaps) - len(longest)} more gaps" if len(gaps) > len(longest) else ""
-    return f"the video lacks {count} of {len(clock)} frames: {listed}{more}" if gaps else ""
+    said = [f"the video lacks {count} of {len(clock)} frames: {listed}{more}"] if gaps else []
+    first, last = int(shown[0]), int(shown[-1])
+    if len(clock) - (last + 1 - first) > 0.01 * len(clock):
+        said.append(
+            f"it shows frames {numbers[first]} to {numbers[last]} of {numbers[0]} to {numbers[-1]}"
+        )
+    return "; ".join(said)
 
 
 def copy_videos(files: Mapping[str, Path], folder: Path) -> None:

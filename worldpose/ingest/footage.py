@@ -176,7 +176,7 @@ def read_footage(
         index: index of the video; None = read it from the video.
 
     Raises:
-        InputError: no video, another size or rate, or a clip of which it has no frame.
+        InputError: no video, another size or rate, or no frame of any clip.
     """
     from worldpose.video.folder import index_video  # late: most commands open no video
 
@@ -195,16 +195,15 @@ def read_footage(
     inside = (number >= 0) & (number < len(clock))
     picture = np.full(len(frame), -1, dtype=np.int64)
     picture[inside] = clock[number[inside]]
-    for clip, first, count in clips:
-        row = int(np.searchsorted(frame, first))
-        if (picture[row : row + count] < 0).all():
-            begin, end = frames.numbers(np.array([first, first + count - 1]))
-            raise InputError(
-                f"{path}: clip {clip}",
-                expected=f"frames {begin} to {end} of this video",
-                found=f"frames 0 to {len(clock) - 1}",
-                todo="Check the clip's first_frame and the camera's offset_frames.",
-            )
+    if (picture < 0).all():
+        clip, first, count = clips[0]
+        begin, end = frames.numbers(np.array([first, first + count - 1]))
+        raise InputError(
+            f"{path}: clip {clip}",
+            expected=f"frames {begin} to {end} of this video",
+            found=f"frames 0 to {len(clock) - 1}",
+            todo="Check the clip's first_frame and the camera's offset_frames.",
+        )
     return Footage(index, frame, picture)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -107,11 +107,12 @@ class MatchFolder:
         return tuple(name for name in self.spec.broadcast_views if name in known)
 
 
-def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
+def read_match(folder: str | os.PathLike[str], known: Container[str] = ()) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
     Args:
         folder: contains match.yaml and the files that it names.
+        known: paths in the folder of videos that may be gone, as their results are at hand.
 
     Raises:
         InputError: the folder is unreadable (its disk is not mounted, or this user has no
@@ -120,7 +121,7 @@ def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
     """
     folder = Path(folder)
     with reachable(folder):
-        return _read_match(folder)
+        return _read_match(folder, known)
 
 
 def read_spec(folder: Path) -> MatchSpec:
@@ -141,7 +142,7 @@ def read_spec(folder: Path) -> MatchSpec:
     return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
-def _read_match(folder: Path) -> MatchFolder:
+def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
     spec = read_spec(folder)
     if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
@@ -151,7 +152,7 @@ def _read_match(folder: Path) -> MatchFolder:
             todo=f"Add the static cameras, or `broadcast: {spec.cameras[0].id}` to a clip.",
         )
     detections = _detections(folder, spec)
-    videos = _videos(folder, spec)
+    videos = _videos(folder, spec, known)
     _require_one_view(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
@@ -317,24 +318,32 @@ def _boxes(
     return files_by_unit(folder, "boxes", (".txt",), known, units)
 
 
-def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
+def _videos(folder: Path, spec: MatchSpec, known: Container[str]) -> dict[str, Path]:
+    def is_there(usual: str) -> bool:
+        return usual in known or find_file(folder, usual).exists()
+
+    def path_of(name: str, where: str, *, folders: bool = False) -> Path:
+        if name in known and not find_file(folder, name).exists():
+            return folder / name
+        return existing_file(folder, name, where, folders=folders)
+
     videos: dict[str, Path] = {}
     named: dict[str, Path] = {}
     for index, camera in enumerate(spec.cameras):
         if camera.video is not None:
             where = f"{folder / 'match.yaml'}: cameras[{index}].video"
-            named[camera.id] = existing_file(folder, camera.video, where, folders=True)
+            named[camera.id] = path_of(camera.video, where, folders=True)
     for camera in spec.static_cameras:
         usual = f"videos/{camera.id}.mp4"
         if camera.id in named:
             videos[camera.id] = named[camera.id]
-        elif find_file(folder, usual).exists():
-            videos[camera.id] = existing_file(folder, usual, str(folder))
+        elif is_there(usual):
+            videos[camera.id] = path_of(usual, str(folder))
     for name, view in spec.broadcast_views.items():
         usual = f"broadcast/{name}.mp4"
         _require_own_video(folder, name, view.clip)
-        if find_file(folder, usual).exists():
-            videos[name] = existing_file(folder, usual, str(folder))
+        if is_there(usual):
+            videos[name] = path_of(usual, str(folder))
         elif view.camera.id in named:
             videos[name] = named[view.camera.id]
     return videos

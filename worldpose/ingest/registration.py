@@ -34,7 +34,8 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
         match: match as read by `read_match`.
         previous: the last registration of this folder, if any. A file with unchanged size and
             modification time keeps its digest. As in git, this is only a shortcut: it misses a
-            change that preserves both; without `previous` the function reads all files.
+            change that preserves both; without `previous` the function reads all files. A video
+            of it that is gone keeps its digest, so that its results stay readable.
 
     Raises:
         InputError: a file is empty, unreadable, or still being written.
@@ -49,14 +50,21 @@ def _register(match: MatchFolder, previous: Registration | None) -> Registration
     if previous is not None and previous.folder == folder:
         known = {(file.path, file.size, file.modified_ns): file.sha256 for file in previous.files}
     identifying = _identifying_files(match)
+    gone = {
+        file.path: file
+        for file in (previous.files if known and previous else ())
+        if match.folder / file.path in match.videos.values()
+        and not (match.folder / file.path).exists()
+    }
     paths = sorted({*identifying, *_further_files(match)})
     with ThreadPoolExecutor(READERS) as threads:
         files = tuple(threads.map(lambda path: _source_file(match.folder, path, known), paths))
     states = {match.folder / file.path: (file.size, file.modified_ns) for file in files}
     require_settled(states, "ingest again")
+    files = tuple(sorted((*files, *gone.values()), key=lambda file: file.path))
     identity = hashlib.sha256()
     for file in files:
-        if file.path in identifying:
+        if file.path in identifying or file.path in gone:
             identity.update(f"{file.sha256} {file.path}\n".encode())
     return Registration(spec=match.spec, folder=folder, identity=identity.hexdigest(), files=files)
 

@@ -93,7 +93,9 @@ def test_a_wrong_file_is_refused_with_its_place(tmp_path, fault, word):
 def stored(given):
     """Return detections as the store gives them."""
     arrays = checked_arrays(INGEST, given.arrays(), {"frame": given.frame})
-    labels = checked_attributes(INGEST, arrays, {"camera_id": "a", "video": None, **given.labels()})
+    labels = checked_attributes(
+        INGEST, arrays, {"camera_id": "a", "video": None, "left_out": None, **given.labels()}
+    )
     dims = {name: INGEST.layout(name).dims for name in arrays}
     data = xr.Dataset({name: (dims[name], array) for name, array in arrays.items()})
     return data.assign_coords(point=labels["point"]) if "point" in labels else data
