@@ -185,6 +185,7 @@ def _read_videos(match: MatchFolder, new: Container[str]) -> None:
 
     static = {camera.id for camera in match.spec.static_cameras}
     broken: dict[str, InputError] = {}
+    unseen: dict[str, list[InputError]] = {}
     for unit, path in match.videos.items():
         if unit in match.detections or not (path.is_dir() or unit in new):
             continue
@@ -195,7 +196,11 @@ def _read_videos(match: MatchFolder, new: Container[str]) -> None:
                 raise
             broken[unit] = error
             continue
-        require_footage(match.spec, unit, path, index)
+        for clip, refusal in require_footage(match.spec, unit, path, index).items():
+            unseen.setdefault(clip, []).append(refusal)
+    for errors in unseen.values():
+        if len(errors) + len(broken) >= len(static):
+            raise errors[0]
     if broken and len(static) - len(broken) < 2:
         raise next(iter(broken.values()))
 

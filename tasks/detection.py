@@ -43,7 +43,8 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
         found = _open_uncorrected(inputs) if edits else None
         found = found or _detect_people(inputs, spool)
         result.figures |= found.figures
-        warnings = [*found.warnings, *_warn_of_gaps(found)]
+        settings = inputs.settings(DetectionSettings)
+        warnings = [*found.warnings, *_warn_of_gaps(found), *_warn_of_size(found, settings)]
         result.warnings += [f"{inputs.recipe.name}: {each}." for each in warnings]
         detections = found.detections
         if edits:
@@ -96,6 +97,23 @@ def _warn_of_gaps(found: _Found) -> list[str]:
     ]
 
 
+def _warn_of_size(found: _Found, settings: DetectionSettings) -> list[str]:
+    """Return a sentence if people are larger than those whom the bundled detector knows."""
+    largest = 2 * 160.0  # twice the tallest people of its training [px]
+    boxes, score = np.asarray(found.detections.boxes), np.asarray(found.detections.score)
+    heights = (boxes[..., 3] - boxes[..., 1])[score >= 0.3]
+    if settings.detector != DetectionSettings().detector or not len(heights):
+        return []
+    usual = float(np.median(heights))
+    if usual <= largest:
+        return []
+    return [
+        f"people are {usual:.0f} px tall in the images, and the bundled detector knows people of "
+        "28 to 160 px: it misses people and finds wrong ones. Give 2D poses, or other nets by "
+        "detection.detector and detection.pose"
+    ]
+
+
 def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
     """Return the published detections without corrections; None if there are none."""
     published = inputs.open_uncorrected("edits")
@@ -124,7 +142,7 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     inputs.require_registered("video")
     report = finder.report
-    if len(report.unreadable) == report.frames:
+    if len(report.unreadable) == report.frames and _has_images(inputs):
         raise InputError(
             str(inputs.file("video")),
             expected="images that can be decoded",
@@ -154,6 +172,13 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
         },
         (reason,) if (reason := report.why_no_person()) else (),
     )
+
+
+def _has_images(inputs: UnitInputs) -> bool:
+    """Return whether the video shows the clip at all: a camera may film other clips alone."""
+    footage, frames = inputs.open(f"ingest/{inputs.sources['camera']}"), inputs.frames
+    pictures = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
+    return bool((pictures >= 0).any())
 
 
 def _given_people(inputs: UnitInputs) -> dict[int, People]:

@@ -190,8 +190,7 @@ def proposal_evidence(
 
 
 def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
-    result = run[unit] if unit in run else {}  # none of a camera whose video cannot be read
-    if "point_inlier" not in result:
+    if unit not in run or "point_inlier" not in (result := run[unit]):
         return ()
     wrong = ~result["point_inlier"].values
     return tuple(str(name) for name in result["point"].values[wrong])

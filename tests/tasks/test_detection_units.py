@@ -111,6 +111,32 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     assert any("no image, or none that can be decoded, for 20.0%" in w for w in figures.warnings)
 
 
+def test_a_camera_may_film_one_clip_alone(tmp_path, reading):
+    greys = {name: [10 + 4 * n for n in range(count)] for name, count in (("a", 40), ("b", 15))}
+    write_filmed(tmp_path / "match", greys, CLIPS)
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, tmp_path / "match")
+    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+    alone = store.open_result("filmed", "detection", "b.late", results["detection/b.late"])
+    assert dict(alone.sizes)["detection"] == 0
+    told = store.manifest("filmed", "ingest", "b", results["ingest/b"]).warnings
+    assert any("it shows frames 2 to 13 of 2 to 29" in text for text in told)
+
+
+@pytest.mark.parametrize(("tall", "told"), [(20.0, False), (900.0, True)])
+def test_people_too_large_for_the_bundled_detector_are_told(
+    filmed, tmp_path, reading, monkeypatch, tall, told
+):
+    boxes = np.array([[0.0, 0.0, 8.0, tall]])
+    detect = staticmethod(lambda pictures: [People(boxes, np.array([0.9])) for _ in pictures])
+    monkeypatch.setattr(Reading, "detect", detect)
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+    warnings = store.manifest("filmed", "detection", "left.late", results["detection/left.late"])
+    assert any("people of 28 to 160 px" in text for text in warnings.warnings) == told
+
+
 def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, tmp_path, reading):
     path = filmed / "videos" / "left.mp4"
     with av.open(str(path)) as video:

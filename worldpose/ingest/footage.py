@@ -145,11 +145,18 @@ class Footage:
         index: all frames of the video.
         frame: (frames,) match frames of all clips, rising.
         picture: (frames,) video frame of each match frame; -1 where the video lacks it.
+        length: number of frames of the camera's clock from the video's first to its last.
     """
 
     index: FrameIndex
     frame: NDArray[np.int64]
     picture: NDArray[np.int64]
+    length: int
+
+    def shows(self, first: int, count: int) -> bool:
+        """Return whether the video has an image of a clip."""
+        row = int(np.searchsorted(self.frame, first))
+        return bool((self.picture[row : row + count] >= 0).any())
 
     @property
     def missing(self) -> list[list[int]]:
@@ -195,16 +202,24 @@ def read_footage(
     inside = (number >= 0) & (number < len(clock))
     picture = np.full(len(frame), -1, dtype=np.int64)
     picture[inside] = clock[number[inside]]
+    found = Footage(index, frame, picture, len(clock))
     if (picture < 0).all():
-        clip, first, count = clips[0]
-        begin, end = frames.numbers(np.array([first, first + count - 1]))
-        raise InputError(
-            f"{path}: clip {clip}",
-            expected=f"frames {begin} to {end} of this video",
-            found=f"frames 0 to {len(clock) - 1}",
-            todo="Check the clip's first_frame and the camera's offset_frames.",
-        )
-    return Footage(index, frame, picture)
+        raise no_images(path, found, frames, clips[0])
+    return found
+
+
+def no_images(
+    path: Path, footage: Footage, frames: UnitFrames, clip: tuple[str, int, int]
+) -> InputError:
+    """Return the error of a video that shows no frame of a clip (id, first, count)."""
+    name, first, count = clip
+    begin, end = frames.numbers(np.array([first, first + count - 1]))
+    return InputError(
+        f"{path}: clip {name}",
+        expected=f"frames {begin} to {end} of this video",
+        found=f"frames 0 to {footage.length - 1}",
+        todo="Check the clip's first_frame and the camera's offset_frames.",
+    )
 
 
 def footage_clips(spec: MatchSpec, unit_id: str) -> list[tuple[str, int, int]]:
@@ -220,11 +235,17 @@ def footage_size(spec: MatchSpec, unit_id: str) -> tuple[int, int]:
 
 def require_footage(
     spec: MatchSpec, unit_id: str, path: Path, index: FrameIndex | None = None
-) -> None:
-    """Raise InputError as `read_footage` if a video contradicts match.yaml."""
+) -> dict[str, InputError]:
+    """Raise InputError as `read_footage` if a video contradicts match.yaml.
+
+    Returns:
+        For each clip of which the video has no image, the error if no other camera has one.
+    """
     frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
     fps = spec.fps * frames.rate
-    read_footage(path, fps, footage_size(spec, unit_id), frames, clips, index)
+    footage = read_footage(path, fps, footage_size(spec, unit_id), frames, clips, index)
+    unseen = [clip for clip in clips if not footage.shows(clip[1], clip[2])]
+    return {clip[0]: no_images(path, footage, frames, clip) for clip in unseen}
 
 
 def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
