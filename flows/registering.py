@@ -164,6 +164,11 @@ def _read_new_files(
 
             index = index_video(match.videos[unit])
             read_boxes(path, index.size, len(index))
+    for unit, path in match.camera_data.items():
+        if is_new(path):
+            from worldpose.ingest.camera_data import read_given_camera  # late: as below
+
+            read_given_camera(match, unit, path)
     for path in filter(is_new, match.estimates.values()):
         from worldpose.body_fitting.monocular import (
             read_monocular,  # late: few matches have such files

@@ -23,7 +23,8 @@ from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
 from tasks.unit import UnitInputs, unit_task
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
-from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
+from worldpose.broadcast_calibration.given_camera import GivenCamera
+from worldpose.broadcast_calibration.key_frames import KnownPeople, must_turn, propose_key_frames
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES
 from worldpose.broadcast_calibration.players import People, boxes_of
@@ -41,6 +42,7 @@ from worldpose.broadcast_calibration.uncertainty import (
     pool_centers,
     static_covariance,
 )
+from worldpose.formats.camera_data import read_camera_data
 from worldpose.ingest.clock import ImageClock, camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.writer import ResultWriter
@@ -81,8 +83,13 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         for frame, markings in clicked.items()
         if start <= int(frame) < stop
     ]
+    settings, given = inputs.settings(BroadcastCalibrationSettings), None
+    if "camera_data" in sources:
+        given, projected = _open_given(inputs, pitch, clock, _known_people(clock, people, seen))
     if "side" in sources:
         key_frames = _propose(inputs, pitch, clock, people, seen)
+    elif given is not None and not clicked:
+        file, key_frames = sources["camera_data"], projected
     calibration = calibrate_broadcast(
         pitch,
         BroadcastClip(
@@ -93,10 +100,11 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
             boxes=boxes,
             where=file,
             first=start,
-            proposed="side" in sources,
+            proposed=not clicked,
             smooth_weight=sources.get("smooth", 1.0),
+            given=given,
         ),
-        inputs.settings(BroadcastCalibrationSettings),
+        settings,
     )
     inputs.require_registered("video")
     layout = BROADCAST_CALIBRATION
@@ -147,12 +155,39 @@ def _propose(
             for number in np.unique(numbers).tolist():
                 yield from video.frames(number, number + 1)
 
-    known = None
-    if people is not None and seen is not None:
-        feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
-        known = KnownPeople(seen[clock.frame_of(images)], feet, people.fps, int(images[0]))
+    known = _known_people(clock, people, seen)
     where, side = str(inputs.file("video")), inputs.sources["side"]
     return propose_key_frames(spread_out(), pitch, side=side, where=where, people=known)
+
+
+def _open_given(
+    inputs: UnitInputs, pitch: PitchTemplate, clock: ImageClock, people: KnownPeople | None
+) -> tuple[GivenCamera, list[KeyFrame]]:
+    """Return the camera data of the clip's images, and key frames as they project them."""
+    with open_video(inputs.file("video")) as video:
+        size = video.index.size
+    rate = float(inputs.sources["fps"]) * clock.rate
+    data = read_camera_data(inputs.file("camera_data"), rate, size)
+    inputs.require_registered("camera_data")
+    given, first = GivenCamera.of(data, clock.images), int(clock.images[0])
+    prior = inputs.settings(BroadcastCalibrationSettings).prior
+    found = given.propose_key_frames(pitch, size, prior)
+    whole = given.camera(size, prior).camera
+    cameras = {first + each.frame: whole[each.frame] for each in found}
+    if cameras and not any(inputs.sources["key_frames"].values()):
+        must_turn(cameras, pitch, "near", people, inputs.sources["camera_data"])
+    moved = [each.model_copy(update={"frame": first + each.frame}) for each in found]
+    return given, moved
+
+
+def _known_people(
+    clock: ImageClock, people: People | None, seen: KeypointDetections | None
+) -> KnownPeople | None:
+    """Return the people in a clip's images, and where the static cameras see them, if any do."""
+    if people is None or seen is None:
+        return None
+    feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
+    return KnownPeople(seen[clock.frame_of(clock.images)], feet, people.fps, int(clock.images[0]))
 
 
 def _open_pitch(inputs: UnitInputs) -> PitchTemplate:

@@ -121,6 +121,7 @@ def read_npz_members(path: Path, names: Collection[str]) -> dict[str, NDArray[An
 
 
 DECIMAL_COMMA: Final = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+THOUSANDS: Final = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 DECIMAL_POINT: Final = re.compile(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?")
 
 
@@ -164,7 +165,9 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
             str(path), expected="text in rows and columns", found=say_failure(error), todo=todo
         ) from error
     numbers = [cell.strip() for _, row in rows for cell in row]
-    has_commas = separator != "," and any(DECIMAL_COMMA.fullmatch(cell) for cell in numbers)
+    commas = [cell for cell in numbers if DECIMAL_COMMA.fullmatch(cell)]
+    # Between commas, a number in quotes such as "1,500" may be one with a sign of thousands.
+    has_commas = any(separator != "," or not THOUSANDS.fullmatch(cell) for cell in commas)
     if has_commas and any(DECIMAL_POINT.fullmatch(cell) for cell in numbers):
         raise InputError(
             str(path),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 GROUPS: Final = {
     "Bring a match in": {
         "init": "project:init",
-        "simulate": "matches:simulate",
+        "simulate": "simulate:simulate",
         "import": "matches:import_command",
         "clips": "programme:clips",
         "ingest": "matches:ingest",

@@ -58,7 +58,8 @@ def evaluate(
     Options:
         prediction: A joints file, a folder with joints.npz and cameras/, or a match of the
             project.
-        reference: A joints file, a folder with joints.npz, cameras/ or both, or a .c3d or .trc.
+        reference: A joints file, a folder with joints.npz, cameras/ or both, a .c3d or .trc, or a
+            .csv of positions of a provider (a table of kloppy).
         match_in: Match whole tracks by their boxes in this camera of the reference, as the
             paper does; by distance by default.
         fps: Frames per second; the match's by default.
@@ -67,7 +68,7 @@ def evaluate(
             --prediction; may be given more than once for one table.
         body: Body model for the methods' poses; the open body by default.
         markers: YAML file that maps markers of a reference to joints.
-        first_frame: Match frame of the methods' first image.
+        first_frame: Match frame of the methods' first image, or of the first row of positions.
         method_fps: Frames per second of a method's input video, if not the clip's.
         table: Table of methods: text, csv or latex.
     """
@@ -95,7 +96,7 @@ def evaluate(
             found="others",
             todo="Name prediction and ground truth, or use --ablation 10.",
         )
-    from flows.results.evaluation import score
+    from flows.results.evaluation import Reading, score
 
     scores = score(
         prediction,
@@ -105,7 +106,7 @@ def evaluate(
         stage=stage,
         fps=fps,
         match_in=match_in,
-        marker_map=markers,
+        reading=Reading(markers, first_frame),
     )
     if scores.later_run:
         line(scores.later_run, to=errors)
@@ -121,6 +122,8 @@ def _print_scores(scores: Scores, *, as_json: bool) -> None:
         if alignment is not None:
             metrics["reference_offset_s"] = alignment.offset
             metrics["reference_residual_m"] = alignment.residual
+        if scores.notes:
+            metrics["notes"] = scores.notes
         print_json(metrics)
         return
     if alignment is not None:
@@ -128,6 +131,8 @@ def _print_scores(scores: Scores, *, as_json: bool) -> None:
             f"the reference's clock is {alignment.offset:.4f} s at match frame 0; after a rigid "
             f"alignment, joints are {1000.0 * alignment.residual:.1f} mm apart (root mean square)"
         )
+    for note in scores.notes:
+        line(note)
     rows = [
         (name, value, meaning)
         for name, _, value, meaning in score_rows(scores.evaluation)

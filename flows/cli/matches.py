@@ -1,16 +1,13 @@
-"""Commands that create and register matches: simulate, import, ingest."""
+"""Commands that create and register matches: import, ingest."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.progress import Progress, TaskID
 
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
@@ -26,152 +23,14 @@ from flows.cli.console import (
 )
 from flows.registering import register
 from flows.stage import Match
-from worldpose.errors import UsageError, WorldposeError, unknown_name
+from worldpose.errors import UsageError, WorldposeError
+from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import unclicked_clips
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
-
-
-def simulate(
-    scenario: Annotated[str, typer.Option()],
-    out: Path | None = None,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
-    duration: Annotated[float | None, typer.Option(min=0.2)] = None,
-    cameras: Annotated[int | None, typer.Option(min=1)] = None,
-    players: Annotated[int | None, typer.Option(min=0)] = None,
-    trajectories: Path | None = None,
-    mocap: Path | None = None,
-    calibrated: Annotated[bool, typer.Option("--calibrated")] = False,
-    stills: bool = True,
-    video: bool = True,
-    render: Annotated[bool, typer.Option("--render")] = False,
-    masks: Annotated[bool, typer.Option("--masks")] = False,
-    recordings: Path | None = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Make a synthetic match folder with known truth.
-
-    Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
-
-    Options:
-        scenario: Name of a scenario; `list` shows all.
-        out: Match folder to create.
-        seed: Random seed; equal seeds give equal bytes.
-        duration: Duration [s].
-        cameras: Number of static cameras.
-        players: Number of people.
-        trajectories: Tracking data (npz) that people follow.
-        mocap: Motion capture (BVH) that one person performs.
-        calibrated: Also write the exact static cameras.
-        stills: Draw one image per static camera, about 1 s each.
-        video: Render the scenario's broadcast video: 0.1 s per frame.
-        render: Render videos of all cameras instead of detections.
-        masks: With --render, also write each pixel's person.
-        recordings: For foreign-*: folder of motion capture and tracking data (npz) to replay.
-    """
-    from worldpose.simulation.foreign.matches import simulate_foreign_match
-    from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
-    from worldpose.simulation.matches import MatchOptions, simulate_match
-    from worldpose.simulation.scenarios import SCENARIOS
-
-    about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
-    if scenario == "list":
-        if as_json:
-            print_json({"scenarios": about})
-            return
-        print_table("scenarios", ("name", "what happens"), list(about.items()))
-        return
-    if scenario not in about:
-        todo = "List the scenarios: worldpose simulate --scenario list."
-        raise unknown_name(f"--scenario {scenario}", scenario, about, todo)
-    if out is None:
-        raise UsageError(
-            "--out", expected="a folder to create", found="none", todo="Add --out FOLDER."
-        )
-    if masks and not render:
-        raise UsageError(
-            "--masks", expected="--masks with --render", found="no --render", todo="Add --render."
-        )
-    if scenario in FOREIGN_SCENARIOS:
-        _refuse_options(
-            f"foreign scenario {scenario}",
-            {
-                "--trajectories": trajectories is not None,
-                "--mocap": mocap is not None,
-                "--render": render,
-                "--players 0": players == 0,
-            },
-        )
-        spec = simulate_foreign_match(
-            FOREIGN_SCENARIOS[scenario],
-            seed,
-            out,
-            duration=duration,
-            cameras=cameras,
-            people=players,
-            recordings=recordings,
-            calibrated=calibrated,
-        )
-        _report_match(spec.match_id, out, as_json)
-        return
-    _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
-    with _show_rendering() as advance:
-        spec = simulate_match(
-            SCENARIOS[scenario],
-            seed,
-            out,
-            MatchOptions(
-                duration=duration,
-                cameras=cameras,
-                players=players,
-                trajectories=trajectories,
-                mocap=mocap,
-                calibrated=calibrated,
-                stills=stills,
-                video=video,
-                render=render,
-                masks=masks,
-            ),
-            advance=advance,
-        )
-    _report_match(spec.match_id, out, as_json)
-
-
-def _refuse_options(what: str, options: dict[str, bool]) -> None:
-    """Raise UsageError for the first option that was given and does not apply."""
-    for option, given in options.items():
-        if given:
-            raise UsageError(
-                option,
-                expected=f"an option of {what}",
-                found=f"{option}, which it does not have",
-                todo="Omit the option; docs/explanation/simulation.md describes the alternatives.",
-            )
-
-
-def _report_match(match_id: str, out: Path, as_json: bool) -> None:
-    """Print the id of the created match."""
-    about = {"match": match_id, "folder": str(out)}
-    answer(as_json, about, f"made match {match_id} in {out}")
-
-
-@contextmanager
-def _show_rendering() -> Iterator[Callable[[str, int, int], None]]:
-    """Report rendering progress: a bar for each camera, or a line when one is done."""
-    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def advance(name: str, done: int, frames: int) -> None:
-            if name not in tasks:
-                tasks[name] = bars.add_task(name, total=frames)
-            bars.update(tasks[name], completed=done)
-            if done == frames:
-                line(f"filmed {name}: {frames} frames", to=errors)
-
-        yield advance
 
 
 def import_command(
@@ -188,6 +47,10 @@ def import_command(
     clicks: Path | None = None,
     camera: str | None = None,
     lens: list[Path] | None = None,
+    camera_data: Annotated[Path | None, typer.Option("--camera-data")] = None,
+    first_frame: Annotated[int | None, typer.Option("--first-frame", min=0)] = None,
+    freed_camera: Annotated[int | None, typer.Option("--freed-camera", min=0, max=255)] = None,
+    zoom_table: Annotated[Path | None, typer.Option("--zoom-table")] = None,
     left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
     template: TemplateName | None = None,
     unit: str | None = None,
@@ -217,10 +80,15 @@ def import_command(
         pitch: Survey of the markings (CSV); writes only pitch.json.
         clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
             name of a point or marking of the pitch, or a position in metres.
-        camera: With --clicks or --lens: the camera, or the clip of the broadcast camera; by
-            default, images and lenses are named after cameras.
+        camera: With --clicks, --lens or --camera-data: the camera, or the clip of the broadcast
+            camera; by default, images and lenses are named after cameras.
         lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
             pickle, matrix and distortion as two .npy files, or TOML.
+        camera_data: Data of the broadcast camera in every frame: FreeD packets, or a table with
+            pan, tilt, roll [deg], x, y, z, and focal_px, fov, or focal_mm.
+        first_frame: With --camera-data: number in the video of its first frame.
+        freed_camera: With --camera-data: FreeD's number of the camera.
+        zoom_table: With --camera-data: focal lengths of the lens by FreeD's zoom counts (CSV).
         left_handed: The survey's x, y and height are left-handed.
         template: With --pitch: the game whose markings are surveyed, such as futsal; football by
             default.
@@ -241,6 +109,10 @@ def import_command(
         "--clicks": clicks,
         "--camera": camera,
         "--lens": lens,
+        "--camera-data": camera_data,
+        "--first-frame": first_frame is not None,
+        "--freed-camera": freed_camera is not None,
+        "--zoom-table": zoom_table,
         "--left-handed": left_handed,
         "--template": template,
         "--unit": unit,
@@ -264,6 +136,17 @@ def import_command(
         _import_lenses(lens, out, camera, as_json=as_json)
     elif kind == "--clicks" and clicks is not None:
         _import_clicks(clicks, out, camera, as_json=as_json)
+    elif kind == "--camera-data" and camera_data is not None:
+        target, data = import_camera_data(
+            camera_data,
+            out,
+            camera,
+            first=first_frame,
+            number=freed_camera,
+            zoom_table=zoom_table,
+        )
+        about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
+        answer(as_json, about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, template, out, left_handed=left_handed, as_json=as_json)
     elif pose2sim is not None:
@@ -303,7 +186,14 @@ ALONE: Final = {
     ),
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
     "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
-    "--camera": ("with --clicks or --lens", ()),
+    "--camera-data": (
+        "with --out, and --camera, --first-frame, --freed-camera or --zoom-table",
+        ("--camera", "--first-frame", "--freed-camera", "--zoom-table"),
+    ),
+    "--camera": ("with --clicks, --lens or --camera-data", ()),
+    "--first-frame": ("with --camera-data", ()),
+    "--freed-camera": ("with --camera-data", ()),
+    "--zoom-table": ("with --camera-data", ()),
     "--pitch": ("with --out alone", ("--left-handed", "--template")),
     "--template": ("with --pitch", ()),
 }
@@ -314,7 +204,7 @@ def _require_alone(kind: str, given: set[str]) -> None:
     """Refuse options of another import."""
     with_what, allowed = ALONE[kind]
     others = sorted(given - {kind, *allowed})
-    if others or kind in ("--camera", "--template"):
+    if others or with_what in ("with --pitch", ALONE["--camera"][0], ALONE["--zoom-table"][0]):
         raise UsageError(
             kind,
             expected=f"{kind} {with_what}",
@@ -376,6 +266,8 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
         line(f"wrote {out / name}")
     for owner, count in found.clicks.items():
         line(f"{owner}: {count} clicks and lines")
+    for note in found.notes:
+        line(note)
     if found.mirrored is not None:
         side = "near" if found.mirrored else "far"
         line(f"places: y points to the {side} side, as the clicks show")

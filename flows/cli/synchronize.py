@@ -143,7 +143,11 @@ def _find_clocks(
     pitch: PitchTemplate | None,
 ) -> tuple[Synchronization, list[Course]]:
     """Return the constant offsets of all cameras, and their offsets over the clip."""
-    from worldpose.triangulation.clock_courses import shift_by_courses, trace_clocks
+    from worldpose.triangulation.clock_courses import (
+        add_slow_drifts,
+        shift_by_courses,
+        trace_clocks,
+    )
     from worldpose.triangulation.synchronization import synchronize as estimate
 
     size = None if pitch is None else (pitch.length, pitch.width)
@@ -155,6 +159,9 @@ def _find_clocks(
         traced = trace_clocks(cameras[group], some, fps, found.late[group], pitch_size=size)
         for c, course in zip(group.tolist(), traced, strict=True):
             courses[c] = course
+    courses = add_slow_drifts(
+        courses, cameras, detections, fps, max_offset_s=max_offset_s, pitch=pitch
+    )
     if np.isfinite(found.late).all() or len(courses) < 3:
         return found, courses
     # One clock that changes can hide the offsets of all others.

@@ -19,15 +19,17 @@ from flows.results.best_results import (
 from flows.results.broadcast_views import broadcast_cameras, broadcast_unit, clip_of
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
+from worldpose.broadcast_calibration.given_camera import GivenCamera
 from worldpose.broadcast_calibration.report import camera_before
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.geometry.pan_tilt import camera_angles
+from worldpose.ingest.camera_data import read_given_camera
 from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.reports.broadcast import (
-    camera_angles,
     largest_pose_changes,
     plot_before_after,
     plot_camera_course,
@@ -60,12 +62,14 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
         pictures.append(
             CaptionedImage(
                 f"{clip_title(view)}: the broadcast camera over its frames, smoothed (blue, with "
-                "bands of two standard deviations) and each frame on its own (orange).",
+                "bands of two standard deviations) and each frame on its own (orange)"
+                f"{', and camera data (dashed)' if view in match.folder.camera_data else ''}.",
                 plot_camera_course(
                     frame,
                     camera,
                     run[broadcast_unit(run, view)]["covariance"].values,
                     camera_before(result.data_vars),
+                    _given_curves(match, view, clock.number),
                 ),
             )
         )
@@ -95,6 +99,18 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
                 )
             )
     return pictures
+
+
+def _given_curves(
+    match: Match, view: str, images: NDArray[np.int64]
+) -> dict[str, NDArray[np.float64]] | None:
+    """Return the curves of a view's camera data at images (frames,); None without data."""
+    if view not in match.folder.camera_data:
+        return None
+    data = read_given_camera(match.folder, view, match.folder.camera_data[view])
+    names = ("pan [deg]", "tilt [deg]", "roll [deg]", "focal length [px]", "k1", "k2")
+    values = GivenCamera.of(data, images).values[:, [0, 1, 2, 6, 7, 8]]
+    return dict(zip(names, values.T, strict=True))
 
 
 def _before_and_after(

@@ -30,6 +30,7 @@ from worldpose.evaluation.marker_reference import (
     read_markers,
 )
 from worldpose.evaluation.metrics import PersonScore, evaluate_joints
+from worldpose.evaluation.position_reference import align_positions
 from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.geometry.cameras import Camera
@@ -50,6 +51,18 @@ class Scores:
     """Alignment of markers to the prediction, if markers are the ground truth."""
     later_run: str = ""
     """A sentence about a later run than that of the prediction, if there is one."""
+    notes: tuple[str, ...] = ()
+    """Sentences about how the reference was read."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a file of markers or positions is read."""
+
+    marker_map: Path | None = None
+    """YAML file that maps markers to joints; None = markers have the joints' names."""
+    first_frame: int | None = None
+    """Match frame of the first row of positions; None = they have match frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,35 +87,42 @@ def score(
     stage: str | None = None,
     fps: float | None = None,
     match_in: str | None = None,
-    marker_map: Path | None = None,
+    reading: Reading = Reading(),
 ) -> Scores:
     """Compute every score for which both prediction and reference have data.
 
     Args:
         prediction: a joints file, a folder with `joints.npz` and `cameras/`, or a match.
-        reference: a joints file, a folder with `joints.npz`, `cameras/` or both, or a C3D or TRC
-            file of markers, which is aligned with the prediction in time and space.
+        reference: a joints file, a folder with `joints.npz`, `cameras/` or both, a C3D or TRC
+            file of markers, which is aligned with the prediction in time and space, or a CSV of
+            positions, with which people are compared on the ground.
         project: project with the runs of matches.
         run_id: the match's run as for `open_results`; only if `prediction` is a match.
         stage: stage whose joints are scored if `prediction` is a match; None = the last one with
             joints.
         fps: frames per second; None = the match's, if there is one.
         match_in: reference camera in whose image tracks are matched (E3).
-        marker_map: YAML file that maps markers to joints; None = markers have the joints' names.
+        reading: how the reference's file is read.
 
     Raises:
         UsageError: an unknown name, or no data that both sides have.
         InputError: a file has the wrong format.
     """
-    measured = Path(reference).suffix.lower() in SUFFIXES
-    truth = Side(None, {}) if measured else reference_side(reference)
+    suffix, notes = Path(reference).suffix.lower(), list[str]()
+    measured, placed = suffix in SUFFIXES, suffix == ".csv"
+    truth = Side(None, {}) if measured or placed else reference_side(reference)
     estimate = _prediction(prediction, project, truth, run_id=run_id, stage=stage)
     match = estimate.match or truth.match
     alignment = None
     if measured:
         rate = fps or (None if match is None else match.spec.fps)
-        tracks, alignment = _align_markers(Path(reference), estimate.joints, rate, marker_map)
+        tracks, alignment = _align_markers(
+            Path(reference), estimate.joints, rate, reading.marker_map
+        )
         truth = Side(tracks, {})
+    elif placed and estimate.joints is not None:
+        mine, tracks, notes = align_positions(Path(reference), estimate.joints, reading.first_frame)
+        estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
     is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
     if is_broadcast and truth.joints is not None:  # `views` counts static cameras
@@ -124,6 +144,9 @@ def score(
             fps=fps or (None if spec is None else spec.fps),
             camera=None if match_in is None else true_cameras[match_in],
         )
+    if placed:  # hips alone tell nothing of the challenge's joints
+        names = ("challenge_score", "challenge_global_m", "challenge_local_m")
+        evaluation = evaluation.model_copy(update=dict.fromkeys(names))
     errors, cameras = evaluate_cameras(estimate.cameras, true_cameras, _pitch(match))
     if not cameras and not people and evaluation.frames is None:
         raise UsageError(
@@ -133,7 +156,7 @@ def score(
             todo="Name files or folders with the same kind of data.",
         )
     evaluation = evaluation.model_copy(update={"cameras": errors})
-    return Scores(evaluation, people, cameras, alignment, estimate.later_run)
+    return Scores(evaluation, people, cameras, alignment, estimate.later_run, tuple(notes))
 
 
 def _align_markers(

@@ -62,10 +62,12 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     known = folder.key_frames[unit].key_frames if unit in folder.key_frames else ()
     clicked: dict[str, JsonValue] = {str(key.frame): key.markings.by_name() for key in known}
     proposed = {"side": view.camera.side} if unit in folder.proposed_views else {}
+    given = folder.camera_data.get(unit)
     return {
         **video_sources(match, unit),
         "key_frames": {key_frames_file(unit): clicked},
         **proposed,
+        **({} if given is None else match.file_sources("camera_data", given)),
         "broadcast_offset_frames": view.offset,
         **({} if (weight := view.clip.broadcast_smooth_weight) == 1.0 else {"smooth": weight}),
     }

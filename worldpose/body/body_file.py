@@ -232,6 +232,7 @@ def install_body(file: Path, folder: Path | None = None, name: str | None = None
             todo="Take SMPL's file, not that of SMPL-H, SMPL-X or another model.",
         )
     _require_metres(file, float(np.ptp(model.template, axis=0).max()))
+    _require_axes(file, model)
     path = body_path(model_name, folder)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_body(path, model)
@@ -251,6 +252,24 @@ def _require_metres(file: Path, span: float) -> None:
         todo="Give SMPL's file as downloaded, or bring v_template, shapedirs and posedirs to "
         "metres.",
     )
+
+
+def _require_axes(file: Path, model: BodyModel) -> None:
+    """Raise InputError if the left is not at x, up at y and ahead at z, or shapes are no metres."""
+    joints = model.joint_regressor @ model.template
+    left, up = joints[1] - joints[2], joints[15] - joints[0]  # hips; head and pelvis
+    ahead = joints[10:12].sum(axis=0) - joints[7:9].sum(axis=0)  # feet and ankles
+    largest = [int(np.abs(way).argmax()) for way in (left, up, ahead)]
+    signs = [way[n] < 0.0 for way, n in zip((left, up, ahead), largest, strict=True)]
+    shown = ", ".join("+-"[int(s)] + "xyz"[n] for s, n in zip(signs, largest, strict=True))
+    reach = float(np.abs(model.shape_directions).max())
+    if shown != "+x, +y, +z" or reach > 1.0:
+        raise InputError(
+            f"{file}: {'shapedirs' if reach > 1.0 else 'v_template'}",
+            expected="a body whose left is +x, up +y, ahead +z, and shapes in metres",
+            found=f"{shown}, and shapes that move points by up to {reach:.3g}",
+            todo="Give SMPL's file as downloaded.",
+        )
 
 
 def body_path(name: str, folder: Path | None = None) -> Path:

@@ -11,6 +11,7 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, join_evidence
+from worldpose.broadcast_calibration.given_camera import GivenCamera
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.learned_noise import (
     LearnedNoise,
@@ -35,6 +36,7 @@ from worldpose.broadcast_calibration.players import (
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.report import (
     BroadcastCalibration,
+    BroadcastReport,
     JointFit,
     TrackedClip,
     report_calibration,
@@ -67,8 +69,9 @@ class BroadcastClip:
         first: number of the clip's first frame in its video; key frames and messages use the
             numbers of the video.
         proposed: the key frames are proposals: they start the fit and are no evidence in it, since
-            they come from the paint that the fit measures in every frame.
+            they come from the paint that the fit measures in every frame, or from `given`.
         smooth_weight: factor on the smoothness of focal length and distortion.
+        given: camera data of a tracking system in all frames; None without.
     """
 
     key_frames: Sequence[KeyFrame]
@@ -80,6 +83,7 @@ class BroadcastClip:
     first: int = 0
     proposed: bool = False
     smooth_weight: float = 1.0
+    given: GivenCamera | None = None
 
     @property
     def moving_boxes(self) -> Floats | None:
@@ -128,6 +132,13 @@ def track(
             found=f"{sorted(key.frame for key in key_frames)}",
             todo="Put all clicks of a frame into one entry.",
         )
+    if not key_frames:
+        raise InputError(
+            where,
+            expected="a key frame in the clip, or camera data with angles, place and focal length",
+            found="none",
+            todo="Click points in a frame that shows an area's corners or the centre circle.",
+        )
     kept: dict[int, Image] = {}
     followed = follow(
         _keep_frames(clip.pictures(), wanted, kept), clip.moving_boxes, settings.flow_points
@@ -174,6 +185,10 @@ def refine(
     surface = tracked.keys.surface
     offset: FeedOffset | None = None
     before = camera
+    given, denied = clip.given, ""
+    if given is not None:
+        keys = camera.frames(tracked.keys.frames)
+        denied = given.contradiction(keys, tracked.keys.frames, settings.prior)
     for number in range(settings.passes):  # one or more
         samples = FieldSamples.of(pitch, learned.errors, surface)
         lines, corrected = follow_lines(camera, samples, clip.pictures(), boxes, settings)
@@ -188,10 +203,13 @@ def refine(
             matches = match(corrected, people)
             players, noise = player_evidence(corrected, people, matches, settings)
             parts.append(players)
+        prior = build_prior(settings.prior, corrected.focal, corrected.image_size)
+        if given is not None and not denied:
+            prior = given.add_to(prior, corrected.image_size, settings.prior)
         problem = ClipProblem(
             points=PointEvidence.none(),
             flow=tracked.flow,
-            prior=build_prior(settings.prior, corrected.focal, corrected.image_size),
+            prior=prior,
             weights=TermWeights(
                 field=settings.field_weight,
                 player=settings.player_weight / max(noise.frames, 1.0),
@@ -233,7 +251,37 @@ def refine(
         learned.describe(pitch, problem, solution),
     )
     report = report_calibration(tracked, fit, pitch, settings, clip.first)
+    if given is not None:
+        report = _report_given(clip, given, denied, report, solution.camera)
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
+
+
+def _report_given(
+    clip: BroadcastClip,
+    given: GivenCamera,
+    denied: str,
+    report: BroadcastReport,
+    camera: MovingCamera,
+) -> BroadcastReport:
+    """Return a report with the comparison of the camera and its camera data.
+
+    Raises:
+        InputError: the camera rests on the data alone, and the paint does not confirm them.
+    """
+    confirmed = float(np.mean(report.marking_count >= 30))
+    if clip.proposed and confirmed < 0.5:
+        raise InputError(
+            clip.where,
+            expected="painted lines where the camera data project them",
+            found=f"them in {100.0 * confirmed:.0f} % of the frames",
+            todo="Check axes, signs and first frame of the camera data, or click key frames.",
+        )
+    reason = f"camera data contradict the key frames, and are no prior: {denied}"
+    return replace(
+        report,
+        decisions=(*report.decisions, *given.describe(camera)),
+        reasons=(*report.reasons, *([reason] if denied else [])),
+    )
 
 
 def _fit_and_learn(

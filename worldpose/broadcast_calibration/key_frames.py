@@ -112,19 +112,24 @@ def propose_key_frames(
         number: proposal for (number, proposal), kept in zip(clear, agreed, strict=True) if kept
     }
     cameras = {number: each.camera for number, each in chosen.items()}
-    if _must_turn(cameras, pitch, side, people, where):
+    if must_turn(cameras, pitch, side, people, where):
         chosen = {number: each.turn() for number, each in chosen.items()}
     return [KeyFrame(frame=number, markings=each.drawn) for number, each in chosen.items()]
 
 
-def _must_turn(
+def must_turn(
     cameras: Mapping[int, Camera],
     pitch: PitchTemplate,
     side: Side | None,
     people: KnownPeople | None,
     where: str,
 ) -> bool:
-    """Return whether the people stand where they are only after half a turn of the cameras."""
+    """Return whether the people stand where they are only after half a turn of the cameras.
+
+    Raises:
+        InputError: the people do not decide the side that is not stated, or contradict a stated
+            one, which camera data state, too.
+    """
     same, turned = (0.0, 0.0) if people is None else _compare_people(cameras, pitch, people)
     if side is None and abs(same - turned) < MIN_EVIDENCE:
         raise InputError(
@@ -140,7 +145,8 @@ def _must_turn(
             expected="people at the places where the static cameras see them",
             found="agreement only after half a turn about the centre spot: the stated side is "
             "wrong, or that of the static cameras",
-            todo="State the opposite side in match.yaml, or take `side` out of this camera.",
+            todo="State the opposite side in match.yaml, take `side` out of this camera, or turn "
+            "its camera data.",
         )
     return side is None and turned > same
 

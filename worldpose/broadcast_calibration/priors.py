@@ -20,9 +20,12 @@ class Prior:
         principal_point: (2,) [px].
         principal_std: (2,) [px].
         log_focal: (frames,) mean of the logarithm of the focal length [px].
-        log_focal_std: standard deviation of this logarithm in one of the frames.
+        log_focal_std: (frames,), or one for all: deviation of this logarithm in a frame.
         distortion: (frames, 3).
         distortion_std: (frames, 3).
+        rotation: (frames, 3, 3) of x_cam = R (x_world - center).
+        rotation_std: (frames,) standard deviation of a turn about each axis [rad]; infinite =
+            nothing is known.
     """
 
     center: Floats
@@ -30,9 +33,11 @@ class Prior:
     principal_point: Floats
     principal_std: Floats
     log_focal: Floats
-    log_focal_std: float
+    log_focal_std: Floats | float
     distortion: Floats
     distortion_std: Floats
+    rotation: Floats | None = None
+    rotation_std: Floats | None = None
 
 
 def build_prior(settings: BroadcastPrior, focal: Floats, image_size: Integers) -> Prior:

@@ -8,7 +8,8 @@ For the camera L_t of every frame t of a clip, all with one center and principal
     E_player = 1/2 sum_i sum_j I_ij rho(|Pi(P_i; L_t) - p_j|^2 / s_j^2)   matched keypoints
     E_flow   = 1/2 sum_k rho(|Pi(Pi^-1(y_k; L_t); L_t+1) - y'_k|^2 / s_k^2)   followed points
     E_smooth = 1/2 sum_t |(l_t-1 - 2 l_t + l_t+1) / s|^2   rotation, log focal length, distortion
-    E_prior  = 1/2 (center, principal point, lenses and errors d of the pitch)^2 / variance
+    E_prior  = 1/2 (center, principal point, lenses and errors d of the pitch, and the rotation
+                    if camera data give it)^2 / variance
 
 Pi is the projection and rho the Geman-McClure function; lambda_4 and lambda_5 are those of the
 paper, whose supplement adds the flow and the smoothness. The paper measures residuals in pixels;
@@ -150,7 +151,7 @@ def second_differences(camera: MovingCamera) -> Floats:
 def prior_residuals(
     camera: MovingCamera, paint_offsets: Floats, prior: Prior, system: ArrowSystem
 ) -> float:
-    """Add E_prior of center, principal point, lenses and paint to a system, and return it."""
+    """Add E_prior of center, principal point, lenses, rotation and paint to a system; return it."""
     blocks, corner = system.blocks, system.corner
     right, right_corner = system.right, system.right_corner
     paint = range(CLIP_SIZE, len(corner))
@@ -164,12 +165,18 @@ def prior_residuals(
     right_corner[3:CLIP_SIZE] += moved / prior.principal_std
     lens = np.concatenate([np.log(camera.focal)[:, None], camera.distortion], axis=1)
     middle = np.concatenate([prior.log_focal[:, None], prior.distortion], axis=1)
-    width = np.full((len(lens), 1), prior.log_focal_std)
+    width = np.broadcast_to(prior.log_focal_std, len(lens))[:, None]
     spread = np.concatenate([width, prior.distortion_std], axis=1)
     gone = (lens - middle) / spread
     blocks[0][:, range(3, FRAME_SIZE), range(3, FRAME_SIZE)] += 1.0 / spread**2
     right[:, 3:] += gone / spread
     squares = off @ prior.center_information @ off + moved @ moved
+    if prior.rotation is not None and prior.rotation_std is not None:
+        turn = camera.rotation @ np.swapaxes(prior.rotation, -1, -2)
+        axes = Rigid(turn, np.zeros(3)).rotvec / prior.rotation_std[:, None]
+        blocks[0][:, range(3), range(3)] += 1.0 / prior.rotation_std[:, None] ** 2
+        right[:, :3] += axes / prior.rotation_std[:, None]
+        squares += float((axes**2).sum())
     return 0.5 * float(squares + (gone**2).sum() + (paint_offsets**2).sum())
 
 

@@ -43,6 +43,13 @@ class BroadcastPrior(Record):
     k3_std: float = Field(default=0.5, ge=1e-6, le=100)
     """Standard deviation of k3 about zero, with the growth of k2 [1]: the released cameras have no
     k3."""
+    given_rotation_std_deg: float = Field(default=0.3, ge=1e-6, le=180)
+    """Standard deviation of a camera's angles in camera data, about each axis [deg]: of heads that
+    were aligned by eye. Data that key frames contradict by three deviations are no prior."""
+    given_log_focal_std: float = Field(default=0.03, ge=1e-6, le=100)
+    """Standard deviation of the logarithm of a focal length in camera data [1]."""
+    given_center_std_m: float = Field(default=1.0, ge=1e-6, le=1000)
+    """Standard deviation of a camera's place in camera data, each axis [m]."""
     center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
     """Mean center in the world [m]: on the main stand, at the halfway line."""
     center_std_m: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)

@@ -41,7 +41,8 @@ def read_calibration_xml(
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a calibration of Qualisys, Vicon or OptiTrack, in file order.
 
-    The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`.
+    The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`. Parameters
+    that Qualisys' server states (`QTM_Parameters_Ver_...`) contain the first.
 
     Args:
         path: the file.
@@ -59,6 +60,8 @@ def read_calibration_xml(
         raise calibration_error(
             str(path), "XML of Qualisys, Vicon or OptiTrack", say_failure(error)
         ) from error
+    if root.tag.startswith("QTM_Parameters"):
+        root = _child(str(path), root, "calibration")
     readers = {
         "calibration": _read_qualisys,
         "Cameras": _read_vicon,

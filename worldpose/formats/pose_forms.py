@@ -92,7 +92,8 @@ def plain_person(person: Any) -> dict[str, Any] | None:  # noqa: ANN401
         return None
     given = person.get("keypoints")
     if isinstance(given, dict):
-        rows = [given.get(key, []) for key in ("x", "y", "visible")]
+        told = given.get("visible")
+        rows = [given.get("x", []), given.get("y", []), [] if told is None else told]
         if not all(isinstance(row, list) for row in rows):
             return {"keypoints": given}
         if not rows[2]:

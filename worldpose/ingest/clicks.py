@@ -65,6 +65,7 @@ class ImportedClicks:
         clicks: number of clicks and drawn lines, by camera or clip.
         own_points: points that the Laws do not name, with their places (3,) [m, world].
         repeated: labels that were clicked more than once in one image.
+        notes: sentences about what was left out.
         mirrored: whether the labels' y axis points towards the near side; None without coordinates.
     """
 
@@ -72,6 +73,7 @@ class ImportedClicks:
     clicks: dict[str, int] = field(default_factory=dict)
     own_points: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     repeated: list[RepeatedClick] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     mirrored: bool | None = None
 
 
@@ -111,6 +113,12 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
     records: dict[str, Record] = {}
     for name, (camera, given) in by_owner.items():
         own = [image.of_size((camera.width, camera.height)) for image in given]
+        report.notes += [
+            f"{image.name}: read is one of {image.answers} annotations, the one marked as ground "
+            "truth or else the last"
+            for image in own
+            if image.answers > 1
+        ]
         for image in own:
             if image.size != (camera.width, camera.height):
                 raise InputError(

@@ -55,6 +55,8 @@ class MatchFolder:
         lenses: given lenses without a pose, by id of a static camera; may lack some.
         estimates: monocular body estimates, by name of a broadcast view; may lack some.
         boxes: given boxes of people, by id or name of a video; may lack some.
+        camera_data: what a tracking system states about the camera, by name of a broadcast view;
+            may lack some.
     """
 
     folder: Path
@@ -69,6 +71,7 @@ class MatchFolder:
     lenses: Mapping[str, LensCalibration] = field(default_factory=dict)
     estimates: Mapping[str, Path] = field(default_factory=dict)
     boxes: Mapping[str, Path] = field(default_factory=dict)
+    camera_data: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def to_click(self) -> tuple[str, ...]:
@@ -102,8 +105,9 @@ class MatchFolder:
 
     @property
     def calibrated_views(self) -> tuple[str, ...]:
-        """Broadcast views with a video whose key frames are clicked or proposed."""
-        known = {*self.key_frames, *self.proposed_views} & self.videos.keys()
+        """Broadcast views with a video whose key frames are clicked, proposed or given."""
+        given = () if self.pitch is None else self.camera_data
+        known = {*self.key_frames, *self.proposed_views, *given} & self.videos.keys()
         return tuple(name for name in self.spec.broadcast_views if name in known)
 
 
@@ -168,8 +172,9 @@ def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
         stills=_stills(folder, spec),
         key_frames=read_key_frames(folder, spec, pitch),
         lenses=_lenses(folder, spec, calibrations),
-        estimates=_estimates(folder, spec),
+        estimates=_estimates(folder, spec, ".npz"),
         boxes=_boxes(folder, videos, detections),
+        camera_data=_estimates(folder, spec, CAMERA_DATA),
     )
 
 
@@ -306,8 +311,17 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     return files_by_unit(folder, "detections", (".json", ".npz"), known, units)
 
 
-def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    return files_by_unit(folder, "estimates", (".npz",), spec.broadcast_views, BROADCAST_FILES)
+CAMERA_DATA: Final = ".csv"
+"""Ending of files of camera data in `estimates/`."""
+
+
+def camera_data_file(view: str) -> str:
+    """Return the path of a broadcast view's camera data, relative to the match folder."""
+    return f"estimates/{view}{CAMERA_DATA}"
+
+
+def _estimates(folder: Path, spec: MatchSpec, suffix: str) -> dict[str, Path]:
+    return files_by_unit(folder, "estimates", (suffix,), spec.broadcast_views, BROADCAST_FILES)
 
 
 def _boxes(

@@ -95,7 +95,7 @@ def _identifying_files(match: MatchFolder) -> set[str]:
 def _further_files(match: MatchFolder) -> set[str]:
     names = ("match.yaml", "calibration.toml", LENS_FILE, "annotations")
     roots = [*(match.folder / name for name in names), *match.stills.values()]
-    roots += [*match.estimates.values(), *match.boxes.values()]
+    roots += [*match.estimates.values(), *match.boxes.values(), *match.camera_data.values()]
     return {path for root in roots for path in _files_under(match.folder, root)}
 
 

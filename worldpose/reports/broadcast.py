@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import cv2
@@ -15,6 +15,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.shots import Shot
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.pan_tilt import camera_angles
 from worldpose.reports.drawing import (
     INK,
     PALETTE,
@@ -35,6 +36,7 @@ def plot_camera_course(
     camera: Camera,
     covariance: Floats,
     before: Camera | None = None,
+    given: Mapping[str, Floats] | None = None,
 ) -> bytes:
     """Return a PNG of a clip's focal length, pan, tilt, roll, k1 and k2 over time.
 
@@ -46,6 +48,7 @@ def plot_camera_course(
         covariance: (frames, 7, 7) covariance of a step, in the order of
             `data_contracts.broadcast_calibration.FRAME_STEP`.
         before: the same frames, independent and without smoothing; drawn below.
+        given: what camera data state instead, by the name of a curve.
     """
     curves = _curves(camera)
     rough = {} if before is None else _curves(before)
@@ -70,6 +73,8 @@ def plot_camera_course(
         low, high = values - 2.0 * deviation, values + 2.0 * deviation
         axes.fill_between(frame, low, high, color=PALETTE[0], alpha=0.25, linewidth=0)
         axes.plot(frame, values, color=PALETTE[0], linewidth=1.6)
+        if given is not None and name in given:
+            axes.plot(frame, given[name], color=INK, linewidth=1.0, linestyle="--")
         axes.set_title(name, color=INK, loc="left", fontsize=12)
         axes.margins(x=0.01)
         axes.ticklabel_format(useOffset=False)
@@ -139,22 +144,6 @@ def plot_before_after(
         draw_people(axes, camera, tracks, frame)
         axes.plot(*seen.reshape(-1, 2).T, "x", color="white", markersize=5.0, zorder=4)
     return png(figure)
-
-
-def camera_angles(camera: Camera) -> tuple[Floats, Floats, Floats]:
-    """Return pan, tilt and roll (frames,) of a camera [deg].
-
-    Pan is from the world's y axis towards x, tilt from the horizon upwards, roll clockwise about
-    the view: a camera that rolls so shows a horizon that turns the other way.
-
-    Args:
-        camera: a batch (frames,).
-    """
-    right, down, ahead = np.moveaxis(camera.cam_from_world.rotation, 1, 0)
-    pan = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1]))
-    tilt = np.degrees(np.arcsin(np.clip(ahead[:, 2], -1.0, 1.0)))
-    roll = np.degrees(np.arctan2(-right[:, 2], -down[:, 2]))
-    return pan, tilt, roll
 
 
 def plot_flow(

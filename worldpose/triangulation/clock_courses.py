@@ -12,6 +12,7 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.changes import find_changes
 from worldpose.camera_consistency.health import CameraHealth
 from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.camera_changes import (
@@ -23,6 +24,7 @@ from worldpose.triangulation.camera_changes import (
 from worldpose.triangulation.clocks import move_to_match_time
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.synchronization import synchronize
 
 Course = list[tuple[int, float]]
 """Clock offset of a camera: rising rows of a clip with values [frame], linear between them."""
@@ -77,6 +79,41 @@ def trace_clocks(
         c = change.found.camera
         courses[c] = _add_change(courses[c], change, frames)
     return courses
+
+
+def add_slow_drifts(
+    courses: Sequence[Course],
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    *,
+    max_offset_s: float,
+    pitch: PitchTemplate | None = None,
+) -> list[Course]:
+    """Return courses with drifts that both ends of a clip show, such as 29.97 beside 30.
+
+    `trace_clocks` sees changes within a second; these are a frame in half a minute. Arguments are
+    those of `worldpose.triangulation.synchronization.synchronize`.
+    """
+    # Least difference of the ends in standard deviations [1], and in frames; their length [s].
+    min_score, min_frames, end_s = 5.0, 0.1, 30.0
+    frames = len(detections.frame)
+    span = min(frames // 2, round(end_s * fps))
+    late, std = [], []
+    for rows in (slice(0, span), slice(frames - span, frames)):
+        found = synchronize(cameras, detections[rows], fps, max_offset_s=max_offset_s, pitch=pitch)
+        late.append(found.late)
+        std.append(found.std)
+    change = late[1] - late[0]
+    drifts = np.abs(change) > np.maximum(min_score * np.hypot(*std), min_frames)
+    share = (np.array([[0], [frames - 1]]) - 0.5 * (span - 1)) / (frames - span)
+    ends = late[0] + share * change
+    return [
+        [(0, float(ends[0, c])), (frames - 1, float(ends[1, c]))]
+        if drifts[c] and len(course) == 1
+        else course
+        for c, course in enumerate(courses)
+    ]
 
 
 def shift_by_courses(

@@ -101,6 +101,21 @@ def test_arrays_of_another_shape_are_refused(arrays, tmp_path, changes, found):
     assert not (tmp_path / "bodies").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda a: {"v_template": a["v_template"][:, [0, 2, 1]]}, r"\+x, \+z, \+y"),
+        (lambda a: {"v_template": a["v_template"] * [-1, 1, 1]}, r"-x, \+y, \+z"),
+        (lambda a: {"v_template": a["v_template"] * [1, -1, -1]}, r"\+x, -y, -z"),
+        (lambda a: {"shapedirs": 1e3 * a["shapedirs"]}, "shapedirs: .* by up to"),
+    ],
+)
+def test_a_body_in_other_axes_or_units_is_refused(arrays, tmp_path, change, found):
+    (tmp_path / "other.pkl").write_bytes(pickled({**arrays, **change(arrays)}))
+    with pytest.raises(InputError, match=found):
+        install_body(tmp_path / "other.pkl", tmp_path / "bodies")
+
+
 @pytest.mark.parametrize("name", ["open-neutral/2", "../up", "Capital", ".hidden"])
 def test_a_name_that_cannot_be_a_file_is_refused(official, tmp_path, name):
     with pytest.raises(UsageError, match="--name"):

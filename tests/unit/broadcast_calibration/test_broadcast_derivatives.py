@@ -67,7 +67,11 @@ def test_the_gradient_is_the_slope_of_the_cost():
     problem = ClipProblem(
         robust,
         flow,
-        build_prior(BroadcastPrior(), true.focal, true.image_size),
+        replace(
+            build_prior(BroadcastPrior(), true.focal, true.image_size),
+            rotation=true.rotation,
+            rotation_std=np.array([np.inf, *[2e-3] * 5]),
+        ),
         TermWeights(field=1.3, player=0.4, flow=0.7),
         np.array([np.inf] * 3 + [1e-3, 1e-2, 1e-2, 1e-2]),
         2.0,

@@ -1,5 +1,7 @@
 """Whole clips of rendered images: every frame's camera against the true one."""
 
+import re
+
 import numpy as np
 import pytest
 import turning_clip as clip
@@ -10,9 +12,11 @@ from data_contracts.broadcast_calibration import (
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.given_camera import GivenCamera
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
+from worldpose.geometry.pan_tilt import camera_angles
 from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.settings import RenderingSettings
 
@@ -205,3 +209,64 @@ def test_without_any_paint_players_hold_the_camera(true, bare):
     assert np.median(place_errors(held.camera, true)) < 0.5
     # Clicks alone do not tell the place as well.
     assert np.median(place_errors(held.camera, true)) < np.median(place_errors(alone.camera, true))
+
+
+def camera_data(true, pan_off=0.0, focal=1.0):
+    """Camera data with an offset of the pan [deg], counts of the zoom, and no k1 and k2."""
+    values = np.full((FRAMES, 10), np.nan)
+    values[:, :3] = np.stack(camera_angles(true.camera), axis=1) + [pan_off, 0.0, 0.0]
+    values[:, 3:6] = true.center + [0.2, -0.1, 0.1]
+    values[:, 6], values[:, 9] = focal * true.focal, 9e4 - true.focal
+    return GivenCamera(values)
+
+
+def calibrate_given(given, pictures, keys=None):
+    size = pictures[0].shape[::-1]
+    proposed = given.propose_key_frames(clip.PITCH, size, SETTINGS.prior)
+    found = BroadcastClip(
+        keys or proposed, lambda: iter(pictures), FPS, proposed=not keys, given=given
+    )
+    return calibrate_broadcast(clip.PITCH, found, SETTINGS)
+
+
+def test_camera_data_start_a_clip_without_clicks_and_are_compared(true, pictures):
+    found = calibrate_given(camera_data(true, pan_off=0.1, focal=1.005), pictures)
+    errors = place_errors(found.camera, true)
+    assert np.median(errors) < 0.7
+    said = " ".join(found.report.decisions)
+    pan = re.search(r"pan \[deg\] ([+-][0-9.]+) \(median\), within ([0-9.]+)", said)
+    assert float(pan[1]) == pytest.approx(0.1, abs=0.08)
+    assert float(pan[2]) < 0.02
+    assert "rank correlation of zoom counts and focal length: -1.000" in said
+    assert not any("camera data" in reason for reason in found.report.reasons)
+
+
+def test_paint_refuses_camera_data_of_another_view(true, pictures):
+    with pytest.raises(InputError, match=r"painted lines where the camera data project them"):
+        calibrate_given(camera_data(true, pan_off=4.0), pictures)
+
+
+def test_key_frames_overrule_camera_data_that_contradict_them(calibrated, true, pictures):
+    keys = [clicks(true, 3), clicks(true, 12)]
+    given = camera_data(true, pan_off=20.0, focal=np.nan)
+    with pytest.raises(InputError, match="camera data with angles, place and focal"):
+        calibrate_given(given, pictures)
+    found = calibrate_broadcast(
+        clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS, given=given), SETTINGS
+    )
+    (told,) = [each for each in found.report.reasons if "are no prior: pan [deg]" in each]
+    assert float(told.rpartition(" ")[2]) == pytest.approx(20.0, abs=0.2)
+    np.testing.assert_allclose(found.camera.focal, calibrated.camera.focal, rtol=1e-9)
+
+
+def test_camera_data_hold_the_angles_where_nothing_else_does(true, bare):
+    """Without paint, two key frames say little; the data say the rest."""
+    given, keys = camera_data(true, pan_off=0.05), [clicks(true, 3), clicks(true, 12)]
+    alone, held = (
+        calibrate_broadcast(
+            clip.PITCH, BroadcastClip(keys, lambda: iter(bare), FPS, given=each), SETTINGS
+        )
+        for each in (None, given)
+    )
+    off = [np.abs(found.camera.center - true.center).max() for found in (alone, held)]
+    assert off[1] < min(off[0], 1.0)

@@ -60,6 +60,13 @@ def test_a_file_of_all_frames(tmp_path, content):
     assert found.changes.clamped == 2 * (SURE > 1.0).sum()
 
 
+def test_keypoints_without_scores_are_sure(tmp_path):
+    person = ultralytics()
+    person["keypoints"]["visible"] = None
+    (tmp_path / "cam.json").write_text(json.dumps([[person]]))
+    assert (read_people(tmp_path / "cam.json").people.confidence == 1.0).all()
+
+
 @pytest.mark.parametrize("person", [mmpose(), ultralytics()])
 def test_a_file_of_each_frame(tmp_path, person):
     info = {"meta_info": {}, "instance_info": [person]}

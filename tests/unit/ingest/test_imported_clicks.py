@@ -129,6 +129,21 @@ def test_a_picture_that_the_annotator_turned_is_turned_back(tmp_path, angle, kin
     np.testing.assert_allclose(drawn.xy, LINE, atol=1e-9)
 
 
+@pytest.mark.parametrize("truth", [False, True])
+def test_of_several_annotators_the_truth_or_the_last_is_read_and_told(tmp_path, truth):
+    tasks = []
+    for mark, x in (("first", 10.0), ("last", 20.0)):
+        file = label_studio(tmp_path / mark, [("halfway_far", (x, 9.0))])
+        tasks.append(json.loads(file.read_text())[0])
+    first, last = (task["annotations"][0] for task in tasks)
+    tasks[0]["annotations"] = [first | {"ground_truth": truth}, last]
+    file.write_text(json.dumps(tasks[:1]))
+    report = import_clicks(file, match(tmp_path / "m"))
+    points, _ = clicked(tmp_path / "m")
+    assert points["halfway_far"][0] == pytest.approx(10.0 if truth else 20.0)
+    assert "one of 2 annotations" in report.notes[0]
+
+
 def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
     file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
     (task,) = json.loads(file.read_text())

@@ -1,6 +1,7 @@
 """Cameras that are knocked, sway, or lose frames within a clip: which one, when and how much."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from worldpose.triangulation.camera_changes import (
     move_on,
     triangulate_views,
 )
-from worldpose.triangulation.clock_courses import trace_clocks
+from worldpose.triangulation.clock_courses import add_slow_drifts, trace_clocks
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -56,9 +57,9 @@ def late(pixels, *_):
     return np.concatenate([pixels[:120], pixels[125:]])
 
 
-def fast(pixels, *_):
+def fast(pixels, *_, rate=1.02):
     """Each image shows a moment 2 % later than the one before."""
-    at = np.arange(FRAMES) * 1.02
+    at = np.arange(FRAMES) * rate
     low = at.astype(int)
     share = (at - low)[:, None, None, None]
     return (1.0 - share) * pixels[low] + share * pixels[low + 1]
@@ -172,6 +173,17 @@ def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
     rows, values = np.array(courses[BAD]).T
     assert abs(rows[-1] - 120) <= 5
     np.testing.assert_allclose(values, [0.0, 0.0, 5.0], atol=0.15)
+
+
+def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
+    people = view(cameras, partial(fast, rate=1.01))
+    untracked = replace(people, detection_index=np.empty((0, 0, 0), np.int16))
+    given = [[(0, 0.0)], [(0, 0.0)], [(0, 0.5)], [(0, 0.0)]]
+    courses = add_slow_drifts(given, cameras, untracked, FPS, max_offset_s=0.4)
+    assert [len(course) for course in courses] == [1, 1, 2, 1]
+    rows, values = np.array(courses[BAD]).T
+    assert rows.tolist() == [0, FRAMES - 1]
+    np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
 
 
 CAMERA = Camera.from_matrices(

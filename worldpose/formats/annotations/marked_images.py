@@ -40,12 +40,14 @@ class MarkedImage:
         size: width, height [px]; None where the file has shares of them in place of pixels.
         points: label and (2,) pixel of every click, in the order of the file.
         lines: label and (points, 2) pixels of every drawn line.
+        answers: people who marked the image, of whom one is read.
     """
 
     name: str
     size: tuple[int, int] | None
     points: tuple[tuple[str, Floats], ...]
     lines: tuple[tuple[str, Floats], ...]
+    answers: int = 1
 
     def of_size(self, size: tuple[int, int]) -> MarkedImage:
         """Return the image with pixels, in a size that the file may lack."""
@@ -204,7 +206,7 @@ def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
         name = names[0] if names else f"task {number}"
         regions = [
             _Region.model_validate(each)
-            for each in (answers[-1].result if answers else ())
+            for each in Answer.choose(answers).result
             if each.get("type") in _LABELS
         ]
         sizes = {(region.original_width, region.original_height) for region in regions}
@@ -214,7 +216,7 @@ def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
         points = ((label, at[0]) for kind, label, at in shapes if kind == "keypointlabels")
         lines = ((label, at) for kind, label, at in shapes if kind != "keypointlabels")
         if sizes:
-            yield MarkedImage(name, sizes.pop(), tuple(points), tuple(lines))
+            yield MarkedImage(name, sizes.pop(), tuple(points), tuple(lines), len(answers))
 
 
 def _full_task(task: Any) -> Any:  # noqa: ANN401

@@ -1,0 +1,127 @@
+"""Camera data of tracking systems: FreeD packets by hand, tables, and the axes of both."""
+
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.formats.camera_data import (
+    COLUMNS,
+    apply_zoom_table,
+    read_camera_data,
+    write_camera_data,
+)
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.pan_tilt import camera_angles, rotation_of_angles
+from worldpose.geometry.rigid import Rigid
+
+PACKET = bytes.fromhex("D107 2D0000 F10000 000000 00FA00 FE0C00 017700 001234 000001 0000 87")
+"""Camera 7: pan 90, tilt -30, roll 0 degrees; 1, -2, 1.5 m; zoom 4660. 40 - B9 (the sum) = 87."""
+SIZE = (1920, 1080)
+
+
+def packet(**changed):
+    content = bytearray(PACKET)
+    for place, value in changed.items():
+        content[int(place[1:])] = value
+    content[-1] = (0x40 - sum(content[:-1])) % 256
+    return bytes(content)
+
+
+def read(tmp_path, content, name="data", **options):
+    file = tmp_path / name
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_camera_data(file, 25.0, SIZE, **options)
+
+
+def test_a_packet_is_read_as_computed_by_hand(tmp_path):
+    data = read(tmp_path, PACKET + packet(b2=0xA6, b3=0, b4=0), first=10)
+    assert data.frame.tolist() == [10, 11]
+    expected = [90.0, -30.0, 0.0, 1.0, -2.0, 1.5, np.nan, np.nan, np.nan, 4660.0]
+    np.testing.assert_array_equal(data.values[0], expected)
+    assert data.values[1, 0] == -180.0
+    assert any("no focal length" in note for note in data.notes)
+    mixed = read(tmp_path, PACKET + packet(b1=8, b2=0) + PACKET, number=8)
+    np.testing.assert_array_equal(mixed.values[:, 0], [0.0])
+
+
+@pytest.mark.parametrize(
+    ("angles", "right", "down", "ahead"),
+    [
+        ((0.0, 0.0, 0.0), (1, 0, 0), (0, 0, -1), (0, 1, 0)),
+        ((90.0, 0.0, 0.0), (0, -1, 0), (0, 0, -1), (1, 0, 0)),  # clockwise from above
+        ((0.0, 90.0, 0.0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),  # upwards
+        ((0.0, 0.0, 90.0), (0, 0, -1), (-1, 0, 0), (0, 1, 0)),  # clockwise from behind
+    ],
+)
+def test_angles_turn_the_axes_of_the_camera(angles, right, down, ahead):
+    rotation = rotation_of_angles(*np.array(angles)[:, None])[0]
+    np.testing.assert_allclose(rotation, [right, down, ahead], atol=1e-12)
+
+
+def test_angles_of_a_rotation_are_those_that_made_it():
+    given = np.random.default_rng(1).uniform(-80.0, 80.0, (3, 9))
+    pose = Rigid(rotation_of_angles(*given), np.zeros(3))
+    camera = Camera(np.ones(2), np.zeros(2), np.zeros(5), pose, np.array(SIZE))
+    np.testing.assert_allclose(camera_angles(camera), given, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (PACKET + PACKET[:-1] + b"\x88", r"packet 2: expected .* checksum 87, found .* with 88"),
+        (PACKET + PACKET[:20], r"packet 2: expected 29 bytes .* found 20 bytes"),
+        (PACKET + b"\xd2" + PACKET[1:], r"packet 2: expected .* type D1"),
+        (PACKET + packet(b1=8), r"1 of camera 7, 1 of camera 8.*--freed-camera"),
+        (packet(b5=0x2E), r"entry 1: tilt: expected at most 90, found 92"),
+        ("pan,tilt,z\n1,2,15000\n", "entry 1: z_m: expected at most 300.*state the unit"),
+        ("pan,tilt,focal_px\n1,2,0\n", "entry 1: focal_px: .* at least 1, found 0"),
+        ("pan,tilt\n1,2\n1,x\n", r"column tilt: entry 2: expected a number, found 'x'"),
+        ("pan,x\n1,2\n", "columns pan, tilt"),
+        ("pan,tilt,pan (deg)\n1,2,3\n", "every column once"),
+        ("frame,pan,tilt\n3,1,1\n3,1,1\n", "entry 2: expected frames that rise"),
+        ("frame,pan,tilt\n3.5,1,1\n", "whole numbers"),
+        ("timecode,pan,tilt\n10:00:00:25,1,1\n", "HH:MM:SS:FF at 25"),
+        ("pan,tilt,focal_mm\n1,2,50\n", "focal_mm with sensor_width_mm"),
+        ("pan,tilt,fov,focal_px\n1,2,50,9\n", "Keep one"),
+    ],
+)
+def test_what_cannot_be_right_is_refused_with_its_place(tmp_path, content, message):
+    with pytest.raises(InputError, match=f"(?s){message}"):
+        read(tmp_path, content)
+
+
+def test_tables_have_units_time_codes_and_decimal_commas(tmp_path):
+    table = (
+        "TC;Pan (deg);tilt_deg;Roll;X [mm];y_cm;Pos Z;FOV;K1;K2;Iris\n"
+        "09:59:59:24;1,5;-2;0;1000;200;3;90;0,1;0,2;4\n"
+        "10:00:00:01;1,5;-2;;;;;90;;;4\n"
+    )
+    data = read(tmp_path, table.encode("utf-16"), first=7)
+    assert data.frame.tolist() == [7, 9]
+    np.testing.assert_allclose(data.values[0], [1.5, -2, 0, 1, 2, 3, 960, 0.1, 0.2, np.nan])
+    assert np.isnan(data.values[1, [2, 3, 4, 5, 7, 8]]).all()
+    assert any("left out: Iris" in note for note in data.notes)
+    dropped = "timecode,pan,tilt\n00:00:59;29,0,0\n00:01:00;02,0,0\n"
+    file = tmp_path / "dropped.csv"
+    file.write_text(dropped)
+    assert read_camera_data(file, 29.97, SIZE).frame.tolist() == [0, 1]
+    wide = "pan,tilt,focal_mm,sensor_width_mm,zoom\n1,2,96,9.6,5\n"
+    assert read(tmp_path, wide).values[0, 6] == 19200.0
+
+
+def test_what_is_written_is_read_again_and_a_lens_table_gives_focal_lengths(tmp_path):
+    data = read(tmp_path, PACKET + packet(b21=0x20) + packet(b21=0x40))
+    lens = tmp_path / "lens.csv"
+    lens.write_text("zoom,focal_px\n9000,1000\n4000,2000\n")
+    focal = apply_zoom_table(data, lens, SIZE)
+    np.testing.assert_allclose(focal.values[:2, 6], [1868.0, 1151.2])  # counts 4660 and 8244
+    assert np.isnan(focal.values[2, 6])
+    assert any("1 rows" in note for note in focal.notes)
+    write_camera_data(tmp_path / "again.csv", focal)
+    again = read_camera_data(tmp_path / "again.csv", 25.0, SIZE)
+    np.testing.assert_allclose(again.values, focal.values, rtol=1e-8)
+    assert [*COLUMNS[7:9]] == ["k1", "k2"]
+    assert "k1" not in (tmp_path / "again.csv").read_text()
+    lens.write_text("zoom,focal_px\n1,5\n2,5\n")
+    with pytest.raises(InputError, match="only rises or only falls"):
+        apply_zoom_table(data, lens, SIZE)

@@ -1,0 +1,257 @@
+"""Camera data of broadcast tracking systems: FreeD packets, and tables with a row per image.
+
+FreeD's conventions hold for all forms: a right-handed world with z up; pan from the y axis
+clockwise as seen from above, tilt upwards, roll clockwise as seen from behind the camera.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats, Integers
+from data_contracts.conventions import UNITS
+from worldpose.errors import InputError
+from worldpose.formats.tables import write_rows
+from worldpose.parsing import read_cells
+
+_BYTES: Final = 1 << 26
+"""Maximum size of a file [byte]: twelve hours of packets at 50 Hz."""
+COLUMNS: Final = ("pan", "tilt", "roll", "x_m", "y_m", "z_m", "focal_px", "k1", "k2", "zoom")
+"""Columns of a table of camera data in a match folder, beside `frame`."""
+_LIMITS: Final = (360.0, 90.0, 180.0, 300.0, 300.0, 300.0, 1e6, 1e3, 1e3, 1e9)
+"""Largest absolute values of these columns."""
+COUNTS: Final = "zoom counts are no focal length: without --zoom-table, they are compared alone"
+"""Note of data whose zoom is in counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraData:
+    """What a tracking system states about one camera.
+
+    Attributes:
+        frame: (rows,) numbers of the images in the video, rising.
+        values: (rows, 10) as COLUMNS: angles [deg], center [m], focal length [px], OpenCV's k1 and
+            k2 [1], and counts of the zoom, which only rise or only fall with the focal length; NaN
+            where nothing is stated.
+        notes: sentences about what was assumed and left out.
+    """
+
+    frame: Integers
+    values: Floats
+    notes: tuple[str, ...] = ()
+
+
+def write_camera_data(path: Path, data: CameraData) -> None:
+    """Write camera data as a table that `read_camera_data` reads, without empty columns."""
+    known = np.flatnonzero(np.isfinite(data.values).any(axis=0))
+    head = ",".join(["frame", *(COLUMNS[n] for n in known)])
+    write_rows(path, [head], [(data.frame, "%d"), (data.values[:, known], "%.9g")], ",")
+
+
+def read_camera_data(
+    path: Path, fps: float, size: tuple[int, int], first: int | None = None, *, number: int = -1
+) -> CameraData:
+    """Return the camera data of a file.
+
+    Args:
+        path: FreeD packets one after another, or a table (CSV, TSV).
+        fps: images per second of the video, for time codes.
+        size: width and height of the image [px], for fields of view.
+        first: number in the video of the first row; None = the table's number, else 0.
+        number: FreeD's number of the camera; -1 = there is only one.
+
+    Raises:
+        InputError: another form, a wrong checksum, a missing or unknown column, no number, frames
+            that do not rise, or a value out of bounds; the error names packet or row.
+    """
+    content = b""
+    if path.is_file() and path.stat().st_size <= _BYTES:
+        content = path.read_bytes()
+    is_freed = content.startswith(b"\xd1")
+    data = _read_freed(path, content, number) if is_freed else _read_table(path, fps, size)
+    frame = data.frame if first is None else data.frame - data.frame[0] + first
+    falls = np.flatnonzero(np.diff(frame) <= 0)
+    if len(falls):
+        row = int(falls[0])
+        found = f"{frame[row]}, then {frame[row + 1]}"
+        raise _wrong(f"{path}: entry {row + 2}", "frames that rise, each once", found)
+    with np.errstate(invalid="ignore"):
+        off = (np.abs(data.values) > _LIMITS) | (data.values[:, [6]] < 1.0) & (np.arange(10) == 6)
+    for row, column in np.argwhere(off)[:1]:
+        where = f"{path}: entry {row + 1}: {COLUMNS[column]}"
+        expected = f"at most {_LIMITS[column]:g}" + (", at least 1" if column == 6 else "")
+        todo = "Correct it, or state the unit in the title, as in x_mm."
+        raise _wrong(where, expected, f"{data.values[row, column]:.7g}", todo)
+    return replace(data, frame=frame)
+
+
+def _read_freed(path: Path, content: bytes, number: int) -> CameraData:
+    """Return the camera data of FreeD packets of one camera.
+
+    Angles are signed 24-bit numbers of 1/32768 degree, positions of 1/64 mm. Zoom is a count.
+    """
+    length = 29  # of a packet with a camera's position (type D1)
+    packets = [content[at : at + length] for at in range(0, len(content), length)]
+    for count, packet in enumerate(packets, 1):
+        checksum = (0x40 - sum(packet[:-1])) % 256
+        if len(packet) < length or packet[0] != 0xD1 or packet[-1] != checksum:
+            expected = f"{length} bytes of type D1 with the checksum {checksum:02X}"
+            found = f"{len(packet)} bytes of type {packet[0]:02X} with {packet[-1]:02X}"
+            todo = "Cut the packet out, or record them again."
+            raise _wrong(f"{path}: packet {count}", expected, found, todo)
+    ids = [packet[1] for packet in packets]
+    if number not in (set(ids) if len(set(ids)) > 1 else {-1, *ids}):
+        counts = (f"{ids.count(each)} of camera {each}" for each in sorted(set(ids)))
+        expected = "packets of one camera" if number < 0 else f"packets of camera {number}"
+        todo = "Name the camera by --freed-camera NUMBER."
+        raise _wrong(str(path), expected, ", ".join(counts), todo)
+    kept = [packet for packet, own in zip(packets, ids, strict=True) if number in (-1, own)]
+    raw = np.frombuffer(b"".join(kept), np.uint8).reshape(-1, length)[:, 2:23].astype(np.int64)
+    counts_24 = raw.reshape(-1, 7, 3) @ np.array([65536, 256, 1])
+    signed = counts_24 - (counts_24 >= 1 << 23) * (1 << 24)
+    values = np.full((len(raw), len(COLUMNS)), np.nan)
+    values[:, :3], values[:, 9] = signed[:, :3] / 32768.0, counts_24[:, 6]
+    notes = [COUNTS, "packets have no times: each is one frame of the video"]
+    if signed[:, 3:6].any():
+        values[:, 3:6] = signed[:, 3:6] / 64e3
+    else:
+        notes.append("the packets state no position")
+    return CameraData(np.arange(len(raw)), values, tuple(notes))
+
+
+_TITLES: Final[Mapping[str, str]] = {
+    **{"frame_number": "frame", "frame_no": "frame", "tc": "timecode", "time_code": "timecode"},
+    **{"focal_length_px": "focal_px", "focal_length_mm": "focal_mm", "vfov": "fov_y"},
+    **{"fov_x": "fov", "hfov": "fov", "fov_h": "fov", "fov_v": "fov_y"},
+}
+"""Other names of columns; `_deg` may follow those of angles, and a unit of length x, y, z."""
+_KNOWN: Final = {
+    *("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y"),
+}
+_METRES: Final[Mapping[str, float]] = {"": 1.0} | {unit: each[0] for unit, each in UNITS.items()}
+
+
+def _read_columns(
+    path: Path, needed: Sequence[str]
+) -> tuple[dict[str, Floats], list[str], list[str]]:
+    """Return the numbers of known columns, cells of time codes, and titles of unknown columns."""
+    todo = "Name the columns so; x, y and z may have a unit, as in x_mm."
+    rows, has_commas = read_cells(path, _BYTES, todo)
+    columns: dict[str, Floats] = {}
+    codes, left_out = [], []
+    for place, title in enumerate(rows[0][1] if rows else ()):
+        text = re.sub(r"[^a-z0-9]+", "_", title.lower()).strip("_").removesuffix("_deg")
+        axis = re.fullmatch(r"(?:pos_|position_)?([xyz])(?:_([a-z]+))?", text)
+        factor = _METRES.get(axis[2] or "", 0.0) if axis else 1.0
+        name = f"{axis[1]}_m" if axis and factor else _TITLES.get(text, text)
+        cells = [row[place].strip() if place < len(row) else "" for _, row in rows[1:]]
+        where = f"{path}: column {title}"
+        if name not in _KNOWN:
+            left_out.append(title.strip())
+        elif name in columns:
+            raise _wrong(where, "every column once", f"{name} again")
+        elif name == "timecode":
+            codes = cells
+        else:
+            columns[name] = factor * _numbers(where, cells, "," if has_commas else ".")
+    if not {*needed} <= columns.keys() or len(rows) < 2:
+        expected = f"rows with the columns {', '.join(needed)}, of {', '.join(sorted(_KNOWN))}"
+        raise _wrong(str(path), expected, f"{len(rows)} rows, {', '.join(columns) or '-'}", todo)
+    return columns, codes, left_out
+
+
+def _numbers(where: str, cells: Sequence[str], decimal: str) -> Floats:
+    """Return the numbers of a column; NaN where a cell is empty."""
+    values = np.full(len(cells), np.nan)
+    for n, text in enumerate(cells):
+        try:
+            values[n] = float(text.replace(decimal, ".") or "nan")
+        except ValueError:
+            values[n] = np.inf
+        if np.isinf(values[n]):
+            raise _wrong(f"{where}: entry {n + 1}", "a number", repr(text))
+    return values
+
+
+def _read_table(path: Path, fps: float, size: tuple[int, int]) -> CameraData:
+    """Return the camera data of a table with a row per image."""
+    columns, codes, left_out = _read_columns(path, ("pan", "tilt"))
+    unknown = np.full(len(columns["pan"]), np.nan)
+    notes = [f"columns left out: {', '.join(left_out)}"] if left_out else []
+    frame = columns.get("frame", np.arange(len(unknown), dtype=np.float64))
+    if "frame" not in columns and codes:
+        frame = np.array([_frames(path, n, text, fps) for n, text in enumerate(codes, 1)])
+        frame = frame - frame[0]
+        notes.append(f"time code {codes[0]} is the first frame")
+    elif "frame" not in columns:
+        notes.append("the table has no frames: each row is one frame of the video")
+    if not (np.abs(frame) < 1e9).all() or (frame != np.floor(frame)).any():
+        raise _wrong(f"{path}: column frame", "whole numbers", "others")
+    columns["focal_px"] = _focal_lengths(path, columns, size)
+    values = np.stack([columns.get(name, unknown) for name in COLUMNS], axis=1)
+    return CameraData(frame.astype(np.int64), values, tuple(notes))
+
+
+def _focal_lengths(path: Path, columns: Mapping[str, Floats], size: tuple[int, int]) -> Floats:
+    """Return focal lengths [px], also from those in millimetres, or from fields of view."""
+    given = [name for name in ("focal_px", "focal_mm", "fov", "fov_y") if name in columns]
+    if not given:
+        return np.full(len(next(iter(columns.values()))), np.nan)
+    values = columns[given[0]]
+    if given == ["focal_px"]:
+        return values
+    if given == ["focal_mm"] and "sensor_width_mm" in columns:
+        return values * size[0] / columns["sensor_width_mm"]
+    if given in (["fov"], ["fov_y"]):
+        return 0.5 * size[given == ["fov_y"]] / np.tan(np.radians(0.5 * values))
+    expected = "one of focal_px, fov, fov_y, or focal_mm with sensor_width_mm"
+    raise _wrong(str(path), expected, ", ".join(given), "Keep one of these columns.")
+
+
+def apply_zoom_table(data: CameraData, path: Path, size: tuple[int, int]) -> CameraData:
+    """Return camera data with the focal lengths of their zoom counts, linear between the rows.
+
+    Args:
+        data: camera data with zoom counts.
+        path: a table of the lens: the column zoom, and one of the focal length or field of view.
+        size: width and height of the image [px].
+
+    Raises:
+        InputError: the table is invalid, or its focal length does not only rise or only fall.
+    """
+    columns, _, _ = _read_columns(path, ("zoom",))
+    order = np.argsort(columns["zoom"])
+    zoom, focal = columns["zoom"][order], _focal_lengths(path, columns, size)[order]
+    steps = np.diff([zoom, focal * np.sign(focal[-1] - focal[0])])
+    if not (steps > 0.0).all() or not steps.size:
+        expected = "two rows or more whose focal length only rises or only falls with zoom"
+        raise _wrong(str(path), expected, f"{len(zoom)} rows of another kind")
+    values = data.values.copy()
+    values[:, 6] = np.interp(values[:, 9], zoom, focal, left=np.nan, right=np.nan)
+    notes = [note for note in data.notes if note != COUNTS]
+    if outside := int(np.isnan(values[:, 6]).sum()):
+        notes.append(f"{outside} rows have zoom counts outside of the table of the lens")
+    return replace(data, values=values, notes=tuple(notes))
+
+
+def _frames(path: Path, number: int, text: str, fps: float) -> int:
+    """Return the count of frames of a time code, which drops numbers if it has a semicolon."""
+    found, base = re.fullmatch(r"(\d+):(\d\d):(\d\d)([:;.])(\d+)", text), round(fps)
+    if found is None or int(found[5]) >= base:
+        where = f"{path}: entry {number}: timecode"
+        raise _wrong(where, f"HH:MM:SS:FF at {fps:g} frames per second", repr(text))
+    minutes = 60 * int(found[1]) + int(found[2])
+    dropped = (minutes - minutes // 10) * round(base / 15) if found[4] == ";" else 0
+    return (60 * minutes + int(found[3])) * base + int(found[5]) - dropped
+
+
+def _wrong(
+    where: str, expected: str, found: str, todo: str = "Export the camera data again."
+) -> InputError:
+    return InputError(where, expected=expected, found=found, todo=todo)
