@@ -161,13 +161,6 @@ def routes(context: PageContext) -> APIRouter:
         context.match(match_id)
         return context.continuing.go_on(match_id, given.gates)
 
-    @router.post("/cancellation")
-    def cancel(match_id: str) -> dict[str, bool]:
-        context.match(match_id)
-        if not context.continuing.cancel(match_id):
-            raise HTTPException(409, "no run of these pages is at work: end it where it was begun")
-        return {"cancelled": True}
-
     @router.post("/corrections")
     def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:
         edits = {each.id: each.edit for each in given.edits}

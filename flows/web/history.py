@@ -68,6 +68,33 @@ def routes(context: PageContext) -> APIRouter:
         a, b = (_find_run(context.store, match_id, name) for name in (before, after))
         return describe_changes(compare_runs(context.store, a, b))
 
+    @router.get("/thumbnail")
+    def thumbnail(match_id: str) -> Response:
+        import cv2  # imported here: few pages decode an image
+
+        picture = _first_picture(context.match(match_id))
+        if picture is None:
+            raise HTTPException(404, "no camera has an image")
+        height = round(THUMBNAIL_WIDTH * picture.shape[0] / picture.shape[1])
+        small = cv2.resize(picture, (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
+        answer = image_response(np.asarray(small, dtype=np.uint8), "jpeg")
+        answer.headers["cache-control"] = "private, max-age=3600"
+        return answer
+
+    _add_changes(router, context)
+    return router
+
+
+def _add_changes(router: APIRouter, context: PageContext) -> None:
+    """Add the routes that cancel a run, and keep one by a name."""
+
+    @router.post("/cancellation")
+    def cancel(match_id: str) -> dict[str, bool]:
+        context.match(match_id)
+        if not context.continuing.cancel(match_id):
+            raise HTTPException(409, "no run of these pages is at work: end it where it was begun")
+        return {"cancelled": True}
+
     @router.post("/pins")
     def pin(match_id: str, given: GivenPin, who: Person) -> dict[str, str]:
         context.match(match_id)
@@ -87,21 +114,6 @@ def routes(context: PageContext) -> APIRouter:
     def unpin(match_id: str, name: str) -> dict[str, str]:
         context.match(match_id)
         return {"name": unpin_run(context.store.blobs, match_id, name).name}
-
-    @router.get("/thumbnail")
-    def thumbnail(match_id: str) -> Response:
-        import cv2  # imported here: few pages decode an image
-
-        picture = _first_picture(context.match(match_id))
-        if picture is None:
-            raise HTTPException(404, "no camera has an image")
-        height = round(THUMBNAIL_WIDTH * picture.shape[0] / picture.shape[1])
-        small = cv2.resize(picture, (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
-        answer = image_response(np.asarray(small, dtype=np.uint8), "jpeg")
-        answer.headers["cache-control"] = "private, max-age=3600"
-        return answer
-
-    return router
 
 
 def _find_run(store: Store, match_id: str, run_id: str) -> RunRecord:
