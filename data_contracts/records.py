@@ -19,6 +19,9 @@ See docs/reference/conventions.md.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """An id that is safe as a file and object name: cameras, clips, matches."""
 
+Label = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f]{1,64}$")]
+"""A name that people gave, on one line."""
+
 UnitName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,128}$")]
 """A unit of a stage: an id, or the ids of a camera and a clip with a dot between them."""
 

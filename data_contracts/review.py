@@ -13,6 +13,7 @@ from data_contracts.records import (
     Digest,
     Frame,
     Key,
+    Label,
     Name,
     PersonId,
     PixelCoordinate,
@@ -172,7 +173,7 @@ class SplitTrack(Record):
 
 
 class NamedTrack(Record):
-    """The roster id of a track."""
+    """The name of a track, which no result depends on."""
 
     kind: Literal["named_track"] = "named_track"
     clip: Name
@@ -180,8 +181,8 @@ class NamedTrack(Record):
     seen: Sighting | None = None
     """Detection of the person at the time of the correction; if it now belongs to another person,
     the correction does not apply."""
-    name: Name | None
-    """Id in the roster; None removes it."""
+    name: Label | None
+    """Id in the roster, or any other name; None removes it."""
 
 
 Edit = Annotated[

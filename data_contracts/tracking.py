@@ -7,7 +7,7 @@ from typing import Literal
 from data_contracts.arrays import GroupLayout, array_layout, array_layouts
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME
-from data_contracts.records import Amount, Count, Frame, Name, Number, PersonId, Record
+from data_contracts.records import Amount, Count, Frame, Label, Number, PersonId, Record
 
 PERSON = array_layout("person", "(person) int32 [1]", "person id, stable within the clip, from 0")
 
@@ -62,8 +62,8 @@ class Track(Record):
     """Frames with at least one matched detection."""
     views: Amount
     """Mean number of cameras in those frames."""
-    name: Name | None = None
-    """Roster id, where known."""
+    name: Label | None = None
+    """Roster id or name; readers take it from the journal, and no result contains it."""
     kind: Literal["triangulated", "mixed", "plane"] = "triangulated"
     """Whether views triangulate the person in all frames, in some, or in none, where the feet alone
     give a place on the pitch."""

@@ -15,6 +15,7 @@ from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import read_still, read_unit, require_footage
 from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec, require_calibrated
 from worldpose.ingest.registration import READERS, register_match
+from worldpose.store.paths import is_name
 from worldpose.store.store import Store
 
 
@@ -79,9 +80,9 @@ def find_registration(store: Store, name: str) -> Registration:
     """
     folder = Path(name)
     match_id = read_spec(folder).match_id if (folder / "match.yaml").is_file() else name
-    known = store.matches()
-    registration = store.registration(match_id) if match_id in known else None
+    registration = store.registration(match_id) if is_name(match_id) else None
     if registration is None:
+        known = store.matches()
         close = get_close_matches(match_id, known, n=1)
         meant = f"Did you mean {close[0]!r}? If not, register" if close else "Register"
         raise InputError(

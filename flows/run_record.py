@@ -60,7 +60,10 @@ def describe_end(record: RunRecord) -> str:
     said = [f"{count} {one if count == 1 else many}" for count, one, many in counts if count]
     if record.state == "partial" and not record.failed:
         said = [f"partial, not all stages have results. {' '.join(record.warnings)}", *said]
-    return f"run {record.run_id} of {record.match_id}: {', '.join(said)}"
+    elif record.state == "partial":
+        said = ["partial", *said]
+    first = f". {record.failed[0].unit}: {record.failed[0].message}" if record.failed else ""
+    return f"run {record.run_id} of {record.match_id}: {', '.join(said)}{first}"
 
 
 CLOCK_SECONDS: Final = 5.0

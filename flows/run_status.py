@@ -86,7 +86,8 @@ class UnitStatus:
     @property
     def own_reasons(self) -> tuple[Reason, ...]:
         """Causes in this unit itself; empty if only its inputs changed."""
-        return tuple(each for each in self.reasons if each not in self._input_changes)
+        inputs = {id(each) for each in self._input_changes}  # a source can have many differences
+        return tuple(each for each in self.reasons if id(each) not in inputs)
 
     @property
     def changed_inputs(self) -> tuple[str, ...]:
@@ -129,24 +130,14 @@ def unit_state(unit: PlannedUnit, record: RunRecord | None) -> UnitState:
     return UnitState.MISSING if recorded in (None, unit.key) else UnitState.STALE
 
 
-def list_unit_states(
-    store: Store, match: Match, latest: RunRecord | None
-) -> dict[UnitState, list[str]]:
-    """Return all units of a match, as `stage/unit`, by their state relative to its latest run.
+def plan_as_latest(
+    store: Store, match: Match, latest: RunRecord | None, overrides: Overrides
+) -> list[PlannedUnit]:
+    """Plan the whole method with the settings and the iteration of the latest run.
 
     Raises:
         InputError: a setting of that run names a missing file.
     """
-    units: dict[UnitState, list[str]] = {state: [] for state in UnitState}
-    for unit in _plan_as_latest(store, match, latest, {}):
-        units[unit_state(unit, latest)].append(unit.name)
-    return units
-
-
-def _plan_as_latest(
-    store: Store, match: Match, latest: RunRecord | None, overrides: Overrides
-) -> list[PlannedUnit]:
-    """Plan the whole method with the settings of the next run and the iteration of the latest."""
     found = resolve(match.layers, overrides)
     most, iteration = found.general.iterations, 1 if latest is None else latest.iteration
     iteration = iteration if most == "auto" else min(iteration, most)
@@ -353,7 +344,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     match_id, _, unit_name = name.partition("/")
     match = open_match(store, match_id)
     latest = latest_run(store, match_id)
-    planned = {unit.name: unit for unit in _plan_as_latest(store, match, latest, overrides)}
+    planned = {unit.name: unit for unit in plan_as_latest(store, match, latest, overrides)}
     if unit_name not in planned:
         raise InputError(
             name,

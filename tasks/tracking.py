@@ -20,7 +20,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import (
     Identities,
-    IdentityEdit,
+    TrackEdit,
     add_plane_tracks,
     replay_identities,
     stored_identities,
@@ -61,7 +61,7 @@ BLOCK: Final = 256
 def tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the person of each detection, with people's corrections."""
     corrections = inputs.sources.get("identities") or []
-    edits = TypeAdapter(list[IdentityEdit]).validate_python(corrections)
+    edits = TypeAdapter(list[TrackEdit]).validate_python(corrections)
     found, figures, warnings = (_open_uncorrected if edits else _track_people)(inputs)
     result.warnings += warnings
     replay = replay_identities(found, edits)

@@ -19,10 +19,11 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.match_state import match_state
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
 from flows.run_record import latest_run
-from flows.run_status import UnitState, find_run, list_unit_states
+from flows.run_status import UnitState, find_run
 from flows.settings import resolve
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
@@ -86,7 +87,7 @@ def status(
             (
                 row["match"],
                 row["run"] or "-",
-                row["state"],
+                row["now"],
                 *counts,
                 str(len(row["failed"])),
                 str(len(row["waiting"])),
@@ -99,6 +100,8 @@ def status(
             line(f"{row['match']}: {row['problem']}")
         for text in row["warnings"]:
             line(f"{row['match']}: {text}")
+        if row["why"]:
+            line(f"{row['match']}: {row['now']}. {row['why']} {row['todo']}")
         if row["waiting"]:
             line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
         for name, run_id in row["pins"].items():
@@ -117,6 +120,9 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "match": match_id,
         "run": None,
         "state": "unreadable",
+        "now": "unreadable",
+        "why": "",
+        "todo": "",
         "units": {state: [] for state in STATES},
         "failed": [],
         "left_out": {},
@@ -131,8 +137,9 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         status |= _recorded_status(store, match_id)
         latest, match = latest_run(store, match_id), open_match(store, match_id)
         status["settings"] = resolve(match.layers).overrides
-        found = list_unit_states(store, match, latest)
-        status["units"] = {state.value: names for state, names in found.items()}
+        now = match_state(store, match)
+        status["units"] |= {state.value: list(names) for state, names in now.units.items()}
+        status |= {"now": now.words, "why": now.why, "todo": now.todo}
         status["waiting"] = [unit.unit for unit in still_waiting(store, match, latest)]
     except (OSError, WorldposeError) as failure:  # a damaged record, a setting names a lost file
         status["problem"] = str(failure)

@@ -21,6 +21,7 @@ from flows.results.broadcast_views import (
     broadcast_views,
     camera_in_frames,
 )
+from flows.review.identities import names_of
 from flows.stage import Match
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel, BodyParameters
@@ -222,11 +223,14 @@ def _extra_tracks(
 
 
 def tracked_people(run: Run, clip: str) -> tuple[xr.Dataset, dict[int, Track]]:
-    """Return the tracking of one clip, and its people by id."""
+    """Return the tracking of one clip, and its people by id, with their newest names."""
     plane = f"{PLANE}/{clip}"
     tracking = run[plane if plane in run else f"tracking/{clip}"]
-    tracks = map(Track.model_validate, tracking.attrs["tracks"])
-    return tracking, {track.person: track for track in tracks}
+    names = names_of(run, clip)
+    found = {}
+    for track in map(Track.model_validate, tracking.attrs["tracks"]):
+        found[track.person] = track.model_copy(update={"name": names.get(track.person)})
+    return tracking, found
 
 
 def person_kinds(run: Run, clip: str) -> dict[int, str]:

@@ -11,10 +11,14 @@ from data_contracts.review import (
     AddedDetection,
     Correction,
     DeletedDetection,
+    MergedTracks,
     MovedKeypoint,
     MovedPoint,
+    NamedTrack,
     RedrawnMarking,
+    SplitTrack,
 )
+from flows.review.metric_words import reason_words
 from flows.review.verdicts import Review
 
 CALIBRATIONS: Final = ("static_calibration/", "broadcast_calibration/")
@@ -27,6 +31,8 @@ def review_json(shown: Review) -> dict[str, Any]:
         **shown.request.model_dump(mode="json"),
         "state": shown.state,
         "question": shown.question,
+        "said": [reason_words(each) for each in shown.request.reasons],
+        "consequences": shown.consequences,
         "decision": None if decision is None else decision.model_dump(mode="json"),
     }
 
@@ -49,6 +55,13 @@ def in_words(correction: Correction) -> str:
             for it in (edit.was, edit.xy)
         )
         return f"{edit.joint} of {place}: {was} -> {xy}"
+    if isinstance(edit, MergedTracks):
+        return f"person {edit.merged} is person {edit.kept} in {edit.clip}"
+    if isinstance(edit, SplitTrack):
+        frame = edit.first_frame_of_new
+        return f"person {edit.person} in {edit.clip} is another person from frame {frame} on"
+    if isinstance(edit, NamedTrack):
+        return f"person {edit.person} in {edit.clip} is {edit.name or 'without a name'}"
     return f"{edit.kind} {edit.model_dump_json(exclude={'kind'})}"
 
 

@@ -71,7 +71,7 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
 
 
 def _open(store: Store, match: Match, name: str) -> StoredResult:
-    return open_stored(store, match.match_id, name, "edits")
+    return open_stored(store, store.run(match.match_id), name, "edits")
 
 
 def results_of(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from pydantic import JsonValue
 
 from data_contracts.records import Record
+from data_contracts.run import RunRecord
 from worldpose.errors import InputError
 from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Store
@@ -63,7 +64,7 @@ def edits_since(
 
 
 class StoredResult(NamedTuple):
-    """A result of the latest run, without corrections if that version is stored.
+    """A result of a run, without corrections if that version is stored.
 
     `plain` is the key of the result without corrections, `edits` are those that it contains, as its
     recipe lists them.
@@ -74,10 +75,10 @@ class StoredResult(NamedTuple):
     edits: list[JsonValue]
 
 
-def open_stored(store: Store, match_id: str, name: str, source: str) -> StoredResult:
-    """Open a result of the latest run by `stage/unit`; `source` names its recipe's corrections."""
+def open_stored(store: Store, run: RunRecord, name: str, source: str) -> StoredResult:
+    """Open a run's result by `stage/unit`; `source` names its recipe's corrections."""
     stage, _, unit = name.partition("/")
-    key = store.run(match_id).results[name]
+    match_id, key = run.match_id, run.results[name]
     recipe = store.manifest(match_id, stage, unit, key).recipe
     sources = dict(recipe.sources)
     taken_in = sources.pop(source, None) or []

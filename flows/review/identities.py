@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from data_contracts.review import Edit
+from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
     StaleEditError,
+    StoredResult,
     edits_since,
     open_stored,
     require_results,
@@ -14,13 +15,16 @@ from flows.review.edit_conflicts import (
 from flows.stage import Match
 from worldpose.review.identities import (
     IDENTITY_EDITS,
+    TRACK_EDITS,
     Identities,
+    IdentityEdit,
     IdentityReplay,
     find_objection,
     replay_identities,
     stored_identities,
 )
-from worldpose.store.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Run, Store
 
 
 def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
@@ -38,9 +42,63 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     name, match_id = f"tracking/{clip}", match.match_id
     results = store.run(match_id).results if store.runs(match_id) else {}
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
-    stored = open_stored(store, match_id, name, "identities")
-    later = edits_since(said, stored.edits, f"clip {clip}", match_id)
-    return replay_identities(stored_identities(stored.result), later)
+    stored = open_stored(store, store.run(match_id), name, "identities")
+    moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
+    later = edits_since(moves, stored.edits, f"clip {clip}", match_id)
+    return _replay(stored, said, moves[: len(moves) - len(later)])
+
+
+def names_of(run: Run, clip: str) -> dict[int, str]:
+    """Return the newest names of a run's people by id.
+
+    A name belongs to no result: the journal's names are replayed over the tracks of the run, in
+    order with the merges and splits that these contain.
+    """
+    match_id, unit = run.record.match_id, f"tracking/{clip}"
+    journal = read_journal(run.store, match_id)
+    if unit not in run or not any(
+        isinstance(each.edit, NamedTrack) and each.edit.clip == clip
+        for each in journal.standing.values()
+    ):
+        return {}
+    moves = run.manifest(unit).recipe.sources.get("identities") or []
+    assert isinstance(moves, list)
+    said = []
+    for name, each in journal.corrections.items():
+        edit = each.edit
+        if not isinstance(edit, IDENTITY_EDITS) or edit.clip != clip:
+            continue
+        is_name = isinstance(edit, NamedTrack)
+        if name in journal.standing if is_name else edit.model_dump(mode="json") in moves:
+            said.append(edit)
+    stored = open_stored(run.store, run.record, unit, "identities")
+    taken = [edit for edit in said if isinstance(edit, TRACK_EDITS)] if stored.edits else []
+    return _replay(stored, said, taken, with_joints=False).identities.names
+
+
+def _replay(
+    stored: StoredResult,
+    said: Sequence[IdentityEdit],
+    taken: Sequence[IdentityEdit],
+    *,
+    with_joints: bool = True,
+) -> IdentityReplay:
+    """Replay corrections over a result that contains the merges and splits `taken` already."""
+    merged, others = list[IdentityEdit](), list[IdentityEdit]()
+    for number, edit in enumerate(said):
+        if isinstance(edit, NamedTrack):
+            person, seen = edit.person, edit.seen
+            for move in said[number + 1 :]:
+                if move in taken and isinstance(move, MergedTracks) and move.merged == person:
+                    person = move.kept
+                elif move in taken and isinstance(move, SplitTrack) and move.person == person:
+                    seen = None  # it can belong to the new person, and the name does not
+            after = edit.model_copy(update={"person": person, "seen": seen})
+            (others if person == edit.person else merged).append(after)
+        elif edit not in taken:
+            others.append(edit)
+    tracks = stored_identities(stored.result, with_joints=with_joints)
+    return replay_identities(tracks, [*merged, *others])  # a person's own name counts more
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:

@@ -1,7 +1,4 @@
-"""Names of metrics, and reasons of gates, as people read them; the journal keeps them as they are.
-
-The pages have the same rules in `infra/review_pages/src/words.js`.
-"""
+"""Names of metrics, and reasons of gates, as people read them; the journal keeps the originals."""
 
 from __future__ import annotations
 
@@ -20,8 +17,32 @@ UNITS: Final[Mapping[str, str]] = {
     "hz": "Hz",
 }
 """Last part of a metric's name to its unit."""
-_WORDS: Final[Mapping[str, str]] = {"clicks_wrong": "outlier clicks"}
-"""Metrics whose names alone mislead."""
+_WORDS: Final[Mapping[str, str]] = {
+    "expected_ground_error_median_m": "expected error on the pitch",
+    "expected_ground_error_p95_m": "expected error on the worst part of the pitch",
+    "clicks_wrong": "clicks that contradict the others",
+    "unreadable_share": "frames without a readable image",
+    "empty_share": "images without people",
+    "bridged_share": "boxes filled in between two frames",
+    "flicker_share": "people seen for moments only",
+    "contradictions": "cameras that contradict each other",
+    "undecided": "uncertain joins of two tracks",
+    "unmatched_share": "detections that belong to no track",
+    "mean_ray_distance_m": "disagreement of the cameras about a person",
+    "corrections_refused": "corrections that do not fit any more",
+    "standard_deviation_m": "uncertainty of the joints",
+    "filled_share": "frames in which no camera sees the person",
+    "held_out_error_after_px": "error in people that were kept back",
+    "held_out_growth": "error in people that were kept back, relative to before",
+    "offset_rms_m": "distance of bodies from the seen joints",
+    "held_out_certain_excess_m": "bodies are worse than joints by",
+    "expected_error_median_px": "expected error of the drawn pitch",
+}
+"""Metrics of gates as operators say them."""
+_FLAGS: Final[Mapping[str, str]] = {
+    "weak": "the camera is uncertain: more clicks are needed where none are"
+}
+"""Metrics that are 0 or 1, and what 1 says."""
 _BEYOND: Final = re.compile(
     r"(?P<name>\w+) is (?P<value>\S+?)(?P<parts> \(.*\))?, at most (?P<limit>\S+) passes"
 )
@@ -30,18 +51,26 @@ _UNKNOWN: Final = re.compile(r"(?P<name>\w+) could not be computed")
 
 def metric_words(name: str) -> tuple[str, str]:
     """Return a metric's name in words, and its unit; `offset_rms_m` is `offset rms` in `m`."""
-    if name in _WORDS:
-        return _WORDS[name], ""
     rest, _, last = name.rpartition("_")
     unit = UNITS.get(last, "") if rest else ""
-    return (rest if unit else name).replace("_", " "), unit
+    return _WORDS.get(name, (rest if unit else name).replace("_", " ")), unit
+
+
+def quantity(name: str, value: float) -> str:
+    """Format the value of a metric with its unit: short lengths in cm, shares in percent."""
+    unit = metric_words(name)[1]
+    if unit == "m" and abs(value) < 1.0:
+        return f"{100.0 * value:.3g} cm"
+    if name.endswith("_share"):
+        return f"{100.0 * value:.3g} %"
+    return f"{value:.4g} {unit}".rstrip()
 
 
 def reason_words(reason: str) -> str:
     """Return a gate's reason in words.
 
-    `offset_rms_m is 0.05, at most 0.03 passes` becomes `offset rms: 0.05 m, limit 0.03 m`; a reason
-    that a person or a method wrote stays.
+    `filled_share is 0.1, at most 0.05 passes` becomes `frames in which no camera sees the person:
+    10 %, limit 5 %`; a reason that a person or a method wrote stays.
     """
     found = _BEYOND.fullmatch(reason)
     if found is None:
@@ -49,10 +78,11 @@ def reason_words(reason: str) -> str:
         if unknown is None:
             return reason
         return f"{metric_words(unknown['name'])[0]} could not be computed"
-    name, unit = metric_words(found["name"])
-    behind = f" {unit}" if unit else ""
-    parts = found["parts"] or ""
-    return f"{name}: {found['value']}{behind}{parts}, limit {found['limit']}{behind}"
+    name, parts = found["name"], found["parts"] or ""
+    if name in _FLAGS:
+        return _FLAGS[name]
+    value, limit = (quantity(name, float(found[each])) for each in ("value", "limit"))
+    return f"{metric_words(name)[0]}: {value}{parts}, limit {limit}"
 
 
 def all_reasons(reasons: Iterable[str]) -> str:

@@ -29,7 +29,7 @@ from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.review.detections import DETECTION_EDITS
-from worldpose.review.identities import IDENTITY_EDITS
+from worldpose.review.identities import TRACK_EDITS
 from worldpose.review.journal import Journal, last_decision, requests_by_id, say
 from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Run, Store
@@ -70,6 +70,19 @@ class Review:
         gate = GATES.get(self.request.gate)
         return "Is it good enough to be built upon?" if gate is None else gate.question
 
+    @property
+    def consequences(self) -> dict[str, str]:
+        """What approving and rejecting will do."""
+        gate = GATES.get(self.request.gate)
+        fix = "its input" if gate is None else gate.to_correct
+        uses = "uses it as it is"
+        if self.request.gate == "camera_consistency":
+            uses = "leaves these cameras out"
+        return {
+            "approve": f"Approve: the run goes on and {uses}.",
+            "reject": f"Reject: nothing later uses it. Correct {fix}; then it is computed again.",
+        }
+
 
 def reviews_of(store: Store, match: Match, latest: RunRecord | None) -> list[Review]:
     """Return all of a match's review requests, first to last."""
@@ -84,6 +97,11 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
     """
     if latest is None or not latest.waiting:
         return frozenset()
+    once = ("corrected_units", latest.run_id)  # a page asks several times
+    return match.once(once, lambda: _find_corrected(store, match, latest))
+
+
+def _find_corrected(store: Store, match: Match, latest: RunRecord) -> frozenset[str]:
     results = latest.results
     held = {unit.unit for unit in latest.waiting}
     usable = {name: key for name, key in results.items() if name not in held}
@@ -308,7 +326,7 @@ def unit_origins(
         if isinstance(edit, MovedPoint | RedrawnMarking):
             stage = "static_calibration" if edit.frame is None else "broadcast_calibration"
             corrected.add(f"{stage}/{edit.camera}")
-        elif isinstance(edit, IDENTITY_EDITS):
+        elif isinstance(edit, TRACK_EDITS):
             corrected.add(f"tracking/{edit.clip}")
         elif isinstance(edit, DETECTION_EDITS):
             found = f"detection/{edit.camera}"

@@ -113,7 +113,7 @@ class AlertDispatcher:
 
     def __init__(self, state: StateFolder, channels: Sequence[Channel]) -> None:
         self.state, self.channels = state, tuple(channels)
-        self._told = _kept_alerts(state)
+        self._told = kept_alerts(state)
         self._lock = Lock()
 
     def hold(self, alerts: Iterable[Alert]) -> None:
@@ -174,7 +174,7 @@ class AlertDispatcher:
             LOG.warning("%s cannot be written: %s", self.state.alerts, error.strerror)
 
 
-def _kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
+def kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
     """Return the sent alerts; empty if the file is damaged, so that they are sent again."""
     try:
         kept = json.loads(state.alerts.read_text())

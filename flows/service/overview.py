@@ -14,7 +14,9 @@ from typing import Final, Literal
 from data_contracts.review import ReviewRecord, ReviewRequest
 from data_contracts.run import RunRecord
 from flows.gates import GATES
+from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
+from flows.registering import open_for_review
 from flows.results.timings import Cost
 from flows.review.metric_words import all_reasons
 from flows.run_record import latest_run
@@ -25,7 +27,9 @@ from worldpose.store.store import Store
 UnitState = Literal["done", "waiting", "failed", "blocked"]
 
 ALWAYS_READ: Final = 4
-"""Matches that every look reads."""
+"""Matches that every look reads, unless there are `MANY`."""
+MANY: Final = 100
+"""Of more matches, a look reads no more than its time allows."""
 REREAD_SECONDS: Final = 60.0
 """Age at which a status is read again without a change: a file can be damaged."""
 BODIES = "body_fitting"
@@ -66,6 +70,7 @@ class MatchStatus:
         latest: its latest finished run.
         at_work_since: start of a run that has not ended.
         stages: stage to its units, in the order of the method.
+        now: the state with what to do; None if it was not read.
         problem: why its status is not readable.
         is_unseen: whether it was not read yet.
     """
@@ -74,6 +79,7 @@ class MatchStatus:
     latest: RunRecord | None = None
     at_work_since: datetime | None = None
     stages: Mapping[str, tuple[UnitSummary, ...]] = field(default_factory=dict)
+    now: MatchState | None = None
     problem: str = ""
     is_unseen: bool = False
 
@@ -102,10 +108,13 @@ class MatchStatus:
 
 
 class Overview:
-    """Repeated reads of a project's status; immutable data is read once."""
+    """Repeated reads of a project's status; immutable data is read once.
 
-    def __init__(self, store: Store) -> None:
-        self.store = store
+    Only with states it opens match folders and plans their next runs, which takes longer.
+    """
+
+    def __init__(self, store: Store, *, with_states: bool = False) -> None:
+        self.store, self.with_states = store, with_states
         self._manifest = cache(store.manifest)
         self._poses = cache(lambda match_id, run_id: _poses_of(store.run(match_id, run_id)))
         self._known: dict[str, tuple[object, MatchStatus]] = {}
@@ -122,7 +131,8 @@ class Overview:
         begun = time.monotonic()
         oldest = sorted(names, key=lambda name: self._seen_at.get(name, 0.0))
         for number, match_id in enumerate(oldest):
-            if number >= ALWAYS_READ and time.monotonic() - begun > budget:
+            is_late = time.monotonic() - begun > budget
+            if is_late and number and (number >= ALWAYS_READ or len(names) > MANY):
                 break
             try:
                 self._match(match_id)
@@ -159,7 +169,8 @@ class Overview:
         last = "" if latest is None else latest.run_id
         at_work = [each.started_at for each in begun if each.run_id > last]
         stages = {} if latest is None else self._stages(latest)
-        return MatchStatus(match_id, latest, at_work[-1] if at_work else None, stages)
+        now = state_now(self.store, match_id) if self.with_states else None
+        return MatchStatus(match_id, latest, at_work[-1] if at_work else None, stages, now)
 
     def _stages(self, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:
         records = read_journal(self.store, run.match_id).questions
@@ -207,6 +218,14 @@ class Overview:
         request = asked.get(waits.request)
         since = run.finished_at if request is None else request.created_at
         return replace(done, state="waiting", waiting_since=since, why=all_reasons(waits.reasons))
+
+
+def state_now(store: Store, match_id: str) -> MatchState:
+    """Return the state of a match; of one that cannot be opened, the reason."""
+    try:
+        return match_state(store, open_for_review(store, match_id))
+    except (OSError, WorldposeError) as error:
+        return describe_problem(error)
 
 
 def age(since: datetime | None) -> float:

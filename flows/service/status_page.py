@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from data_contracts.operations import Arrival
 from flows.method import METHOD
 from flows.review.descriptions import when
 from flows.review.metric_words import in_short, reason_words
+from flows.service.alerts import kept_alerts
 from flows.service.layout import served_state
 from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.web.app_context import PageContext
@@ -42,7 +44,7 @@ FILES: Final = Path(__file__).with_name("status")
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the status page, and of its JSON."""
     router = APIRouter()
-    overview = Overview(context.store)
+    overview = Overview(context.store, with_states=True)
 
     @router.get("/api/status")
     def status() -> dict[str, Any]:
@@ -58,7 +60,10 @@ def routes(context: PageContext) -> APIRouter:
         inbox = "" if serving is None else serving.inbox
         found = overview.look(BUDGET_SECONDS)
         rows = [StatusRow(each, *_run_of(context, each)) for each in found]
-        text = status_html(rows, _arrivals(context), dashboard, inbox=inbox, opened=match)
+        alerts = kept_alerts(served_state(context.store.url)).values()
+        text = status_html(
+            rows, _arrivals(context), dashboard, inbox=inbox, opened=match, alerts=alerts
+        )
         is_whole = not any(each.is_unseen for each in found)
         rest = None if is_whole else BackgroundTask(overview.look, REST_SECONDS)
         return HTMLResponse(text, background=rest)
@@ -86,6 +91,21 @@ class StatusRow:
     at_work: Mapping[str, Any] | None = None
     prefect: str = ""
 
+    @property
+    def words(self) -> str:
+        """The state in words, as the page of the match has it."""
+        if self.at_work is not None and self.at_work["state"] == "running":
+            return "running"
+        if self.match.problem:
+            return "cannot be opened"
+        return self.match.state if self.match.now is None else self.match.now.words
+
+    @property
+    def kind(self) -> str:
+        """The state without its reason, to count matches by it."""
+        words = re.split(r":| because", self.words)[0]
+        return re.sub(r"^\d+ questions?", "with questions", words)
+
 
 def _run_of(context: PageContext, match: MatchStatus) -> tuple[Mapping[str, Any] | None, str]:
     runs = context.continuing
@@ -99,6 +119,7 @@ def status_html(
     *,
     inbox: str = "",
     opened: str = "",
+    alerts: Iterable[Mapping[str, str]] = (),
 ) -> str:
     """Render the page; every name and message is escaped.
 
@@ -111,7 +132,8 @@ def status_html(
     return PAGE.render(
         rows=rows,
         stages=[stage.name for stage in METHOD if stage.name in seen],
-        counts=Counter(each.state for each in shown).most_common(),
+        counts=Counter(row.kind for row in rows).most_common(),
+        alerts=alerts,
         arrivals=sorted(arrivals, key=lambda each: each.changed_at, reverse=True),
         begun={each.match_id for each in shown if each.latest is not None},
         detailed=[each for each in shown if has_all or each.match_id == opened],
@@ -160,6 +182,8 @@ def _as_json(match: MatchStatus, at_work: Mapping[str, Any] | None, prefect: str
     return {
         "match": match.match_id,
         "state": match.state,
+        "now": StatusRow(match, at_work).words,
+        "why": "" if match.now is None else match.now.why,
         "problem": match.problem,
         "run": None if latest is None else latest.run_id,
         "seconds": None if latest is None else latest.seconds,

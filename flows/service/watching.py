@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -37,6 +38,8 @@ TROUBLE_SECONDS: Final = 3600.0
 """Between two log lines about a lasting failure."""
 TROUBLE_LENGTH: Final = 500
 """Maximum length of such a line."""
+_PREFIX: Final = re.compile(r"^Flow run encountered an exception: (\w*IncompleteRunError: )?")
+"""What Prefect writes before the reason of a failure."""
 FAILED_DAYS: Final = 7
 """After so long, a failed run raises no alert."""
 RESTART_PATIENCE: Final = timedelta(minutes=5)
@@ -183,8 +186,8 @@ def failed_runs(plan: ServePlan, began: datetime) -> list[FailedRun]:
         FailedRun(
             run["id"],
             run["name"],
-            str(run["state_name"]).lower(),
-            message,
+            "partial" if ": partial" in message else str(run["state_name"]).lower(),
+            _PREFIX.sub("", message),
             str(run["parameters"].get("match_id") or ""),
         )
         for run in runs

@@ -102,11 +102,14 @@ def refitting_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     if not match.has_static_cameras:
         own = match.file_sources("estimates", estimates.get(unit))
         return {**broadcast_calibration.tracking_sources(match, unit), **own}
-    named = {unit: spec.clip(unit).people, **_namesakes(match, unit)}
+    named = _namesakes(match, unit)
+    shared = {name for people in named.values() for name in people.values()}
+    here = {person: name for person, name in spec.clip(unit).people.items() if name in shared}
+    named = {unit: here, **named}
     seen: dict[str, JsonValue] = {}
     for view in _views(match, unit):
         clock = match.frame_sources(view)
-        own = {
+        view_sources = {
             "offset_frames": clock["offset_frames"],
             **({} if clock["rate"] == 1.0 else {"rate": clock["rate"]}),
             "seen_in_broadcast": next(iter(detection.seen_in_broadcast(match, view)), None),
@@ -114,7 +117,7 @@ def refitting_sources(match: Match, unit: str) -> dict[str, JsonValue]:
         }
         ends = "" if view == unit else f".{view}"
         seen |= match.file_sources(f"estimates{ends}", estimates.get(view))
-        seen |= {f"{name}{ends}": value for name, value in own.items()}
+        seen |= {f"{name}{ends}": value for name, value in view_sources.items()}
     return {
         **sources(match, unit),
         **seen,

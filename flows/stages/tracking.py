@@ -9,7 +9,7 @@ from pydantic import JsonValue
 from flows.stage import Match, Stage
 from flows.stages import detection
 from worldpose.ingest.footage import unit_frames
-from worldpose.review.identities import IDENTITY_EDITS
+from worldpose.review.identities import TRACK_EDITS
 from worldpose.tracking.settings import TrackingSettings
 
 MIN_CAMERAS: Final = 2
@@ -40,14 +40,14 @@ def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip, its pitch, the roster size, and identity corrections.
+    """Return the clip, its pitch, the roster size, and merges and splits of tracks.
 
-    Without such corrections the key is the tracker's alone.
+    Without such corrections the key is the tracker's alone; names change no result.
     """
     said: list[JsonValue] = [
         correction.edit.model_dump(mode="json")
         for correction in match.corrections
-        if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == unit
+        if isinstance(correction.edit, TRACK_EDITS) and correction.edit.clip == unit
     ]
     pitch = match.folder.pitch
     size = {"template", "length", "width", "crown", "end_fall"}

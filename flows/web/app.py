@@ -28,6 +28,7 @@ from flows.web import (
     corrections,
     detections,
     evidence,
+    history,
     identities,
     queue,
     results,
@@ -93,11 +94,8 @@ def create_app(project: str, access: Access, intake: Intake | None = None) -> Fa
     )
     add_answers(app)
     app.include_router(_sessions(context))
-    pages = (
-        *(queue, corrections, evidence, calibration, detections, identities),
-        *(results, settings, status_page),
-    )
-    for module in pages:
+    tools = corrections, evidence, calibration, detections, identities
+    for module in (queue, history, *tools, results, settings, status_page):
         app.include_router(module.routes(context))
     app.include_router(routes_of_intake(context, intake))
     app.include_router(_files())

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -32,6 +34,7 @@ from flows.service.match_runs import (
 from flows.stage import Match
 from flows.web.access import Access
 from worldpose.review.journal import requests_by_id
+from worldpose.store.paths import is_name
 from worldpose.store.store import Store
 
 
@@ -59,7 +62,7 @@ class PageContext:
         Raises:
             HTTPException: 404; a name from outside never becomes a path.
         """
-        if name not in self.store.matches():
+        if not is_name(name) or self.store.registration(name) is None:
             raise HTTPException(404, "no such match")
         return open_for_review(self.store, name)
 
@@ -141,6 +144,26 @@ class Continuing:
         resumed = resume(self.store, open_for_review(self.store, match_id))
         return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"} if resumed else None
 
+    def cancel(self, match_id: str) -> bool:
+        """End the match's run, or take it out of the queue; its finished results are kept.
+
+        Returns:
+            Whether a run was there that pages or the service started.
+
+        Raises:
+            UnreachablePrefectError: Prefect does not answer.
+        """
+        with self._lock:
+            served = match_runs_of(self.store.url)
+            if served is None:
+                return self._local.cancel(match_id)
+            self._seen = None
+            own = [run for run in served.active() if run.match_id == match_id]
+            for run in own:
+                end = "CANCELLING" if run.state == "RUNNING" else "CANCELLED"
+                served.set_state(run.id, end, "cancelled on the page of the match")
+            return bool(own)
+
     def state(self, match_id: str) -> dict[str, Any] | None:
         """Return the state of the match's run, or of the last one if that failed; else None."""
         try:
@@ -154,13 +177,20 @@ class Continuing:
             run = next((each for each in own if each.state in AT_WORK), own[0])
             percent, doing = seen.progress.get(run.id, (0.0, run.message))
             lines = [doing] if doing else []
+            stage = re.match(r"[a-z_]+", doing)
             if run.state in QUEUED:
                 ahead = [each for each in seen.active[: seen.active.index(run)] if each.is_ahead]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
                 lines = ["The run starts in a moment."]
                 if ahead:
                     lines = [f"The run waits for its turn: {runs} before it."]
-            return {"state": "running", "lines": lines, "percent": percent, "prefect": run.link}
+            return {
+                "state": "running",
+                "lines": lines,
+                "percent": percent,
+                "prefect": run.link,
+                "stage": stage[0] if stage and run.state in AT_WORK else "",
+            }
         last = seen.ended.get(match_id)
         if last is None or last.state not in ("FAILED", "CRASHED"):
             return None
@@ -215,12 +245,13 @@ def read_progress(said: str) -> dict[str, Any]:
     stages = [found[1] for each in lines if (found := _STAGE_LINE.match(each)) is not None]
     units = [found for each in lines if (found := _UNIT_LINE.match(each)) is not None]
     doing = [stages[-1].replace("_", " ")] if stages else []
+    stage = stages[-1] if stages else ""
     if not units:
-        return {"lines": doing, "percent": 0.0}
+        return {"lines": doing, "percent": 0.0, "stage": stage}
     percent, left = float(units[-1][1]), units[-1][2].strip()
     if doing and left:
         doing = [f"{doing[0]}, {left} left"]
-    return {"lines": doing, "percent": percent}
+    return {"lines": doing, "percent": percent, "stage": stage}
 
 
 @dataclass(frozen=True)
@@ -242,6 +273,7 @@ class LocalRuns:
     _waiting: list[tuple[str, str | None]] = field(default_factory=list)
     _at_work: str | None = None
     _output: Path | None = None
+    _process: subprocess.Popen[bytes] | None = None
     _ended: dict[str, tuple[int, Path]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -275,6 +307,16 @@ class LocalRuns:
         lines = said.read_text(errors="replace").splitlines()[-LAST_LINES:]
         return {"state": "ended", "code": code, "lines": lines}
 
+    def cancel(self, match_id: str) -> bool:
+        """End the match's run as Ctrl-C does, or take it out of the queue; return whether."""
+        with self._lock:
+            waits = match_id in dict(self._waiting)
+            self._waiting = [each for each in self._waiting if each[0] != match_id]
+            is_at_work = match_id == self._at_work and self._process is not None
+            if is_at_work and self._process is not None:
+                os.killpg(self._process.pid, signal.SIGINT)
+            return waits or is_at_work
+
     def _run_all(self, match_id: str, gates: str | None) -> None:
         while True:
             said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
@@ -285,14 +327,18 @@ class LocalRuns:
             if gates is not None:
                 command += ["--gates", gates]
             with said.open("wb") as output:
-                code = subprocess.Popen(
+                process = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
-                ).wait()
+                )
             with self._lock:
+                self._process = process
+            code = process.wait()
+            with self._lock:
+                self._process = None
                 self._ended[match_id], self._output = (code, said), None
                 if not self._waiting:
                     self._at_work = None

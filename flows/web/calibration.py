@@ -19,6 +19,7 @@ from data_contracts.arrays import Image
 from data_contracts.match import Side
 from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
+from flows.gates import GATES
 from flows.review.verdicts import reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
@@ -55,6 +56,10 @@ class Clicked(Record):
             points=tuple(ClickedPoint(name=n, xy=xy) for n, xy in sorted(self.points.items())),
             drawn=tuple(DrawnMarking(name=name, xy=xy) for name, xy in drawn),
         )
+
+
+GROUND_LIMIT_M: Final = dict(GATES["static_calibration"].limits)["expected_ground_error_median_m"]
+"""Expected error on the pitch above which a run asks about a camera [m]."""
 
 
 class Wanted(Record):
@@ -326,6 +331,7 @@ def _answer(found: Preview) -> dict[str, Any]:
         "stage": report.stage,
         "median": _number(ground.median),
         "p95": _number(ground.p95),
+        "limit": GROUND_LIMIT_M,
         "ground": {
             "x": _round_numbers(ground.x, 2),
             "y": _round_numbers(ground.y, 2),

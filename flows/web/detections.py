@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,13 +16,17 @@ from pydantic import Field
 
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.records import DetectionIndex, Frame, Record
+from data_contracts.records import DetectionIndex, Frame, Name, Record
+from data_contracts.review import MovedKeypoint
 from flows.reports.match_pictures import frame_picture
 from flows.results.best_results import static_cameras
+from flows.review.corrections import keep_edits
 from flows.review.detections import accept, detections_now, left_to_look_at
 from flows.review.identities import identities_now
 from flows.stage import Match
+from flows.stages.ingest import edits_by_camera
 from flows.web.app_context import PageContext, Person
+from flows.web.browser_words import describe_error
 from flows.web.images import image_response
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
@@ -30,6 +35,8 @@ from worldpose.store.store import Store, open_run
 
 MAX_LISTED: Final = 60
 """Maximum number of listed detections to review."""
+MAX_INTERPOLATED: Final = 100
+"""Maximum number of frames between two corrections that are filled in."""
 MAX_ACCEPTED: Final = 500
 """Maximum number of detections accepted by name at once."""
 
@@ -41,6 +48,14 @@ class Accepting(Record):
     """Accept every detection with at least this score [1]; None = only those in `people`."""
     people: tuple[tuple[Frame, DetectionIndex], ...] = Field(default=(), max_length=MAX_ACCEPTED)
     """Match frame, and index among the detections of the frame."""
+
+
+class Interpolating(Record):
+    """A keypoint that moves along a line from its last correction to a frame."""
+
+    frame: Frame
+    detection: DetectionIndex
+    joint: Name
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -66,7 +81,7 @@ def routes(context: PageContext) -> APIRouter:
             "has_picture": owner in match.folder.videos,
             "joints": COCO17,
             "bones": COCO17_BONES,
-            **_describe_frame(detections_now(context.store, match, owner, frame)),
+            **_read_frame(context.store, match, owner, frame),
             "cameras": [camera.id for camera in spec.static_cameras],
         }
 
@@ -91,8 +106,69 @@ def routes(context: PageContext) -> APIRouter:
         accept(context.store, match, owner, at_least=at_least, people=people, who=who)
         return _queue(context.store, context.match(match_id), owner)
 
+    @router.post("/interpolation")
+    def interpolate(
+        match_id: str, owner: str, given: Interpolating, who: Person
+    ) -> dict[str, list[str]]:
+        edits = _interpolate(context.store, context.match(match_id), owner, given)
+        named = {f"moved_keypoint.{uuid.uuid4().hex[:16]}": edit for edit in edits}
+        note = "placed along a line"
+        keep_edits(context.store, lambda: context.match(match_id), named, who=who, note=note)
+        return {"kept": [*named]}
+
     _add_views(router, context)
     return router
+
+
+def _interpolate(
+    store: Store, match: Match, camera: str, given: Interpolating
+) -> list[MovedKeypoint]:
+    """Return the edits between the last correction of a person's keypoint and a frame.
+
+    The person's track tells the detections in between; frames without one are skipped.
+
+    Raises:
+        InputError: the detection has no track, or no earlier correction is of this keypoint.
+    """
+    clip = match.folder.spec.clips_with(given.frame)[0].id
+    found = identities_now(store, match, clip).identities
+    number = {int(frame): row for row, frame in enumerate(found.frame)}
+    index = found.detection_index[:, found.cameras.index(camera)]
+    own = np.flatnonzero(index[number[given.frame]] == given.detection)
+    known = {} if not len(own) else dict(zip(number, index[:, own[0]].tolist(), strict=True))
+    corrected = [
+        edit
+        for edit in edits_by_camera(match).get(camera, ())
+        if isinstance(edit, MovedKeypoint)
+        and edit.joint == given.joint
+        and edit.xy is not None
+        and given.frame - MAX_INTERPOLATED <= edit.frame < given.frame
+        and known.get(edit.frame) == edit.detection
+    ]
+    joint, last = (
+        COCO17.index(given.joint),
+        max(corrected, key=lambda each: each.frame, default=None),
+    )
+    now = detections_now(store, match, camera, given.frame).keypoints[0, given.detection, joint]
+    if last is None or last.xy is None or not np.isfinite(now).all():
+        raise InputError(
+            f"{given.joint} of detection {given.detection} in {camera}, frame {given.frame}",
+            expected=f"a correction of it in the {MAX_INTERPOLATED} frames before, of one track",
+            found="none",
+            todo="Correct this keypoint in an earlier frame first, then here.",
+        )
+    edits = []
+    for frame in range(last.frame + 1, given.frame):
+        detection = known.get(frame, -1)
+        if detection < 0:
+            continue
+        place = detections_now(store, match, camera, frame).keypoints[0, detection, joint]
+        was = (float(place[0]), float(place[1])) if np.isfinite(place).all() else None
+        share = (frame - last.frame) / (given.frame - last.frame)
+        x, y = (1.0 - share) * np.asarray(last.xy) + share * np.asarray(now)
+        at = {"camera": camera, "frame": frame, "detection": detection, "joint": given.joint}
+        edits.append(MovedKeypoint(**at, was=was, xy=(round(float(x), 2), round(float(y), 2))))
+    return edits
 
 
 def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
@@ -116,6 +192,15 @@ def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
             for score, frame, detection in rows[:MAX_LISTED]
         ],
     }
+
+
+def _read_frame(store: Store, match: Match, owner: str, frame: int) -> dict[str, Any]:
+    """Return the detections of a frame; without any in the latest run, a note about it."""
+    try:
+        found = detections_now(store, match, owner, frame)
+    except InputError as error:  # the image can be looked at
+        return {"people": [], "free": 0, "note": describe_error(error)}
+    return {**_describe_frame(found), "note": ""}
 
 
 def _describe_frame(found: KeypointDetections) -> dict[str, Any]:

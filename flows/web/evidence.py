@@ -20,11 +20,13 @@ from flows.reports.broadcast import broadcast_pictures, broadcast_tables
 from flows.reports.cameras import camera_evidence, health_picture, proposal_evidence
 from flows.reports.clip_video import clip_view
 from flows.reports.clips import clip_pictures, detection_pictures
+from flows.reports.match_pictures import frame_pictures
 from flows.reports.people import adjustment_tables, body_tables
 from flows.results.best_results import ADJUSTED, placed_joints, static_cameras
 from flows.stage import Match
 from flows.stages.detection import seen_by
 from flows.web.app_context import PageContext
+from flows.web.images import encode_image
 from flows.web.results import DrawnFiles
 from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import plot_paths
@@ -222,7 +224,14 @@ def _acceptance(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 
 def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
-    return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists of edits
+    cameras = [str(name) for name in run[ADJUSTED]["camera"].values]
+    pictures = [
+        replace(picture, caption=f"Camera {camera}, as it was before. {picture.caption}")
+        for camera in cameras[:MOST_CAMERAS]
+        for picture in _camera(store, run, match, camera).pictures
+    ]
+    # The other tables are lists of edits.
+    return Evidence(tuple(pictures), tuple(adjustment_tables(run)[:1]))
 
 
 def _broadcast(store: Store, run: Run, match: Match, view: str) -> Evidence:
@@ -230,8 +239,33 @@ def _broadcast(store: Store, run: Run, match: Match, view: str) -> Evidence:
     return Evidence(tuple(pictures), tuple(tables))
 
 
+def _people(store: Store, run: Run, match: Match, unit: str) -> Evidence:
+    """Draw the boxes in the frames with the fewest, a middling and the largest number of people."""
+    import cv2  # imported here: few pages decode an image
+
+    result = run[f"detection/{unit}"]
+    boxes, frames = result["boxes"].values, result["frame"].values
+    counts = np.isfinite(boxes).all(axis=2).sum(axis=1)
+    order = np.argsort(counts, kind="stable")
+    rows = sorted({int(order[0]), int(order[len(order) // 2]), int(order[-1])})
+    owner = unit if unit in match.folder.videos else unit.rpartition(".")[0]
+    pictures = []
+    for row, picture in zip(
+        rows, frame_pictures(store, match, owner, [int(frames[r]) for r in rows]), strict=True
+    ):
+        if picture is None:
+            continue
+        drawn = np.ascontiguousarray(picture)
+        for x0, y0, x1, y1 in boxes[row][np.isfinite(boxes[row]).all(axis=1)].round().astype(int):
+            cv2.rectangle(drawn, (x0, y0), (x1, y1), (255, 213, 74), max(2, drawn.shape[1] // 700))
+        caption = f"{owner}, frame {frames[row]}: {counts[row]} people detected."
+        pictures.append(CaptionedImage(caption, encode_image(drawn, "png")))
+    return Evidence(tuple(pictures))
+
+
 _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
     "static_calibration": _camera,
+    "detection": _people,
     "camera_consistency": _consistency,
     "tracking": _identities,
     "triangulation": _clip,

@@ -10,14 +10,19 @@ from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image, find_runs
+from data_contracts.review import Correction, SplitTrack
 from flows.reports.match_pictures import frame_picture
+from flows.review.descriptions import in_words
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from flows.web.browser_words import in_browser
 from flows.web.images import image_response
+from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import Identities, find_sighting
 from worldpose.store.store import Store, open_run
+from worldpose.triangulation.camera_changes import describe_change
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,7 +60,8 @@ def routes(context: PageContext) -> APIRouter:
             "frame_count": len(found.frame),
             "step": step,
             "pitch": None if pitch is None else {"length": pitch.length, "width": pitch.width},
-            "roster": [each.id for each in spec.roster],
+            "roster": [{"id": each.id, "name": each.name or each.id} for each in spec.roster],
+            "events": _list_events(match, clip, found),
             "has_video": any(camera in match.folder.videos for camera in found.cameras),
             "people": [_person(found, ways, track.person, step) for track in found.tracks],
             "joins": [
@@ -76,6 +82,31 @@ def routes(context: PageContext) -> APIRouter:
         return image_response(_crop(context.store, match, found, person, frame), "png")
 
     return router
+
+
+def _list_events(match: Match, clip: str, found: Identities) -> list[dict[str, Any]]:
+    """Return what happened in frames of the clip: corrections, and cameras that changed."""
+    first, last = int(found.frame[0]), int(found.frame[-1])
+    events: list[dict[str, Any]] = [
+        {
+            "kind": "camera",
+            "frame": first if change.frame is None else change.frame,
+            "words": in_browser(describe_change(change)),
+        }
+        for change in found.changes
+    ]
+    corrected: dict[int, list[Correction]] = {}
+    for each in match.corrections:
+        edit = each.edit
+        frame = edit.frame if isinstance(edit, DETECTION_EDITS) else None
+        if isinstance(edit, SplitTrack) and edit.clip == clip:
+            frame = edit.first_frame_of_new
+        if frame is not None and first <= frame <= last:
+            corrected.setdefault(frame, []).append(each)
+    for frame, made in corrected.items():
+        words = in_words(made[-1]) + (f", and {len(made) - 1} more" if len(made) > 1 else "")
+        events.append({"kind": "correction", "frame": frame, "words": words})
+    return events
 
 
 def _person(found: Identities, ways: NDArray[np.float64], person: int, step: int) -> dict[str, Any]:

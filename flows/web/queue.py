@@ -13,14 +13,15 @@ from typing import Any, Final
 from fastapi import APIRouter
 
 from data_contracts.review import ReviewRequest
-from data_contracts.run import RunRecord
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
 from flows.layers import read_layer
+from flows.match_state import describe_problem, match_state
+from flows.method import METHOD
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
-from flows.run_status import list_unit_states
+from flows.service.overview import MANY
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
@@ -35,7 +36,7 @@ BUDGET_SECONDS: Final = 0.25
 REREAD_SECONDS: Final = 60.0
 """Age at which a summary is made again without a change: a video can be removed."""
 ALWAYS_CHECKED: Final = 8
-"""Matches that every request checks."""
+"""Matches that every request checks, unless there are `MANY`."""
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -73,11 +74,11 @@ def routes(context: PageContext) -> APIRouter:
                 for clip in folder.spec.clips
                 for name in dict.fromkeys((clip.id, *folder.spec.views_of(clip.id)))
             ],
-            "failures": []
-            if latest is None
-            else [
-                {**each.model_dump(), "message": in_browser(each.message)} for each in latest.failed
+            "failures": [
+                {**each.model_dump(), "message": " ".join(in_browser(each.message).split())}
+                for each in (() if latest is None else latest.failed)
             ],
+            "stages": [stage.name for stage in METHOD if stage.units(opened)],
             "left_out": {} if latest is None else latest.left_out,
             "warnings": [] if latest is None else [in_browser(each) for each in latest.warnings],
         }
@@ -108,7 +109,8 @@ class _Glances:
             oldest = sorted(names, key=lambda name: self._checked.get(name, 0.0))
             left = len(oldest)
             for number, name in enumerate(oldest):
-                if number >= ALWAYS_CHECKED and time.monotonic() - begun > BUDGET_SECONDS:
+                is_late = time.monotonic() - begun > BUDGET_SECONDS
+                if is_late and number and (number >= ALWAYS_CHECKED or len(names) > MANY):
                     break
                 self._check(name)
                 self._checked[name] = time.monotonic()
@@ -209,24 +211,32 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
         },
         "waiting": waiting,
         "to_click": list(folder.to_click),
+        "has_image": bool({*folder.stills, *folder.videos}),
         "corrections": corrections,
         "first_clicks": first_clicks,
         "stale": len(match.stale),
-        **_units(store, match, latest),
+        "state": _state(store, match),
         "at_work": _local_run(context, match.match_id) or _elsewhere(store, match.match_id),
     }
 
 
-def _units(store: Store, match: Match, latest: RunRecord | None) -> dict[str, Any]:
-    """Return the numbers of units by state as `worldpose status` has them; None before a run."""
-    if latest is None:
-        return {"units": None, "units_problem": None}
+def _state(store: Store, match: Match) -> dict[str, Any]:
+    """Return the state of a match as JSON, with the numbers of its units as the command has them.
+
+    While a run of these pages is at work, the pages show its progress in place of this state.
+    """
     try:
-        found = list_unit_states(store, match, latest)
+        found = match_state(store, match)
     except (OSError, WorldposeError) as error:  # a setting can name a missing file
-        return {"units": None, "units_problem": describe_error(error)}
-    counts = {state.value: len(names) for state, names in found.items()}
-    return {"units": counts, "units_problem": None}
+        found = describe_problem(error)
+    return {
+        "name": found.name,
+        "words": found.words,
+        "why": in_browser(found.why),
+        "todo": found.todo,
+        "seconds": found.seconds,
+        "units": {state.value: len(names) for state, names in found.units.items()},
+    }
 
 
 def _local_run(context: PageContext, match_id: str) -> dict[str, Any] | None:
@@ -252,8 +262,18 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
     if key is not None:
         result = context.store.open_result(match.match_id, "broadcast_calibration", clip, key)
         pick_next = [int(frame) for frame in result.attrs["pick_next"]]
+    folder = match.folder
+    spec = next((each for each in folder.spec.clips if each.id == clip), None)
+    owners = [camera.id for camera in folder.spec.static_cameras]
+    owners += [] if spec is None else folder.spec.views_of(clip)
+    filmed = [name for name in owners if name in folder.videos or name in folder.detections]
+    frames = {"first_frame": 0, "frame_count": 0}
+    if spec is not None:
+        frames = {"first_frame": spec.first_frame, "frame_count": spec.frame_count}
     return {
         "id": clip,
+        **frames,
+        "cameras": filmed,
         "has_video": clip in match.folder.videos,
         "key_frames": key_frames(match, clip),
         "pick_next": pick_next,

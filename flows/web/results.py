@@ -29,7 +29,7 @@ from flows.results.best_results import (
     open_results,
     tracked_people,
 )
-from flows.results.comparison import compare_runs
+from flows.results.comparison import SubjectChange, compare_runs
 from flows.results.export import export
 from flows.results.outputs import OWNERS
 from flows.stage import Match
@@ -37,6 +37,7 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
+from worldpose.review.journal import read_journal
 from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
@@ -52,7 +53,7 @@ REPORT_POLICY: Final = (
 
 
 class DrawnFiles:
-    """Files that were drawn on request, each once per run."""
+    """Files that were drawn on request, each once per run and state of its journal."""
 
     def __init__(self) -> None:
         self._folder = TemporaryDirectory(prefix="worldpose-pages-")
@@ -61,7 +62,9 @@ class DrawnFiles:
     def get(self, run: Run, name: str, draw: Callable[[Path], object]) -> Path:
         """Return the file `name` of a run, drawn by `draw` if it is not there."""
         record = run.record
-        unique = hashlib.sha256(f"{record.match_id} {record.run_id} {name}".encode()).hexdigest()
+        said = read_journal(run.store, record.match_id).last  # people's names, corrections
+        given = f"{record.match_id} {record.run_id} {said} {name}"
+        unique = hashlib.sha256(given.encode()).hexdigest()
         file = Path(self._folder.name) / f"{unique}{Path(name).suffix}"
         with self._lock:
             if not file.is_file():
@@ -87,11 +90,11 @@ class _Clips:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._key: tuple[str, str, str] | None = None
+        self._key: tuple[str, str, str, int] | None = None
         self._clip: ViewerClip | None = None
 
     def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
-        key = (run.record.match_id, run.record.run_id, clip)
+        key = (run.record.match_id, run.record.run_id, clip, match.journal.last)
         with self._lock:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)
@@ -229,10 +232,15 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     }
 
 
+def describe_changes(changes: list[SubjectChange]) -> list[dict[str, Any]]:
+    """Return the cameras, clips and players that changed, as JSON."""
+    return [asdict(each) for each in changes if each.mark != "unchanged"]
+
+
 def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
     """Return the metrics of a run, and their changes since the run before it."""
     record, parent = run.record, run.record.parent
-    changes, problem = [], ""
+    changes, problem = list[SubjectChange](), ""
     if parent is not None:
         try:
             before = context.store.run(match.match_id, parent)
@@ -251,6 +259,6 @@ def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str,
         "names": _player_names(match, run),
         "before": parent,
         "problem": problem,
-        "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
+        "changes": describe_changes(changes),
         "unchanged": sum(each.mark == "unchanged" for each in changes),
     }

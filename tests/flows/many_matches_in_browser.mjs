@@ -29,6 +29,11 @@ for (const [name, [path, selector]] of Object.entries(places)) {
 // All matches are there after some requests, each of which reads a part of them.
 await page.goto("about:blank").catch(() => page.goto("about:blank")); // the status page loads itself again
 await page.goto(`${task.base}/`);
-await page.waitForFunction((count) => document.querySelectorAll("li.panel > a.name").length === count, task.count);
-await page.waitForFunction(() => ![...document.querySelectorAll(".state")].some((each) => each.textContent.includes("being read")));
+await page.waitForSelector(`input[placeholder="Search ${task.count} matches"]`);
+const known = () => [...document.querySelectorAll("[data-filter] b")].reduce((sum, each) => sum + Number(each.textContent), 0);
+await page.waitForFunction(`(${known})() === ${task.count}`);
+seen.rows = await page.locator("li.panel").count();
+await page.fill("[aria-label=Search]", "copy017");
+await page.waitForFunction(() => document.querySelectorAll("li.panel").length === 1);
+seen.sought = await page.locator("li.panel a.name").innerText();
 await tell(seen);

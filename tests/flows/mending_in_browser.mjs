@@ -15,11 +15,13 @@ await tell(seen);
 
 async function mend() {
   // Two people who change places: split where they do, then each is joined with their own end.
-  await page.goto(`${task.base}/#/identities/${match}/clip`);
+  await page.goto(`${task.base}/#/identities/${match}/clip`); // the former address leads to the page of the match
   const [one, other, tail] = task.swapped;
   const row = (id) => page.locator(`[data-person="${id}"]`);
   await row(one).click();
-  await page.locator("input[type=range]").fill(String(task.middle));
+  await page.locator("[data-scene=ready]").waitFor();
+  await page.locator("[data-scrub]").fill(String(task.middle));
+  await row(one).click({ position: { x: 20, y: 10 } });
   await shot("identities");
   const before = await page.locator("[data-person]").evaluateAll((rows) => rows.map((each) => each.dataset.person));
   const isSaid = (text) => page.waitForSelector(`[role=status] >> text=${text}`);
@@ -29,8 +31,8 @@ async function mend() {
   const after = await page.locator("[data-person]").evaluateAll((rows) => rows.map((each) => each.dataset.person));
   const [end] = after.filter((id) => !before.includes(id));
   for (const [kept, merged] of [[one, tail], [other, end]]) {
-    await row(kept).click();
-    await row(merged).click({ modifiers: ["Shift"] });
+    await row(kept).click({ position: { x: 20, y: 10 } });
+    await row(merged).click({ modifiers: ["Shift"], position: { x: 20, y: 10 } });
     await page.locator("body").press("m");
     await row(merged).waitFor({ state: "detached" });
 }
@@ -38,6 +40,8 @@ async function mend() {
 // A keypoint that the other cameras contradict is put where they expect it.
 const { camera, frame, detection, joint } = task.keypoint;
 await page.goto(`${task.base}/#/detections/${match}/${camera}?frame=${frame}`);
+await page.locator("[data-scene=ready]").waitFor();
+await page.click("[data-edit]");
 const keypoint = page.locator(`[data-keypoint="${detection}.${joint}"]`);
 await keypoint.waitFor();
 await page.locator("aside > table tr", { has: page.locator(`td:first-child:text-is("${detection}")`) }).click();

@@ -12,7 +12,7 @@ await shot("queue");
 
 // The camera that nobody clicked, from the queue by the way a person takes.
 await page.click(`a.name[href="#/match/${match}"]`);
-await page.click(`p.note a >> text=${task.camera}`);
+await page.click(`[data-now=calibrate] a >> text=${task.camera}`);
 await page.waitForSelector(".stage canvas");
 await shot("nothing");
 const { middle, choose, click, place, saved } = await clicking(page, task.size);
@@ -59,7 +59,7 @@ await saved();
 await page.click(`nav a >> text=${task.match}`);
 // Whether the adjustment exceeds its limit depends on noise: here every result is asked about.
 await page.route(/\/runs$/, (route) => route.continue({ postData: { ...route.request().postDataJSON(), gates: "always" } }));
-await page.click("button >> text=Run it");
+await page.click("[data-now=new] button");
 const end = Date.now() + 1000 * task.patience;
 const now = async () => (await page.request.get(`${task.base}/api/matches/${match}`)).json();
 const asked = (state) => state.waiting.map((each) => each.unit).join();
@@ -100,6 +100,7 @@ await shot("complete");
 // A keypoint is put elsewhere, taken out, and that is taken back.
 await page.goto(`${task.base}/#/detections/${match}/${encodeURIComponent(task.camera)}`);
 await page.waitForSelector("[data-keypoint]", { timeout: 60000 });
+await page.click("[data-edit]");
 await page.keyboard.press("n");
 const keypoint = page.locator("g.on [data-keypoint]").first();
 const at = await keypoint.boundingBox();

@@ -10,7 +10,8 @@ const kinds = async () => {
   const { groups } = await (await page.request.get(path)).json();
   return groups.flatMap((group) => Object.entries(group.kinds)).filter(([kind]) => kind.endsWith("track") || kind.endsWith("tracks"));
 };
-const note = () => page.locator("[data-outdated]");
+const state = (name) => page.locator(`[data-now=${name}]`);
+const choose = () => page.locator("[data-person]").first().click({ position: { x: 20, y: 10 } });
 
 await logIn(page, task.base, "Ada");
 if (task.later) await showEarlier();
@@ -21,20 +22,17 @@ await tell(seen);
 async function showEarlier() {
   await page.goto(`${task.base}/#/match/${match}`);
   seen.later = await page.locator("[data-later]").textContent();
-  seen.links = await page.locator("a >> text=/Open the report|in 3D/").count();
-  await shoot(page, "later");
-  await page.goto(`${task.base}/#/results/${match}/clip`);
   await page.locator('[data-scene="ready"]').waitFor();
-  seen.laterIn3d = await page.locator("[data-later]").textContent();
-  await shoot(page, "later_3d");
+  seen.now = await state("outdated").count(); // the split is in no run yet
+  seen.links = await page.locator("a >> text=/Open the report/").count();
+  await shoot(page, "later");
 }
 
 async function correct() {
   await page.goto(`${task.base}/#/match/${match}`);
-  await page.waitForSelector("[data-corrections]");
-  seen.before = await note().count();
-  await page.goto(`${task.base}/#/identities/${match}/clip`);
-  await page.locator("[data-person]").first().click();
+  await page.locator('[data-scene="ready"]').waitFor();
+  seen.before = await state("ready").count();
+  await choose();
 
   // A dialog is open: its keys are no shortcuts.
   await page.locator("button.help").click();
@@ -44,43 +42,43 @@ async function correct() {
 
   // The key of the shortcut and the button open the field with the focus in it.
   seen.names = [];
-  for (const begin of [() => page.keyboard.press("n"), () => page.locator("button >> text=Name").click()]) {
-    await page.locator("[data-person]").first().click();
+  for (const begin of [() => page.keyboard.press("n"), () => page.locator("[data-tracks] button >> text=Name").click()]) {
+    await choose();
     await begin();
     await page.keyboard.type("smith");
     await shoot(page, "naming");
     await page.keyboard.press("Enter");
     await page.locator(".row >> text=smith").waitFor();
     seen.names.push(await kinds());
+    await page.locator(".people >> text=smith").waitFor(); // in the 3D view too
+    seen.named = await state("ready").count(); // a name needs no run
     await page.keyboard.press("Control+z");
     await page.locator(".row >> text=smith").waitFor({ state: "detached" });
 }
 seen.undone = await kinds();
 
 // A split is undone by the button.
-await page.locator("[data-person]").first().click();
-await page.locator("input[type=range]").fill(String(task.middle));
+await page.locator("[data-scrub]").fill(String(task.middle));
+await choose();
 const people = await page.locator("[data-person]").count();
 await page.keyboard.press("s");
 await page.waitForFunction((count) => document.querySelectorAll("[data-person]").length > count, people);
 await shootSizes(page, seen, "split");
-await page.locator("button >> text=Undo").click();
+await page.locator("[data-tracks] button >> text=Undo").click();
 await page.waitForFunction((count) => document.querySelectorAll("[data-person]").length === count, people);
 seen.unsplit = await kinds();
 
-// After a correction both pages say what is to be computed.
-await page.locator("[data-person]").first().click();
-await page.keyboard.press("n");
-await page.keyboard.type("kane");
-await page.keyboard.press("Enter");
-await page.locator(".row >> text=kane").waitFor();
-await page.goto(`${task.base}/#/match/${match}`);
-await note().waitFor();
-seen.note = await note().locator("span").textContent();
-seen.button = await note().locator("button").textContent();
+// After a correction all pages say that a run is needed, and why.
+await choose();
+await page.keyboard.press("s");
+await page.waitForFunction((count) => document.querySelectorAll("[data-person]").length > count, people);
+await state("outdated").waitFor();
+seen.words = await state("outdated").locator(".words").innerText();
+seen.button = await state("outdated").locator("button").innerText();
 await shootSizes(page, seen, "outdated");
-seen.units = (await (await page.request.get(path)).json()).units;
 await page.goto(`${task.base}/#/`);
 seen.home = await page.locator("li.panel .state").first().textContent();
 await shoot(page, "home");
+await page.goto(`${task.base}/status`);
+seen.status = await page.locator("td.run .state").innerText();
 }

@@ -3,18 +3,19 @@
 import pytest
 from command_line import TINY
 
-from data_contracts.review import Correction, MergedTracks, SplitTrack
+from data_contracts.review import Correction, MergedTracks, NamedTrack, SplitTrack
 from flows.registering import open_match
+from flows.results.best_results import clip_positions
 from flows.review.corrections import keep_edits
 from flows.review.edit_conflicts import StaleEditError
-from flows.review.identities import identities_now
+from flows.review.identities import identities_now, names_of
 from flows.review.verdicts import origins_of
 from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from tasks.tracking import tracking
 from worldpose.review.identities import find_sighting
 from worldpose.store.paths import ResultId
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 
 @pytest.fixture
@@ -86,3 +87,35 @@ def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
     latest = latest_run(store, TINY)
     origins = origins_of(store, open_match(store, TINY), latest)
     assert origins[f"tracking/{clip}"] == "corrected"
+
+
+def test_a_name_recomputes_nothing_and_is_in_the_tables_at_once(store):
+    clip = planned(store).recipe.unit
+    found = identities_now(store, open_match(store, TINY), clip).identities
+    keys = [unit.key for unit in plan_run(store, open_match(store, TINY), {})]
+    names = ("José Núñez", "#10 (goal)")  # no ids of a roster
+    for person, name in enumerate(names):
+        seen = find_sighting(found, person)
+        say(store, **{f"n{person}": NamedTrack(clip=clip, person=person, seen=seen, name=name)})
+    assert [unit.key for unit in plan_run(store, open_match(store, TINY), {})] == keys
+    run = Run(store, latest_run(store, TINY))
+    assert clip_positions(run, clip).names[:3] == [*names, ""]
+    assert origins_of(store, open_match(store, TINY), run.record)[f"tracking/{clip}"] == "automatic"
+    # A split that the run does not contain yet leaves its names; the pages show both.
+    middle = int(found.frame[len(found.frame) // 2])
+    say(store, split=SplitTrack(clip=clip, person=0, first_frame_of_new=middle))
+    new = int(found.person.max()) + 1
+    say(store, late=NamedTrack(clip=clip, person=new, name="late"))
+    assert names_of(run, clip) == dict(enumerate(names))
+    now = identities_now(store, open_match(store, TINY), clip).identities.names
+    assert now == {0: names[0], 1: names[1], new: "late"}
+    unit = planned(store)
+    compute(store, unit)
+    results = {**run.record.results, f"tracking/{clip}": unit.key}
+    after = Run(store, run.record.model_copy(update={"results": results}))
+    assert names_of(after, clip) == now
+    say(store, none=NamedTrack(clip=clip, person=0, name=None))
+    assert names_of(after, clip) == {1: names[1], new: "late"}
+    # Later iterations have no tracks without corrections.
+    store.withdraw(ResultId(TINY, "tracking", clip, run.record.results[f"tracking/{clip}"]))
+    assert names_of(after, clip) == {1: names[1], new: "late"}

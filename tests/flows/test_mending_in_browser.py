@@ -156,13 +156,10 @@ def test_what_is_typed_is_no_shortcut_and_every_correction_can_be_undone(project
         earlier = drive(SHORTCUTS, {**task, "later": True}, tmp_path, 600)
     assert seen["afterHelp"] == seen["undone"] == seen["unsplit"] == []
     assert seen["names"] == [[["named_track", 1]]] * 2
-    assert seen["before"] == 0
-    units = seen["units"]
-    assert units["stale"] > 0
-    count = units["stale"] + units["missing"]
-    assert seen["note"] == f"The results are out of date: {count} units to recompute."
-    assert seen["button"] == "Recompute"
-    assert seen["home"] == f"out of date: {count} units to recompute"
+    assert (seen["before"], seen["named"]) == (1, 1)
+    assert seen["button"].startswith("Run again, about ")
+    because = "out of date because of 1 correction"
+    assert [seen[name].strip().lower() for name in ("words", "home", "status")] == [because] * 3
     assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
     later = "These are results of run 0001. The later run 0002 failed and has no people."
-    assert (earlier["later"], earlier["laterIn3d"], earlier["links"]) == (later, later, 2)
+    assert (earlier["later"], earlier["now"], earlier["links"]) == (later, 1, 1)

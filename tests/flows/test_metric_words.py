@@ -14,11 +14,22 @@ PAGES = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "words.js
 @pytest.mark.parametrize(
     ("reason", "words"),
     [
-        ("offset_rms_m is 0.05, at most 0.03 passes", "offset rms: 0.05 m, limit 0.03 m"),
-        ("clicks_wrong is 1, at most 0 passes", "outlier clicks: 1, limit 0"),
+        (
+            "offset_rms_m is 0.05, at most 0.03 passes",
+            "distance of bodies from the seen joints: 5 cm, limit 3 cm",
+        ),
+        ("clicks_wrong is 1, at most 0 passes", "clicks that contradict the others: 1, limit 0"),
         (
             "held_out_certain_excess_m is 0.03 (knee, ankle), at most 0.01 passes",
-            "held out certain excess: 0.03 m (knee, ankle), limit 0.01 m",
+            "bodies are worse than joints by: 3 cm (knee, ankle), limit 1 cm",
+        ),
+        (
+            "filled_share is 0.1, at most 0.05 passes",
+            "frames in which no camera sees the person: 10 %, limit 5 %",
+        ),
+        (
+            "weak is 1, at most 0 passes",
+            "the camera is uncertain: more clicks are needed where none are",
         ),
         ("residual_px could not be computed", "residual could not be computed"),
         ("Ada rejected it: the_click is 1", "Ada rejected it: the_click is 1"),
@@ -41,8 +52,11 @@ def test_every_metric_of_a_gate_is_put_into_words():
 
 def test_metrics_have_their_unit_behind_the_value():
     figures = {"offset_rms_m": 0.0512345, "m": 2.0, "undecided": 0.0, "offset_rms_m.knee": 1.0}
-    assert in_short(figures) == "offset rms 0.05123 m, m 2, undecided 0"
-    assert metric_words("expected_error_median_px") == ("expected error median", "px")
+    assert (
+        in_short(figures)
+        == "distance of bodies from the seen joints 0.05123 m, m 2, uncertain joins of two tracks 0"
+    )
+    assert metric_words("expected_error_median_px") == ("expected error of the drawn pitch", "px")
     assert all_reasons(["a_m is 2, at most 1 passes", "b"]) == "a: 2 m, limit 1 m; b"
 
 

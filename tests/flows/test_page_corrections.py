@@ -104,7 +104,9 @@ def test_what_is_refused_on_a_page_names_no_command(ada):
     gone = ada.post(f"{MATCH}/withdrawals", json={"correction": "none"})
     assert gone.status_code == 422
     assert "no such correction" in gone.json()["error"]
-    for path in ("results", "results/report", "detections/cam00", "identities/clip"):
+    note = ada.get(f"{MATCH}/detections/cam00").json()["note"]
+    assert "found none. Run the match on its page." in note
+    for path in ("results", "results/report", "identities/clip"):
         answer = ada.get(f"{MATCH}/{path}")
         assert answer.status_code >= 400
         said = str(answer.json().get("error", answer.json()))

@@ -187,13 +187,18 @@ def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
 
 def test_pages_have_the_units_of_the_status_command_after_a_correction(ada, project_copy):
     (person, *_) = ada.get(f"{MATCH}/identities/clip").json()["people"]
-    edit = {"kind": "named_track", "clip": "clip", "person": person["id"], "name": "smith"}
-    edit["seen"] = person["seen"]
-    for corrections in (None, {"edits": [{"id": "named_track.1", "edit": edit}]}):
+    edit = {"kind": "split_track", "clip": "clip", "person": person["id"], "seen": person["seen"]}
+    edit["first_frame_of_new"] = sum(person["segments"][0]) // 2
+    for corrections in (None, {"edits": [{"id": "split_track.1", "edit": edit}]}):
         if corrections is not None:
             ada.post(f"{MATCH}/corrections", json=corrections).raise_for_status()
         (row,) = succeed("status", "--json", "--project", project_copy).json["matches"]
         units = {state: len(names) for state, names in row["units"].items()}
         assert (units["stale"] > 0) == (corrections is not None)
-        assert ada.get(MATCH).json()["units"] == units
-        assert ada.get("/api/matches").json()["matches"][0]["units"] == units
+        found = ada.get(MATCH).json()["state"]
+        assert found["units"] == units
+        because = "out of date because of 1 correction"
+        assert (found["words"], row["now"]) == ((because,) * 2 if corrections else ("ready",) * 2)
+        assert ada.get("/api/matches").json()["matches"][0]["state"] == found
+        (status,) = ada.get("/api/status").json()["matches"]
+        assert status["now"] == found["words"]

@@ -105,7 +105,8 @@ def test_a_run_at_work_says_how_far_it_is(project_copy, tmp_path, monkeypatch):
     while (state := runs.state(TINY)).get("percent") != 31.0:
         assert time.monotonic() < end
         time.sleep(0.02)
-    assert state == {"state": "running", "lines": ["tracking, 18 s left"], "percent": 31.0}
+    said = {"lines": ["tracking, 18 s left"], "percent": 31.0, "stage": "tracking"}
+    assert state == {"state": "running", **said}
     gate.touch()
     while runs.state(TINY)["state"] != "ended":
         assert time.monotonic() < end

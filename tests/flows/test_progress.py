@@ -95,7 +95,7 @@ def test_a_unit_is_one_line_of_80_columns_with_metrics_only_if_asked_for(verbose
     assert all(len(each) <= 80 for each in lines), lines
     row = r"broadcast_ca…y_characters 5432\.1 s +1 % 16 d +0 % 772 d$"
     assert re.search(row, lines[2]), lines
-    assert ("outlier clicks 1" in lines[-1]) == verbose
+    assert ("clicks that contradict the others 1" in lines[-1]) == verbose
 
 
 def test_expected_work_comes_from_the_latest_run(project_copy):
@@ -173,7 +173,7 @@ def test_pages_read_what_the_command_line_prints(clock, monkeypatch):
     monkeypatch.setattr(console, "errors", Console(file=printed, width=80))
     reporter = console.ConsoleReporter()
     reporter.run_planned({"static_calibration": 10.0, "tracking": 30.0})
-    assert read_progress(printed.getvalue()) == {"lines": [], "percent": 0.0}
+    assert read_progress(printed.getvalue()) == {"lines": [], "percent": 0.0, "stage": ""}
     reporter.stage_started("static_calibration", "find cameras", units=2, missing=2)
     assert read_progress(printed.getvalue())["lines"] == ["static calibration"]
     for unit in "ab":
@@ -183,7 +183,8 @@ def test_pages_read_what_the_command_line_prints(clock, monkeypatch):
     clock[0] += 15.0
     reporter.unit_done("tracking/clip", 15.0, {})
     reporter.unit_waits("tracking/clip", ["50 % of 3.0 s are beyond the limit 5 %"])
-    progress = {"lines": ["tracking, 15 s left"], "percent": 62.0}
+    progress = {"lines": ["tracking, 15 s left"], "percent": 62.0, "stage": "tracking"}
     assert read_progress(printed.getvalue()) == progress
     reporter.unit_done("tracking/other", 15.0, {})
-    assert read_progress(printed.getvalue()) == {"lines": ["tracking"], "percent": 100.0}
+    progress = {"lines": ["tracking"], "percent": 100.0, "stage": "tracking"}
+    assert read_progress(printed.getvalue()) == progress

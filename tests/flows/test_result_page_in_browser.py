@@ -29,3 +29,5 @@ def test_people_are_seen_in_3d_and_played(project_copy, tmp_path):
     assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
     assert seen["reports"] == [[5, 120], [5, 120]]
     assert seen["cameras"] == 6
+    assert seen["refused"].startswith("usd: needs the extra usd")
+    assert seen["pages"] == 1

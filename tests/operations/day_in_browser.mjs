@@ -58,12 +58,12 @@ async function create() {
 // Every camera is clicked, one of them with a wrong click.
 async function calibrate() {
   await page.click(`a.name[href="#/match/${match}"]`);
-  await page.waitForSelector("text=Before it can be run");
+  await page.waitForSelector("[data-now=calibrate]");
   await settled();
   await shootSizes(page, seen, "to_click");
   for (const [camera, points] of Object.entries(task.clicks)) {
     await page.goto(matchPage);
-    await page.click(`p.note a >> text=${camera}`);
+    await page.click(`[data-now=calibrate] a >> text=${camera}`);
     await page.waitForSelector(".stage canvas");
     const hand = await clicking(page, task.size);
     for (const [name, at] of Object.entries(points)) await hand.place(name, at);
@@ -77,8 +77,8 @@ async function calibrate() {
 // The run asks about the camera with the wrong click.
 async function answer() {
   await page.goto(matchPage);
-  await page.click("button >> text=Run it");
-  await page.waitForSelector(".progress");
+  await page.click("[data-now=new] button");
+  await page.waitForSelector("[data-now=running]");
   await shootSizes(page, seen, "running");
   await until("a question", async () => (await state()).waiting.length > 0 && (await state()).at_work?.state !== "running");
   seen.asked = (await state()).waiting.map((each) => each.unit);
@@ -119,7 +119,7 @@ async function complete() {
     }
     return at === "complete";
   });
-  await page.waitForSelector("text=in 3D");
+  await page.waitForSelector('[data-scene="ready"]');
   await settled();
   await shootSizes(page, seen, `complete_${seen.states.length}`);
 }
@@ -130,25 +130,27 @@ async function mend() {
   await page.waitForSelector("[data-person]");
   const people = () => page.locator("[data-person]").evaluateAll((rows) => rows.map((each) => each.dataset.person));
   const before = await people();
-  await page.locator("[data-person]").first().click();
-  await page.locator("input[type=range]").fill("5");
+  await page.locator("[data-scene=ready]").waitFor();
+  await page.locator("[data-scrub]").fill("5");
+  const row = (id, more = {}) => page.locator(`[data-person="${id}"]`).click({ position: { x: 60, y: 10 }, ...more });
+  await row(before[0]);
   await page.waitForFunction(() => document.querySelector(".crops img")?.naturalWidth);
   await shootSizes(page, seen, "identities");
   await page.locator("body").press("s");
   await page.waitForFunction((count) => document.querySelectorAll("[data-person]").length > count, before.length);
   const [end] = (await people()).filter((id) => !before.includes(id));
-  await page.locator(`[data-person="${before[0]}"]`).click();
-  await page.locator(`[data-person="${end}"]`).click({ modifiers: ["Shift"] });
+  await row(before[0]);
+  await row(end, { modifiers: ["Shift"] });
   await page.locator("body").press("m");
   await page.locator(`[data-person="${end}"]`).waitFor({ state: "detached" });
-  await page.locator(`[data-person="${before[0]}"]`).click();
+  await row(before[0]);
   await page.locator("body").press("n");
-  await page.fill("[aria-label=Name]", "kane");
-  await page.click("text=Keep");
-  await page.waitForSelector(".row >> text=kane");
+  await page.keyboard.type("kane");
+  await page.keyboard.press("Enter");
+  await page.waitForSelector(".row >> text=Harry Kane");
   await page.goto(matchPage);
   const last = (await state()).run.id;
-  await page.click("button >> text=Recompute");
+  await page.click("[data-now=outdated] button");
   await until("the next run", async () => (await state()).run.id !== last || (await state()).at_work?.state === "running");
   await complete();
 }
@@ -156,7 +158,6 @@ async function mend() {
 // The result plays in 3D next to the video.
 async function watch() {
   await page.goto(matchPage);
-  await page.click("text=in 3D");
   await page.waitForSelector('[data-scene="ready"]');
   seen.named = await page.locator(".people button >> text=Harry Kane").count();
   await page.click("[data-watch]");
@@ -176,9 +177,9 @@ async function watch() {
 
 async function download() {
   await page.goto(`${task.pages}/#/results/${match}/clip`);
-  await page.waitForSelector(".downloads a");
+  await page.waitForSelector("[data-downloads] a");
   const asked = page.waitForEvent("download", { timeout: 1000 * task.patience });
-  await page.click(".downloads a >> text=/^joints$/");
+  await page.click("[data-downloads] a >> text=/^joints$/");
   await (await asked).saveAs(task.saved);
 }
 

@@ -11,6 +11,7 @@ import pytest
 from command_line import worldpose
 
 from data_contracts.operations import Arrival
+from flows.service import watching
 from flows.service.alerts import LONGEST_PAUSE, Alert, AlertDispatcher, FailedRun, alerts_now
 from flows.service.channels import Channel, apprise_mail, channels_of
 from flows.service.layout import StateFolder
@@ -274,7 +275,7 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     )
     assert (poor.alert, poor.text) == (
         "quality",
-        "m/body_fitting/clip: offset rms: 0.05 m, limit 0.03 m",
+        "m/body_fitting/clip: distance of bodies from the seen joints: 5 cm, limit 3 cm",
     )
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
@@ -286,3 +287,15 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     assert failed.link == "http://127.0.0.1:4200/runs/flow-run/1f2e"
     (full,) = alerts_now(plan.model_copy(update={"disk_gb": 1e9}), [], [], [])
     assert full.alert == "disk_low"
+
+
+def test_an_alert_of_a_partial_run_says_so_and_why(plan, monkeypatch):
+    text = "run 0003 of m: partial, 1 unit failed, 7 are blocked. tracking/clip: no light"
+    raised = f"Flow run encountered an exception: IncompleteRunError: {text}"
+    run = {"id": "1f2e", "name": "m, 1", "state_name": "Failed", "state": {"message": raised}}
+    run["parameters"] = {"match_id": "m"}
+    monkeypatch.setattr(watching.MatchRuns, "runs", lambda *asked, **wanted: [run])
+    monkeypatch.setattr(watching, "may_restart", lambda run: False)
+    (alert,) = alerts_now(plan, [], [], watching.failed_runs(plan, NOW))
+    assert alert.text == f"run m, 1 is partial: {text}"
+    assert alert.match_id == "m"

@@ -16,7 +16,7 @@ CONTENT, OTHER = "c" * 64, "d" * 64
 ASKED = datetime(2026, 5, 1, 12, tzinfo=UTC)
 ENDED = ASKED + timedelta(minutes=5)
 WRONG = "clicks_wrong is 1, at most 0 passes"
-IN_WORDS = "outlier clicks: 1, limit 0"
+IN_WORDS = "clicks that contradict the others: 1, limit 0"
 FIGURES = {
     "expected_ground_error_median_m": 0.01,
     "expected_ground_error_p95_m": 0.04,

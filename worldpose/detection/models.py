@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -211,11 +212,16 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
         kind, path = _split_name(name)
         found[name] = None if path is None else digest_of_weights(path)
         for library in LIBRARIES[kind.partition("-")[0]]:
-            try:
-                found[library] = version(library)
-            except PackageNotFoundError:
-                found[library] = None
+            found[library] = _installed_version(library)
     return found
+
+
+@cache
+def _installed_version(library: str) -> str | None:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return None
 
 
 def digest_of_weights(path: Path) -> str:

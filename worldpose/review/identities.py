@@ -16,9 +16,12 @@ from data_contracts.triangulation import CameraChange
 if TYPE_CHECKING:
     import xarray as xr
 
-IdentityEdit: TypeAlias = MergedTracks | SplitTrack | NamedTrack
+TrackEdit: TypeAlias = MergedTracks | SplitTrack
+IdentityEdit: TypeAlias = TrackEdit | NamedTrack
 T = TypeVar("T", bound=np.generic)
-IDENTITY_EDITS = (MergedTracks, SplitTrack, NamedTrack)
+TRACK_EDITS = (MergedTracks, SplitTrack)
+"""Corrections that results of tracking depend on."""
+IDENTITY_EDITS = (*TRACK_EDITS, NamedTrack)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,7 @@ class Identities:
         joints: (frames, persons, 17, 3) [m], world; NaN where missing.
         on_plane: (frames, persons), whether the person is not triangulated there, and placed by
             the feet.
-        names: roster id by person, of named people.
+        names: roster id or name by person, of named people.
         joins: certain and possible continuations of one track as another.
         changes: cameras that changed so much within the clip that the tracker lost their people.
     """
@@ -87,18 +90,23 @@ class IdentityReplay:
     objections: tuple[str | None, ...]
 
 
-def stored_identities(result: xr.Dataset) -> Identities:
-    """Return the identities of a published result of stage `tracking`."""
-    tracks = (Track.model_validate(track) for track in result.attrs["tracks"])
+def stored_identities(result: xr.Dataset, *, with_joints: bool = True) -> Identities:
+    """Return the identities of a published result of stage `tracking`, without names.
+
+    Without joints, `joints` has none, and all ray distances are 0.
+    """
+    index = result["detection_index"].values
+    no_joints = np.zeros((len(index), index.shape[2], 0, 3), dtype=np.float32)
+    no_distance = np.zeros(index.shape, dtype=np.float32)
     return Identities(
         frame=result["frame"].values,
         cameras=tuple(str(name) for name in result["camera"].values),
         person=result["person"].values,
-        detection_index=result["detection_index"].values,
-        ray_distance=result["ray_distance"].values,
-        joints=result["joints"].values,
+        detection_index=index,
+        ray_distance=result["ray_distance"].values if with_joints else no_distance,
+        joints=result["joints"].values if with_joints else no_joints,
         on_plane=find_plane_frames(result),
-        names={track.person: track.name for track in tracks if track.name is not None},
+        names={},
         joins=tuple(Join.model_validate(join) for join in result.attrs["joins"]),
         changes=tuple(CameraChange.model_validate(each) for each in result.attrs["changes"]),
     )

@@ -373,7 +373,8 @@ class Run(Mapping[str, "xr.Dataset"]):
     def __init__(self, store: Store, record: RunRecord) -> None:
         self.record = record
         """Record of the run: results, settings, metrics, versions, times."""
-        self._store = store
+        self.store = store
+        """Store that holds the results."""
         self._opened: dict[str, xr.Dataset] = {}
 
     def __getitem__(self, name: str) -> xr.Dataset:
@@ -388,7 +389,7 @@ class Run(Mapping[str, "xr.Dataset"]):
             raise KeyError(f"run {self.record.run_id} has no result of {name!r}: {why}")
         if name not in self._opened:
             stage, _, unit = name.partition("/")
-            result = self._store.open_result(
+            result = self.store.open_result(
                 self.record.match_id, stage, unit, self.record.results[name]
             )
             self._opened[name] = self._label(result)
@@ -397,7 +398,7 @@ class Run(Mapping[str, "xr.Dataset"]):
     def manifest(self, name: str) -> ResultManifest:
         """Return how a result was computed: recipe, versions, metrics, warnings."""
         stage, _, unit = name.partition("/")
-        return self._store.manifest(self.record.match_id, stage, unit, self.record.results[name])
+        return self.store.manifest(self.record.match_id, stage, unit, self.record.results[name])
 
     def bodies(self, clip: str) -> xr.Dataset:
         """Return the best bodies of a clip: refitted ones where the run has them.
@@ -448,7 +449,7 @@ class Run(Mapping[str, "xr.Dataset"]):
                 if dim not in result.coords and result.sizes.get(dim) == len(values)
             }
         )
-        registration = self._store.registration(self.record.match_id)
+        registration = self.store.registration(self.record.match_id)
         if "frame" in result.coords and registration is not None:
             about = {"units": "s", "about": "time of the match frame: frame / frames per second"}
             seconds = result["frame"].values / registration.spec.fps
@@ -469,7 +470,7 @@ class Run(Mapping[str, "xr.Dataset"]):
         title = f"Run {record.run_id} of match {record.match_id}: {record.state}"
         return "\n".join(
             [
-                f"{title}, finished {record.finished_at:%Y-%m-%d %H:%M} UTC, {self._store.url}",
+                f"{title}, finished {record.finished_at:%Y-%m-%d %H:%M} UTC, {self.store.url}",
                 *(f"  {name}  {record.results[name][:12]}" for name in self),
                 *(f"  {failure.unit}  failed: {failure.error}" for failure in record.failed),
             ]

@@ -6,3 +6,8 @@ const FIELDS = "textarea, select, [contenteditable], input:not([type=range], [ty
 export function isTyping(event) {
   return event.defaultPrevented || event.isComposing || Boolean(event.target.closest?.(FIELDS)) || document.querySelector("dialog[open]") !== null;
 }
+
+// The part of a page that was used last has the shortcuts; a page with one part has no areas.
+let area = "";
+export const enter = (name) => (area = name);
+export const isIn = (...names) => area === "" || names.includes(area);

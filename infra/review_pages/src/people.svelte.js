@@ -128,6 +128,18 @@ export class People {
     });
   }
 
+  // The chosen keypoint moves along a straight line from its last correction to here.
+  fillIn() {
+    return this.#inTurn(async () => {
+      if (this.joint === null || !this.chosen) return;
+      const what = { frame: this.info.frame, detection: this.who, joint: this.info.joints[this.joint] };
+      const { kept } = await post(`${this.where}/interpolation`, what);
+      await this.load(this.info.frame);
+      this.done.push(kept);
+      this.loadQueue();
+    });
+  }
+
   drop() {
     return this.#correct(() => (this.chosen ? { kind: "deleted_detection", detection: this.who } : null));
   }
@@ -141,7 +153,7 @@ export class People {
   undo() {
     return this.#inTurn(async () => {
       if (!this.done.length) return;
-      await post(`${this.path}/withdrawals`, { correction: this.done.at(-1) });
+      for (const correction of [this.done.at(-1)].flat()) await post(`${this.path}/withdrawals`, { correction });
       await this.load(this.info.frame);
       this.done.pop();
       this.loadQueue();

@@ -10,23 +10,11 @@ export function shown(value) {
 
 const UNITS = { m: "m", mm: "mm", px: "px", rad: "rad", deg: "°", s: "s", frames: "frames", hz: "Hz" };
 
-// Metrics whose names alone mislead.
-const WORDS = { clicks_wrong: "outlier clicks" };
-
 const unitOf = (name) => UNITS[/_([a-z]+)$/.exec(name)?.[1]];
-const withoutUnit = (name) => WORDS[name] ?? spoken(unitOf(name) ? name.replace(/_[a-z]+$/, "") : name);
+const withoutUnit = (name) => spoken(unitOf(name) ? name.replace(/_[a-z]+$/, "") : name);
 
 // The name of a metric, `offset_rms_m`, as a title: `offset rms [m]`.
 export const metric = (name) => (unitOf(name) ? `${withoutUnit(name)} [${unitOf(name)}]` : withoutUnit(name));
-
-// Why a gate holds a result, `offset_rms_m is 0.05, at most 0.03 passes`, as a person reads it: `offset rms: 0.05 m, limit 0.03 m`.
-export const reason = (text) =>
-  text
-    .replace(/^(\w+) is (\S+?)( \(.*\))?, at most (\S+) passes$/, (_, name, value, parts, limit) => {
-      const behind = unitOf(name) ? ` ${unitOf(name)}` : "";
-      return `${withoutUnit(name)}: ${value}${behind}${parts ?? ""}, limit ${limit}${behind}`;
-    })
-    .replace(/^(\w+)(?= could not be computed$)/, (name) => withoutUnit(name));
 
 // An expected error on the ground, in the unit that a person thinks in.
 export function ground(metres) {
@@ -50,24 +38,28 @@ export function ago(moment) {
   }
 }
 
-// The state of a match as `worldpose status` has it: its latest run, and the units that differ from it.
-export function unsettled({ units }) {
-  return units ? { stale: units.stale, missing: units.missing, ready: units.ready, all: units.stale + units.missing + units.ready } : { stale: 0, missing: 0, ready: 0, all: 0 };
-}
-
-export const isOutdated = (match) => Boolean(match.run) && unsettled(match).stale + unsettled(match).ready > 0;
-
-const unitCount = (count) => `${count} ${count === 1 ? "unit" : "units"}`;
-
-export function outdated(match) {
-  const { stale, missing, ready } = unsettled(match);
-  return stale + missing ? `out of date: ${unitCount(stale + missing)} to recompute` : `out of date: ${unitCount(ready)} to take over from earlier runs`;
+// A date as people read it: today the time alone.
+export function moment(text) {
+  const date = new Date(text);
+  const time = date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hour12: false });
+  if (date.toDateString() === new Date().toDateString()) return `today, ${time}`;
+  return `${date.toLocaleDateString([], { day: "numeric", month: "short", year: "numeric" })}, ${time}`;
 }
 
 export const parts = (unit) => {
   const at = unit.indexOf("/");
   return [unit.slice(0, at), unit.slice(at + 1)];
 };
+
+// Results as operators say them.
+const RESULTS = {
+  static_calibration: "Calibration of", detection: "People in", camera_consistency: "Cameras that contradict each other in", tracking: "Tracks in", triangulation: "Joints in",
+  bundle_adjustment: "Adjustment of the", body_fitting: "Bodies in", broadcast_calibration: "Camera of",
+};
+export function result(unit) {
+  const [stage, name] = parts(unit);
+  return `${RESULTS[stage] ?? spoken(stage)} ${name.replace(".", ", ")}`;
+}
 
 export function bytes(count) {
   if (count < 1e6) return `${Math.ceil(count / 1e3)} kB`;

@@ -1,0 +1,86 @@
+"""The page of a match lists and compares runs, keeps and cancels them, and fills in keypoints."""
+
+import sys
+import time
+
+import numpy as np
+import page_client
+import pytest
+from command_line import TINY
+from page_client import MATCH
+
+from data_contracts.conventions import COCO17
+from flows.registering import open_match
+from flows.review.detections import detections_now
+from flows.review.identities import identities_now
+from flows.web import app_context
+from worldpose.store.store import Store
+
+
+@pytest.fixture
+def ada(project_copy):
+    return page_client.log_in(page_client.served(project_copy), "Ada")
+
+
+def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy):
+    store = Store.open(str(project_copy))
+    first = store.run(TINY)
+    figures = {name: dict(each) for name, each in first.figures.items()}
+    figures["static_calibration/cam00"]["expected_ground_error_median_m"] *= 2.0
+    changed = {"run_id": store.reserve_run(TINY, {}), "parent": "0001", "figures": figures}
+    changed["overrides"] = {"tracking": {"x": 1}}
+    store.finish_run(first.model_copy(update=changed))
+    late, early = ada.get(f"{MATCH}/runs").json()
+    assert [(each["id"], each["cause"]) for each in (late, early)] == [
+        ("0002", "other settings"),
+        ("0001", "first run"),
+    ]
+    assert "tracking.x = 1" in late["settings"]
+    (worse,) = ada.get(f"{MATCH}/runs/0001/0002").json()
+    assert (worse["kind"], worse["name"], worse["mark"]) == ("camera", "cam00", "worse")
+    assert ada.get(f"{MATCH}/runs/0001/0009").status_code == 404
+    pin = {"run": "0001", "name": "v1"}
+    assert ada.post(f"{MATCH}/pins", json=pin).status_code == 200
+    assert ada.get(f"{MATCH}/runs").json()[1]["pins"] == ["v1"]
+    assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 200
+    assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 422
+
+
+def test_a_run_is_cancelled(ada, monkeypatch):
+    assert ada.post(f"{MATCH}/cancellation", json={}).status_code == 409
+    sleep = [sys.executable, "-c", "import time; time.sleep(90)"]
+    monkeypatch.setattr(app_context, "_COMMAND", sleep)
+    ada.post(f"{MATCH}/runs", json={}).raise_for_status()
+    begun = time.monotonic()
+    while ada.post(f"{MATCH}/cancellation", json={}).status_code != 200:
+        assert time.monotonic() - begun < 20
+    while (ada.get(MATCH).json()["at_work"] or {}).get("state") == "running":
+        assert time.monotonic() - begun < 40
+        time.sleep(0.2)
+
+
+def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
+    store = Store.open(str(project_copy))
+    match = open_match(store, TINY)
+    found = identities_now(store, match, "clip").identities
+    row, k = 5, int((found.detection_index[5:10] >= 0).all(axis=0).sum(axis=0).argmax())
+    c = int(np.flatnonzero((found.detection_index[row : row + 5, :, k] >= 0).all(axis=0))[0])
+    camera, path = found.cameras[c], f"{MATCH}/detections/{found.cameras[c]}/interpolation"
+
+    def place(offset):
+        frame, detection = int(found.frame[row + offset]), found.detection_index[row + offset, c, k]
+        seen = detections_now(store, open_match(store, TINY), camera, frame)
+        return {"frame": frame, "detection": int(detection)}, seen.keypoints[0, detection]
+
+    joint = int(np.isfinite(np.stack([place(n)[1] for n in range(5)])).all(axis=(0, 2)).argmax())
+    assert ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).status_code == 422
+    for offset, xy in ((0, (100.0, 200.0)), (4, (140.0, 208.0))):
+        at, was = place(offset)
+        edit = {"kind": "moved_keypoint", "camera": camera, **at, "joint": COCO17[joint], "xy": xy}
+        edit["was"] = [float(value) for value in was[joint]]
+        edits = {"edits": [{"id": f"moved_keypoint.{offset}", "edit": edit}]}
+        ada.post(f"{MATCH}/corrections", json=edits).raise_for_status()
+    kept = ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).json()["kept"]
+    assert len(kept) == 3
+    filled = [place(n)[1][joint].tolist() for n in range(5)]
+    assert filled == [[100, 200], [110, 202], [120, 204], [130, 206], [140, 208]]
