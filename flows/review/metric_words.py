@@ -31,6 +31,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "mean_ray_distance_m": "disagreement of the cameras about a person",
     "corrections_refused": "corrections that do not fit any more",
     "standard_deviation_m": "uncertainty of the joints",
+    "unhealthy_share": "time in which a camera is not healthy",
     "filled_share": "frames in which no camera sees the person",
     "held_out_error_after_px": "error in people that were kept back",
     "held_out_growth": "error in people that were kept back, relative to before",
