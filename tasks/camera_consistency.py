@@ -102,5 +102,9 @@ def _doubt_calibration(inputs: UnitInputs, clip: ClipInputs, found: Consistency)
     if off and not alone:
         whole = "has another world or pitch than the stills" if unpainted else "contradicts stills"
         return f"calibration.toml {whole}: {fits}"
-    clocks = "calibration.toml is that of other cameras, or the clocks differ by more than some"
-    return f"{alone}: {clocks} frames (worldpose synchronize)" if alone else ""
+    clocks = "calibration.toml is that of other cameras, the 2D poses are wrong, or the clocks"
+    return (
+        f"{alone}: {clocks} differ by more than some frames (worldpose synchronize)"
+        if alone
+        else ""
+    )

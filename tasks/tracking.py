@@ -221,6 +221,10 @@ def _follow_changes(
             camera = clip.camera_ids.index(changes[-1].camera)
             given = clip.cameras, people, clip.fps, TriangulationSettings()
             changes[-1] = refine_change(*given, camera, changes[-1])
+            if abs(changes[-1].zoom) > 0.1 or abs(changes[-1].roll_rad) > np.radians(10.0):
+                # No knock does that: people who agree nowhere seem to agree by chance.
+                clip = open_clip(inputs, further=changes[:-1])
+                return clip, track(clip), tuple(changes[:-1])
             clip = open_clip(inputs, further=changes)
         lost = find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
         found = [change_record(each, clip.camera_ids[each.found.camera], frame) for each in lost]

@@ -200,9 +200,9 @@ def _find_changes(
         if not measured:
             if measured is None and not new and np.median(health.misfit) > 3.0:
                 warnings.append(
-                    "all cameras move within the clip, each in its own way, as electronic "
-                    "stabilisation does: no person agrees with the views. Turn it off, or give the "
-                    "videos without it."
+                    "no person agrees with the views: all cameras move within the clip, each in "
+                    "its own way, as electronic stabilisation does, or the 2D poses or the "
+                    "calibration are wrong. Give videos without stabilisation, or better 2D poses."
                 )
             break
         camera = names[measured.found.camera]

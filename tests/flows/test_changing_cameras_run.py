@@ -31,9 +31,9 @@ def joints(tiny):
 
 @pytest.fixture
 def imported(server, joints, tmp_path):
-    """Returns what imports a match whose bad camera's pixels (frames, 2, 17, 2) are changed."""
+    """Returns what imports a match; `spoil` changes pixels (frames, 2, 17, 2) of bad cameras."""
 
-    def build(spoil):
+    def build(spoil, bad=(BAD,)):
         rng, records = np.random.default_rng(0), {}
         (tmp_path / "poses").mkdir()
         for turn in range(4):
@@ -43,7 +43,7 @@ def imported(server, joints, tmp_path):
             records[name] = camera.to_calibration(name)
             pixels = camera.project(joints.reshape(-1, 3)).reshape(*joints.shape[:3], 2)
             pixels += rng.normal(0.0, 1.0, pixels.shape)
-            pixels = (spoil(pixels) if name == BAD else pixels)[:FRAMES]
+            pixels = (spoil(pixels) if name in bad else pixels)[:FRAMES]
             people = [
                 {
                     "image_id": int(frame),
@@ -120,3 +120,15 @@ def test_lost_frames_are_named_and_synchronized(imported, joints):
     said, corrected = run(match, joints)
     assert "camera cam2" not in said
     assert corrected < 11.5 < error  # 10.5 and 36.8 mm
+
+
+def test_poses_that_agree_nowhere_accuse_no_camera(imported, joints):
+    rng = np.random.default_rng(4)
+
+    def wrong(pixels):
+        wander = rng.normal(0.0, 12.0, (len(pixels), 2, 1, 2)).cumsum(axis=0)
+        return pixels + rng.uniform(-250.0, 250.0, (1, 2, 1, 2)) + wander
+
+    said, _ = run(imported(wrong, [f"cam{n}" for n in range(4)]), joints)
+    assert "moves at frame" not in said
+    assert "2D poses" in said
