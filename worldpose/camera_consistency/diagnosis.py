@@ -119,7 +119,9 @@ class Diagnosis:
             if found is not None:
                 self.blame(c, found[0], core)
                 # Its group shows other people, unless the correction brings it to the core.
-                if self.has_partner(c) and (self.faults[-1].share_corrected or 0.0) <= 0.5:
+                share = self.faults[-1].share_corrected
+                least = 0.5 if self.has_partner(c) else 0.2
+                if (share is None and self.has_partner(c)) or (share is not None and share < least):
                     self.faults.pop()
         self.complete_swaps(core)
         for c in [c for c in range(count) if c not in core and c not in self.faulty and core]:
@@ -195,7 +197,7 @@ class Diagnosis:
             hypothesis.detail,
             hypothesis.value,
             hypothesis.source,
-            share_corrected=0.0,
+            share_corrected=None,
         )
         if people is not None:
             now, corrected = (
