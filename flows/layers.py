@@ -14,18 +14,20 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final
 
 import yaml
 from pydantic import JsonValue
 
-from data_contracts.match import MatchSpec
+from data_contracts.match import MatchSpec, Registration
+from data_contracts.pitch import PitchSpec
 from data_contracts.settings import RunSettings
 from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
 from worldpose.formats.files import parse_yaml
 from worldpose.ingest.match_folder import MatchFolder, image_sizes
-from worldpose.ingest.pitch_file import pitch_file
+from worldpose.ingest.pitch_file import pitch_file, read_pitch
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.paths import checked_name
@@ -164,6 +166,16 @@ def add_venue(folder: MatchFolder, layers: Iterable[Layer]) -> MatchFolder:
     if cameras != spec.cameras:
         spec = spec.model_copy(update={"cameras": cameras})
     return replace(folder, spec=spec, lenses=lenses)
+
+
+def pitch_of(store: Store, registration: Registration) -> PitchSpec | None:
+    """Return the pitch of a match's folder or else of its layers; None if neither states one."""
+    spec, folder = registration.spec, Path(registration.folder)
+    if spec.pitch is None and not pitch_file(folder, spec):
+        found = merge_general(read_layers(store, spec)).pitch
+        if found is not None:
+            return found
+    return read_pitch(folder, spec)
 
 
 def _path(name: str) -> str:

@@ -15,6 +15,7 @@ from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import read_still, read_unit, require_footage
 from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec, require_calibrated
 from worldpose.ingest.registration import READERS, register_match
+from worldpose.ingest.validation import reachable
 from worldpose.store.paths import is_name
 from worldpose.store.store import Store
 
@@ -31,7 +32,8 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
     """
     match_id = read_spec(folder).match_id
     previous = store.registration(match_id)
-    at_home = previous is not None and previous.folder == str(folder.resolve())
+    with reachable(folder):
+        at_home = previous is not None and previous.folder == str(folder.resolve())
     known = [file.path for file in previous.files] if previous is not None and at_home else ()
     match_folder = read_match(folder, known)
     registration = register_match(match_folder, previous)

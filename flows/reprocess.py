@@ -13,6 +13,7 @@ from flows.results.automatic_exports import export_after_run
 from flows.run_plan import PlannedUnit
 from flows.run_status import RunStatus, run_status
 from flows.running import RunRequest, run_match, settle, shared_machines
+from flows.stage import Match
 from worldpose.errors import InternalError, WorldposeError
 from worldpose.store.store import Store
 
@@ -78,22 +79,25 @@ def _reprocess(
         if is_rehearsal:
             return Reprocessed(match_id, "stale", status, status.latest)
         reporter().say(f"{match_id}: {len(status.to_compute)} units to compute")
-        record = _run(store, status, machines_for(status.to_compute))
+        match, record = _run(store, status, machines_for(status.to_compute))
     except Exception as failure:  # any error, so that the other matches continue
         text = str(failure)
         if not isinstance(failure, WorldposeError | OSError):
             text = str(InternalError.wrap(match_id, failure))
         reporter().say(f"{match_id} failed: {text}")
         return Reprocessed(match_id, "failed", status, problem=text)
+    try:
+        export_after_run(store, match, record)
+    except (WorldposeError, OSError) as failure:
+        return Reprocessed(match_id, record.state, status, record, problem=str(failure))
     return Reprocessed(match_id, record.state, status, record)
 
 
-def _run(store: Store, status: RunStatus, request: RunRequest) -> RunRecord:
+def _run(store: Store, status: RunStatus, request: RunRequest) -> tuple[Match, RunRecord]:
     request = replace(request, until_stage=status.until_stage, gates=status.gates)
     match, request = settle(store, status.match, request)
     if request.most_iterations == 1:
         record = run_match(store, match, request)
     else:
         record = iterate_match(store, match, request, request.most_iterations).record
-    export_after_run(store, match, record)
-    return record
+    return match, record

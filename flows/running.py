@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.settings import IterationCount
 from flows.gates import Gatekeeper
-from flows.layers import ENVIRONMENT, write_layer
+from flows.layers import ENVIRONMENT, check_general, write_layer
 from flows.method import task_modules
 from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
@@ -114,11 +114,17 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
         require_whole(request)
     before = match.layers
     if request.default_settings:
-        own = {name: value for name, value in before[-1].values.items() if name == "venue"}
+        stated_by_runs = ("iterations", "body_folder")
+        own = {
+            name: value
+            for name, value in before[-1].values.items()
+            if "." not in name and name not in stated_by_runs
+        }
         before = (*before[:-1], replace(before[-1], values=own))
     stated = flatten(request.settings)
     stated |= {} if request.iterations is None else {"iterations": request.iterations}
     stated |= {} if request.body_folder is None else {"body_folder": request.body_folder}
+    check_general(before[-1].name, "the request", stated)
     layers = (*before[:-1], replace(before[-1], values={**before[-1].values, **stated}))
     found = resolve(layers)
     folder = found.origins.get("body_folder")

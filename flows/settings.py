@@ -7,12 +7,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
+from pathlib import Path
 
 from pydantic import JsonValue, ValidationError
 
 from data_contracts.records import Record, field_docstrings
 from data_contracts.settings import RunSettings
-from flows.layers import VENUES, Layer, check_general, merge_general, read_layer, write_layer
+from flows.layers import (
+    MATCHES,
+    VENUES,
+    Layer,
+    check_general,
+    merge_general,
+    read_layer,
+    write_layer,
+)
 from flows.method import METHOD
 from flows.stage import Stage
 from worldpose.errors import InputError, UsageError, unknown_name
@@ -142,7 +151,12 @@ def save_layer(
     """
     layer = replace(read_layer(store, name), values=values, revision="new")
     check_general(name, layer.file, values)
-    resolve([*(each for each in layers if each.name != name), layer])
+    given = [each for each in layers if each.name != name]
+    if name.startswith(MATCHES):  # of the venue that it names now
+        venues = [each.values["venue"] for each in (*given, layer) if "venue" in each.values]
+        given = [each for each in given if not each.name.startswith(VENUES)]
+        given += [read_layer(store, f"{VENUES}/{venue}") for venue in venues[-1:]]
+    resolve([*given, layer])
     write_layer(store, name, values)
 
 
@@ -209,6 +223,8 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
             )
         _place(f"--set {assignment}", stage_name, list(by_name))
         value = parse_value(text)
+        if stage_name == "detection":
+            value = _absolute_weights(value)
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:
@@ -222,6 +238,16 @@ def parse_value(text: str) -> JsonValue:
         value: JsonValue = json.loads(text)
     except (ValueError, RecursionError):  # not JSON, or unclosed brackets
         return text
+    return value
+
+
+def _absolute_weights(value: JsonValue) -> JsonValue:
+    """Return `onnx:FILE` and its like with absolute paths: other processes run elsewhere."""
+    if isinstance(value, list):
+        return [_absolute_weights(each) for each in value]
+    kind, colon, path = value.partition(":") if isinstance(value, str) else ("", "", "")
+    if path and kind.partition("-")[0] in ("embedded", "transformers", "onnx"):
+        return f"{kind}{colon}{Path(path).expanduser().absolute()}"
     return value
 
 

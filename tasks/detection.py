@@ -145,7 +145,11 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     inputs.require_registered("video")
     report = finder.report
-    if len(report.unreadable) == report.frames and _has_images(inputs):
+    unreadable = report.unreadable
+    told = (reason,) if (reason := report.why_no_person()) else ()
+    if len(unreadable) == report.frames and not _has_images(inputs):
+        unreadable, told = [], ("the camera does not film this clip",)
+    elif len(unreadable) == report.frames:
         raise InputError(
             str(inputs.file("video")),
             expected="images that can be decoded",
@@ -164,12 +168,12 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             array.name: np.array(values, dtype=np.float32)
             for array, values in zip(IMAGE_ARRAYS, zip(*quality, strict=True), strict=True)
         },
-        stretches(np.array(report.unreadable, dtype=np.int64)),
+        stretches(np.array(unreadable, dtype=np.int64)),
         {
             "frames": report.frames,
             "detections": report.detections,
             "detections_a_frame": report.detections / report.frames,
-            "unreadable_share": len(report.unreadable) / report.frames,
+            "unreadable_share": len(unreadable) / report.frames,
             "empty_share": report.empty / report.frames,
             "stride": settings.stride,
             "turned_deg": 90 * report.quarters,
@@ -177,7 +181,7 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             "bridged_share": report.bridged / max(1, report.detections),
             "flicker_share": report.flickers / max(1, report.detections),
         },
-        (reason,) if (reason := report.why_no_person()) else (),
+        told,
     )
 
 

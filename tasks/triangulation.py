@@ -155,7 +155,9 @@ def _health_arrays(
     unknown = np.full(len(rows), np.nan)
     for name in ("brightness", "sharpness"):
         measures[name] = np.stack([each.get(name, unknown) for each in filmed], axis=1)
-    has_images = ["brightness" in each for each in filmed]
+    has_images = np.array(["brightness" in each for each in filmed])
+    # A camera may film other clips alone.
+    has_images = has_images & ~np.isnan(measures["brightness"]).all(axis=0)
     measures["missing"] = np.where(has_images, np.isnan(measures["brightness"]), np.nan)
     values = measure_health(health, measures)
     if len(rows) < len(frame):
@@ -217,11 +219,12 @@ def _find_changes(
             new.append(change)
         spoilt = {each.camera for each in new if each.kind == "clock" or not each.is_explained}
         aside = [
-            each.model_copy(update={"is_left_out": True}) if each.camera in spoilt else each
+            each.model_copy(update={"is_left_out": True, "kind": "view"})
+            if each.camera in spoilt
+            else each
             for each in new
         ]
         if len(names) - len(spoilt) < 3:
-            warnings.append("changes of other cameras can hide behind these.")
             break
         clip = open_tracked_clip(inputs, further=aside)
         health = measure_departures(clip.cameras, clip.detections, fps, settings, rows)
@@ -229,6 +232,9 @@ def _find_changes(
         warnings.append(f"{describe_change(change)}.")
         if change.kind == "clock":
             result.figures[CLOCK_CHANGE + change.camera] = change.late_frames
+    if len(names) - len(spoilt) < 3 < len(names):
+        those = ", ".join(sorted(spoilt))
+        warnings.append(f"changes of other cameras can hide behind those of {those}.")
     return [*known, *new]
 
 

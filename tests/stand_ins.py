@@ -1,12 +1,21 @@
 """Placeholder results, for tests of decisions that depend on keys alone."""
 
+import tempfile
 from datetime import UTC, datetime
+from functools import cache
 
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest
 from worldpose.store.documents import digest, record_checksum, seal
 from worldpose.store.paths import MANIFEST, ResultId
+from worldpose.store.store import Store
 from worldpose.store.writer import content_digest, stored_files
+
+
+@cache
+def empty_store():
+    """A project without matches, for results that nobody names or corrects."""
+    return Store.create(f"{tempfile.mkdtemp()}/project")
 
 
 def publish_stand_in(store, match, unit, files=("zarr.json",)):

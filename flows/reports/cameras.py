@@ -93,9 +93,11 @@ def health_picture(run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     if not any(unit in run for unit in units):
         return []
     found = run[next(unit for unit in units if unit in run)]
+    if "health" not in found:
+        return []
     changes = [CameraChange.model_validate(each) for each in found.attrs["changes"]]
-    names = [camera.id for camera in match.folder.spec.static_cameras]
     used = found["camera"].values.tolist()
+    names = list(dict.fromkeys([*(c.id for c in match.folder.spec.static_cameras), *used]))
     place = [names.index(name) for name in used]
     starts = found["health_frame"].values
     shape = (len(starts), len(names))

@@ -61,11 +61,12 @@ def frame_pictures(
     Raises:
         InputError: an image is damaged.
     """
-    if owner not in match.folder.videos:
+    file = match.folder.videos.get(owner)
+    if file is None or not file.exists():  # results outlive their videos
         yield from (None for _ in frames)
         return
     numbers = _numbers(store, match, owner, np.asarray(frames, dtype=np.int64))
-    with open_video(match.folder.videos[owner]) as video:
+    with open_video(file) as video:
         numbers[numbers >= len(video)] = -1
         yield from pictures_at(video, numbers)
 

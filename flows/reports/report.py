@@ -84,9 +84,9 @@ def write_report(
     Raises:
         UsageError: there is no such static camera with a video.
     """
-    match = match.at_hand()
     if camera is not None:
         _check_film(match, camera)
+    match = match.at_hand()
     run = open_results(store, match.match_id, run_id)
     source = reference or _own_reference(match)
     scores: Evaluation | None = None

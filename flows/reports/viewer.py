@@ -36,7 +36,6 @@ from worldpose.formats.viewer_file import (
     viewer_pieces,
     write_viewer,
 )
-from worldpose.ingest.pitch_file import read_pitch
 from worldpose.reports.html_page import EmbeddedPage
 from worldpose.store.store import Run
 
@@ -84,7 +83,7 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         UsageError: a video is asked for, and no camera of a clip has one.
         InputError: there is nobody to show.
     """
-    pitch = read_pitch(Path(origin.registration.folder), origin.registration.spec)
+    pitch = origin.pitch
     page, footage = _viewer_page(), origin.footage
     written: dict[Path, tuple[str, ...]] = {
         out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips

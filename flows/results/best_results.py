@@ -15,6 +15,7 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Join, Track
+from flows.layers import pitch_of
 from flows.results.broadcast_views import (
     BROADCAST,
     broadcast_unit,
@@ -31,7 +32,6 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.ingest.pitch_file import read_pitch
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store, open_run
@@ -345,7 +345,7 @@ class Origin:
     @property
     def pitch(self) -> PitchSpec | None:
         """Return the pitch of the match folder; None without one."""
-        return read_pitch(Path(self.registration.folder), self.registration.spec)
+        return pitch_of(self.run.store, self.registration)
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""

@@ -23,7 +23,7 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.review.journal import read_journal
+from worldpose.review.journal import Journal, read_journal
 from worldpose.store.store import Run, Store
 
 
@@ -46,6 +46,12 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
     later = edits_since(moves, stored.edits, f"clip {clip}", match_id)
     return _replay(stored, said, moves[: len(moves) - len(later)])
+
+
+def names_said(journal: Journal) -> str:
+    """Return a text that changes with the names of people, and with no other correction."""
+    named = (name for name, each in journal.standing.items() if isinstance(each.edit, NamedTrack))
+    return " ".join(sorted(named))
 
 
 def names_of(run: Run, clip: str) -> dict[int, str]:

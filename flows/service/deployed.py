@@ -104,7 +104,11 @@ def match(
         request = replace(request, gates=request.gates or "auto")
         compute = _run_until_decided if request.most_iterations == 1 else _iterate_until_decided
         record = compute(store, match_id, request)
-        export_after_run(store, opened, record)
+        try:
+            export_after_run(store, opened, record)
+        except (WorldposeError, OSError):
+            require_complete(record)  # its reason comes first
+            raise
         return require_complete(record)
 
 

@@ -49,7 +49,7 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/api/status")
     def status() -> dict[str, Any]:
         return {
-            "matches": [_as_json(match, *_run_of(context, match)) for match in overview.look()],
+            "matches": [_as_json(*each) for each in _with_runs(context, overview.look())],
             "arrivals": [each.model_dump(mode="json") for each in _arrivals(context)],
         }
 
@@ -59,7 +59,7 @@ def routes(context: PageContext) -> APIRouter:
         dashboard = "" if serving is None else serving.prefect.removesuffix("/api")
         inbox = "" if serving is None else serving.inbox
         found = overview.look(BUDGET_SECONDS)
-        rows = [StatusRow(each, *_run_of(context, each)) for each in found]
+        rows = [StatusRow(*each) for each in _with_runs(context, found)]
         alerts = kept_alerts(served_state(context.store.url)).values()
         text = status_html(
             rows, _arrivals(context), dashboard, inbox=inbox, opened=match, alerts=alerts
@@ -107,9 +107,13 @@ class StatusRow:
         return re.sub(r"^\d+ questions?", "with questions", words)
 
 
-def _run_of(context: PageContext, match: MatchStatus) -> tuple[Mapping[str, Any] | None, str]:
-    runs = context.continuing
-    return runs.state(match.match_id), runs.links().get(match.match_id, "")
+def _with_runs(
+    context: PageContext, found: Iterable[MatchStatus]
+) -> list[tuple[MatchStatus, Mapping[str, Any] | None, str]]:
+    """Return each match with the state of its run at work, and the run's page at Prefect."""
+    links = context.continuing.links()
+    ids = ((each, each.match_id) for each in found)
+    return [(each, context.continuing.state(name), links.get(name, "")) for each, name in ids]
 
 
 def status_html(

@@ -32,7 +32,7 @@ MOST_REMEMBERED: Final = 10_000
 """Wrong tokens and ended sessions that are remembered, the latest."""
 
 
-EDITING: Final = ("/corrections", "/withdrawals", "/withdrawal", "/acceptances")
+EDITING: Final = ("/corrections", "/withdrawals", "/withdrawal", "/acceptances", "/interpolation")
 """Suffixes of the paths by which an annotator changes something."""
 OF_ALL: Final = ("/api/logout", "/preview")
 """Suffixes of the paths that change nothing of the project."""

@@ -130,9 +130,16 @@ def _interpolate(
     Raises:
         InputError: the detection has no track, or no earlier correction is of this keypoint.
     """
-    clip = match.folder.spec.clips_with(given.frame)[0].id
-    found = identities_now(store, match, clip).identities
-    number = {int(frame): row for row, frame in enumerate(found.frame)}
+    clips = match.folder.spec.clips_with(given.frame)
+    found = identities_now(store, match, clips[0].id).identities if clips else None
+    number = {} if found is None else {int(frame): row for row, frame in enumerate(found.frame)}
+    if found is None or camera not in found.cameras or given.frame not in number:
+        raise InputError(
+            f"{camera}, frame {given.frame}",
+            expected="a camera and a frame whose people are tracked",
+            found="none",
+            todo="Fill in between corrections in a static camera's frames.",
+        )
     index = found.detection_index[:, found.cameras.index(camera)]
     own = np.flatnonzero(index[number[given.frame]] == given.detection)
     known = {} if not len(own) else dict(zip(number, index[:, own[0]].tolist(), strict=True))

@@ -32,6 +32,7 @@ from flows.results.best_results import (
 from flows.results.comparison import SubjectChange, compare_runs
 from flows.results.export import export
 from flows.results.outputs import OWNERS
+from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
@@ -62,7 +63,7 @@ class DrawnFiles:
     def get(self, run: Run, name: str, draw: Callable[[Path], object]) -> Path:
         """Return the file `name` of a run, drawn by `draw` if it is not there."""
         record = run.record
-        said = read_journal(run.store, record.match_id).last  # people's names, corrections
+        said = names_said(read_journal(run.store, record.match_id))
         given = f"{record.match_id} {record.run_id} {said} {name}"
         unique = hashlib.sha256(given.encode()).hexdigest()
         file = Path(self._folder.name) / f"{unique}{Path(name).suffix}"
@@ -90,11 +91,11 @@ class _Clips:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._key: tuple[str, str, str, int] | None = None
+        self._key: tuple[str, str, str, str] | None = None
         self._clip: ViewerClip | None = None
 
     def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
-        key = (run.record.match_id, run.record.run_id, clip, match.journal.last)
+        key = (run.record.match_id, run.record.run_id, clip, names_said(match.journal))
         with self._lock:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)

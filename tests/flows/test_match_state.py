@@ -47,7 +47,7 @@ def fail(store, state):
     )
     record = first.model_copy(
         update={
-            "run_id": store.reserve_run(TINY, {}),
+            "run_id": store.reserve_run(TINY),
             "parent": first.run_id,
             "state": state,
             "results": kept,
@@ -103,9 +103,9 @@ def test_a_run_that_was_killed_is_stopped_and_can_be_continued(store, monkeypatc
     gone.wait()
     with monkeypatch.context() as patched:
         patched.setattr("os.getpid", lambda: gone.pid)
-        number = store.reserve_run(TINY, {})
+        number = store.reserve_run(TINY)
     found = state(store)
     assert (found.name, found.words) == ("stopped", "stopped before its end")
     assert f"Run {number} ended before it was recorded" in found.why
-    store.reserve_run(TINY, {})  # of this process, which is at work
+    store.reserve_run(TINY)  # of this process, which is at work
     assert state(store).name == "running"

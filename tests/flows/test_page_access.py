@@ -11,7 +11,7 @@ import pytest
 from command_line import TINY
 from page_client import HERE, MATCH, TOKEN, a_click, moved
 
-from flows.web.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
+from flows.web.access import EDITING, SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
 from flows.web.app import BODY_BYTES, OPEN, create_app
 from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
@@ -28,6 +28,7 @@ def every_route(app):
     """Method and path of every route of the server, from the server itself."""
     names = {"match_id": TINY, "owner": "cam00", "request": "r", "number": "0", "clip": "clip"}
     names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f", "group": "g"}
+    names |= {"before": "0001", "after": "0002", "name": "n"}
     for path, methods in app.openapi()["paths"].items():
         for method in methods:
             yield method.upper(), path.format_map(names)
@@ -350,10 +351,11 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
     assert ann.post(f"{MATCH}/corrections", json=edit).status_code == 200
     *_, last = read_journal(Store.open(str(project_copy)), TINY).records
     assert last.who == "Ann"
+    assert {"/corrections", "/interpolation", "/acceptances"} <= set(EDITING)
     changing = {path for method, path in every_route(served) if method != "GET"} - OPEN
     for path in changing - {"/api/logout"}:
         is_preview = path.endswith("/preview")
-        is_edit = path.endswith(("/corrections", "/withdrawals", "/withdrawal", "/acceptances"))
+        is_edit = path.endswith(EDITING)
         codes = [each.post(path, json={"no": 1}).status_code for each in (vera, ann, ake)]
         may = [is_preview, is_preview or is_edit, True]
         assert [code != 403 for code in codes] == may, path

@@ -27,7 +27,7 @@ def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy):
     first = store.run(TINY)
     figures = {name: dict(each) for name, each in first.figures.items()}
     figures["static_calibration/cam00"]["expected_ground_error_median_m"] *= 2.0
-    changed = {"run_id": store.reserve_run(TINY, {}), "parent": "0001", "figures": figures}
+    changed = {"run_id": store.reserve_run(TINY), "parent": "0001", "figures": figures}
     changed["overrides"] = {"tracking": {"x": 1}}
     store.finish_run(first.model_copy(update=changed))
     late, early = ada.get(f"{MATCH}/runs").json()

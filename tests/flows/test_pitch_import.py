@@ -107,6 +107,7 @@ def test_the_tracker_knows_the_areas_of_a_small_pitch():
     camera, clip = CameraSpec(id="cam", width=1920, height=1080), ClipSpec(id="clip", frame_count=1)
     spec = MatchSpec(match_id="m", fps=25, cameras=(camera,), clips=(clip,))
     areas = {"penalty_area_depth": 10.0, "penalty_area_width": 24.0, "goal_area_depth": 0.0}
+    areas["penalty_mark_distance"] = 8.0
     small = PitchSpec(length=60.0, width=40.0, any_size=True, dimensions=areas)
     folder = SimpleNamespace(pitch=small, spec=spec, detections={}, videos={})
     given = tracking.sources(SimpleNamespace(corrections=(), folder=folder), "clip")["pitch"]

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from stand_ins import empty_store
 from typer.testing import CliRunner
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
@@ -35,6 +36,7 @@ class StubRun(Mapping):
 
     def __init__(self, **results):
         self.results = {name.replace("__", "/"): data for name, data in results.items()}
+        self.store = empty_store()
         self.record = SimpleNamespace(
             run_id="0001",
             match_id="m",

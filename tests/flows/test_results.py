@@ -213,7 +213,7 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     outside = Outside()
     outside.feed(page)
     assert outside.asked == []
-    assert page.count('src="data:image/') == 10
+    assert page.count('src="data:image/') == 11
     assert page.count("<iframe") == 1
     assert "Mean joint error" in page
     assert "expected ground error" in page
@@ -223,7 +223,7 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     assert "top speed m/s" in people[0]
     assert "triangulation/clip" in page
     for suffix in (".svg", ".pdf", ".json"):
-        assert len(list(figures.glob(f"*{suffix}"))) == 10
+        assert len(list(figures.glob(f"*{suffix}"))) == 11
     for number, file in enumerate(sorted(figures.glob("*.json")), start=1):
         shown = json.loads(file.read_text())
         assert file.name.startswith(f"{number:02d}-")

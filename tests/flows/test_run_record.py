@@ -100,5 +100,7 @@ def test_a_run_that_asks_no_person_warns_of_a_result_that_is_probably_wrong(stor
     strict = replace(GATES["tracking"], limits=IdentityLimits(mean_ray_distance_m=0.0))
     monkeypatch.setattr(run_record, "GATES", {"tracking": strict})
     (text,) = (text for text in recorded(store, METHOD).warnings if "may be wrong" in text)
-    assert text.startswith("tracking/clip may be wrong: mean ray distance: 0.")
+    assert text.startswith(
+        "tracking/clip may be wrong: disagreement of the cameras about a person: "
+    )
     assert "--gates auto" in text

@@ -20,7 +20,7 @@ from flows.run_plan import plan_run
 from flows.running import RunRequest, settle
 from flows.service import deployed
 from flows.service.plan import ServePlan
-from flows.settings import resolve
+from flows.settings import parse_overrides, resolve
 from flows.web import app_context
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.errors import InputError
@@ -329,3 +329,34 @@ def test_exports_follow_each_run_and_a_failed_one_says_that_the_run_is_kept(stor
     write_layer(store, "project", {"exports": ["joints"], "exports_folder": "/dev/null/x"})
     command("run", TINY, "--project", store.url, code=1)
     assert store.runs(TINY) == ("0001",)
+
+
+def test_a_venue_that_does_not_exist_is_refused_and_a_wrong_one_can_be_corrected(store):
+    write_layer(store, "venues/parken", {"tracking.gate_m": 0.6})
+    given = ("settings", TINY, "--project", store.url)
+    command(*given, "--set", "venue=parkn", code=1)
+    assert not read_layer(store, f"matches/{TINY}").values
+    write_layer(store, f"matches/{TINY}", {"venue": "gone"})  # as by another program
+    command(*given, "--set", "venue=parken")
+    assert shown(store, TINY)["tracking.gate_m"] == (0.6, "venue parken")
+
+
+def test_default_settings_forget_what_runs_stated_and_nothing_else(store):
+    stated = {"tracking.gate_m": 0.6, "iterations": 2, "gates": "always"}
+    write_layer(store, f"matches/{TINY}", stated)
+    settle(store, open_match(store, TINY), RunRequest({}, default_settings=True))
+    assert dict(read_layer(store, f"matches/{TINY}").values) == {"gates": "always"}
+
+
+def test_exports_have_the_pitch_of_the_layers(store):
+    registration = open_match(store, TINY).registration
+    folder = registration.model_copy(update={"folder": store.url})  # without pitch.json
+    write_layer(store, "project", {"pitch": {"length": 101.0, "width": 66.0}})
+    assert layers.pitch_of(store, folder).length == 101.0
+
+
+def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
+    path = f"onnx-rtmdet:{tmp_path / 'net.onnx'}"
+    assert given["detection"] == {"detector": path, "pose": "embedded"}

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from stand_ins import empty_store
 
 from data_contracts.conventions import FEET
 from flows.match import task_of
@@ -30,7 +31,7 @@ NOISE_PX = 1.0
 class Results(dict):
     """Results by name with what joints need of a run's record."""
 
-    record = SimpleNamespace(body_folder=None)
+    store, record = empty_store(), SimpleNamespace(match_id="m", body_folder=None)
 
 
 def add_feet(folder):

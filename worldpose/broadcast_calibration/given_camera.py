@@ -83,10 +83,11 @@ class GivenCamera:
 
         There are none without angles, place and focal length.
         """
-        most, each = 8, 12  # key frames, spread over the clip, and pixels of a marking
+        # Key frames, spread over the clip; pixels of a marking; least markings of a key frame.
+        most, each, least = 8, 12, 4
         camera, found = self.camera(image_size, settings), []
         known = np.flatnonzero(~np.isnan(camera.rows).any(axis=1))
-        for frame in known[np.linspace(0, len(known) - 1, min(len(known), most)).astype(int)]:
+        for frame in known[np.linspace(0, len(known) - 1, min(len(known), 4 * most)).astype(int)]:
             drawn = []
             for name in (*pitch.lines, *pitch.arcs):
                 pixels = camera.camera[frame].project(pitch.marking_points(name, 0.5))
@@ -96,8 +97,11 @@ class GivenCamera:
                 if len(xy) > 1:
                     some = tuple(xy[:: max(1, len(xy) // each)])
                     drawn.append(DrawnMarking(name=name, xy=some))
-            found.append(KeyFrame(frame=int(frame), markings=ClickedMarkings(drawn=tuple(drawn))))
-        return found
+            if len(drawn) >= least:
+                markings = ClickedMarkings(drawn=tuple(drawn))
+                found.append(KeyFrame(frame=int(frame), markings=markings))
+        chosen = np.linspace(0, len(found) - 1, min(len(found), most)).astype(int)
+        return [found[k] for k in chosen]
 
     def compare(self, camera: MovingCamera) -> dict[str, Floats]:
         """Return what these data state minus a camera of the same frames, by name and unit.

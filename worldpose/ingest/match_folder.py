@@ -134,6 +134,11 @@ def read_spec(folder: Path) -> MatchSpec:
     Raises:
         InputError: the file is missing or invalid.
     """
+    with reachable(folder):
+        return _read_spec(folder)
+
+
+def _read_spec(folder: Path) -> MatchSpec:
     file = folder / "match.yaml"
     if folder.is_dir() and not file.exists():
         raise InputError(
@@ -356,10 +361,10 @@ def _videos(folder: Path, spec: MatchSpec, known: Container[str]) -> dict[str, P
     for name, view in spec.broadcast_views.items():
         usual = f"broadcast/{name}.mp4"
         _require_own_video(folder, name, view.clip)
-        if is_there(usual):
-            videos[name] = path_of(usual, str(folder))
-        elif view.camera.id in named:
+        if view.camera.id in named and not find_file(folder, usual).exists():
             videos[name] = named[view.camera.id]
+        elif is_there(usual):
+            videos[name] = path_of(usual, str(folder))
     return videos
 
 

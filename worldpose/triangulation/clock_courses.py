@@ -91,20 +91,24 @@ def add_slow_drifts(
     those of `worldpose.triangulation.synchronization.synchronize`.
     """
     # Least difference of the ends in standard deviations [1], and in frames; their length [s].
-    min_score, min_frames, end_s = 5.0, 0.1, 30.0
+    min_score, min_frames, end_s = 5.0, 0.25, 30.0
     frames = len(detections.frame)
     span = min(frames // 2, round(end_s * fps))
-    late, std = [], []
+    late, std, groups = [], [], []
     for rows in (slice(0, span), slice(frames - span, frames)):
         found = synchronize(cameras, detections[rows], fps, max_offset_s=max_offset_s, pitch=pitch)
         late.append(found.late)
         std.append(found.std)
+        groups.append(found.groups)
     change = late[1] - late[0]
+    for group in groups[0]:
+        # Each end has its own zero, the median of the cameras whose offset it knows.
+        both = [c for c in group if np.isfinite(change[c])]
+        change[both] -= np.median(change[both]) if both else 0.0
     drifts = np.abs(change) > np.maximum(min_score * np.hypot(*std), min_frames)
-    share = (np.array([[0], [frames - 1]]) - 0.5 * (span - 1)) / (frames - span)
-    ends = late[0] + share * change
+    end = 0.5 * (frames - 1) / (frames - span) * change
     return [
-        [(0, float(ends[0, c])), (frames - 1, float(ends[1, c]))]
+        [(0, course[0][1] - float(end[c])), (frames - 1, course[0][1] + float(end[c]))]
         if drifts[c] and len(course) == 1
         else course
         for c, course in enumerate(courses)

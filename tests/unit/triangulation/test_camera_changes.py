@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -218,12 +219,28 @@ def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
 def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     people = view(cameras, partial(fast, rate=1.01))
     untracked = replace(people, detection_index=np.empty((0, 0, 0), np.int16))
-    given = [[(0, 0.0)], [(0, 0.0)], [(0, 0.5)], [(0, 0.0)]]
+    middle = 0.005 * (FRAMES - 1)
+    given = [[(0, 0.0)], [(0, 0.0)], [(0, middle)], [(0, 0.0)]]
     courses = add_slow_drifts(given, cameras, untracked, FPS, max_offset_s=0.4)
     assert [len(course) for course in courses] == [1, 1, 2, 1]
     rows, values = np.array(courses[BAD]).T
     assert rows.tolist() == [0, FRAMES - 1]
     np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
+
+
+def test_an_end_that_does_not_know_a_camera_gives_no_drift(cameras, monkeypatch):
+    """The median of known offsets, which is each end's zero, jumps from 6.5 to 3 frames."""
+    ends = [([-6.5, -3.5, 3.5, 5.5], (0, 1, 2, 3)), ([-3.0, 0.0, 7.0, np.nan], (0, 1, 2))]
+
+    def synchronize(*_, **__):
+        late, group = ends.pop(0)
+        std = np.where(np.isfinite(late), 0.01, np.inf)
+        return SimpleNamespace(late=np.array(late), std=std, groups=(group,))
+
+    monkeypatch.setattr("worldpose.triangulation.clock_courses.synchronize", synchronize)
+    given = [[(0, offset)] for offset in (0.0, 3.0, 10.0, 12.0)]
+    people = view(cameras, late)
+    assert add_slow_drifts(given, cameras, people, FPS, max_offset_s=0.4) == given
 
 
 CAMERA = Camera.from_matrices(
