@@ -16,7 +16,8 @@ NIGHT = {"cron": "0 3 * * *", "timezone": "Europe/Vienna"}
 def schedules(served):
     found = served.ask("/deployments/name/reprocess/worldpose-reprocess")
     keep = ("id", "slug", "active", "schedule")
-    return [{name: each[name] for name in keep} for each in found["schedules"]]
+    kept = [{name: each[name] for name in keep} for each in found["schedules"]]
+    return sorted(kept, key=lambda each: each["id"])
 
 
 @pytest.mark.slow
