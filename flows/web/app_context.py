@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Lock, Thread, Timer
 from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
@@ -92,6 +92,8 @@ _STAGE_LINE = re.compile(r" *[\d.]+ s  (\w+): \d+ of \d+ to compute")
 _UNIT_LINE = re.compile(r" *[\d.]+ s    \S+ +[\d.]+ s .* (\d+) %((?: [\d.]+ \w+)?)$")
 LAST_LINES = 12
 """Lines of a run's output that a page shows."""
+PATIENCE_SECONDS = 15.0
+"""Time in which a cancelled run ends by itself [s]."""
 FRESH_SECONDS = 2.0
 """Maximum age of Prefect's answer that pages show [s]."""
 EPOCH = datetime.fromtimestamp(0, UTC)
@@ -265,6 +267,11 @@ class _Seen:
     problem: UnreachablePrefectError | None = None
 
 
+def _terminate(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGTERM)
+
+
 @dataclass
 class LocalRuns:
     """Runs of pages without a service, one after another."""
@@ -315,6 +322,10 @@ class LocalRuns:
             is_at_work = match_id == self._at_work and self._process is not None
             if is_at_work and self._process is not None:
                 os.killpg(self._process.pid, signal.SIGINT)
+                # Some ignore it, as what is started in the background of a script.
+                later = Timer(PATIENCE_SECONDS, _terminate, [self._process])
+                later.daemon = True
+                later.start()
             return waits or is_at_work
 
     def _run_all(self, match_id: str, gates: str | None) -> None:

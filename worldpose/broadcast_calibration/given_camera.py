@@ -84,7 +84,7 @@ class GivenCamera:
         There are none without angles, place and focal length.
         """
         # Key frames, spread over the clip; pixels of a marking; least markings of a key frame.
-        most, each, least = 8, 12, 4
+        most, each, least = 8, 12, 2
         camera, found = self.camera(image_size, settings), []
         known = np.flatnonzero(~np.isnan(camera.rows).any(axis=1))
         for frame in known[np.linspace(0, len(known) - 1, min(len(known), 4 * most)).astype(int)]:
