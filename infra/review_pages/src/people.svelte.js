@@ -21,7 +21,10 @@ export class People {
     this.owner = owner;
     this.path = matchPath(match);
     this.where = `${this.path}/detections/${encodeURIComponent(owner)}`;
-    this.chosen = $derived(this.info?.people.find((each) => each.detection === this.who));
+  }
+
+  get chosen() {
+    return this.info?.people.find((each) => each.detection === this.who);
   }
 
   async load(number) {
