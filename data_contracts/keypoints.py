@@ -150,6 +150,18 @@ class KeypointDetections(Generic[Array]):
         """Return the same detections with one tracked person alone."""
         return self.assign_people(self.detection_index[:, :, person : person + 1])
 
+    def by_person(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Return keypoints (frames, cameras, persons, 17, 2) [px] and their confidence, by person.
+
+        NaN and 0 where the person is not seen.
+        """
+        frames, cameras = np.ogrid[: len(self.keypoints), : self.keypoints.shape[1]]
+        place = (frames[..., None], cameras[..., None], self.detection_index)
+        keypoints, confidence = self.keypoints[place], self.confidence[place]
+        seen = (self.detection_index >= 0)[..., None] & (confidence > 0.0)
+        seen &= np.isfinite(keypoints).all(axis=-1)
+        return np.where(seen[..., None], keypoints, np.nan), np.where(seen, confidence, 0.0)
+
     def select(
         self: KeypointDetections, detections: slice | NDArray[np.intp] | Flags
     ) -> KeypointDetections:

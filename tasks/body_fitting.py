@@ -35,6 +35,7 @@ from worldpose.body_fitting.report import FitMetrics, far_offsets
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
+from worldpose.reference_method import require_torch
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.results import ExtraJoints
@@ -48,6 +49,8 @@ def body_fitting(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write bodies and their keypoints, and compare them with joints in held-out cameras."""
     people = open_people(inputs)
     fit = write_fit(inputs, result, BODY_FITTING, people, inputs)
+    if inputs.settings(BodyFittingSettings).method == "paper":
+        return  # the comparison would refit our bodies
     clip, placed = people.clip, inputs.made_from(f"retriangulation/{inputs.unit}")
     settings = triangulation_settings(placed, inputs.unit)
     seen = SeenClip(clip.cameras, camera_errors(inputs, clip), people, settings, clip.fps)
@@ -249,7 +252,14 @@ def write_fit(
     """
     model, settings, ground = _fitting_basis(people, fitting)
     metrics = FitMetrics(people.fps, people.stride)
-    windows = fit_in_windows(model, people, settings, ground, further.known_shapes)
+    if settings.method == "paper":
+        require_torch()
+        from worldpose.body_fitting import paper_variant
+
+        seen = (people.clip.cameras, people)
+        windows = paper_variant.fit_in_windows(model, people, seen, settings, further.known_shapes)
+    else:
+        windows = fit_in_windows(model, people, settings, ground, further.known_shapes)
     with inputs.open_spool() as spool:
         for part, bodies in windows:
             spool.add(frame_arrays(bodies))

@@ -23,6 +23,7 @@ from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
 from worldpose.ingest.clock import camera_frames
 from worldpose.ingest.footage import read_still
 from worldpose.pitch.template import PitchTemplate
+from worldpose.reference_method import require_torch
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import Proposal, calibrate_proposal
 from worldpose.static_calibration.report import (
@@ -87,15 +88,22 @@ def _calibrate(inputs: UnitInputs) -> StaticCalibration:
     if sources["clicked"]:
         ((file, clicked),) = sources["clicked"].items()
         width, height = sources["image_size"]
-        return calibrate_camera(
+        by_paper = settings.method == "paper"
+        found = calibrate_camera(
             pitch,
             clicked_markings(clicked),
             (width, height),
-            picture=picture,
+            picture=None if by_paper else picture,
             settings=settings,
             where=file,
             lens=lens,
         )
+        if by_paper:
+            require_torch()
+            from worldpose.reference_method.static_calibration import calibrate
+
+            found = calibrate(found, pitch, picture if settings.lines else None)
+        return found
     where = f"image of {inputs.unit}"
     return calibrate_proposal(
         pitch,

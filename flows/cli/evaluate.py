@@ -63,7 +63,8 @@ def evaluate(
         match_in: Match whole tracks by their boxes in this camera of the reference, as the
             paper does; by distance by default.
         fps: Frames per second; the match's by default.
-        ablation: Simulate N penalty-box trials and print the paper's ablation instead.
+        ablation: Simulate N penalty-box trials and print the paper's ablation instead, by our
+            method and by the paper's own (worldpose/reference_method; needs torch).
         method: Score another method's result (docs/how-to/baselines.md) instead of
             --prediction; may be given more than once for one table.
         body: Body model for the methods' poses; the open body by default.
@@ -181,7 +182,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
 
     Seeds count from 0; JSON has every trial's metrics.
     """
-    from flows.results.ablation import PAPER, TRIANGULATIONS, Score, ablation
+    from flows.results.ablation import BY_PAPER, PAPER, TRIANGULATIONS, Score, ablation
 
     trials = ablation(
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
@@ -200,7 +201,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
         return
     columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px")
     for clicks, found in trials.items():
-        for how in TRIANGULATIONS:
+        for how in (*TRIANGULATIONS, BY_PAPER):
             names = [row.removesuffix(how) for row in found[0] if _is_of(row, how)]
             rows = [_row(name, [t[name + how] for t in found]) for name in names]
             if rows:
@@ -210,10 +211,11 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
 
 
 def _is_of(row: str, how: str) -> bool:
-    """Return whether an ablation's row uses this triangulation; the first one has no suffix."""
-    from flows.results.ablation import TRIANGULATIONS
+    """Return whether an ablation's row ends with this way; our own has no suffix."""
+    from flows.results.ablation import BY_PAPER, TRIANGULATIONS
 
-    return max((end for end in TRIANGULATIONS if row.endswith(end)), key=len) == how
+    ends = (end for end in (*TRIANGULATIONS, BY_PAPER) if row.endswith(end))
+    return max(ends, key=len) == how
 
 
 def _row(name: str, scores: list[Score]) -> tuple[str, str, str, str, str]:

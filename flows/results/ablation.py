@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from data_contracts.arrays import Floats
 from worldpose.body.body_file import find_body
 from worldpose.body_fitting.estimate import fit_bodies
-from worldpose.body_fitting.results import ClipEvidence
+from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
@@ -22,6 +23,7 @@ from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
+from worldpose.reference_method import require_torch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import ClickSettings
@@ -31,6 +33,7 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.results import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
 SCENARIO: Final = "penalty-box"
@@ -50,6 +53,9 @@ PAPER: Final = {
     "+ BA + SMPL": (80.0, 66.3),
 }
 """G-MPJPE and PA-MPJPE of the paper's table [mm]."""
+
+BY_PAPER: Final = ", the paper's method"
+"""End of the names of rows that `worldpose.reference_method` computes."""
 
 _OURS: Final = TriangulationSettings()
 _STATED: Final = {"offsets": "none", "learn_noise": False}
@@ -87,7 +93,8 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     Base is calibration from clicks alone, without painted lines, as in the paper. `S only` frees
     the whole lens and drops the camera priors, as is common practice; the rows `unguarded` show its
     result without held-out validation. Every row is triangulated from the same tracks; the last one
-    fits bodies to our triangulation after adjustment.
+    fits bodies to our triangulation after adjustment. Rows that end with `BY_PAPER` are the four of
+    the paper by its own method.
 
     Note:
         Paper, table of the Vicon trial.
@@ -110,14 +117,22 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     }
     names = tuple(calibrations)
     scores = {
-        name + how: _score(scene, clip, names, cameras, changed, settings)
+        name + how: _score(
+            scene,
+            clip,
+            names,
+            cameras,
+            changed,
+            triangulate_joints(cameras, clip.detections, settings).joints,
+        )
         for how, settings in TRIANGULATIONS.items()
         for name, (cameras, changed) in rows.items()
     }
+    placed = triangulate_joints(both.cameras, clip.detections, _OURS, both.covariance)
     scores["+ BA + SMPL"] = _score(
-        scene, clip, names, both.cameras, both.accepted, _OURS, both.covariance, bodies=True
+        scene, clip, names, both.cameras, both.accepted, _fit(scene, clip, placed)
     )
-    return scores
+    return scores | _by_paper(scene, clip, calibrations, pitch)
 
 
 def ablation(
@@ -169,25 +184,74 @@ def _clip(
     )
 
 
+def _by_paper(
+    scene: Scene, clip: Clip, known: Mapping[str, StaticCalibration], pitch: PitchTemplate
+) -> dict[str, Score]:
+    """Return the paper's four rows by its own method, from the same tracks.
+
+    Its first row has stages 1 and 2 of each camera; there are no images for stage 3. A camera that
+    stage 1 does not determine starts stage 2 from ours.
+    """
+    require_torch()
+    from worldpose.reference_method.static_calibration import calibrate
+    from worldpose.triangulation.paper_variant import place_joints
+
+    def calibrate_one(ours: StaticCalibration) -> Camera:
+        try:
+            return calibrate(ours, pitch).estimate.camera
+        except InputError:
+            return calibrate(ours, pitch, start=ours.estimate.camera).estimate.camera
+
+    first = list(map(calibrate_one, known.values()))
+    base, none = replace(clip, cameras=Camera.stack(first)), np.zeros(len(known))
+    settings = BundleAdjustmentSettings(method="paper")
+    both = adjust_cameras(base, settings)
+    marks = adjust_cameras(base, settings.model_copy(update={"evidence": "markings"}))
+    rows = {
+        "base": (base.cameras, none),
+        "+ BA, S and P": (both.cameras, both.accepted),
+        "+ BA, S, unguarded": (marks.cameras, marks.accepted),
+    }
+    scores, joints = {}, {}
+    for name, (cameras, changed) in rows.items():
+        start = triangulate_joints(cameras, clip.detections, _OURS).joints
+        joints[name] = place_joints(cameras, clip.detections, start, about_mid_hip=False)
+        scores[name + BY_PAPER] = _score(scene, clip, tuple(known), cameras, changed, joints[name])
+    bodies = _fit_as_paper(clip, both.cameras, joints["+ BA, S and P"])
+    scores["+ BA + SMPL" + BY_PAPER] = _score(
+        scene, clip, tuple(known), both.cameras, both.accepted, bodies
+    )
+    return scores
+
+
+def _fit_as_paper(clip: Clip, cameras: Camera, joints: Floats) -> Floats:
+    """Return the joints of the paper's bodies, of the open body."""
+    from worldpose.body_fitting.paper_variant import fit_in_windows
+
+    settings = BodyFittingSettings(method="paper")
+    evidence = ClipEvidence(joints, np.zeros((*joints.shape, 3)), clip.fps)
+    seen = (cameras, clip.detections)
+    parts = fit_in_windows(find_body(settings.body_model), evidence, seen, settings, {})
+    return BodyFit.concatenate([fit for _, fit in parts]).joints
+
+
+def _fit(scene: Scene, clip: Clip, placed: Triangulation) -> Floats:
+    """Return the joints of our bodies."""
+    how = BodyFittingSettings()
+    floor = PitchTemplate.from_spec(scene.surveyed).height
+    evidence = ClipEvidence(placed.joints, placed.covariance, clip.fps, placed.common_bias)
+    return fit_bodies(find_body(how.body_model), evidence, how, floor).joints
+
+
 def _score(
     scene: Scene,
     clip: Clip,
     names: tuple[str, ...],
     cameras: Camera,
     changed: np.ndarray,
-    settings: TriangulationSettings,
-    covariance: np.ndarray | None = None,
-    bodies: bool = False,
+    joints: Floats,
 ) -> Score:
-    """Score cameras and the joints triangulated with them, or bodies fitted to these joints."""
-    placed = triangulate_joints(cameras, clip.detections, settings, covariance)
-    joints = placed.joints
-    if bodies:
-        how = BodyFittingSettings()
-        floor = PitchTemplate.from_spec(scene.surveyed).height
-        model = find_body(how.body_model)
-        evidence = ClipEvidence(joints, placed.covariance, clip.fps, placed.common_bias)
-        joints = fit_bodies(model, evidence, how, floor).joints
+    """Score cameras, and joints (frames, persons, 17, 3) [m] that were placed with them."""
     tracks = JointTracks(clip.detections.frame, np.arange(joints.shape[1]), joints)
     found, _ = evaluate_joints(tracks, scene.truth, fps=clip.fps)
     estimated = {name: cameras[c] for c, name in enumerate(names)}

@@ -37,6 +37,7 @@ ORDER_IN_WORLDPOSE = (
     "formats",
     "ingest",
     "static_calibration",
+    "reference_method",
     "review",
     "detection",
     "training",

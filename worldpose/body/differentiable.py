@@ -108,7 +108,7 @@ class DifferentiableBody:
         angles = torch.cat(
             [global_orient.expand((*batch, -1)), body_pose.expand((*batch, -1))], dim=-1
         )
-        local = self._rotations(_split(angles, JOINTS, 3))
+        local = rotation_matrices(_split(angles, JOINTS, 3))
         rest = shaped.expand((*batch, -1, -1))
         rotations, joints = [local[..., 0, :, :]], [rest[..., 0, :]]
         for joint, parent in enumerate(self._parents[1:], start=1):
@@ -118,16 +118,21 @@ class DifferentiableBody:
         turned, placed = torch.stack(rotations, dim=-3), torch.stack(joints, dim=-2)
         return local, turned, placed, placed - (turned @ rest[..., None])[..., 0]
 
-    def _rotations(self, rotvec: Tensor) -> Tensor:
-        """Return Rodrigues' rotations (..., 3, 3); sinc keeps value and gradient exact at zero."""
-        angle = torch.linalg.vector_norm(rotvec, dim=-1)[..., None, None]
-        x, y, z = rotvec.unbind(-1)
-        zero = torch.zeros_like(x)
-        cross = _split(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1), 3, 3)
-        half = torch.sinc(angle / (2.0 * math.pi))
-        outer = rotvec[..., :, None] * rotvec[..., None, :]
-        turning = torch.cos(angle) * self._identity + torch.sinc(angle / math.pi) * cross
-        return turning + 0.5 * torch.square(half) * outer
+
+def rotation_matrices(rotvec: Tensor) -> Tensor:
+    """Return Rodrigues' rotations (..., 3, 3) of vectors (..., 3) [rad].
+
+    Value and gradient are exact at zero.
+    """
+    angle = torch.linalg.vector_norm(rotvec, dim=-1)[..., None, None]
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = _split(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1), 3, 3)
+    half = torch.sinc(angle / (2.0 * math.pi))
+    outer = rotvec[..., :, None] * rotvec[..., None, :]
+    identity = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    turning = torch.cos(angle) * identity + torch.sinc(angle / math.pi) * cross
+    return turning + 0.5 * torch.square(half) * outer
 
 
 def _split(tensor: Tensor, *sizes: int) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from data_contracts.records import Record
@@ -15,6 +17,9 @@ class BodyFittingSettings(Record):
     chosen on simulated seeds 101 to 104, not on the seeds of reported results.
     """
 
+    method: Literal["worldpose", "paper"] = "worldpose"
+    """Method; `paper` fits 2D keypoints about the mid-hips without pose prior, offsets, ground or
+    robust loss, and uses of these settings the body and the gaps (needs the extra `body`)."""
     body_model: str = OPEN_BODY
     """Body model to fit: the open body, open-neutral/3 with narrower hip joints, or one installed
     with `worldpose body install`."""

@@ -43,11 +43,12 @@ from worldpose.broadcast_calibration.report import (
 )
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.shots import require_one_shot
-from worldpose.broadcast_calibration.solver import ClipSolution, descend, solve
+from worldpose.broadcast_calibration.solver import ClipSolution, solve
 from worldpose.broadcast_calibration.tracking import Chain, Followed, chain, follow
 from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
+from worldpose.reference_method import require_torch
 
 Pictures = Callable[[], Iterator[Image]]
 """Starts a new pass over all frames of the clip, grey (height, width), in order."""
@@ -181,7 +182,7 @@ def refine(
     share = estimate_flow_share(
         tracked.chain, tracked.keys.frames, deviation, settings.flow_drift_px
     )
-    noise, matches = PlayerNoise(0.0, 0.0), None
+    noise, matches, players = PlayerNoise(0.0, 0.0), None, PointEvidence.none()
     surface = tracked.keys.surface
     offset: FeedOffset | None = None
     before = camera
@@ -224,8 +225,8 @@ def refine(
         camera = solution.camera
         shown = problem.of_size(solution.paint_offsets)
         surface = pitch.surface + (learned.errors.size_m * shown)[2:]
-    if settings.solver == "adam":
-        solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
+    if settings.method == "paper":
+        solution = _refit_as_paper(pitch, tracked, players, problem, settings)
     lasting = correlation_time(tracked.chain.camera, fps)
     uncertainty = compute_uncertainty(
         solution, problem, settings.line_shift_px, settings.player_shift, lasting
@@ -258,6 +259,21 @@ def refine(
         )
         report = _report_given(clip, given, denied, report, solution.camera)
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
+
+
+def _refit_as_paper(
+    pitch: PitchTemplate,
+    tracked: TrackedClip,
+    players: PointEvidence,
+    problem: ClipProblem,
+    settings: BroadcastCalibrationSettings,
+) -> ClipSolution:
+    require_torch()
+    from worldpose.broadcast_calibration.paper_variant import refit
+
+    start, count = tracked.chain.camera, settings.line_samples
+    camera = refit(start, pitch, players, count, settings.adam_iterations)
+    return ClipSolution.at(camera, np.zeros((problem.paint_count, 3)), problem)
 
 
 def _report_given(

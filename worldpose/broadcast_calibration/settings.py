@@ -122,10 +122,11 @@ class BroadcastCalibrationSettings(Record):
     """Iterations of player matching and line search [1]."""
     max_iterations: int = Field(default=30, ge=1, le=10000)
     """Maximum solver iterations in each of these passes [1]."""
-    solver: Literal["levenberg_marquardt", "adam"] = "levenberg_marquardt"
-    """Solver of the last fit; Adam is the paper's (M5)."""
+    method: Literal["worldpose", "paper"] = "worldpose"
+    """Method of the last fit; `paper` minimizes E_field and E_player alone by Adam, from the
+    tracked camera (M5; needs the extra `body`)."""
     adam_iterations: int = Field(default=2000, ge=1, le=1_000_000)
-    """Iterations of Adam, if chosen [1]."""
+    """Iterations of Adam, if `method` is `paper` [1]."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)
     """Minimum share of followed points consistent with a rotating and zooming camera between two
     frames of one shot [1]."""

@@ -10,7 +10,7 @@ import numpy as np
 from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.clip_problem import ClipProblem
 from worldpose.broadcast_calibration.evidence import PointEvidence
-from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, MovingCamera
 from worldpose.broadcast_calibration.residuals import ClipEquations, linearize
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.arrow import ArrowFactor, ArrowSystem
@@ -100,29 +100,3 @@ def displace(points: PointEvidence, problem: ClipProblem, paint_offsets: Floats)
 
 RATE: Final = 1e-3
 """Learning rate of every parameter [its unit; thousands of pixels for the principal point] (M5)."""
-
-
-def descend(camera: MovingCamera, problem: ClipProblem, iterations: int) -> ClipSolution:
-    """Return the camera after some iterations of Adam (Kingma and Ba) at a rate of 1e-3.
-
-    Parameters are those of the solver: rotations in radians, logarithms of focal lengths,
-    distortion, metres. The principal point is in units of 1,000 px.
-    """
-    decay = (0.9, 0.999)
-    state = ClipSolution.at(camera, np.zeros((problem.paint_count, 3)), problem)
-    frames = len(camera) * FRAME_SIZE
-    unit = np.ones(frames + CLIP_SIZE + state.paint_offsets.size)
-    unit[frames + 3 : frames + CLIP_SIZE] = 1e3
-    mean, square = np.zeros(len(unit)), np.zeros(len(unit))
-    costs = [state.cost]
-    for iteration in range(1, iterations + 1):
-        system = state.equations.system
-        gradient = unit * np.concatenate([system.right.ravel(), system.right_corner])
-        mean = decay[0] * mean + (1.0 - decay[0]) * gradient
-        square = decay[1] * square + (1.0 - decay[1]) * gradient**2
-        first = mean / (1.0 - decay[0] ** iteration)
-        second = square / (1.0 - decay[1] ** iteration)
-        step = -RATE * unit * first / (np.sqrt(second) + 1e-8)
-        state = state.take_step(step[:frames].reshape(-1, FRAME_SIZE), step[frames:], problem)
-        costs.append(state.cost)
-    return replace(state, costs=tuple(costs))

@@ -139,22 +139,6 @@ class Observations(NamedTuple):
         return rows._replace(points=self.points[used], point_of=number)
 
 
-def keypoints_by_person(detections: KeypointDetections) -> tuple[Floats, Floats]:
-    """Return keypoints (frames, cameras, persons, 17, 2) and their confidence, by person.
-
-    NaN and 0 where the person is not seen.
-    """
-    keypoints, confidence = detections.keypoints, detections.confidence
-    frames, cameras = np.ogrid[: len(keypoints), : keypoints.shape[1]]
-    place = (frames[..., None], cameras[..., None], detections.detection_index)
-    seen = (detections.detection_index >= 0)[..., None] & (confidence[place] > 0.0)
-    seen &= np.isfinite(keypoints[place]).all(axis=-1)
-    return (
-        np.where(seen[..., None], keypoints[place], np.nan),
-        np.where(seen, confidence[place], 0.0),
-    )
-
-
 def select_observations(
     clip: Clip, frames: Integers, people: Flags, cameras: Camera, min_views: int
 ) -> Observations:
@@ -162,7 +146,7 @@ def select_observations(
 
     People are (persons,) or (k, persons); the cameras predict their size in the image.
     """
-    image, confidence = keypoints_by_person(clip.detections[frames])
+    image, confidence = clip.detections[frames].by_person()
     joints = clip.joints[frames]
     good = np.isfinite(joints[..., 0]) & (clip.views[frames] >= min_views)
     good &= np.broadcast_to(people, good.shape[:2])[..., None]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.adjuster import Adjuster, merge_cameras, place_people
 from worldpose.bundle_adjustment.clip import Clip, learn_confidence, propose_frames
 from worldpose.bundle_adjustment.held_out_validation import (
@@ -15,12 +14,13 @@ from worldpose.bundle_adjustment.held_out_validation import (
 )
 from worldpose.bundle_adjustment.report import (
     BundleAdjustment,
+    camera_motion,
     describe_motion,
     explain_decision,
     refuse_all,
 )
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.geometry.cameras import Camera
+from worldpose.reference_method import require_torch
 
 
 def adjust_cameras(
@@ -49,6 +49,11 @@ def adjust_cameras(
     )
     used = np.flatnonzero(np.isin(clip.detections.frame, settings.chosen_frames))
     used = used if settings.chosen_frames else proposed
+    if settings.method == "paper":
+        require_torch()
+        from worldpose.bundle_adjustment.paper_variant import adjust_unguarded
+
+        return adjust_unguarded(clip, settings, proposed, used)
     judged = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views, used
     )
@@ -112,19 +117,4 @@ def adjust_cameras(
         evidence=evidence,
         motion=motion,
         refused=freely.cameras,
-    )
-
-
-def camera_motion(before: Camera, after: Camera) -> Floats:
-    """Return the motion (cameras, 3) of cameras: of center [m], axes [rad] and focal length [1]."""
-    turned = before.cam_from_world.rotation @ after.cam_from_world.rotation.swapaxes(1, 2)
-    # Use the chord: the trace loses half of the digits of a small angle.
-    chord = np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
-    return np.stack(
-        [
-            np.linalg.norm(after.center - before.center, axis=1),
-            2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)),
-            after.focal[:, 0] / before.focal[:, 0] - 1.0,
-        ],
-        axis=1,
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
-from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
+from worldpose.bundle_adjustment.clip import Clip, project_joints
 from worldpose.bundle_adjustment.residuals import (
     MEDIAN_SQUARED,
     AdjustmentProblem,
@@ -64,7 +64,7 @@ def held_out_errors(
     error = loss.copy()
     judges = np.flatnonzero(people.any(axis=0))
     judged = detections.assign_people(index[:, :, judges])
-    image, weight = keypoints_by_person(judged)
+    image, weight = judged.by_person()
 
     def measure(c: int) -> tuple[Floats, Floats]:
         joints = _triangulate(clip, cameras, c, judged)
@@ -225,7 +225,7 @@ def find_contradictions(
     fewest = 20  # one person, hardly more than once
     limit = 4.0  # twice the stated error, as for one correct camera in thirty
     detections = clip.detections[frames]
-    image, weight = keypoints_by_person(detections)
+    image, weight = detections.by_person()
     joints = clip.joints[frames]
     _, noise = project_joints(clip.cameras, joints, weight, clip.triangulation)
     known = known_covariance(clip, settings)

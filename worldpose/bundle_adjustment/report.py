@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_by_person, project_joints
+from worldpose.bundle_adjustment.clip import Clicks, Clip, project_joints
 from worldpose.bundle_adjustment.held_out_validation import CHANCE, PooledEvidence, Verdict
 from worldpose.bundle_adjustment.residuals import KeypointNoise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
@@ -169,7 +169,7 @@ def _find_outliers(
     """Return rows (n, 5) of frame, camera, person, joint and Mahalanobis distance."""
     detections = clip.detections[frames]
     joints = triangulate_joints(cameras, detections, clip.triangulation).joints
-    image, weight = keypoints_by_person(detections)
+    image, weight = detections.by_person()
     predicted, stated = project_joints(cameras, joints, weight, clip.triangulation)
     off = np.linalg.norm(predicted - image, axis=-1) / (noise.scale * stated)
     off[~np.isfinite(off)] = np.nan
@@ -290,6 +290,21 @@ def explain_decision(
     if objection and not stands_alone:
         return f"refused: {change}, but {objection}"
     return f"refused: {change}, but no more after other cameras were refused"
+
+
+def camera_motion(before: Camera, after: Camera) -> Floats:
+    """Return the motion (cameras, 3) of cameras: of center [m], axes [rad] and focal length [1]."""
+    turned = before.cam_from_world.rotation @ after.cam_from_world.rotation.swapaxes(1, 2)
+    # Use the chord: the trace loses half of the digits of a small angle.
+    chord = np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    return np.stack(
+        [
+            np.linalg.norm(after.center - before.center, axis=1),
+            2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)),
+            after.focal[:, 0] / before.focal[:, 0] - 1.0,
+        ],
+        axis=1,
+    )
 
 
 def describe_motion(motion: Floats) -> str:

@@ -45,6 +45,9 @@ class GivenCameraPrior(Record):
 class BundleAdjustmentSettings(Record):
     """Selection and weights of people in the adjustment, and conditions of acceptance."""
 
+    method: Literal["worldpose", "paper"] = "worldpose"
+    """Method; `paper` is the paper's, without robust loss, prior or held-out validation (needs the
+    extra `body`)."""
     evidence: Literal["markings_and_players", "markings"] = "markings_and_players"
     """Observations in the adjustment. `markings` alone, with every parameter of the lens free and
     no prior, is the case that the paper warns of; it exists for measurements."""

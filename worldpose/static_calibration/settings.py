@@ -101,6 +101,9 @@ class CameraPrior(Record):
 class ProposalSettings(Record):
     """Prior of cameras without clicks, and the people who decide their sides."""
 
+    method: Literal["worldpose", "paper"] = "worldpose"
+    """Method; `paper` replaces the camera by that of the paper's three stages, from clicks that are
+    inliers (needs the extra `body`)."""
     prior: CameraPrior = CameraPrior()
     """Gaussian prior of the camera."""
     people_frames: int = Field(default=12, ge=1, le=1000)
@@ -111,6 +114,9 @@ class ProposalSettings(Record):
 class StaticCalibrationSettings(Record):
     """Click noise, camera prior, and thresholds of outliers and accuracy."""
 
+    method: Literal["worldpose", "paper"] = "worldpose"
+    """Method; `paper` replaces the camera by that of the paper's three stages, from clicks that are
+    inliers (needs the extra `body`)."""
     prior: CameraPrior = CameraPrior()
     """Gaussian prior of the camera."""
     click_noise_px: float = Field(default=1.0, ge=1e-6, le=100)

@@ -25,6 +25,7 @@ from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.reference_method import require_torch
 from worldpose.triangulation.clocks import estimate_clocks, read_frames
 from worldpose.triangulation.limb_lengths import (
     find_swaps,
@@ -191,7 +192,14 @@ def reconstruct_chunks(
             model.motion,
             slice(part.start - first, part.stop - first),
         )
-        yield Chunk(part, here, smooth)
+        placed = here
+        if settings.method != "worldpose":
+            require_torch()
+            from worldpose.triangulation.paper_variant import replace_joints
+
+            middle = settings.method == "paper_midhip"
+            placed, smooth = replace_joints(cameras, read(part), here, smooth, about_mid_hip=middle)
+        yield Chunk(part, placed, smooth)
         if after is not None:
             before, here = here, after
 

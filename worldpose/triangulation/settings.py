@@ -17,6 +17,9 @@ class TriangulationSettings(Record):
     serves people of 60 and of 600 pixels.
     """
 
+    method: Literal["worldpose", "paper", "paper_midhip"] = "worldpose"
+    """Method: `paper` is plain least squares over all views in each frame, and `paper_midhip` the
+    same with the mid-hips of each person moved together (needs the extra `body`)."""
     pixel_noise_px: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation per image axis that does not depend on distance [px]: the grid
     of a detector."""

@@ -1,0 +1,20 @@
+"""The paper's own variants, equation by equation, in torch: the baseline of the ablation.
+
+Each function names its equation and section. Where the paper leaves a choice open, the docstring
+says which one is made; no choice was tuned. Stages import this package only for `method=paper`.
+"""
+
+from worldpose.errors import InputError
+
+
+def require_torch() -> None:
+    """Check that torch is installed.
+
+    Raises:
+        InputError: it is not.
+    """
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        todo = "Install worldpose[body], or use method=worldpose."
+        raise InputError("method=paper", expected="torch", found=f"{error}", todo=todo) from error

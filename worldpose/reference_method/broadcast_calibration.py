@@ -1,0 +1,80 @@
+"""E_calib of the moving camera (section "Broadcasting Camera Calibration")."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from data_contracts.arrays import Floats, Integers
+from worldpose.geometry.cameras import Camera
+from worldpose.reference_method.cameras import TensorCameras
+
+FIELD_WEIGHT: Final = 1.0
+"""lambda_4."""
+PLAYER_WEIGHT: Final = 0.5
+"""lambda_5."""
+RATE: Final = 1e-3
+"""Adam's learning rate."""
+SCALE_PX: Final = 100.0
+"""Scale of the Geman-McClure function, that of SMPLify-X [px]; the paper gives none."""
+
+
+def robust(off: Tensor) -> Tensor:
+    """Return Geman and McClure's rho(x) = x^2 / (1 + x^2 / c^2) (n,) of errors (n, 2) [px]."""
+    squared = off.square().sum(-1)
+    return squared / (1.0 + squared / SCALE_PX**2)
+
+
+def energy(cameras: TensorCameras, points: Tensor, image: Tensor, frame: Tensor) -> Tensor:
+    """Return sum rho(Pi(X; Lambda_b) - x): E_field of markings, E_player of matched keypoints.
+
+    Args:
+        cameras: (frames,) Lambda_b.
+        points: (n, 3) X' of markings, or P of people with I_ij = 1 [m], world.
+        image: (n, 2) [px], their detections; of markings their initial positions.
+        frame: (n,)
+    """
+    return robust(cameras.project(points, frame) - image).sum()
+
+
+def refine(
+    start: Camera,
+    field: tuple[Floats, Floats, Integers],
+    players: tuple[Floats, Floats, Integers],
+    iterations: int = 2000,
+) -> Camera:
+    """Return arg min of E_calib = lambda_4 E_field + lambda_5 E_player, by Adam.
+
+    R, f and k1 to k3 are free in each frame, and the centre C in the clip. The principal point is
+    one for the clip, as our records hold it; the paper has one per frame.
+
+    Args:
+        start: (frames,) batch with one centre.
+        field: points (n, 3) [m], world, pixels (n, 2) and frames (n,) of the markings.
+        players: the same of people's keypoints.
+        iterations: number of steps.
+    """
+    cameras = TensorCameras.of(start)
+    turn, center, focal, middle, lens = (
+        part.clone() for part in cameras.values.split((3, 3, 1, 2, 3), dim=1)
+    )
+    moving = [part.requires_grad_() for part in (turn, center[:1], focal, middle[:1], lens)]
+
+    def values() -> Tensor:
+        return torch.cat([part.expand(len(focal), -1) for part in moving], dim=1)
+
+    solver = torch.optim.Adam(moving, lr=RATE)
+    terms = [
+        (weight, *(torch.tensor(array) for array in term))
+        for weight, term in ((FIELD_WEIGHT, field), (PLAYER_WEIGHT, players))
+    ]
+    for _ in range(iterations):
+        solver.zero_grad()
+        moved = cameras.with_values(values())
+        total = sum(weight * energy(moved, *term) for weight, *term in terms)
+        assert isinstance(total, Tensor)
+        total.backward()
+        solver.step()
+    return cameras.with_values(values().detach()).camera()
