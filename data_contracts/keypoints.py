@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
-from data_contracts.arrays import AnyFloats, ClipArray, Flags, Integers, array_layout, array_layouts
+from data_contracts.arrays import (
+    AnyFloats,
+    ClipArray,
+    Flags,
+    Floats,
+    Integers,
+    array_layout,
+    array_layouts,
+)
 from data_contracts.conventions import COCO17
 
 Array = TypeVar("Array", bound=ClipArray, default=AnyFloats, covariant=True)
@@ -150,7 +158,7 @@ class KeypointDetections(Generic[Array]):
         """Return the same detections with one tracked person alone."""
         return self.assign_people(self.detection_index[:, :, person : person + 1])
 
-    def by_person(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    def by_person(self: KeypointDetections) -> tuple[Floats, Floats]:
         """Return keypoints (frames, cameras, persons, 17, 2) [px] and their confidence, by person.
 
         NaN and 0 where the person is not seen.
@@ -160,7 +168,8 @@ class KeypointDetections(Generic[Array]):
         keypoints, confidence = self.keypoints[place], self.confidence[place]
         seen = (self.detection_index >= 0)[..., None] & (confidence > 0.0)
         seen &= np.isfinite(keypoints).all(axis=-1)
-        return np.where(seen[..., None], keypoints, np.nan), np.where(seen, confidence, 0.0)
+        found: Floats = np.where(seen[..., None], keypoints, np.nan)
+        return found, np.where(seen, confidence, 0.0)
 
     def select(
         self: KeypointDetections, detections: slice | NDArray[np.intp] | Flags

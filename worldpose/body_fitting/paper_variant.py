@@ -51,9 +51,8 @@ def fit_in_windows(
         for person in range(joints.shape[1]):
             pixels = image[:, :, person]
             _fit(body, cameras, joints[:, person], pixels, shapes, arrays, person)
-            gone = long_gaps(
-                np.isfinite(joints[:, person]).any((1, 2)), settings.max_filled_gap_s * evidence.fps
-            )
+            known = np.asarray(np.isfinite(joints[:, person]).any((1, 2)))
+            gone = long_gaps(known, settings.max_filled_gap_s * evidence.fps)
             arrays.drop(person, slice(0, len(joints)), gone)
         betas = np.broadcast_to(arrays.betas, (len(joints), *arrays.betas.shape))
         fit = BodyFit(

@@ -62,9 +62,10 @@ def fit_shape(body: DifferentiableBody, joints: Floats) -> Floats:
     first, second = np.array(BONES).T
 
     def lengths(betas: Tensor) -> Tensor:
-        still = betas.new_zeros(75).split((3, 69, 3))
+        still = (betas.new_zeros(size) for size in (3, 69, 3))
         rest = body.keypoints(betas, *still)
-        return torch.linalg.vector_norm(rest[second] - rest[first], dim=-1)
+        found: Tensor = torch.linalg.vector_norm(rest[second] - rest[first], dim=-1)
+        return found
 
     mean = torch.zeros(body.model.shapes, dtype=torch.float64)
     measured = np.linalg.norm(joints[:, second] - joints[:, first], axis=-1)
@@ -173,7 +174,7 @@ def fit_person(
         iterations: maximum iterations of L-BFGS.
     """
     shape = torch.tensor(fit_shape(body, joints) if betas is None else betas)
-    still = torch.zeros(len(joints), 75, dtype=torch.float64).split((3, 69, 3), dim=1)
+    still = (torch.zeros(len(joints), n, dtype=torch.float64) for n in (3, 69, 3))
     start = align_root(body, Omega(shape, *still), joints)
     aligned = align_keypoints(cameras, image, torch.tensor(joints))
     omega = Omega(*(each.clone().requires_grad_() for each in start))

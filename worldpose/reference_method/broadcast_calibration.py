@@ -57,24 +57,19 @@ def refine(
         iterations: number of steps.
     """
     cameras = TensorCameras.of(start)
-    turn, center, focal, middle, lens = (
-        part.clone() for part in cameras.values.split((3, 3, 1, 2, 3), dim=1)
-    )
+    bounds = ((0, 3), (3, 6), (6, 7), (7, 9), (9, 12))
+    turn, center, focal, middle, lens = (cameras.values[:, a:b].clone() for a, b in bounds)
     moving = [part.requires_grad_() for part in (turn, center[:1], focal, middle[:1], lens)]
 
     def values() -> Tensor:
         return torch.cat([part.expand(len(focal), -1) for part in moving], dim=1)
 
     solver = torch.optim.Adam(moving, lr=RATE)
-    terms = [
-        (weight, *(torch.tensor(array) for array in term))
-        for weight, term in ((FIELD_WEIGHT, field), (PLAYER_WEIGHT, players))
-    ]
+    markings, people = (tuple(torch.tensor(each) for each in term) for term in (field, players))
     for _ in range(iterations):
         solver.zero_grad()
         moved = cameras.with_values(values())
-        total = sum(weight * energy(moved, *term) for weight, *term in terms)
-        assert isinstance(total, Tensor)
+        total = FIELD_WEIGHT * energy(moved, *markings) + PLAYER_WEIGHT * energy(moved, *people)
         total.backward()
         solver.step()
     return cameras.with_values(values().detach()).camera()

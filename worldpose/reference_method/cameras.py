@@ -117,7 +117,8 @@ def project(points: Tensor, values: Tensor, rotation: Tensor, aspect: Tensor) ->
     depth = torch.where(local[..., 2:] > 0.0, local[..., 2:], torch.nan)
     plane = local[..., :2] / depth
     squared = plane.square().sum(-1, keepdim=True)
-    k1, k2, k3 = values[..., 9:].split(1, dim=-1)
+    k1, k2, k3 = (values[..., i, None] for i in (9, 10, 11))
     bent = plane * (1.0 + k1 * squared + k2 * squared**2 + k3 * squared**3)
     focal = values[..., 6].exp()
-    return bent * torch.stack([focal, focal * aspect], dim=-1) + 1e3 * values[..., 7:9]
+    scale: Tensor = torch.stack([focal, focal * aspect], dim=-1)
+    return bent * scale + 1e3 * values[..., 7:9]

@@ -66,7 +66,7 @@ def refine_on_points(start: Camera, points: Floats, image: Floats) -> Camera:
         points: (n, 3) X' [m], world, on the crowned pitch.
         image: (n, 2) x [px].
     """
-    cameras, every = TensorCameras.of(start[None]), torch.arange(len(points))
+    cameras, every = TensorCameras.of(Camera.stack([start])), torch.arange(len(points))
     seen = Views(every, torch.zeros_like(every), torch.tensor(image))
     still = torch.zeros(len(points), dtype=torch.bool)
     return adjust(cameras, torch.tensor(points), seen, still, K1_K2).cameras.camera()[0]
@@ -127,7 +127,7 @@ def refine_on_distance_map(
     kept = ((pixels >= 0.0) & (pixels <= start.image_size - 1.0)).all(axis=-1)
     if not kept.any():
         return start
-    cameras, places = TensorCameras.of(start[None]), torch.tensor(points[kept])
+    cameras, places = TensorCameras.of(Camera.stack([start])), torch.tensor(points[kept])
     table = torch.tensor(away, dtype=torch.float64)
     values = cameras.values.clone().requires_grad_()
     solver = torch.optim.Adam([values], lr=1e-4)

@@ -159,7 +159,7 @@ def _step(training: Training[Net, Batch], optimizer: torch.optim.Optimizer, step
     with torch.autocast(device, torch.bfloat16, enabled=settings.bfloat16):
         loss = training.loss(training.net, batch)
     optimizer.zero_grad(set_to_none=True)
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     torch.nn.utils.clip_grad_norm_(training.net.parameters(), settings.clip)
     optimizer.step()
     return float(loss.detach())
