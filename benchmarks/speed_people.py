@@ -402,11 +402,11 @@ def _search(
         value = ((found - wanted) ** 2).sum() + WEIGHT * (pose[:, 3:] ** 2).sum()
         if value <= target:
             raise ReachedError
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         return value
 
     with suppress(ReachedError):
-        search.step(loss)  # type: ignore[no-untyped-call]
+        search.step(loss)
     with torch.no_grad():
         found = keypoints(shape, pose[:, :3], pose[:, 3:], transl)
         cost = ((found - wanted) ** 2).sum() + WEIGHT * (pose[:, 3:] ** 2).sum()

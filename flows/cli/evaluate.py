@@ -56,10 +56,11 @@ def evaluate(
     Example: worldpose evaluate --prediction tiny-1 --reference matches/tiny/reference
 
     Options:
-        prediction: A joints file, a folder with joints.npz and cameras/, or a match of the
-            project.
+        prediction: A joints file, a folder with joints.npz and cameras/, a match of the
+            project, or a challenge submission.
         reference: A joints file, a folder with joints.npz, cameras/ or both, a .c3d or .trc, or a
-            .csv of positions of a provider (a table of kloppy).
+            .csv of positions of a provider (a table of kloppy); true poses in the layout of a
+            submission for one.
         match_in: Match whole tracks by their boxes in this camera of the reference, as the
             paper does; by distance by default.
         fps: Frames per second; the match's by default.
@@ -97,6 +98,11 @@ def evaluate(
             found="others",
             todo="Name prediction and ground truth, or use --ablation 10.",
         )
+    from worldpose.formats.challenge import is_submission
+
+    if is_submission(Path(prediction)) and is_submission(Path(reference)):
+        _print_challenge(Path(prediction), Path(reference), as_json=as_json)
+        return
     from flows.results.evaluation import Reading, score
 
     scores = score(
@@ -112,6 +118,20 @@ def evaluate(
     if scores.later_run:
         line(scores.later_run, to=errors)
     _print_scores(scores, as_json=as_json)
+
+
+def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:
+    from worldpose.evaluation.challenge import compare_submissions, score_submission
+
+    if as_json:
+        print_json(compare_submissions(prediction, reference))
+        return
+    rows = [
+        (clip, f"{each.score:.4f}", f"{each.global_m:.4f}", f"{each.local_m:.4f}", f"{each.poses}")
+        for clip, each in score_submission(prediction, reference).items()
+    ]
+    columns = ("clip", ">score", ">global m", ">local m", ">poses")
+    print_table("score of the challenge: global + 5 x local error of 15 joints", columns, rows)
 
 
 def _print_scores(scores: Scores, *, as_json: bool) -> None:

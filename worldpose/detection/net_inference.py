@@ -163,7 +163,7 @@ class _Graph(NamedTuple):
         with _CAPTURING:
             inputs = [(each.pin_memory(), each.cuda()) for each in given]
             device = [each for _, each in inputs]
-            aside = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+            aside = torch.cuda.Stream()
             aside.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(aside):
                 # Libraries choose kernels and allocate on the first calls.
@@ -175,7 +175,7 @@ class _Graph(NamedTuple):
             with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 found = compute(device)
         outputs = [(torch.empty_like(each, device="cpu", pin_memory=True), each) for each in found]
-        done = torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
+        done = torch.cuda.Event(blocking=True)
         return cls(graph, done, inputs, outputs)
 
     def replay(self, given: Sequence[Tensor]) -> Tensors:

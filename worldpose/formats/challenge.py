@@ -389,6 +389,16 @@ def submission_clips(path: Path) -> tuple[str, ...]:
         return _clips_of(file)
 
 
+def is_submission(path: Path) -> bool:
+    """Return whether a file has a submission's layout: a zip with one, or an npz of clips."""
+    if not path.is_file() or path.suffix not in (".zip", ".npz"):
+        return False
+    try:
+        return "joints" not in submission_clips(path)  # a joints file is an npz, too
+    except InputError:
+        return False
+
+
 def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str, Floats]:
     """Read the joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
 

@@ -1,0 +1,91 @@
+"""Score of a challenge submission against true poses in the same layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from worldpose.body.keypoints import CHALLENGE15
+from worldpose.errors import InputError
+from worldpose.formats.challenge import read_submission
+
+HIPS: Final = (CHALLENGE15.index("right_hip"), CHALLENGE15.index("left_hip"))
+ALL: Final = "all clips"
+"""Name of the row with all clips' joints together."""
+
+
+class ChallengeScore(NamedTuple):
+    """Mean errors of the 15 joints [m], without any alignment, and the poses compared."""
+
+    global_m: float
+    local_m: float
+    poses: int
+
+    @property
+    def score(self) -> float:
+        """The challenge's score: global plus five times local error [m]."""
+        return self.global_m + 5.0 * self.local_m
+
+
+def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeScore]:
+    """Return the scores by clip, and of `ALL` joints together.
+
+    A person is the same row on both sides, as in the challenge, which gives the boxes.
+
+    Args:
+        prediction: a submission, zip or npz.
+        reference: true poses in the same layout; NaN where nobody is.
+
+    Raises:
+        InputError: a clip, person or pose of the reference is missing in the prediction.
+    """
+    true = read_submission(reference)
+    found = read_submission(prediction)
+    errors: dict[str, tuple[Floats, Floats]] = {}
+    for clip, places in true.items():
+        where = f"{prediction}: {clip}"
+        mine = found.get(clip)
+        if mine is None or mine.shape != places.shape:
+            shape = "no such clip" if mine is None else f"{mine.shape}"
+            raise _refuse(where, f"(persons, frames, 15, 3) = {places.shape}", shape)
+        known = np.isfinite(places).all(-1)
+        missing = (known & ~np.isfinite(mine).all(-1)).any(-1)
+        if missing.any():
+            person, frame = np.argwhere(missing)[0].tolist()
+            row = f"{missing.sum()} without one, the first of person {person} in frame {frame}"
+            raise _refuse(where, "a position for every joint of the reference", row)
+        away = mine - places
+        local = away - away[..., HIPS, :].mean(axis=-2, keepdims=True)
+        rooted = known & known[..., HIPS].all(-1, keepdims=True)
+        lengths = (np.linalg.norm(each, axis=-1) for each in (away, local))
+        errors[clip] = next(lengths)[known], next(lengths)[rooted]
+    parts = {clip: [each] for clip, each in errors.items()} | {ALL: list(errors.values())}
+    scores = {}
+    for name, several in parts.items():
+        whole, local = (np.concatenate(column) for column in zip(*several, strict=True))
+        if not len(local):
+            raise _refuse(f"{reference}: {name}", "poses with both hips", "none")
+        count = len(whole) // len(CHALLENGE15)
+        scores[name] = ChallengeScore(float(whole.mean()), float(local.mean()), count)
+    return scores
+
+
+def compare_submissions(prediction: Path, reference: Path) -> dict[str, object]:
+    """Return the scores of `score_submission` under the names of `worldpose evaluate --json`."""
+
+    def row(score: ChallengeScore) -> dict[str, float]:
+        names = ("challenge_score", "challenge_global_m", "challenge_local_m", "poses")
+        values = (score.score, score.global_m, score.local_m, score.poses)
+        return dict(zip(names, values, strict=True))
+
+    scores = score_submission(prediction, reference)
+    clips = {clip: row(score) for clip, score in scores.items() if clip != ALL}
+    return {**row(scores[ALL]), "clips": clips}
+
+
+def _refuse(where: str, expected: str, found: str) -> InputError:
+    todo = "Give every person of the challenge's boxes a pose, in the order of the boxes."
+    return InputError(where, expected=expected, found=found, todo=todo)
