@@ -121,17 +121,14 @@ def evaluate(
 
 
 def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:
-    from worldpose.evaluation.challenge import compare_submissions, score_submission
+    from worldpose.evaluation.challenge import ALL, score_submission
 
+    found = {name: each.row() for name, each in score_submission(prediction, reference).items()}
     if as_json:
-        print_json(compare_submissions(prediction, reference))
+        print_json({**found.pop(ALL), "clips": found})
         return
-    rows = [
-        (clip, f"{each.score:.4f}", f"{each.global_m:.4f}", f"{each.local_m:.4f}", f"{each.poses}")
-        for clip, each in score_submission(prediction, reference).items()
-    ]
-    columns = ("clip", ">score", ">global m", ">local m", ">poses")
-    print_table("score of the challenge: global + 5 x local error of 15 joints", columns, rows)
+    rows = [(name, *(f"{value:.4g}" for value in row.values())) for name, row in found.items()]
+    print_table("", ("clip", *(f">{name}" for name in found[ALL])), rows)
 
 
 def _print_scores(scores: Scores, *, as_json: bool) -> None:

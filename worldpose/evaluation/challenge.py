@@ -24,10 +24,14 @@ class ChallengeScore(NamedTuple):
     local_m: float
     poses: int
 
-    @property
-    def score(self) -> float:
-        """The challenge's score: global plus five times local error [m]."""
-        return self.global_m + 5.0 * self.local_m
+    def row(self) -> dict[str, float]:
+        """Return the score, global plus five times local error [m], and what it is made of."""
+        return {
+            "challenge_score": self.global_m + 5.0 * self.local_m,
+            "challenge_global_m": self.global_m,
+            "challenge_local_m": self.local_m,
+            "poses": self.poses,
+        }
 
 
 def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeScore]:
@@ -51,8 +55,8 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
         if mine is None or mine.shape != places.shape:
             shape = "no such clip" if mine is None else f"{mine.shape}"
             raise _refuse(where, f"(persons, frames, 15, 3) = {places.shape}", shape)
-        known = np.isfinite(places).all(-1)
-        missing = (known & ~np.isfinite(mine).all(-1)).any(-1)
+        known = np.asarray(np.isfinite(places).all(-1))
+        missing = np.asarray((known & ~np.isfinite(mine).all(-1)).any(-1))
         if missing.any():
             person, frame = np.argwhere(missing)[0].tolist()
             row = f"{missing.sum()} without one, the first of person {person} in frame {frame}"
@@ -71,19 +75,6 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
         count = len(whole) // len(CHALLENGE15)
         scores[name] = ChallengeScore(float(whole.mean()), float(local.mean()), count)
     return scores
-
-
-def compare_submissions(prediction: Path, reference: Path) -> dict[str, object]:
-    """Return the scores of `score_submission` under the names of `worldpose evaluate --json`."""
-
-    def row(score: ChallengeScore) -> dict[str, float]:
-        names = ("challenge_score", "challenge_global_m", "challenge_local_m", "poses")
-        values = (score.score, score.global_m, score.local_m, score.poses)
-        return dict(zip(names, values, strict=True))
-
-    scores = score_submission(prediction, reference)
-    clips = {clip: row(score) for clip, score in scores.items() if clip != ALL}
-    return {**row(scores[ALL]), "clips": clips}
 
 
 def _refuse(where: str, expected: str, found: str) -> InputError:
