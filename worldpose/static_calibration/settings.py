@@ -101,9 +101,6 @@ class CameraPrior(Record):
 class ProposalSettings(Record):
     """Prior of cameras without clicks, and the people who decide their sides."""
 
-    method: Literal["worldpose", "paper"] = "worldpose"
-    """Method; `paper` replaces the camera by that of the paper's three stages, from clicks that are
-    inliers (needs the extra `body`)."""
     prior: CameraPrior = CameraPrior()
     """Gaussian prior of the camera."""
     people_frames: int = Field(default=12, ge=1, le=1000)
