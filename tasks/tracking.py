@@ -26,6 +26,7 @@ from worldpose.review.identities import (
     stored_identities,
 )
 from worldpose.store.writer import ResultWriter
+from worldpose.tracking.absences import measure_absences
 from worldpose.tracking.diagnosis import diagnose_no_people
 from worldpose.tracking.joins import describe_doubts
 from worldpose.tracking.plane.clocks import PlaneClocks, estimate_plane_clocks
@@ -53,6 +54,8 @@ from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.world import People, doubt_world
 
+MAX_ABSENT_SHARE: Final = 0.05
+"""Share of time in which people are missing from which the run warns [1]."""
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""
 
@@ -69,6 +72,16 @@ def tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     if edits:
         figures["undecided"] = float(sum(not join.decided for join in corrected.joins))
     figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
+    present = (np.asarray(corrected.detection_index) >= 0).any(axis=1)
+    people = corrected.person.tolist()
+    fps = float(inputs.sources["fps"])
+    figures["absent_share"], gaps = measure_absences(present, corrected.frame, people, fps)
+    if figures["absent_share"] > MAX_ABSENT_SHARE and gaps:
+        more = f", and {len(gaps) - 3} more" if len(gaps) > 3 else ""
+        result.warnings.append(
+            f"{inputs.recipe.name} misses people for {figures['absent_share']:.1%} of the time: "
+            f"{'; '.join(gaps[:3])}{more}. Check the videos or 2D poses there."
+        )
     result.write(
         TRACKING,
         arrays={

@@ -181,15 +181,16 @@ def _read_views(
 
 
 def _read_image(file: Path) -> Image:
-    import cv2
     import numpy as np
 
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    from worldpose.video.folder import decode_image
+
+    image = decode_image(np.fromfile(file, np.uint8), grey=True, turned=False)
     if image is None:
         raise InputError(
             str(file), expected="an image", found="none that OpenCV reads", todo="Save it again."
         )
-    return np.asarray(image, dtype=np.uint8)
+    return image
 
 
 def _as_json(fit: LensFit) -> dict[str, object]:

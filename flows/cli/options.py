@@ -76,9 +76,10 @@ def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Pat
     """Return both files, or None if neither is given.
 
     Raises:
-        UsageError: only one of them is given.
+        UsageError: only one of them is given, or other users can read or write the key.
     """
     if certificate is not None and key is not None:
+        require_private_key(key)
         return certificate, key
     if certificate is None and key is None:
         return None
@@ -88,3 +89,28 @@ def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Pat
         found="one of them",
         todo="Give both files: the certificate and its private key.",
     )
+
+
+def require_private_key(key: Path) -> None:
+    """Refuse a key that others than its owner can read; root's may be readable by a group.
+
+    Raises:
+        UsageError: there is no such file, or it has other rights.
+    """
+    try:
+        found = key.stat()
+    except OSError as error:
+        raise UsageError(
+            f"--key {key}",
+            expected="a readable file",
+            found=error.strerror or str(error),
+            todo="Correct the name, or the rights of its folder.",
+        ) from error
+    others = 0o037 if found.st_uid == 0 else 0o077
+    if found.st_mode & others:
+        raise UsageError(
+            f"--key {key}",
+            expected="a private key that its owner alone can read and write",
+            found=f"mode {found.st_mode & 0o777:o}",
+            todo=f"Run: chmod 600 {key}. If others could read it, make a new key.",
+        )

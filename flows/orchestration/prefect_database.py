@@ -23,6 +23,8 @@ DATABASE = "prefect.db"
 def begin_database(home: Path) -> bool:
     """Copy an empty database to `home`, PREFECT_HOME of a server that will be started.
 
+    Its files are for this account alone: SQLite gives the rights of the database to its log.
+
     Returns:
         Whether the server must create the first one of its version there, to be kept then.
 
@@ -33,16 +35,22 @@ def begin_database(home: Path) -> bool:
     from worldpose.formats.files import whole_file
     from worldpose.store.blobs import storage_errors
 
-    kept = kept_database()
-    if (home / DATABASE).exists():
+    kept, database = kept_database(), home / DATABASE
+    if database.exists() and database.stat().st_size:
+        for file in home.glob(f"{DATABASE}*"):
+            file.chmod(0o600)
         return False
-    if kept is None or not os.access(kept, os.R_OK):
-        return True
-    with storage_errors(str(home / DATABASE)), whole_file(home / DATABASE) as draft:
-        try:
-            shutil.copyfile(kept, draft)
-        except OSError as error:  # a copy error names the source file first, whichever failed
-            raise OSError(error.errno, error.strerror) from error
+    with storage_errors(str(database)):
+        home.mkdir(parents=True, exist_ok=True)
+        if kept is None or not os.access(kept, os.R_OK):
+            database.touch(0o600)
+            return True
+        with whole_file(database) as draft:
+            draft.touch(0o600)
+            try:
+                shutil.copyfile(kept, draft)
+            except OSError as error:  # a copy error names the source file first, whichever failed
+                raise OSError(error.errno, error.strerror) from error
     return False
 
 
@@ -50,14 +58,14 @@ def keep_database(home: Path) -> None:
     """Keep a copy of the unused database that a server has created in `home`."""
     from worldpose.formats.files import whole_file
 
-    kept = kept_database()
-    if kept is None or not (home / DATABASE).exists():
+    kept, database = kept_database(), home / DATABASE
+    if kept is None or not database.exists() or not database.stat().st_size:
         return  # no home, or the environment names another database
     # If the cache is not writable, every project creates its own.
     with (
         suppress(OSError, sqlite3.Error),
         whole_file(kept) as draft,
-        closing(sqlite3.connect(home / DATABASE)) as made,
+        closing(sqlite3.connect(database)) as made,
         closing(sqlite3.connect(draft)) as copy,
     ):
         made.backup(copy)

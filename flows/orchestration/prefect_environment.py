@@ -56,10 +56,22 @@ DATABASE = (
 """Logins of a Prefect server at its database."""
 _SECRET = re.compile(
     r"TOKENS?(?![A-Z])|SECRET|PASSW|PASSPHRASE|CREDENTIAL|AUTH_STRING|(API|ACCESS|PRIVATE)_?KEY|"
-    r"(CONNECTION|DATABASE|WEBHOOK)_URL|^WORLDPOSE_ALERT|^AWS_(PROFILE|ROLE|WEB)",
+    r"(CONNECTION|DATABASE|WEBHOOK)_URL|^WORLDPOSE_ALERT",
     re.IGNORECASE,
 )
-"""Names of variables that hold a secret, or lead to one."""
+"""Names of variables of our own parts and libraries that hold a secret, or lead to one."""
+_ALLOWED = re.compile(
+    r"PATH|HOME|USER|LOGNAME|SHELL|TERM|LANG|LANGUAGE|TZ|TE?MP|TMPDIR|PWD|HOSTNAME|VIRTUAL_ENV|"
+    r"(HTTPS?|NO|ALL)_PROXY|DO_NOT_TRACK|AWS_(DEFAULT_)?REGION|AWS_ENDPOINT_URL.*|AWS_CA_BUNDLE|"
+    r"(REQUESTS_CA|CURL_CA)_BUNDLE|SSL_CERT_(FILE|DIR)|TOKENIZERS_PARALLELISM|MPLCONFIGDIR|"
+    r"(PYTHON|LC_|XDG_|LD_|DYLD_|CONDA_|COV|MALLOC_|GLIBC_|CUDA_|NVIDIA_|NCCL_|HIP_|ROCR_|OMP_|"
+    r"KMP_|MKL_|OPENBLAS_|VECLIB_|BLIS_|NUMBA_|NUMEXPR_|OPENCV_|TORCH|PYTORCH_|HF_|SLURM_|"
+    r"KUBERNETES_|DASK_|PREFECT_|OTEL_|OPENLINEAGE_|WORLDPOSE_).*",
+    re.IGNORECASE,
+)
+"""Names of variables that runs may need; `PASSED` adds others."""
+PASSED = "WORLDPOSE_PASS_VARIABLES"
+"""Variable with the names of further variables that runs get, separated by commas."""
 UNLESS_GIVEN = {
     # The server gets every line; the terminal has our own progress and failures.
     "PREFECT_LOGGING_EXTRA_LOGGERS": "worldpose",
@@ -95,17 +107,18 @@ def authorization(login: str) -> str:
 
 
 def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) -> dict[str, str]:
-    """Return an environment without the variables that hold secrets, selected by name.
+    """Return the variables of an environment that runs may need, without those that hold secrets.
 
     `keep` names variables that a child needs; a name that ends with `*` is a prefix.
     """
-    kept = tuple(keep)
-    exact = {name for name in kept if not name.endswith("*")}
+    kept = (*keep, *(name.strip() for name in environment.get(PASSED, "").split(",")))
     begins = tuple(name[:-1] for name in kept if name.endswith("*"))
     return {
         name: value
         for name, value in environment.items()
-        if name in exact or (begins and name.startswith(begins)) or not _SECRET.search(name)
+        if name in kept
+        or (begins and name.startswith(begins))
+        or (_ALLOWED.fullmatch(name) and not _SECRET.search(name))
     }
 
 

@@ -26,10 +26,14 @@ from worldpose.errors import UsageError
 SESSION_SECONDS: Final = 12 * 3600
 """A working day; after it, people log in again."""
 WRONG_TOKENS: Final = 5
-"""Wrong tokens from one address within `WRONG_SECONDS`; further ones are refused unchecked."""
-WRONG_SECONDS: Final = 10.0
+"""Wrong tokens at once, of all unknown browsers together or of one known one; further ones are
+refused unchecked."""
+FORGIVEN_SECONDS: Final = 1.0
+"""Time after which one more wrong token is looked at."""
+KNOWN_SECONDS: Final = 90 * 86400
+"""Time for which a browser is known after its person has logged in."""
 MOST_REMEMBERED: Final = 10_000
-"""Wrong tokens and ended sessions that are remembered, the latest."""
+"""Known browsers with wrong tokens and ended sessions that are remembered, the latest."""
 
 
 EDITING: Final = ("/corrections", "/withdrawals", "/withdrawal", "/acceptances", "/interpolation")
@@ -116,7 +120,7 @@ class Access:
     users: Mapping[str, User] | None = None
     proxy: Proxy | None = None
     _ended: dict[str, float] = field(default_factory=dict, init=False, compare=False)
-    _wrong: list[tuple[float, str]] = field(default_factory=list, init=False, compare=False)
+    _wrong: dict[str, tuple[float, float]] = field(default_factory=dict, init=False, compare=False)
     _lock: Lock = field(default_factory=Lock, init=False, compare=False)
 
     @property
@@ -157,17 +161,33 @@ class Access:
             while len(self._ended) > MOST_REMEMBERED:
                 self._ended.pop(next(iter(self._ended)))
 
-    def may_try(self, address: str, now: float | None = None) -> bool:
-        """Return whether to check a token from this address: not after many recent wrong ones."""
-        since = (time.monotonic() if now is None else now) - WRONG_SECONDS
-        with self._lock:
-            self._wrong[:] = [each for each in self._wrong if each[0] > since][-MOST_REMEMBERED:]
-            return sum(each[1] == address for each in self._wrong) < WRONG_TOKENS
+    def remember(self, who: str) -> str:
+        """Return what a browser keeps after a login: guesses of others do not lock it out."""
+        nonce = secrets.token_hex(8)
+        return f"{nonce}.{self._sign('known', who, nonce)}"
 
-    def note_wrong(self, address: str, now: float | None = None) -> None:
-        """Remember that this address sent a wrong token."""
+    def guesser(self, who: str, known: str | None) -> str:
+        """Return whose guesses count together: a known browser's of its person, or all others."""
+        nonce, _, signature = (known or "").partition(".")
+        return nonce if self._same(signature, self._sign("known", who, nonce)) else ""
+
+    def may_try(self, guesser: str, now: float | None = None) -> bool:
+        """Take a guess out of the budget of a guesser; return whether there was one left."""
+        now = time.monotonic() if now is None else now
         with self._lock:
-            self._wrong.append((time.monotonic() if now is None else now, address))
+            used, at = self._wrong.pop(guesser, (0.0, now))
+            used = max(0.0, used - (now - at) / FORGIVEN_SECONDS)
+            is_allowed = used <= WRONG_TOKENS - 1
+            self._wrong[guesser] = (used + is_allowed, now)
+            while len(self._wrong) > MOST_REMEMBERED:
+                self._wrong.pop(next(iter(self._wrong)))
+            return is_allowed
+
+    def forgive(self, guesser: str) -> None:
+        """Give back the guess of the right token."""
+        with self._lock:
+            used, at = self._wrong[guesser]
+            self._wrong[guesser] = (max(0.0, used - 1.0), at)
 
     def form_secret(self, session: str) -> str:
         """Return the secret that a page of this session sends with every change."""

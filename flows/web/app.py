@@ -34,10 +34,10 @@ from flows.web import (
     results,
     settings,
 )
-from flows.web.access import LOOPBACK, SESSION_SECONDS, Access
+from flows.web.access import KNOWN_SECONDS, LOOPBACK, SESSION_SECONDS, Access
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import describe_error
-from flows.web.host_guard import refusal, refuse_foreign
+from flows.web.host_guard import host_name, refusal, refuse_foreign
 from flows.web.http_server import serve_http
 from flows.web.intake import CHUNK_BYTES, CHUNK_SUFFIX, Intake
 from flows.web.intake import routes as routes_of_intake
@@ -153,19 +153,28 @@ def _sessions(context: PageContext) -> APIRouter:
 
     @router.post("/api/login")
     def login(given: Login, request: Request) -> JSONResponse:
-        address = "" if request.client is None else request.client.host
-        if not access.may_try(address):
+        guesser = access.guesser(given.who, request.cookies.get(f"{access.cookie}_known"))
+        if not access.may_try(guesser):
             return JSONResponse(
-                {"error": "too many wrong tokens: wait for ten seconds"},
+                {"error": "too many wrong tokens: wait for some seconds"},
                 status_code=429,
-                headers={"retry-after": "10"},
+                headers={"retry-after": "1"},
             )
         if not access.has_token(given.who, given.token):
-            access.note_wrong(address)
             return JSONResponse({"error": "this is not the token"}, status_code=401)
+        access.forgive(guesser)
         request.state.who = given.who
         answer = JSONResponse({"who": given.who})
         _set_session(answer, access, access.session(given.who), access.secure)
+        answer.set_cookie(
+            f"{access.cookie}_known",
+            access.remember(given.who),
+            max_age=KNOWN_SECONDS,
+            path="/api/login",
+            httponly=True,
+            samesite="strict",
+            secure=access.secure,
+        )
         return answer
 
     @router.post("/api/logout")
@@ -273,6 +282,8 @@ OPEN: Final = frozenset(
 BODY_BYTES: Final = 1 << 20
 """Maximum size of a request body [byte]."""
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+HSTS_SECONDS: Final = 365 * 86400
+"""Time for which browsers then reach this name by TLS alone."""
 ASKING: Final = "/preview"
 """Suffix of paths that are posted to with every mouse move, and change nothing."""
 POLICY: Final = (
@@ -331,6 +342,9 @@ class Guard:
             if message["type"] == "http.response.start":
                 sealed = MutableHeaders(scope=message)
                 _seal(sealed, scope["path"])
+                # Not of localhost: a browser would ask all of its ports for TLS, Prefect's too.
+                if access.secure and host_name(headers.get("host", "")) not in LOOPBACK:
+                    sealed["strict-transport-security"] = f"max-age={HSTS_SECONDS}"
                 if role is not None and "set-cookie" not in sealed:  # as logging out sets one
                     for cookie in begun.headers.getlist("set-cookie"):
                         sealed.append("set-cookie", cookie)

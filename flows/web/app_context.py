@@ -21,7 +21,12 @@ from data_contracts.review import ReviewRequest
 from data_contracts.run import EXIT_CODES
 from data_contracts.static_calibration import ClickedMarkings
 from flows.orchestration.prefect_api import UnreachablePrefectError
-from flows.orchestration.prefect_environment import has_server
+from flows.orchestration.prefect_environment import (
+    CLIENT_LOGIN,
+    CLOUD_LOGIN,
+    has_server,
+    without_secrets,
+)
 from flows.registering import open_for_review
 from flows.review.verdicts import resume
 from flows.run_record import describe_end, latest_run
@@ -90,6 +95,8 @@ Person = Annotated[str, Depends(_person)]
 _COMMAND = [sys.executable, "-c", "from flows.cli import main; main()", "run"]
 _STAGE_LINE = re.compile(r" *[\d.]+ s  (\w+): \d+ of \d+ to compute")
 _UNIT_LINE = re.compile(r" *[\d.]+ s    \S+ +[\d.]+ s .* (\d+) %((?: [\d.]+ \w+)?)$")
+STORE_SECRETS = (CLIENT_LOGIN, CLOUD_LOGIN, "AWS_*", "OPENLINEAGE_*")
+"""Variables that a run which the pages start gets although they hold secrets: it uses them."""
 LAST_LINES = 12
 """Lines of a run's output that a page shows."""
 PATIENCE_SECONDS = 15.0
@@ -344,6 +351,7 @@ class LocalRuns:
                     stdout=output,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
+                    env=without_secrets(os.environ, keep=STORE_SECRETS),
                 )
             with self._lock:
                 self._process = process

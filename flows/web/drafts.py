@@ -111,6 +111,7 @@ class Drafts:
     folders: Sequence[Path]
     store: Store
     _lock: Lock = field(default_factory=Lock)
+    _budget: Lock = field(default_factory=Lock)
     _locks: dict[str, Lock] = field(default_factory=dict)
     _jobs: dict[str, Future[Index | str]] = field(default_factory=dict)
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
@@ -203,20 +204,25 @@ class Drafts:
                 raise _refusal(
                     title, f"a file with content, one of at most {MAX_FILES}", "another", "Omit it."
                 )
-            free = shutil.disk_usage(self.inbox).free
-            underway = sum(each.size - self._count_received(draft_id, each) for each in draft.files)
-            needed = file.size + underway + SPARE_BYTES
-            if needed > free:
-                raise _refusal(
-                    title,
-                    f"{needed / 1e9:.1f} GB of free disk space",
-                    f"{free / 1e9:.1f} GB at the inbox",
-                    "Free some, or ask the operator.",
-                )
             name = _choose_name(title, {each.name for each in draft.files})
             chosen = file.model_copy(update={"id": secrets.token_hex(6), "name": name})
-            self._write(draft.model_copy(update={"files": (*draft.files, chosen)}))
+            with self._budget:
+                known = [(it.id, each) for it in self.all() for each in it.files]
+                underway = sum(each.size - self._count_received(at, each) for at, each in known)
+                self._require_space(title, file.size + underway)
+                self._write(draft.model_copy(update={"files": (*draft.files, chosen)}))
             return chosen
+
+    def _require_space(self, title: str, size: int) -> None:
+        """Refuse bytes that would not leave `SPARE_BYTES` of the disk."""
+        needed, free = size + SPARE_BYTES, shutil.disk_usage(self.inbox).free
+        if needed > free:
+            raise _refusal(
+                title,
+                f"{needed / 1e9:.1f} GB of free disk space",
+                f"{free / 1e9:.1f} GB at the inbox",
+                "Free some, or ask the operator.",
+            )
 
     def remove(self, draft_id: str, file_id: str) -> None:
         """Remove a file from a draft."""
@@ -356,6 +362,7 @@ class Drafts:
 
     def _write_piece(self, draft_id: str, file: DraftFile, piece: bytes) -> None:
         """Append bytes to a file that is on its way, all or none; move it when it is whole."""
+        self._require_space(file.title, len(piece))
         part = self._part(draft_id, file)
         with part.open("ab", buffering=0) as opened:
             before = opened.seek(0, os.SEEK_END)

@@ -101,11 +101,15 @@ def test_a_database_is_copied_and_kept_only_where_there_is_none_and_a_place(tmp_
     (tmp_path / DATABASE).write_bytes(b"full")
     assert not begin_database(tmp_path)
     assert (tmp_path / DATABASE).read_bytes() == b"full"
+    assert not begin_database(tmp_path / "copied")
+    files = [at / DATABASE for at in (tmp_path, tmp_path / "copied")]
+    assert [file.stat().st_mode & 0o777 for file in files] == [0o600, 0o600]
     kept.unlink()
     kept.parent.rmdir()
     kept.parent.touch()  # a file where the folder should be: every server makes its own
     keep_database(tmp_path)
     assert begin_database(tmp_path / "another")
+    assert (tmp_path / "another" / DATABASE).stat().st_mode & 0o777 == 0o600
 
 
 def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
@@ -160,6 +164,10 @@ def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
         "PGPASSWORD": "password",
         "WORLDPOSE_REVIEW_TOKEN": "of the terminal",
     }
+    # Names that tell nothing of secrets.
+    given |= dict.fromkeys(
+        ("MYSQL_PWD", "GH_PAT", "SLACK_HOOK", "AZURE_STORAGE_KEY", "NPM_AUTH"), "x"
+    )
     harmless = {"AWS_REGION": "eu", "TOKENIZERS_PARALLELISM": "false", "LC_ALL": "C.UTF-8"}
     cloud = [name for name in os.environ if name.startswith("AWS_")]
     for name in (CLIENT_LOGIN, SERVER_LOGIN, METRICS_TOKEN, *cloud):
@@ -172,6 +180,9 @@ def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
     everywhere = environment_of(plan)
     assert everywhere.keys().isdisjoint({*given, CLIENT_LOGIN, SERVER_LOGIN, METRICS_TOKEN})
     assert everywhere.items() >= harmless.items()
+    monkeypatch.setenv("WORLDPOSE_PASS_VARIABLES", "SLACK_HOOK, GH_PAT")
+    assert environment_of(plan).keys() & given.keys() == {"SLACK_HOOK", "GH_PAT"}
+    monkeypatch.delenv("WORLDPOSE_PASS_VARIABLES")
     secrets = secrets_of(plan, "pages' token")
     login, metrics = secrets.prefect, secrets.metrics
     cloud = {name: value for name, value in given.items() if name.startswith("AWS")}

@@ -11,7 +11,8 @@ import pytest
 from command_line import TINY
 from page_client import HERE, MATCH, TOKEN, a_click, moved
 
-from flows.web.access import EDITING, SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
+from flows.cli.options import certificate_and_key
+from flows.web.access import EDITING, SESSION_SECONDS, WRONG_TOKENS, access_for
 from flows.web.app import BODY_BYTES, OPEN, create_app
 from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
@@ -161,19 +162,60 @@ def test_a_session_that_was_ended_opens_nothing(app, stranger):
     assert other.get(MATCH).status_code == 200
 
 
-def test_wrong_tokens_are_looked_at_a_few_at_a_time(stranger):
-    wrong = {"who": "Eve", "token": TOKEN + "x"}
-    right = {"who": "Ada", "token": TOKEN}
-    codes = [stranger.post("/api/login", json=wrong).status_code for _ in range(WRONG_TOKENS + 2)]
-    assert codes == [401] * WRONG_TOKENS + [429] * 2
+def test_guesses_are_limited_for_all_addresses_together_but_not_for_a_known_browser(app, stranger):
+    ada = page_client.log_in(app, "Ada")
+    wrong, right = {"who": "Ada", "token": TOKEN + "x"}, {"who": "Ada", "token": TOKEN}
+    addresses = [(f"127.0.0.{number}", 5000) for number in range(1, 30)]
+    clients = [page_client.TestClient(app, base_url=HERE, client=each) for each in addresses]
+    codes = [client.post("/api/login", json=wrong).status_code for client in clients]
+    assert 401 in codes
+    assert codes.count(429) >= len(codes) - WRONG_TOKENS - 2  # a guess is forgiven each second
     assert stranger.post("/api/login", json=right).status_code == 429
+    assert ada.post("/api/login", json=right).status_code == 200
+    # As another person, the same browser is unknown; and its own guesses are limited too.
+    assert ada.post("/api/login", json={**right, "who": "Eve"}).status_code == 429
+    codes = [ada.post("/api/login", json=wrong).status_code for _ in range(WRONG_TOKENS + 2)]
+    assert codes[:WRONG_TOKENS] == [401] * WRONG_TOKENS
+    assert codes[-1] == 429
+
+
+def test_a_slow_guesser_locks_nobody_out():
     access = access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
-    for second in range(WRONG_TOKENS):
-        assert access.may_try("a", now=float(second))
-        access.note_wrong("a", now=float(second))
-    assert not access.may_try("a", now=WRONG_SECONDS - 0.1)
-    assert access.may_try("b", now=WRONG_SECONDS - 0.1)  # another address is not kept waiting
-    assert access.may_try("a", now=WRONG_SECONDS + 0.1)
+    assert [access.may_try("", now=0.0) for _ in range(WRONG_TOKENS + 1)][-2:] == [True, False]
+    assert access.may_try("another", now=0.0)
+    tried = [access.may_try("", now=second) for second in range(20, 120, 2)]
+    assert all(tried)
+    for _ in range(50):  # right tokens use nothing up
+        assert access.may_try("", now=121.0)
+        access.forgive("")
+    assert access.guesser("Ada", "forged.0123") == ""
+
+
+def test_tls_pages_tell_browsers_to_stay_with_tls_except_on_this_machine(tmp_path):
+    Store.create(str(tmp_path))
+    names = ("review.example.org",)
+    for secure, host, told in (
+        (True, "review.example.org:8571", True),
+        (True, "localhost:8571", False),
+        (False, "review.example.org", False),
+    ):
+        access = access_for("127.0.0.1", token=TOKEN, names=names, secure=secure)
+        browser = page_client.browser(create_app(str(tmp_path), access))
+        answer = browser.get("/login", headers={"host": host})
+        assert answer.status_code == 200
+        assert ("strict-transport-security" in answer.headers) == told
+
+
+@pytest.mark.parametrize(("mode", "is_private"), [(0o600, True), (0o400, True), (0o644, False)])
+def test_a_key_that_others_can_read_is_refused(mode, is_private, tmp_path):
+    key = tmp_path / "key.pem"
+    key.touch()
+    key.chmod(mode)
+    if is_private:
+        assert certificate_and_key(tmp_path / "cert.pem", key)
+    else:
+        with pytest.raises(UsageError, match=r"mode 644.*chmod 600"):
+            certificate_and_key(tmp_path / "cert.pem", key)
 
 
 def test_a_token_of_any_characters_is_a_wrong_one(stranger):

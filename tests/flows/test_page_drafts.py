@@ -3,6 +3,7 @@
 import os
 import shutil
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import yaml
 from flows.service.inbox import entries, fingerprint_of, missing_of
 from flows.web.access import Access, User, access_for
 from flows.web.app import create_app
+from flows.web.drafts import SPARE_BYTES
 from flows.web.intake import CHUNK_BYTES, Intake
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store
@@ -91,6 +93,23 @@ def a_match(file, **changes):
         "clips": [{"id": "goal", "frame_count": FRAMES}],
         **changes,
     }
+
+
+def test_drafts_share_the_disk_and_leave_the_last_gigabyte(place, footage, monkeypatch):
+    ada, free = open_pages(place), SPARE_BYTES + 10 * footage.stat().st_size
+    usage = shutil.disk_usage(place)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
+    new = {"name": "a.mp4", "size": 4 * footage.stat().st_size, "modified_ms": 1}
+    drafts = [ada.post(DRAFTS, json={}).json()["id"] for _ in range(6)]
+    begin_all = [lambda at=at: ada.post(f"{DRAFTS}/{at}/files", json=new) for at in drafts]
+    with ThreadPoolExecutor(6) as threads:
+        answers = list(threads.map(lambda begin_one: begin_one(), begin_all))
+    assert sorted(answer.status_code for answer in answers) == [200] * 2 + [422] * 4
+    at, took = next((at, it) for at, it in zip(drafts, answers, strict=True) if it.is_success)
+    free = SPARE_BYTES + 5  # others wrote meanwhile
+    answer = put(ada, at, took.json()["file"], 0, footage.read_bytes())
+    assert answer.status_code == 422
+    assert "free disk space" in answer.json()["error"]
 
 
 def test_an_uploaded_match_arrives_whole(place, footage):

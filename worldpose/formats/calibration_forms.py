@@ -39,7 +39,7 @@ from worldpose.formats.calibration_programs import (
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.calibration_unit import require_metres
 from worldpose.formats.files import SETTINGS_BYTES, require_file
-from worldpose.formats.lens_files import read_file_storage
+from worldpose.formats.opencv_storage import read_file_storage
 from worldpose.video.names import is_video
 
 if TYPE_CHECKING:

@@ -23,7 +23,8 @@ from worldpose.formats.calibration_files import (
     read_camera_table,
 )
 from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml
-from worldpose.formats.lens_files import kalibr_tables, read_file_storage
+from worldpose.formats.lens_files import kalibr_tables
+from worldpose.formats.opencv_storage import read_file_storage
 
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """(3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y."""

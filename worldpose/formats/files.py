@@ -75,7 +75,7 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
     Raises:
         InputError: no such file, too large, not YAML, nested too deep, an alias or a repeated key.
     """
-    return parse_yaml(str(path), _read_text(path, SETTINGS_BYTES))
+    return parse_yaml(str(path), read_text(path, SETTINGS_BYTES))
 
 
 def parse_yaml(where: str, text: str) -> Any:  # noqa: ANN401
@@ -89,7 +89,12 @@ def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
     Raises:
         InputError: no such file, too large or not JSON.
     """
-    return _parse(str(path), "JSON", json.loads, _read_text(path, limit))
+    return parse_json(str(path), read_text(path, limit))
+
+
+def parse_json(where: str, text: str) -> Any:  # noqa: ANN401
+    """Return the content of a JSON text; `where` names it in errors."""
+    return _parse(where, "JSON", json.loads, text)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -101,7 +106,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     # Maximum line length of a TOML file; the time for a key of n dotted parts grows as n
     # squared.
     toml_line = 4096
-    text = _read_text(path, SETTINGS_BYTES)
+    text = read_text(path, SETTINGS_BYTES)
     longest = max(map(len, text.splitlines()), default=0)
     if longest > toml_line:
         raise InputError(
@@ -147,7 +152,12 @@ def require_file(path: Path, limit: int | None = None) -> int:
     return size
 
 
-def _read_text(path: Path, limit: int) -> str:
+def read_text(path: Path, limit: int) -> str:
+    """Return the text of a UTF-8 file of at most `limit` bytes.
+
+    Raises:
+        InputError: no such file, too large, or not UTF-8.
+    """
     require_file(path, limit)
     try:
         return path.read_text(encoding="utf-8-sig")

@@ -26,6 +26,7 @@ from worldpose.formats.calibration_files import (
     require_optics,
 )
 from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml, require_file
+from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 
 MATRIX_NAMES: Final = (
@@ -173,7 +174,7 @@ def _read_file(file: Path) -> dict[str, Any]:
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
     if suffix in (".yml", ".yaml", ".json"):
-        return read_file_storage(file) if _is_storage(file) else _read_mapping(file)
+        return read_file_storage(file) if is_storage(file) else _read_mapping(file)
     if suffix in (".pkl", ".pickle"):
         return _read_pickled_lens(file)
     if suffix == ".xml":
@@ -205,7 +206,7 @@ def _read_pickled_lens(file: Path) -> dict[str, Any]:
 
 def _read_camchain(file: Path) -> dict[str, dict[str, Any]] | None:
     """Return the tables of a Kalibr camchain by camera; None for another file."""
-    if file.suffix.lower() not in (".yml", ".yaml") or _is_storage(file):
+    if file.suffix.lower() not in (".yml", ".yaml") or is_storage(file):
         return None
     content = read_yaml(file)
     return dict(kalibr_tables(file, content)) if is_kalibr(content) else None
@@ -272,13 +273,6 @@ def _chain(
     return matrix @ pose
 
 
-def _is_storage(file: Path) -> bool:
-    """Return whether a YAML or JSON file is one of OpenCV's FileStorage."""
-    require_file(file, SETTINGS_BYTES)
-    content = file.read_bytes()
-    return b"%YAML:" in content[:64] or b"opencv-matrix" in content
-
-
 def _read_mapping(file: Path) -> dict[str, Any]:
     """Return numbers, arrays and texts of plain JSON or YAML, as ROS's camera_calibration has.
 
@@ -302,45 +296,6 @@ def _read_mapping(file: Path) -> dict[str, Any]:
                 ) from error
         elif isinstance(value, list | int | float | str):
             found[str(name)] = value
-    return found
-
-
-def read_file_storage(file: Path) -> dict[str, Any]:
-    """Return matrices, numbers and lists of text of a file of OpenCV's FileStorage, by name.
-
-    Raises:
-        InputError: the file is too large, or not of that kind, or has none of these.
-    """
-    require_file(file, SETTINGS_BYTES)
-    import cv2  # late: it takes 0.2 s, and few commands read such a file
-
-    try:
-        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-        names = storage.root().keys() if storage.isOpened() else []
-        found: dict[str, Any] = {}
-        for name in names:
-            node = storage.getNode(name)
-            if node.isMap() and node.mat() is not None:
-                found[name] = np.asarray(node.mat(), dtype=np.float64)
-            elif node.isInt() or node.isReal():
-                found[name] = float(node.real())
-            elif node.isString():
-                found[name] = node.string()
-            elif node.isSeq():
-                parts = [node.at(index) for index in range(node.size())]
-                found[name] = [
-                    part.string() if part.isString() else f"{part.real():g}" for part in parts
-                ]
-        storage.release()
-    except UnicodeDecodeError as error:
-        raise calibration_error(
-            str(file), "a file of OpenCV's FileStorage", "names or text that are not UTF-8"
-        ) from error
-    except (cv2.error, SystemError) as error:
-        said = str(error.__cause__ or error).strip().splitlines()[0][:200]
-        raise calibration_error(str(file), "a file of OpenCV's FileStorage", said) from error
-    if not found:
-        raise calibration_error(str(file), "matrices of OpenCV's FileStorage", "none")
     return found
 
 

@@ -21,7 +21,7 @@ from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.errors import InputError, UsageError
-from worldpose.video.folder import open_video
+from worldpose.video.folder import decode_image, open_video
 
 
 class _Given(BaseModel):
@@ -173,15 +173,18 @@ def read_picture(path: Path) -> Image:
     Raises:
         InputError: the file is no readable image.
     """
-    data = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if data is None:
+    try:
+        image = decode_image(np.fromfile(path, np.uint8))
+    except OSError:
+        image = None
+    if image is None:
         raise InputError(
             str(path),
             expected="a readable image",
             found="a missing or unreadable file",
             todo="Put the images of the data set where its annotations say.",
         )
-    return np.ascontiguousarray(np.asarray(data, dtype=np.uint8)[..., ::-1])
+    return image
 
 
 class PictureCache:

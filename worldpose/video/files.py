@@ -19,7 +19,31 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
 from worldpose.errors import InputError, say_failure
-from worldpose.video.pictures import FrameIndex, Pictures, convert_pixels
+from worldpose.video.pictures import MAX_FRAME_PIXELS, FrameIndex, Pictures, convert_pixels
+
+
+def open_file(path: Path, form: str | None = None) -> InputContainer:
+    """Open a file whose frames decode only within `MAX_FRAME_PIXELS`, whatever its header says.
+
+    Threads keep one frame each, so that large frames get few of them.
+
+    Raises:
+        InputError: the file is a list of other files, which can be outside of its folder.
+    """
+    limit = {"max_pixels": str(MAX_FRAME_PIXELS)}
+    local = {"protocol_whitelist": "file"}
+    container = av.open(str(path), format=form, options=limit, container_options=local)
+    if {"concat", "hls", "dash", "sdp", "imf"} & {*container.format.name.split(",")}:
+        container.close()
+        raise _no_video(path, "a list of other files")
+    for stream in container.streams.video:
+        if stream.codec_context is not None:
+            stream.codec_context.options = limit
+            stream.thread_type = "AUTO"
+            pixels = max(1, stream.width * stream.height)
+            if 16 * pixels > MAX_FRAME_PIXELS:
+                stream.codec_context.thread_count = 2 * MAX_FRAME_PIXELS // pixels
+    return container
 
 
 def index_frames(path: Path) -> FrameIndex:
@@ -31,12 +55,15 @@ def index_frames(path: Path) -> FrameIndex:
         InputError: no video, or frames without time stamps.
     """
     try:
-        with av.open(str(path)) as container:
+        with open_file(path) as container:
             if not container.streams.video:
                 raise _no_video(path, "no video stream")
             stream = container.streams.video[0]
             if stream.codec_context is None:
                 raise _no_video(path, "a video stream that this program has no decoder for")
+            if not stream.width * stream.height:
+                said = f"frames without a size, or of more than {MAX_FRAME_PIXELS:,} pixels"
+                raise _no_video(path, said)
             size: tuple[int, int] | None = None
             packets: list[tuple[int | None, bool]] = []
             for packet in read_packets(container, stream):
@@ -86,9 +113,8 @@ def _count_frames(
 
 def _shown_stamps(path: Path, most: int | None = None) -> list[int | None]:
     """Return the time stamps of all frames, or of the first `most`, in the order shown."""
-    with av.open(str(path)) as container:
+    with open_file(path) as container:
         stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
         pictures = decode_packets(read_packets(container, stream))
         return [picture.pts for picture in islice(pictures, most)]
 
@@ -202,9 +228,8 @@ class VideoReader(Pictures):
         self._open()
 
     def _open(self) -> None:
-        self._container = av.open(str(self.path))
+        self._container = open_file(self.path)
         self._stream = self._container.streams.video[0]
-        self._stream.thread_type = "AUTO"
 
     def close(self) -> None:
         """Close the file."""

@@ -25,12 +25,13 @@ MAX_PIXELS: Final = 200_000_000
 """No camera takes larger images; a few hundred bytes can declare gigabytes."""
 
 
-def decode_image(content: Image, *, grey: bool = False) -> Image | None:
+def decode_image(content: Image, *, grey: bool = False, turned: bool = True) -> Image | None:
     """Return an image (height, width, 3) RGB, or (height, width) grey.
 
     Args:
         content: (bytes,) content of an image file of `FORMATS`.
         grey: without colour.
+        turned: as its EXIF tag says that it is shown, not as it is stored.
 
     Returns:
         None if the bytes are no whole image, or declare more than `MAX_PIXELS`.
@@ -40,8 +41,9 @@ def decode_image(content: Image, *, grey: bool = False) -> Image | None:
     width, height = declared_size(content) or (0, 0)
     if not 0 < width * height <= MAX_PIXELS:
         return None
+    form = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
     try:
-        image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB)
+        image = cv2.imdecode(content, form | (0 if turned else cv2.IMREAD_IGNORE_ORIENTATION))
     except cv2.error:
         return None
     return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)

@@ -18,6 +18,9 @@ from worldpose.errors import InputError
 RATE_SLACK: Final = 0.1
 """Share of missing or duplicate frames from which a video's rate differs from its clock's."""
 
+MAX_FRAME_PIXELS: Final = 100_000_000
+"""Larger frames of videos are refused before they are decoded: one takes up to 0.8 GB."""
+
 
 @dataclass(frozen=True, eq=False)
 class FrameIndex:

@@ -12,7 +12,7 @@ from av.video.stream import VideoStream
 
 from data_contracts.arrays import Image
 from worldpose.errors import InputError
-from worldpose.video.files import decode_packets, index_frames, read_packets
+from worldpose.video.files import decode_packets, index_frames, open_file, read_packets
 from worldpose.video.pictures import FrameIndex, convert_pixels
 
 
@@ -28,7 +28,7 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
     begin = 0
     with av.open(str(out), "w") as target:
         for part, index in zip(parts, indices, strict=True):
-            with av.open(str(part)) as source:
+            with open_file(part) as source:
                 stream = source.streams.video[0]
                 if written is None:
                     written = target.add_stream_from_template(stream)
@@ -54,7 +54,7 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
 def read_dpx(file: Path, *, grey: bool) -> Image | None:
     """Return an image (height, width, 3) RGB, or (height, width) grey; None if it is none."""
     try:
-        with av.open(str(file), format="dpx_pipe") as container:
+        with open_file(file, "dpx_pipe") as container:
             picture = next(iter(container.decode(video=0)), None)
             return None if picture is None else convert_pixels(picture, grey, None)
     except (av.error.FFmpegError, OSError, ValueError):
@@ -66,7 +66,7 @@ def describe_video(path: Path, index: FrameIndex) -> list[str]:
     if path.is_dir():
         return []
     notes = []
-    with av.open(str(path)) as container:
+    with open_file(path) as container:
         stream = container.streams.video[0]
         duration = stream.duration and float(stream.duration * (index.time_base or 1))
         if duration is None and container.duration is not None and len(container.streams) == 1:

@@ -19,11 +19,17 @@ form.addEventListener("submit", async (event) => {
   message.textContent = "";
   const who = field("who").value.trim();
   try {
-    const answer = await fetch("/api/login", {
+    const send = () => fetch("/api/login", {
       method: "POST",
       headers: { "content-type": "application/json" },
       body: JSON.stringify({ who, token: field("token").value.trim() }),
     });
+    let answer = await send();
+    for (let tries = 0; answer.status === 429 && tries < 20; tries += 1) {
+      message.textContent = "Too many wrong tokens were sent: trying again.";
+      await new Promise((resolve) => setTimeout(resolve, 300 + 700 * Math.random()));
+      answer = await send();
+    }
     if (answer.ok) {
       localStorage.setItem("who", who);
       location.replace("/");

@@ -8,6 +8,7 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
+from worldpose.formats.opencv_storage import read_file_storage
 
 MATRIX = np.array([[1400.0, 0.0, 970.0], [0.0, 1404.0, 530.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([[-0.31, 0.12, 0.001, -0.002, -0.03]])
@@ -75,6 +76,55 @@ def test_every_kind_of_file_gives_the_same_lens(kind, tmp_path):
     assert lens.focal_std_px == pytest.approx(14.02)
     assert lens.principal_point_std_px == pytest.approx(9.6)
     assert lens.distortion_std == 0.005
+
+
+DEEP = 100_000
+NESTED = {
+    "flow.yml": f"%YAML:1.0\n---\nK: {'[' * DEEP}{']' * DEEP}\n",
+    "block.yml": f"%YAML:1.0\n---\nK:\n{'- ' * DEEP}1\n",
+    "deep.json": f'{{"opencv-matrix": {"[" * DEEP}{"]" * DEEP}}}',
+    "deep.xml": f"<opencv_storage>{'<a>' * DEEP}{'</a>' * DEEP}</opencv_storage>",
+    "hidden.yml": f'%YAML:1.0\n---\n# "\nK: {"[" * DEEP}"]"\n',
+}
+
+
+@pytest.mark.parametrize("name", NESTED)
+def test_deep_nesting_is_refused_before_a_parser_ends_the_process(name, tmp_path):
+    (tmp_path / name).write_text(NESTED[name])
+    with pytest.raises(InputError, match=r"32 levels|nesting without end|nested more than 32"):
+        read_lenses([tmp_path / name], "left", SIZES)
+
+
+@pytest.mark.parametrize("flag", [0, cv2.FILE_STORAGE_WRITE_BASE64])
+@pytest.mark.parametrize("form", ["xml", "yml", "json"])
+def test_what_opencv_writes_is_read_as_it_was_written(form, flag, tmp_path):
+    file = tmp_path / f"all.{form}"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE | flag)
+    wrote = {
+        "K": MATRIX * 1e-7,
+        "corners": np.arange(12, dtype=np.float32).reshape(2, 3, 2),
+        "flags": np.arange(6, dtype=np.uint8).reshape(2, 3),
+        "odd": np.array([[np.nan, np.inf, -np.inf]]),
+        "count": 3.0,
+        "tiny": 1e-300,
+        "model": "plumb_bob",
+        "about": 'a "b" c',
+    }
+    for name, value in wrote.items():
+        storage.write(name, value)
+    storage.startWriteStruct("names", cv2.FileNode_SEQ)
+    for name in ("1", 'cam "a"', "02"):
+        storage.write("", name)
+    storage.endWriteStruct()
+    storage.release()
+    found = read_file_storage(file)
+    assert found.pop("names") == ["1", 'cam "a"', "02"]
+    assert found.keys() == wrote.keys()
+    for name, value in wrote.items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(found[name], value)
+        else:
+            assert found[name] == value
 
 
 def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):

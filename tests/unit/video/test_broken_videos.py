@@ -153,3 +153,30 @@ def test_images_whose_names_do_not_number_them_are_refused(tmp_path, names, mess
         write_still(tmp_path / f"{name}.png", numbered(1)[0])
     with pytest.raises(InputError, match=message):
         index_video(tmp_path).on_clock(25.0, "images")
+
+
+def write_lie(path, size, told):
+    """Write one PNG image of a size in a MOV file whose header tells another."""
+    with av.open(str(path), "w") as target:
+        stream = target.add_stream("png", rate=25)
+        stream.width, stream.height = size
+        stream.pix_fmt = "gray"
+        for packet in (*stream.encode(av.VideoFrame(*size, "gray")), *stream.encode(None)):
+            target.mux(packet)
+    content = path.read_bytes()
+    at, ends = content.rindex(b"moov"), [struct.pack(">HH", *each) for each in (size, told)]
+    path.write_bytes(content[:at] + content[at:].replace(*ends))
+
+
+@pytest.mark.parametrize("told", [(12000, 12000), (64, 64)])
+def test_too_many_pixels_are_refused_before_they_are_decoded(told, tmp_path):
+    write_lie(tmp_path / "huge.mov", (12000, 12000), told)
+    with pytest.raises(InputError, match="more than 100,000,000 pixels"):
+        index_video(tmp_path / "huge.mov")
+
+
+def test_a_list_of_other_files_is_no_video(tmp_path):
+    write_lie(tmp_path / "other.mov", (64, 64), (64, 64))
+    (tmp_path / "video.mp4").write_text("ffconcat version 1.0\nfile other.mov\n")
+    with pytest.raises(InputError, match="a list of other files"):
+        index_video(tmp_path / "video.mp4")
