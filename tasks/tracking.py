@@ -72,10 +72,12 @@ def tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     if edits:
         figures["undecided"] = float(sum(not join.decided for join in corrected.joins))
     figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
-    present = (np.asarray(corrected.detection_index) >= 0).any(axis=1)
+    present = np.asarray((corrected.detection_index >= 0).any(axis=1), np.bool_)
     people = corrected.person.tolist()
     fps = float(inputs.sources["fps"])
-    figures["absent_share"], gaps = measure_absences(present, corrected.frame, people, fps)
+    figures["absent_share"], gaps = measure_absences(
+        present, np.asarray(corrected.frame, np.int64), people, fps
+    )
     if figures["absent_share"] > MAX_ABSENT_SHARE and gaps:
         more = f", and {len(gaps) - 3} more" if len(gaps) > 3 else ""
         result.warnings.append(

@@ -207,8 +207,8 @@ class Drafts:
             name = _choose_name(title, {each.name for each in draft.files})
             chosen = file.model_copy(update={"id": secrets.token_hex(6), "name": name})
             with self._budget:
-                known = [(it.id, each) for it in self.all() for each in it.files]
-                underway = sum(each.size - self._count_received(at, each) for at, each in known)
+                listed = [(it.id, other) for it in self.all() for other in it.files]
+                underway = sum(other.size - self._count_received(at, other) for at, other in listed)
                 self._require_space(title, file.size + underway)
                 self._write(draft.model_copy(update={"files": (*draft.files, chosen)}))
             return chosen
