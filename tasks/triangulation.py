@@ -29,7 +29,6 @@ from tasks.clip_inputs import (
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.camera_consistency.changes import Change, Kind, find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
-from worldpose.ingest.footage import stretches
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.camera_changes import (
     change_record,
@@ -43,8 +42,6 @@ from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
-MAX_UNHEALTHY_SHARE: Final = 0.05
-"""Share of a clip in which a camera is not healthy from which the run warns [1]."""
 UNHEALTHY: Final = "unhealthy_share"
 """Metric: share of the clip in which a camera is not healthy, of the worst one [1]."""
 
@@ -99,7 +96,6 @@ def _write_joints(
             changes.append(part.smoothing.changes)
         measured = _health_arrays(inputs, clip, health, rows, result)
         found = _find_changes(inputs, clip, health, kinds, settings, rows, result)
-        result.warnings += _describe_health(inputs, clip, measured, {it.camera for it in found})
         result.write(
             layout,
             arrays=spool.arrays()
@@ -175,26 +171,6 @@ def _health_arrays(
         "health": values.astype(np.float32),
         "health_frame": np.asarray(frame[rows][:: health.length], dtype=np.int64),
     }
-
-
-def _describe_health(
-    inputs: UnitInputs, clip: ClipInputs, measured: dict[str, NDArray[Any]], known: set[str]
-) -> list[str]:
-    """Return a sentence about the longest time of each camera, of unknown cause, that is ill."""
-    is_ill = judge_health(measured["health"]) > 1.0
-    starts, said = measured["health_frame"], []
-    ends = np.append(starts[1:], clip.detections.frame[-1] + 1) - 1
-    for c, name in enumerate(clip.camera_ids):
-        if is_ill[:, c].mean() > MAX_UNHEALTHY_SHARE and name not in known:
-            times = stretches(np.flatnonzero(is_ill[:, c]))
-            first, last = max(times, key=lambda span: span[1] - span[0])
-            said.append(
-                f"{inputs.recipe.name}: camera {name} is not healthy for "
-                f"{is_ill[:, c].mean():.0%} of the time, as in frames {starts[first]} to "
-                f"{ends[last]}: its keypoints depart from the people, or its images are missing, "
-                "dark, bright or blurred. See its health in the report."
-            )
-    return said
 
 
 def _find_changes(

@@ -29,7 +29,7 @@ WRONG_TOKENS: Final = 5
 """Wrong tokens at once, of all unknown browsers together or of one known one; further ones are
 refused unchecked."""
 FORGIVEN_SECONDS: Final = 1.0
-"""Time after which one more wrong token is looked at."""
+"""Time that allows one more guess."""
 KNOWN_SECONDS: Final = 90 * 86400
 """Time for which a browser is known after its person has logged in."""
 MOST_REMEMBERED: Final = 10_000

@@ -189,12 +189,8 @@ class Drafts:
         title = title.lower() if title.lower() in MATCH_FILES else title
         if title not in MATCH_FILES and not is_footage(title):
             known = f"a video ({' '.join(VIDEO_SUFFIXES)}), a still ({' '.join(IMAGE_SUFFIXES)})"
-            raise _refusal(
-                title,
-                f"{known} or one of {', '.join(sorted(MATCH_FILES))}",
-                "another file",
-                "Convert a video with any video tool.",
-            )
+            sought = f"{known} or one of {', '.join(sorted(MATCH_FILES))}"
+            raise _refusal(title, sought, "another file", "Convert a video with any video tool.")
         with self._hold(draft_id):
             draft = self.read(draft_id)
             for each in draft.files:
@@ -217,11 +213,9 @@ class Drafts:
         """Refuse bytes that would not leave `SPARE_BYTES` of the disk."""
         needed, free = size + SPARE_BYTES, shutil.disk_usage(self.inbox).free
         if needed > free:
+            wanted, there = f"{needed / 1e9:.1f} GB of free disk space", f"{free / 1e9:.1f} GB"
             raise _refusal(
-                title,
-                f"{needed / 1e9:.1f} GB of free disk space",
-                f"{free / 1e9:.1f} GB at the inbox",
-                "Free some, or ask the operator.",
+                title, wanted, f"{there} at the inbox", "Free some, or ask the operator."
             )
 
     def remove(self, draft_id: str, file_id: str) -> None:

@@ -41,7 +41,7 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
 
     Args:
         prediction: a submission, zip or npz.
-        reference: true poses in the same layout; NaN where nobody is.
+        reference: true poses in the same layout; NaN without a person.
 
     Raises:
         InputError: a clip, person or pose of the reference is missing in the prediction.

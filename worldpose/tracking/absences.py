@@ -17,7 +17,7 @@ def measure_absences(
 ) -> tuple[float, list[str]]:
     """Return the share of time in which people are missing [1], and phrases that name the longest.
 
-    It is the larger one of the frames without anybody over all frames, and of the frames of people
+    It is the larger one of the frames without a person over all frames, and of the frames of people
     who are missing between frames that show them, over all of their frames in between.
 
     Args:
@@ -43,7 +43,7 @@ def measure_absences(
     empty = np.diff(edges) - 1
     for at in np.flatnonzero(empty >= MIN_SECONDS * fps):
         ends = f"{frame[edges[at] + 1]} to {frame[edges[at + 1] - 1]}"
-        gaps.append((int(empty[at]) * present.shape[1], f"everybody in frames {ends}"))
+        gaps.append((int(empty[at]) * present.shape[1], f"all people in frames {ends}"))
     alone = 1.0 - len(anyone) / len(frame)
     said = [text for _, text in sorted(gaps, key=lambda gap: -gap[0])]
     return max(alone, missing / max(1, total)), said

@@ -23,11 +23,11 @@ def clip(**absent):
         ({"one": (40, 63)}, 0.0, []),  # under a second
         ({"one": (40, 64)}, 25 / 200, ["person 7 in frames 140 to 164"]),
         ({"one": (60, 99)}, 0.0, []),  # left for good
-        ({"both": (75, 99)}, 0.25, ["everybody in frames 175 to 199"]),
+        ({"both": (75, 99)}, 0.25, ["all people in frames 175 to 199"]),
         (
             {"both": (0, 49), "two": (60, 89)},
             0.5,
-            ["everybody in frames 100 to 149", "person 9 in frames 160 to 189"],
+            ["all people in frames 100 to 149", "person 9 in frames 160 to 189"],
         ),
     ],
 )
