@@ -5,7 +5,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from tests.camera_builders import look_at_camera  # noqa: E402
+from camera_builders import look_at_camera  # noqa: E402
+
 from worldpose.body.body_file import find_body  # noqa: E402
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
 from worldpose.body.keypoints import SKELETONS, fold_keypoints  # noqa: E402
