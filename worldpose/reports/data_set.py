@@ -1,4 +1,4 @@
-"""HTML page about a data set: statistics, overall and per clip, and findings of its check."""
+"""Page about a data set: statistics and findings of its check; plot of methods' people in it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from data_contracts.release import CheckReport, DataSetStatistics
-from worldpose.reports.drawing import INK, PALE, png, style
+from worldpose.dataset.benchmark import Sample
+from worldpose.reports.drawing import GRASS, INK, PALE, draw_skeleton, person_color, png, style
 from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table, whole_page
 
 
@@ -158,3 +159,44 @@ def _histogram(axes: Axes, values: Sequence[float], title: str, count: str) -> N
     axes.grid(axis="y", color=PALE, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def plot_methods(sample: Sample) -> bytes:
+    """Return a PNG with a column per method: its people, coloured, over the true ones, grey.
+
+    The first row is the camera's view, or that from above without a camera. The second is the view
+    from the side, along the touch line.
+    """
+    count, camera = len(sample.found), sample.camera
+    true = sample.true.reshape(-1, 3)
+    seen = true[:, :2] if camera is None else camera.project(true)
+    corners = []
+    for points in (seen, true[:, 1:]):
+        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+        room = 0.08 * float((high - low).max())
+        corners.append((low - room, high + room))
+    heights = [4.2 * min((high - low)[1] / (high - low)[0], 1.0) for low, high in corners]
+    size = (4.6 * max(count, 2), sum(heights) + 1.8)
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    panels = figure.subplots(2, count, squeeze=False, height_ratios=heights)
+    for (name, found), (upper, lower) in zip(sample.found.items(), panels.T, strict=True):
+        for people, is_true in ((sample.true, True), (found, False)):
+            for person, joints in enumerate(people):
+                color = PALE if is_true else person_color(person)
+                pixels = joints[:, :2] if camera is None else camera.project(joints)
+                draw_skeleton(upper, pixels, color)
+                draw_skeleton(lower, joints[:, 1:], color)
+        for axes, (low, high) in zip((upper, lower), corners, strict=True):
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+            axes.set_facecolor(GRASS)
+            style(axes)
+        if camera is not None:
+            upper.invert_yaxis()
+        upper.set_title(name, color=INK, fontsize=12)
+        lower.set_xlabel("y, across the pitch [m]", color=INK)
+    above = "camera view, y [px]" if camera is not None else "from above, y [m]"
+    panels[0, 0].set_ylabel(above, color=INK)
+    panels[1, 0].set_ylabel("side view, z [m]", color=INK)
+    title = f"{sample.clip}, frame {sample.frame}: truth grey, predictions after the alignment"
+    figure.suptitle(title, color=INK, fontsize=12)
+    return png(figure)
