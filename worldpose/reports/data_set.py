@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from data_contracts.release import CheckReport, DataSetStatistics
+from data_contracts.release import CheckReport, DataSetManifest, DataSetStatistics
 from worldpose.dataset.benchmark import Sample
 from worldpose.reports.drawing import GRASS, INK, PALE, draw_skeleton, person_color, png, style
 from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table, whole_page
@@ -30,6 +30,61 @@ def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, Che
     )
     about = f"Data set of {', '.join(checks)}"
     return whole_page(title, about, (counted_section(found), _check_section(checks)), tiles=tiles)
+
+
+def datasheet(manifest: DataSetManifest, checks: Mapping[str, CheckReport]) -> str:
+    """Return the self-contained page of a data set: composition, people, licences, statistics."""
+    found, clips = manifest.statistics, manifest.clips
+    subjects = {name for clip in clips.values() for name in clip.subjects}
+    metres = {name: sum(each.trajectories_m) for name, each in found.clips.items()}
+    splits, listed = [], []
+    for split in dict.fromkeys(clip.split for clip in clips.values()):
+        own = {name: clip for name, clip in clips.items() if clip.split == split}
+        people = {subject for clip in own.values() for subject in clip.subjects}
+        totals = (
+            len({clip.match_id for clip in own.values()}),
+            len(own),
+            len(people),
+            sum(found.clips[name].frames for name in own),
+            sum(found.clips[name].poses for name in own),
+        )
+        way = sum(metres[name] for name in own)
+        splits.append((split, *(f"{each:,}" for each in totals), f"{way:,.1f}"))
+    for name, clip in clips.items():
+        videos = [f"{v.path or v.source} from image {v.first_image}" for v in clip.footage.values()]
+        run = f"{clip.match_id}, run {clip.run_id}, from frame {clip.first_frame}"
+        listed.append((name, clip.split, run, clip.body_model, "; ".join(videos) or "-"))
+    meetings = {s: [n for n, clip in clips.items() if s in clip.subjects] for s in sorted(subjects)}
+    several = tuple((s, ", ".join(names)) for s, names in meetings.items() if len(names) > 1)
+    columns = ("split", ">matches", ">clips", ">subjects", ">frames", ">poses", ">metres")
+    sources = ("clip", "split", "source", "body model", "footage")
+    blocks = [Table("", columns, tuple(splits)), Table("Clips", sources, tuple(listed))]
+    if several:
+        blocks.append(Table("Subjects in several clips", ("subject", "clips"), several))
+    lead = (
+        "A match belongs to one split, and so does every subject. Nameless people without an entry "
+        "in the registry count once per clip. The truth of a test part is hidden: the part has "
+        "boxes, and cameras with the pose of the first frame alone."
+    )
+    terms = Table("", ("files", "licence"), tuple(manifest.licences.items()))
+    about = (
+        f"World: {manifest.conventions.world} Files: docs/reference/formats.md of worldpose "
+        f"{manifest.worldpose}. Verify the data set with worldpose release --check."
+    )
+    sections = (
+        Section("Composition", tuple(blocks), lead),
+        counted_section(found),
+        Section("Licences", (terms,), "Each kind of file has its own licence."),
+        _check_section(checks),
+    )
+    tiles = (
+        (f"{found.subjects}", "subjects"),
+        (f"{len(clips)}", "sequences"),
+        (f"{1000 * found.distance_km:,.0f} m", "run and walked by all"),
+        (f"{found.poses:,}", "3D poses"),
+        (f"{found.frames:,}", "frames"),
+    )
+    return whole_page(manifest.release, about, sections, tiles=tiles)
 
 
 def counted_section(found: DataSetStatistics) -> Section:
