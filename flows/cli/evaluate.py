@@ -83,12 +83,22 @@ def evaluate(
         print_ablation(ablation, as_json=as_json)
         return
     if reference is not None and prediction and not method:
-        from worldpose.dataset.benchmark import is_data_set
+        from worldpose.dataset.benchmark import is_data_set, score_folders
 
         if len(prediction) > 1 or is_data_set(Path(reference)):
-            _print_data_set(
-                Path(reference), prediction, body, match_in, fps, table, picture, as_json
+            folders = named_folders(prediction)
+            results, sample = score_folders(
+                Path(reference), folders, body=body, match_in=match_in, fps=fps
             )
+            if picture is not None:
+                from worldpose.formats.files import whole_file
+                from worldpose.reports.data_set import plot_methods
+
+                with whole_file(picture) as draft:
+                    draft.write_bytes(plot_methods(sample))
+            for place, note in (each for score in results for each in score.notes.items()):
+                line(f"{place}: {note}", to=errors)
+            print_methods(results, table, as_json=as_json)
             return
     if picture is not None:
         raise UsageError(
@@ -140,20 +150,14 @@ def evaluate(
     _print_scores(scores, as_json=as_json)
 
 
-def _print_data_set(
-    reference: Path,
-    named: Sequence[str],
-    body: str | None,
-    match_in: str | None,
-    fps: float | None,
-    table: TableForm,
-    picture: Path | None,
-    as_json: bool,
-) -> None:
-    from worldpose.dataset.benchmark import score_folders
+def named_folders(given: Sequence[str]) -> dict[str, Path]:
+    """Parse [NAME=]FOLDER arguments; a folder without a name has its own.
 
+    Raises:
+        UsageError: a folder does not exist, or two have the same name.
+    """
     folders: dict[str, Path] = {}
-    for item in named:
+    for item in given:
         name, equals, path = item.partition("=")
         if not equals or Path(item).exists():
             name, path = Path(item).resolve().name, item
@@ -165,17 +169,7 @@ def _print_data_set(
                 todo="Give each method a name and its folder, such as --prediction glamr=results.",
             )
         folders[name] = Path(path)
-    scores, sample = score_folders(reference, folders, body=body, match_in=match_in, fps=fps)
-    if picture is not None:
-        from worldpose.formats.files import whole_file
-        from worldpose.reports.data_set import plot_methods
-
-        with whole_file(picture) as draft:
-            draft.write_bytes(plot_methods(sample))
-    for score in scores:
-        for place, note in score.notes.items():
-            line(f"{place}: {note}", to=errors)
-    print_methods(scores, table, as_json=as_json)
+    return folders
 
 
 def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +19,6 @@ from data_contracts.release import (
     ClipFigures,
     ClipStatistics,
     DataSetManifest,
-    DataSetStatistics,
     Finding,
     ReleasedSequence,
     ReleasedVideo,
@@ -43,7 +41,7 @@ from worldpose.dataset.manifest import (
 )
 from worldpose.dataset.statistics import data_set_statistics
 from worldpose.errors import InputError, UsageError
-from worldpose.formats.archives import write_archive
+from worldpose.formats.archives import write_archive, wrong
 from worldpose.formats.challenge import (
     challenge_truth,
     read_boxes,
@@ -61,8 +59,6 @@ from worldpose.store.store import Store
 
 ASSETS: Final = ("poses", "joints", "cameras", "boxes", "footage")
 """Kinds of files, each with a licence."""
-PAGE: Final = "datasheet.html"
-SPLITS: Final[tuple[Split, ...]] = ("train", "val", "test")
 FootageForm = Literal["none", "digest", "copy"]
 
 
@@ -92,14 +88,14 @@ def write_data_set(
         UsageError: a folder exists, the test part has no hidden folder, or a licence is missing.
         InputError: a result or video is missing, or a subject is in two splits.
     """
+    hidden = options.hidden
     tested = any(split == "test" for _, split in origins)
-    for place in (out, *((options.hidden,) if options.hidden else ())):
+    if tested != (hidden is not None) or (hidden and out.resolve() in hidden.resolve().parents):
+        todo = "Name both --test MATCH and --hidden FOLDER, a folder that you do not publish."
+        raise _refuse("--hidden", "a folder for the test part's truth, not in --out", hidden, todo)
+    for place in (out, hidden or out):
         if place.exists():
             raise _refuse(f"{place}", "a new folder", "one that exists", "Choose another folder.")
-    if tested != (options.hidden is not None):
-        todo = "Name both --test MATCH and --hidden FOLDER, a folder that you do not publish."
-        found = "one without the other"
-        raise _refuse("--hidden", "a folder for the truth of the test part", found, todo)
     needed = ASSETS[:-1] if options.footage == "none" else ASSETS
     for asset in needed:
         if not options.licences.get(asset, "").strip():
@@ -108,7 +104,6 @@ def write_data_set(
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as workshop:
         draft, truth = Path(workshop) / "public", Path(workshop) / "hidden"
-        parts: dict[Split, Path] = {"train": draft / "train", "val": draft / "val", "test": truth}
         clips: dict[str, ReleasedSequence] = {}
         for origin, split in origins:
             for clip in origin.clips:
@@ -116,36 +111,39 @@ def write_data_set(
                 if name in clips:
                     todo = "Name each match once, and rename clips whose names differ by dots."
                     raise _refuse(name, "one clip of this name", "two", todo)
-                clips[name] = _write_clip(origin, clip, name, split, parts[split], draft, options)
+                part = truth if split == "test" else draft / split
+                clips[name] = _write_clip(origin, clip, name, split, part, draft / split, options)
         clips = _name_subjects(clips, options.subjects)
-        statistics = _count(parts, clips)
-        checks = {part.name: check(part) for part in parts.values() if part.is_dir()}
+        parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
+        counted = {name: each for part in parts for name, each in count([part]).clips.items()}
         manifest = DataSetManifest(
             release=options.name,
             worldpose=version("worldpose"),
             pitch=all(origin.spec.pitch != NO_PITCH for origin, _ in origins),
             licences={asset: options.licences[asset] for asset in needed},
             clips=clips,
-            statistics=statistics,
+            statistics=data_set_statistics(counted, len(_splits_of(clips))),
             files=(),
             hidden=_listed(truth),
         )
-        from worldpose.reports.data_set import datasheet  # late: it loads matplotlib, 0.5 s
+        from worldpose.reports.data_set import data_set_page  # late: it loads matplotlib, 0.5 s
 
-        (draft / PAGE).write_text(datasheet(manifest, checks), encoding="utf-8")
+        checks = {part.name: check(part, pitch=manifest.pitch) for part in parts}
+        page = data_set_page(options.name, manifest.statistics, checks, manifest)
+        (draft / "datasheet.html").write_text(page, encoding="utf-8")
         manifest = manifest.model_copy(update={"files": _listed(draft)})
         write_manifest(draft, manifest)
         for origin, _ in origins:
             keep_run(store, origin, options.name)
-        if options.hidden is not None:
-            options.hidden.parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(truth, options.hidden)
+        if hidden is not None:
+            hidden.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(truth, hidden)
         draft.replace(out)
     return manifest
 
 
-def _refuse(where: str, expected: str, found: str, todo: str) -> UsageError:
-    return UsageError(where, expected=expected, found=found, todo=todo)
+def _refuse(where: str, expected: str, found: object, todo: str) -> UsageError:
+    return UsageError(where, expected=expected, found=f"{found}", todo=todo)
 
 
 def _listed(folder: Path) -> tuple[StoredFile, ...]:
@@ -158,10 +156,10 @@ def _write_clip(
     name: str,
     split: Split,
     part: Path,
-    out: Path,
+    public: Path,
     options: ReleaseOptions,
 ) -> ReleasedSequence:
-    """Write the files of one clip into the folder of its split; return what the manifest says."""
+    """Write the files of one clip: its truth to `part`, of a test part the rest to `public`."""
     model, poses, people = fitted_bodies(origin.run, clip)
     tracks, spec = origin.tracks(clip), origin.spec
     write_poses(part / "poses" / f"{name}.npz", poses, model.name)
@@ -176,11 +174,12 @@ def _write_clip(
         boxes = project_people(part, name, label, views[label])
         write_archive(part / "boxes" / f"{label}.npz", boxes)
         if split == "test":
-            write_challenge_camera(out / "test" / "cameras" / f"{label}.npz", camera, 2026)
-            write_archive(out / "test" / "boxes" / f"{label}.npz", boxes)
+            write_challenge_camera(public / "cameras" / f"{label}.npz", camera, 2026)
+            write_archive(public / "boxes" / f"{label}.npz", boxes)
         if options.footage != "none":
-            footage[label] = _write_footage(origin, view, label, out / split, options.footage)
-    names = {person: track.name for person, track in tracked_people(origin.run, clip)[1].items()}
+            footage[label] = _write_footage(origin, view, public / "footage" / label, options)
+    found = {person: track.name for person, track in tracked_people(origin.run, clip)[1].items()}
+    names = [found.get(person) or f"{clip}/{person}" for person in people.tolist()]
     return ReleasedSequence(
         split=split,
         match_id=spec.match_id,
@@ -189,49 +188,40 @@ def _write_clip(
         first_frame=int(tracks.frames[0]),
         fps=spec.fps,
         body_model=model.name,
-        subjects=tuple(
-            f"{spec.match_id}/{names.get(person) or f'{clip}/{person}'}"
-            for person in people.tolist()
-        ),
+        subjects=tuple(f"{spec.match_id}/{each}" for each in names),
         views=views,
         footage=footage,
     )
 
 
-def _write_footage(
-    origin: Origin, view: str, label: str, part: Path, form: FootageForm
-) -> ReleasedVideo:
-    folder = Path(origin.registration.folder)
+def _write_footage(origin: Origin, view: str, out: Path, options: ReleaseOptions) -> ReleasedVideo:
+    folder, spec = Path(origin.registration.folder), origin.spec
     video = read_match(folder).videos.get(view)
-    digest = None
-    if video is not None:
-        digest = origin.registration.digest_of(video.relative_to(folder).as_posix())
+    source = "" if video is None else video.relative_to(folder).as_posix()
+    digest = origin.registration.digest_of(source)
     if video is None or digest is None:
         todo = "Add it to the match folder and run again, or choose --footage none."
-        raise InputError(f"{folder}: {view}", expected="its video", found="none", todo=todo)
-    copied = part / "footage" / f"{label}{video.suffix}"
-    if form == "copy":
+        raise wrong(f"{folder}: {view}", "its video", "none", todo)
+    copied = out.with_name(f"{out.name}{video.suffix}")
+    if options.footage == "copy":
         copied.parent.mkdir(parents=True, exist_ok=True)
         (shutil.copytree if video.is_dir() else shutil.copyfile)(video, copied)
-    first = next(each.first_frame for each in origin.spec.clips_of(view))
     return ReleasedVideo(
-        path=f"{part.name}/footage/{copied.name}" if form == "copy" else None,
-        source=video.relative_to(folder).as_posix(),
+        path="/".join(copied.parts[-3:]) if options.footage == "copy" else None,
+        source=source,
         sha256=digest,
-        first_image=unit_frames(origin.spec, view).number(first),
+        first_image=unit_frames(spec, view).number(spec.clips_of(view)[0].first_frame),
     )
 
 
-def project_people(
-    part: Path, clip: str, view: str, image_size: tuple[int, int]
-) -> dict[str, Floats]:
+def project_people(part: Path, clip: str, view: str, size: tuple[int, int]) -> dict[str, Floats]:
     """Return boxes (frames, persons, 4) [px] and visibility (frames, persons) of a clip's files.
 
     Boxes are around the surfaces of bodies, within the image; NaN outside. Visibility is the share
-    of joints inside the image and behind no nearer person.
+    of joints in the image that no nearer person hides. The image has width and height `size` [px].
     """
     poses, model = read_poses(part / "poses" / f"{clip}.npz")
-    camera = read_camera(part / "cameras" / f"{view}.npz", image_size)
+    camera = read_camera(part / "cameras" / f"{view}.npz", size)
     joints = read_joints(part / f"{clip}.joints.npz").joints
     truth = challenge_truth(find_body(model or ""), poses, camera)
     boxes = np.full((*joints.shape[:2], 4), np.nan)
@@ -250,27 +240,21 @@ def _name_subjects(
     registry = {} if file is None else read_yaml(file)
     known = {person for clip in clips.values() for person in clip.subjects}
     owner: dict[str, str] = {}
-    for subject, people in registry.items() if isinstance(registry, dict) else [(None, None)]:
-        for person in people if isinstance(people, list) else [None]:
+    for subject, people in registry.items() if isinstance(registry, dict) else [("", None)]:
+        for person in people if isinstance(people, list) else [people]:
             if person not in known or person in owner:
-                raise InputError(
-                    f"{file}: {subject}",
-                    expected="a list of MATCH/NAME or MATCH/CLIP/ID of the data set, each once",
-                    found=f"{person!r}",
-                    todo=f"Known are {', '.join(sorted(known)[:8])}, ...",
-                )
+                expected = "a list of MATCH/NAME or MATCH/CLIP/ID of the data set, each once"
+                todo = f"Known are {', '.join(sorted(known)[:8])}, ..."
+                raise wrong(f"{file}: {subject}", expected, f"{person!r}", todo)
             owner[person] = str(subject)
-    named = {
-        name: clip.model_copy(
-            update={"subjects": tuple(owner.get(person, person) for person in clip.subjects)}
-        )
-        for name, clip in clips.items()
-    }
+    named = {}
+    for name, clip in clips.items():
+        subjects = tuple(owner.get(person, person) for person in clip.subjects)
+        named[name] = clip.model_copy(update={"subjects": subjects})
     for subject, splits in _splits_of(named).items():
         if len(splits) > 1:
             todo = "Put all matches of a person into one split, or correct the registry."
-            found = " and ".join(sorted(splits))
-            raise InputError(f"{file}: {subject}", expected="one split", found=found, todo=todo)
+            raise wrong(f"{file}: {subject}", "one split", " and ".join(sorted(splits)), todo)
     return named
 
 
@@ -280,15 +264,6 @@ def _splits_of(clips: Mapping[str, ReleasedSequence]) -> dict[str, set[str]]:
         for subject in clip.subjects:
             found.setdefault(subject, set()).add(clip.split)
     return found
-
-
-def _count(parts: Mapping[Split, Path], clips: Mapping[str, ReleasedSequence]) -> DataSetStatistics:
-    """Return the statistics of the clips of all splits that have a folder."""
-    found: dict[str, ClipStatistics] = {}
-    for part in parts.values():
-        if part.is_dir():
-            found |= count([part]).clips
-    return data_set_statistics(found, len(_splits_of(clips)))
 
 
 def check_data_set(folder: Path, hidden: Path | None = None) -> CheckReport:
@@ -302,10 +277,9 @@ def check_data_set(folder: Path, hidden: Path | None = None) -> CheckReport:
     manifest = read_data_set(folder)
     findings = [*_file_findings(folder, hidden, manifest), *_statement_findings(manifest)]
     figures: dict[str, ClipFigures] = {}
-    for split in SPLITS:
+    for split in dict.fromkeys(clip.split for clip in manifest.clips.values()):
         part = folder / split if split != "test" else hidden
-        clips = {name: clip for name, clip in manifest.clips.items() if clip.split == split}
-        if not clips or part is None:
+        if part is None:
             continue
         try:
             report = check(part, pitch=manifest.pitch)
@@ -313,15 +287,14 @@ def check_data_set(folder: Path, hidden: Path | None = None) -> CheckReport:
             for found in report.findings:
                 where = tuple(f"{split}/{place}" for place in found.where)
                 findings.append(found.model_copy(update={"where": where}))
-            stated = manifest.statistics.clips
             for name, counted in count([part]).clips.items():
-                if name not in stated or not _equal(stated[name], counted):
+                if not _equal(manifest.statistics.clips.get(name), counted):
                     findings.append(_damage("count", "statistics differ from the poses", name))
         except InputError as error:
             findings.append(_damage("unreadable", str(error), split))
-        for name, clip in clips.items():
+        for name, clip in manifest.clips.items():
             try:
-                findings += _clip_findings(part, split, name, clip)
+                findings += _clip_findings(part, name, clip) if clip.split == split else ()
             except InputError as error:
                 findings.append(_damage("unreadable", str(error), f"{split}: {name}"))
     return CheckReport(clips=figures, findings=tuple(findings))
@@ -331,11 +304,11 @@ def _damage(fault: str, says: str, *where: str) -> Finding:
     return Finding(fault=fault, kind="damage", where=where, says=says)
 
 
-def _equal(one: ClipStatistics, two: ClipStatistics) -> bool:
-    ways = zip(one.trajectories_m, two.trajectories_m, strict=False)
-    alike = all(math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-6) for a, b in ways)
-    same = one.model_copy(update={"trajectories_m": two.trajectories_m})
-    return alike and len(one.trajectories_m) == len(two.trajectories_m) and same == two
+def _equal(stated: ClipStatistics | None, counted: ClipStatistics) -> bool:
+    if stated is None or len(stated.trajectories_m) != len(counted.trajectories_m):
+        return False
+    same = stated.model_copy(update={"trajectories_m": counted.trajectories_m}) == counted
+    return same and np.allclose(stated.trajectories_m, counted.trajectories_m, rtol=1e-6, atol=1e-6)
 
 
 def _file_findings(
@@ -350,76 +323,59 @@ def _file_findings(
         if gone := sorted(listed - there):
             yield _damage("missing_files", f"files of {place.name} are gone", *gone)
         if new := sorted(there - listed - {DATA_SET}):
-            yield _damage(
-                "unlisted_files", f"release.json lists no such files of {place.name}", *new
-            )
-        known = [file for file in files if file.path in there]
-        if changed := changed_files(place, known):
+            yield _damage("unlisted_files", "release.json lists no such files", *new)
+        if changed := changed_files(place, [file for file in files if file.path in there]):
             yield _damage("changed_files", f"files of {place.name} have other bytes", *changed)
-    test = folder / "test"
-    public = {"cameras", "boxes", "footage"}
-    truth = [path for path in test.rglob("*.npz") if path.relative_to(test).parts[0] not in public]
-    for path in (test / "cameras").glob("*.npz"):
-        posed = np.isfinite(read_camera_rows(path).rotation).all((-1, -2)).sum()
-        truth += [path] if posed > 1 else []
+    truth = []
+    for path in sorted((folder / "test").rglob("*.npz")):
+        kind = path.relative_to(folder / "test").parts[0]
+        posed = kind == "cameras" and np.isfinite(read_camera_rows(path).rotation).all((1, 2)).sum()
+        if posed > 1 or kind not in ("cameras", "boxes", "footage"):
+            truth.append(path.relative_to(folder).as_posix())
     if truth:
-        names = sorted(path.relative_to(folder).as_posix() for path in truth)
-        yield _damage("test_truth", "the public test part has truth that must be hidden", *names)
+        yield _damage("test_truth", "the public test part has truth that must be hidden", *truth)
 
 
 def _statement_findings(manifest: DataSetManifest) -> Iterator[Finding]:
     """Yield missing licences, subjects in two splits, and totals that clips contradict."""
-    kinds = {kind for file in (*manifest.files, *manifest.hidden) for kind in _kinds(file.path)}
-    for asset in sorted(kinds):
-        if not manifest.licences.get(asset, "").strip():
+    paths = [file.path for file in (*manifest.files, *manifest.hidden)]
+    for asset in ASSETS:
+        here = any(asset in path.split("/") or f".{asset}." in path for path in paths)
+        if here and not manifest.licences.get(asset, "").strip():
             yield _damage("missing_licence", "no licence is stated for these files", asset)
     for subject, splits in _splits_of(manifest.clips).items():
         if len(splits) > 1:
-            yield _damage(
-                "subject_in_two_splits", f"it is in {' and '.join(sorted(splits))}", subject
-            )
+            says = f"it is in {' and '.join(sorted(splits))}"
+            yield _damage("subject_in_two_splits", says, subject)
     stated = manifest.statistics
     whole = data_set_statistics(stated.clips, len(_splits_of(manifest.clips)))
-    numbers = stated.model_dump(exclude={"clips"})
-    for name, value in whole.model_dump(exclude={"clips"}).items():
-        is_number = isinstance(value, float) and isinstance(numbers[name], float)
-        if not (math.isclose(value, numbers[name]) if is_number else value == numbers[name]):
-            yield _damage("count", f"{name} is {numbers[name]}, and {value} of all clips", DATA_SET)
-    if stated.clips.keys() != manifest.clips.keys():
-        yield _damage("count", "statistics are of other clips", DATA_SET)
+    wrong_totals = [name for name, value in whole if value != getattr(stated, name)]
+    if wrong_totals or stated.clips.keys() != manifest.clips.keys():
+        says = f"clips give other totals of {', '.join(wrong_totals) or 'clips'}"
+        yield _damage("count", says, DATA_SET)
 
 
-def _kinds(path: str) -> list[str]:
-    return (
-        ["joints"] if path.endswith(".joints.npz") else [a for a in ASSETS if a in path.split("/")]
-    )
-
-
-def _clip_findings(part: Path, split: str, name: str, clip: ReleasedSequence) -> Iterator[Finding]:
+def _clip_findings(part: Path, name: str, clip: ReleasedSequence) -> Iterator[Finding]:
     """Yield boxes outside the image, and poses, joints and boxes that disagree."""
     poses, model = read_poses(part / "poses" / f"{name}.npz")
-    tracks = read_joints(part / f"{name}.joints.npz")
+    joints = read_joints(part / f"{name}.joints.npz").joints
     mine = fold_keypoints(find_body(model or ""), COCO17)(poses).swapaxes(0, 1)
-    joints = f"{split}/{name}.joints.npz"
-    shapes = {poses.batch_shape[0], len(tracks.person_ids), len(clip.subjects)}
-    if len(shapes) > 1 or mine.shape != tracks.joints.shape or model != clip.body_model:
-        says = "poses, joints and release.json have other people, frames or body models"
-        yield _damage("count", says, joints)
+    where = f"{clip.split}/{name}.joints.npz"
+    if mine.shape != joints.shape or len(clip.subjects) != joints.shape[1]:
+        yield _damage("count", "poses, joints and subjects are not of the same people", where)
         return
-    if not np.allclose(mine, tracks.joints, rtol=0.0, atol=0.005, equal_nan=True):
-        yield _damage("joints_differ", "joints are not those of the poses", joints)
+    if not np.allclose(mine, joints, rtol=0.0, atol=0.005, equal_nan=True):
+        yield _damage("joints_differ", "joints are not those of the poses", where)
     for view, size in clip.views.items():
-        where = f"{split}/boxes/{view}.npz"
+        where = f"{clip.split}/boxes/{view}.npz"
         stored = read_boxes(part / "boxes" / f"{view}.npz")
         boxes, edge = stored["boxes"], np.array(size) - 0.5
-        empty = (
-            (boxes[..., 2:] <= boxes[..., :2]) | (boxes[..., :2] < -0.5) | (boxes[..., 2:] > edge)
-        )
-        if empty.any():
+        low, high = boxes[..., :2], boxes[..., 2:]
+        if ((high <= low) | (low < -0.5) | (high > edge)).any():
             yield _damage("box_outside", "a box has no area or leaves the image", where)
         for key, right in project_people(part, name, view, size).items():
             # Single precision of poses is far below a hundredth of a pixel.
-            same = stored[key].shape == right.shape
-            if not same or not np.allclose(stored[key], right, rtol=0, atol=0.01, equal_nan=True):
+            mine, same = stored[key], stored[key].shape == right.shape
+            if not same or not np.allclose(mine, right, rtol=0.0, atol=0.01, equal_nan=True):
                 says = f"{key}: not those of the bodies in the camera, frame by frame"
                 yield _damage("boxes_differ", says, where)

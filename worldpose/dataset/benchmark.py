@@ -17,7 +17,7 @@ from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import ShippedClip, camera_files, list_clips, read_clip
-from worldpose.dataset.faults import CheckSettings, Fault, camera_faults
+from worldpose.dataset.faults import CheckSettings, camera_faults
 from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
 from worldpose.errors import InputError
 from worldpose.evaluation.matching import (
@@ -38,7 +38,7 @@ from worldpose.evaluation.metrics import (
     pool_people,
 )
 from worldpose.formats.archives import wrong
-from worldpose.formats.challenge import read_boxes, read_camera
+from worldpose.formats.challenge import CameraRows, read_boxes, read_camera
 from worldpose.formats.joints_file import PLURALS, JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
@@ -52,13 +52,11 @@ _KEYS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """People of one frame, true and predicted after the shared alignment, for a plot."""
+    """People of one image of a clip, true and predicted after the shared alignment, for a plot."""
 
     clip: str
     frame: int
-    """Image of the clip, from 0."""
     camera: Camera | None
-    """Camera of the frame; None without one."""
     true: Floats
     """(persons, 17, 3) [m]."""
     found: Mapping[str, Floats]
@@ -67,12 +65,11 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class _People:
-    """People of one clip as a folder has them."""
+    """People of one clip as a folder has them; frames of tracks count images of the clip from 0."""
 
+    folder: Path
     where: str
-    """The file, and its member with positions."""
     tracks: JointTracks
-    """Frames count the images of the clip from 0."""
     first: int
     """Match frame of image 0; 0 if no file numbers frames."""
     clip: ShippedClip
@@ -132,45 +129,50 @@ def score_folders(
     parts = {name: parts_of_clips(folder) for name, folder in predictions.items()}
     for clip, part in parts_of_clips(reference).items():
         truth = _read_people(part, clip, body, match_in)
-        camera = _true_camera(truth)
+        true, camera = truth.tracks.joints, _true_camera(truth)
         rate = fps or clip_frame_rate(read_frame_rates(part), clip)
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
-                raise wrong(
-                    f"{folder}: clip {clip}",
-                    f"this clip of the reference, such as poses/{clip}.npz",
-                    ", ".join(sorted(parts[name])[:8]),
-                    "Write its poses, with NaN where the method found nobody.",
+                expected, found = (
+                    f"poses/{clip}.npz or its joints",
+                    ", ".join(list(parts[name])[:8]),
                 )
+                todo = "Write its poses, with NaN where the method found nobody."
+                raise wrong(f"{folder}: clip {clip}", expected, found, todo)
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
-            boxes = None if camera is None else _boxes(mine, parts[name][clip], truth, camera)
+            boxes = None if camera is None else _boxes(mine, truth, camera)
             clips[name][clip], persons = evaluate_joints(
                 mine.tracks, truth.tracks, settings, fps=rate, camera=camera, boxes=boxes
             )
-            shown[name] = _matched(mine.tracks.joints, truth.tracks.joints, camera, boxes, settings)
+            distances = joint_distances(mine.tracks.joints, true)
+            match = match_people(distances, settings.match_gate_m)
+            sides = mine.tracks.joints, true
+            tracks = match_tracks(*sides, distances, match, camera, boxes, settings)
+            shown[name] = take_matched(mine.tracks.joints, tracks)
             people[name] += persons
             bodies[name].update(mine.bodies)
-            notes[name] |= {**mine.notes, **_describe_shift(mine.where, shown[name], truth)}
-        samples = samples or [_sample(clip, camera, truth.tracks.joints, shown)]
-    scores = [
-        MethodScore(
-            method=name,
-            title=name,
-            source=folder.name,
-            world="shared",
-            body_model=", ".join(sorted(bodies[name])) or "joints",
-            notes=notes[name],
-            match_in=match_in,
-            first_frame=0,
-            settings=settings.model_dump(mode="json"),
-            evaluation=pool_people(people[name], settings).model_copy(
-                update={"frames": sum(each.frames or 0 for each in clips[name].values())}
-            ),
-            clips=clips[name],
+            notes[name] |= {**mine.notes, **_describe_shift(mine.where, shown[name], true)}
+        samples = samples or [_sample(clip, camera, true, shown)]
+    scores = []
+    for name, folder in predictions.items():
+        frames = sum(each.frames or 0 for each in clips[name].values())
+        pooled = pool_people(people[name], settings).model_copy(update={"frames": frames})
+        scores.append(
+            MethodScore(
+                method=name,
+                title=name,
+                source=folder.name,
+                world="shared",
+                body_model=", ".join(sorted(bodies[name])) or "joints",
+                notes=notes[name],
+                match_in=match_in,
+                first_frame=0,
+                settings=settings.model_dump(mode="json"),
+                evaluation=pooled,
+                clips=clips[name],
+            )
         )
-        for name, folder in predictions.items()
-    ]
     return tuple(scores), samples[0]
 
 
@@ -183,35 +185,27 @@ def _read_people(
 
     def find(named: str | None) -> BodyModel:
         if named is None and body is None:
-            raise wrong(
-                f"{poses}: body_model",
-                "the name of the body model that the betas belong to",
-                "no such member",
-                "Install that body (worldpose body install), and name it: --body smpl-neutral.",
-            )
-        model = find_body(named or body or "")
-        used.append(model.name)
-        return model
+            todo = "Install it (worldpose body install), and name it: --body smpl-neutral."
+            raise wrong(f"{poses}: body_model", "the name of the body model", "no name", todo)
+        used.append(named or body or "")
+        return find_body(used[-1])
 
     clips = list_clips(folder)
     shipped = read_clip(folder, clip, clips, find, None, 50.0)
     source = shipped.sources[0]
-    where = f"{folder}/{source.name}" + (": transl" if source.place is not None else "")
     numbered = [each.frames for each in shipped.sources if each.frames is not None]
-    first = int(numbered[0][0]) if numbered and len(numbered[0]) else 0
-    if truth is not None:
-        first = truth.first
+    first = truth.first if truth else int(numbered[0][0]) if numbered and len(numbered[0]) else 0
     rows = np.arange(len(source.points)) if source.frames is None else source.frames - first
-    count = len(truth.tracks.frames) if truth is not None else int(rows.max(initial=-1)) + 1
-    low, high = (int(rows[0]), int(rows[-1])) if len(rows) else (0, -1)
+    count = len(truth.tracks.frames) if truth else int(rows.max(initial=-1)) + 1
+    key = (
+        ": frames" if source.frames is not None else ": transl" if source.place is not None else ""
+    )
+    where = f"{folder}/{source.name}{key}"
+    low, high = int(rows.min(initial=0)), int(rows.max(initial=0))
     if (source.frames is None and len(rows) != count) or low < 0 or high >= count:
-        key = "" if source.frames is None else ": frames"
-        raise wrong(
-            f"{where}{key}",
-            f"frames {first} to {first + count - 1} of the clip, {count} in all",
-            f"{len(rows)}, from {low + first} to {high + first}",
-            "Write one row for each frame of the clip, with NaN where nobody was found.",
-        )
+        expected = f"frames {first} to {first + count - 1} of the clip"
+        todo = "Write one row for each frame of the clip, with NaN where nobody was found."
+        raise wrong(where, expected, f"{first + low} to {first + high}", todo)
     joints = np.full((count, source.points.shape[1], len(COCO17), 3), np.nan)
     for place, name in enumerate(COCO17):
         if name in source.skeleton:
@@ -223,15 +217,12 @@ def _read_people(
     plural = {}
     if poses.is_file():
         with zipfile.ZipFile(poses) as file:
-            keys = {each.removesuffix(".npy") for each in file.namelist()} & PLURALS.keys()
-        read = ", ".join(f"{key} as {PLURALS[key]}" for key in sorted(keys))
+            keys = [key for key in PLURALS if f"{key}.npy" in file.namelist()]
+        read = ", ".join(f"{key} as {PLURALS[key]}" for key in keys)
         plural = {f"{poses}": f"read {read}, as public readers name it"} if keys else {}
-    try:
-        tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
-    except InputError as error:
-        raise wrong(f"{where}: {error.where}", error.expected, error.found, error.todo) from error
+    tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
     camera = wanted[0] if wanted else None
-    return _People(where, tracks, first, shipped, camera, tuple(used), plural)
+    return _People(folder, where, tracks, first, shipped, camera, tuple(used), plural)
 
 
 def _true_camera(truth: _People) -> Camera | None:
@@ -242,11 +233,9 @@ def _true_camera(truth: _People) -> Camera | None:
     """
     if truth.camera is None:
         return None
-    _, findings = check_clip(truth.clip, CheckSettings())
-    place = f"cameras/{truth.camera.stem}"
     known = {fault.name for fault in camera_faults()} | {"frame_offset", "sees_nobody"}
-    for finding in findings:
-        if place in finding.where and finding.fault in known:
+    for finding in check_clip(truth.clip, CheckSettings())[1]:
+        if f"cameras/{truth.camera.stem}" in finding.where and finding.fault in known:
             raise _convention(truth.camera, finding.fault, finding.says)
     return _read_camera(truth.camera, truth)
 
@@ -264,7 +253,7 @@ def _convention(path: Path, fault: str, says: str) -> InputError:
     return wrong(f"{path}: {_KEYS.get(fault, 'R')}", "x_cam = R x_world + t in metres", says, todo)
 
 
-def _boxes(mine: _People, folder: Path, truth: _People, camera: Camera) -> Floats | None:
+def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
     """Return a prediction's boxes (frames, persons, 4) [px]; None = its joints in `camera`.
 
     Raises:
@@ -272,8 +261,7 @@ def _boxes(mine: _People, folder: Path, truth: _People, camera: Camera) -> Float
             people where the true ones are.
     """
     name = mine.clip.name if truth.camera is None else truth.camera.stem
-    file = folder / "boxes" / f"{name}.npz"
-    joints = mine.tracks.joints
+    file, joints = mine.folder / "boxes" / f"{name}.npz", mine.tracks.joints
     if file.is_file():
         boxes = read_boxes(file)["boxes"]
         if boxes.shape[:2] != joints.shape[:2]:
@@ -281,69 +269,45 @@ def _boxes(mine: _People, folder: Path, truth: _People, camera: Camera) -> Float
         return boxes
     if mine.camera is None:
         return None
-    own = _read_camera(mine.camera, truth)
-    rows = next(view.rows for view in mine.clip.views if view.name == mine.camera.stem)
-    places = joint_boxes(truth.tracks.joints, camera)
+    own, places = _read_camera(mine.camera, truth), joint_boxes(truth.tracks.joints, camera)
 
-    def hits(fault: Fault | None) -> int:
-        repair = None if fault is None else fault.camera
-        seen = own
-        if repair is not None:
-            turned = repair(rows).camera()
-            seen = turned if own.batch_shape else turned[0]
+    def count_matches(seen: Camera) -> int:
         overlap = box_overlaps(joint_boxes(joints, seen), places)
         return int((match_boxes(overlap, EvaluationSettings().min_overlap) >= 0).sum())
 
-    known = hits(None)
-    if 2 * known < int(np.isfinite(places).all(-1).sum()):
+    matches = count_matches(own)
+    if 2 * matches < int(np.isfinite(places).all(-1).sum()):
+        rows = next(view.rows for view in mine.clip.views if view.name == mine.camera.stem)
         for fault in camera_faults():
-            if hits(fault) > max(2 * known, len(places)):
+            repaired: CameraRows = rows if fault.camera is None else fault.camera(rows)
+            seen = repaired.camera() if own.batch_shape else repaired.camera()[0]
+            if count_matches(seen) > max(2 * matches, len(places)):
                 raise _convention(mine.camera, fault.name, fault.says)
     return joint_boxes(joints, own)
 
 
-def _matched(
-    people: Floats,
-    true: Floats,
-    camera: Camera | None,
-    boxes: Floats | None,
-    settings: EvaluationSettings,
-) -> Floats:
-    """Return predicted joints (frames, true persons, 17, 3) [m] by whole tracks (E3)."""
-    distances = joint_distances(people, true)
-    match = match_people(distances, settings.match_gate_m)
-    tracks = match_tracks(people, true, distances, match, camera, boxes, settings)
-    return take_matched(people, tracks)
-
-
-def _describe_shift(where: str, found: Floats, truth: _People) -> dict[str, str]:
-    """Return a note if a prediction fits the reference much better some frames later."""
-    true, settings = truth.tracks.joints, EvaluationSettings()
-    errors = {}
+def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
+    """Return a note if a prediction fits the reference much better some frames earlier or later."""
+    errors = {0: np.inf}
     for late in range(-3, 4):
         mine = found[max(late, 0) : len(found) + min(late, 0)]
         theirs = true[max(-late, 0) : len(true) - max(late, 0)]
-        away = aligned_errors(
-            mine, theirs, with_scale=True, min_joints=settings.min_aligned_joints
-        ).shared
-        known = away[np.isfinite(away)]
-        errors[late] = float(known.mean()) if len(known) else np.inf
+        away = aligned_errors(mine, theirs, with_scale=True, min_joints=7).shared
+        errors[late] = float(away[np.isfinite(away)].mean()) if np.isfinite(away).any() else np.inf
     best = min(errors, key=lambda late: (errors[late], abs(late)))
     if not errors[best] < CheckSettings().max_share_left * errors[0]:
         return {}
-    side = "late" if best > 0 else "early"
-    says = f"people are {abs(best)} frames {side}: corrected, the error falls from "
-    return {where: f"{says}{1000 * errors[0]:.1f} to {1000 * errors[best]:.1f} mm"}
+    says = f"people are {abs(best)} frames {'late' if best > 0 else 'early'}: corrected, the error"
+    return {where: f"{says} falls from {1000 * errors[0]:.1f} to {1000 * errors[best]:.1f} mm"}
 
 
 def _sample(clip: str, camera: Camera | None, true: Floats, found: Mapping[str, Floats]) -> Sample:
-    """Return the frame in which most people are true and found, after the shared alignment."""
+    """Return the image in which most people are true and found, after the shared alignment."""
     both = [np.isfinite(each[..., 0]).any(-1).sum(-1) for each in (true, *found.values())]
-    frame = int(np.sum(both, axis=0).argmax()) if len(true) else 0
+    frame = int(np.sum(both, axis=0).argmax())
     moved = {}
     for name, people in found.items():
         source, target = (paper_joints(each).reshape(-1, 3) for each in (people, true))
-        motion = align(source, target, with_scale=True)
-        moved[name] = motion.apply(people[frame].reshape(-1, 3)).reshape(people[frame].shape)
+        moved[name] = align(source, target, with_scale=True).apply(people[frame])
     here = camera[frame] if camera is not None and camera.batch_shape else camera
     return Sample(clip, frame, here, true[frame], moved)

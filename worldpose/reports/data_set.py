@@ -16,75 +16,70 @@ from worldpose.reports.drawing import GRASS, INK, PALE, draw_skeleton, person_co
 from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table, whole_page
 
 
-def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, CheckReport]) -> str:
-    """Return a self-contained HTML page of statistics, and of findings of the check per folder."""
+def data_set_page(
+    title: str,
+    found: DataSetStatistics,
+    checks: Mapping[str, CheckReport],
+    manifest: DataSetManifest | None = None,
+) -> str:
+    """Return a self-contained HTML page of statistics, and of findings of the check per folder.
+
+    A manifest adds composition, subjects and licences: the page is then the data set's datasheet.
+    """
     people = "-" if found.subjects_per_frame is None else f"{found.subjects_per_frame:.1f}"
     wrong = sum(len(report.findings) for report in checks.values())
-    tiles = (
+    tiles = [
         (f"{found.minutes:.1f} min", f"{found.frames:,} frames"),
         (f"{len(found.clips)}", "clip" if len(found.clips) == 1 else "clips"),
         (people, "people per frame"),
         (f"{found.poses:,}", "3D poses"),
         (f"{found.distance_km:.1f} km", "run and walked by all"),
         ("passed" if not wrong else f"{wrong} wrong", "check of cameras, poses and 2D"),
-    )
-    about = f"Data set of {', '.join(checks)}"
-    return whole_page(title, about, (counted_section(found), _check_section(checks)), tiles=tiles)
+    ]
+    about, sections = f"Data set of {', '.join(checks)}", [counted_section(found)]
+    if manifest is not None:
+        about = f"World: {manifest.conventions.world}"
+        tiles.insert(0, (f"{found.subjects}", "subjects"))
+        terms = Table("", ("files", "licence"), tuple(manifest.licences.items()))
+        sections = [_composition(manifest), *sections, Section("Licences", (terms,))]
+    return whole_page(title, about, (*sections, _check_section(checks)), tiles=tiles)
 
 
-def datasheet(manifest: DataSetManifest, checks: Mapping[str, CheckReport]) -> str:
-    """Return the self-contained page of a data set: composition, people, licences, statistics."""
-    found, clips = manifest.statistics, manifest.clips
-    subjects = {name for clip in clips.values() for name in clip.subjects}
-    metres = {name: sum(each.trajectories_m) for name, each in found.clips.items()}
-    splits, listed = [], []
+def _composition(manifest: DataSetManifest) -> Section:
+    """Return the splits, the sources of clips, and the subjects of several clips."""
+    statistics, clips = manifest.statistics.clips, manifest.clips
+    splits, clips_of = [], dict[str, list[str]]()
     for split in dict.fromkeys(clip.split for clip in clips.values()):
-        own = {name: clip for name, clip in clips.items() if clip.split == split}
-        people = {subject for clip in own.values() for subject in clip.subjects}
-        totals = (
-            len({clip.match_id for clip in own.values()}),
+        own = [name for name, clip in clips.items() if clip.split == split]
+        counts = (
+            len({clips[name].match_id for name in own}),
             len(own),
-            len(people),
-            sum(found.clips[name].frames for name in own),
-            sum(found.clips[name].poses for name in own),
+            len({subject for name in own for subject in clips[name].subjects}),
+            sum(statistics[name].frames for name in own),
+            sum(statistics[name].poses for name in own),
         )
-        way = sum(metres[name] for name in own)
-        splits.append((split, *(f"{each:,}" for each in totals), f"{way:,.1f}"))
+        metres = sum(sum(statistics[name].trajectories_m) for name in own)
+        splits.append((split, *(f"{each:,}" for each in counts), f"{metres:,.1f}"))
+    sources = []
     for name, clip in clips.items():
+        for subject in clip.subjects:
+            clips_of.setdefault(subject, []).append(name)
         videos = [f"{v.path or v.source} from image {v.first_image}" for v in clip.footage.values()]
         run = f"{clip.match_id}, run {clip.run_id}, from frame {clip.first_frame}"
-        listed.append((name, clip.split, run, clip.body_model, "; ".join(videos) or "-"))
-    meetings = {s: [n for n, clip in clips.items() if s in clip.subjects] for s in sorted(subjects)}
-    several = tuple((s, ", ".join(names)) for s, names in meetings.items() if len(names) > 1)
+        sources.append((name, clip.split, run, clip.body_model, "; ".join(videos) or "-"))
+    several = tuple((s, ", ".join(names)) for s, names in clips_of.items() if len(names) > 1)
     columns = ("split", ">matches", ">clips", ">subjects", ">frames", ">poses", ">metres")
-    sources = ("clip", "split", "source", "body model", "footage")
-    blocks = [Table("", columns, tuple(splits)), Table("Clips", sources, tuple(listed))]
+    blocks = [Table("", columns, tuple(splits))]
+    titles = ("clip", "split", "source", "body model", "footage")
+    blocks.append(Table("Clips", titles, tuple(sources)))
     if several:
-        blocks.append(Table("Subjects in several clips", ("subject", "clips"), several))
+        blocks.append(Table("Subjects of several clips", ("subject", "clips"), several))
     lead = (
         "A match belongs to one split, and so does every subject. Nameless people without an entry "
         "in the registry count once per clip. The truth of a test part is hidden: the part has "
         "boxes, and cameras with the pose of the first frame alone."
     )
-    terms = Table("", ("files", "licence"), tuple(manifest.licences.items()))
-    about = (
-        f"World: {manifest.conventions.world} Files: docs/reference/formats.md of worldpose "
-        f"{manifest.worldpose}. Verify the data set with worldpose release --check."
-    )
-    sections = (
-        Section("Composition", tuple(blocks), lead),
-        counted_section(found),
-        Section("Licences", (terms,), "Each kind of file has its own licence."),
-        _check_section(checks),
-    )
-    tiles = (
-        (f"{found.subjects}", "subjects"),
-        (f"{len(clips)}", "sequences"),
-        (f"{1000 * found.distance_km:,.0f} m", "run and walked by all"),
-        (f"{found.poses:,}", "3D poses"),
-        (f"{found.frames:,}", "frames"),
-    )
-    return whole_page(manifest.release, about, sections, tiles=tiles)
+    return Section("Composition", tuple(blocks), lead)
 
 
 def counted_section(found: DataSetStatistics) -> Section:
@@ -223,10 +218,12 @@ def plot_methods(sample: Sample) -> bytes:
     from the side, along the touch line.
     """
     count, camera = len(sample.found), sample.camera
-    true = sample.true.reshape(-1, 3)
-    seen = true[:, :2] if camera is None else camera.project(true)
+
+    def views(people: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return people[..., :2] if camera is None else camera.project(people), people[..., 1:]
+
     corners = []
-    for points in (seen, true[:, 1:]):
+    for points in views(sample.true.reshape(-1, 3)):
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         room = 0.08 * float((high - low).max())
         corners.append((low - room, high + room))
@@ -234,24 +231,20 @@ def plot_methods(sample: Sample) -> bytes:
     size = (4.6 * max(count, 2), sum(heights) + 1.8)
     figure = Figure(figsize=size, dpi=110, layout="constrained")
     panels = figure.subplots(2, count, squeeze=False, height_ratios=heights)
-    for (name, found), (upper, lower) in zip(sample.found.items(), panels.T, strict=True):
-        for people, is_true in ((sample.true, True), (found, False)):
-            for person, joints in enumerate(people):
-                color = PALE if is_true else person_color(person)
-                pixels = joints[:, :2] if camera is None else camera.project(joints)
-                draw_skeleton(upper, pixels, color)
-                draw_skeleton(lower, joints[:, 1:], color)
-        for axes, (low, high) in zip((upper, lower), corners, strict=True):
+    labels = "from above, y [m]" if camera is None else "camera view, y [px]", "side view, z [m]"
+    for column, (name, found) in enumerate(sample.found.items()):
+        for row, (low, high) in enumerate(corners):
+            axes = panels[row, column]
+            for person, (true, mine) in enumerate(zip(sample.true, found, strict=True)):
+                draw_skeleton(axes, views(true)[row], PALE)
+                draw_skeleton(axes, views(mine)[row], person_color(person))
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-            axes.set_facecolor(GRASS)
+            axes.set(facecolor=GRASS, ylabel="" if column else labels[row])
             style(axes)
+        panels[0, column].set_title(name, color=INK, fontsize=12)
+        panels[1, column].set_xlabel("y, across the pitch [m]", color=INK)
         if camera is not None:
-            upper.invert_yaxis()
-        upper.set_title(name, color=INK, fontsize=12)
-        lower.set_xlabel("y, across the pitch [m]", color=INK)
-    above = "camera view, y [px]" if camera is not None else "from above, y [m]"
-    panels[0, 0].set_ylabel(above, color=INK)
-    panels[1, 0].set_ylabel("side view, z [m]", color=INK)
+            panels[0, column].invert_yaxis()
     title = f"{sample.clip}, frame {sample.frame}: truth grey, predictions after the alignment"
     figure.suptitle(title, color=INK, fontsize=12)
     return png(figure)

@@ -330,7 +330,7 @@ def test_the_command_checks_a_data_set(written, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"hidden": None}, "--hidden: expected a folder for the truth of the test part"),
+        ({"hidden": None}, "--hidden: expected a folder for the test part"),
         ({"licences": {"poses": "x"}}, "--licence: expected the licence of joints"),
         ({"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")}, "licence of footage"),
         ({"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"}, "keeper: expected one split, found train"),
@@ -350,4 +350,9 @@ def test_a_data_set_that_would_be_wrong_is_refused(origins, tmp_path, changes, t
 
 def test_a_folder_is_never_overwritten(origins, written):
     with pytest.raises(UsageError, match="expected a new folder"):
-        write_data_set(*origins, written / "set", ReleaseOptions("first", LICENCES))
+        write_data_set(
+            *origins, written / "set", ReleaseOptions("first", LICENCES, written / "new")
+        )
+    inside = ReleaseOptions("first", LICENCES, written / "new" / "test")
+    with pytest.raises(UsageError, match="not in --out"):
+        write_data_set(*origins, written / "new", inside)
