@@ -100,14 +100,7 @@ def evaluate(
                 line(f"{place}: {note}", to=errors)
             print_methods(results, table, as_json=as_json)
             return
-    if picture is not None:
-        raise UsageError(
-            f"--picture {picture}",
-            expected="--reference with a data set, and --prediction folders",
-            found=f"--reference {reference}",
-            todo="Name the folder that holds poses/ and cameras/, or leave out --picture.",
-        )
-    if method and reference is not None and not prediction:
+    if method and reference is not None and not prediction and picture is None:
         from flows.results.baselines import score_methods
 
         found = score_methods(
@@ -121,10 +114,10 @@ def evaluate(
         )
         print_methods(found, table, as_json=as_json)
         return
-    if not prediction or reference is None:
+    if not prediction or reference is None or picture is not None:
         raise UsageError(
             "worldpose evaluate",
-            expected="--prediction or --method, and --reference",
+            expected="--prediction or --method, and --reference; --picture only with a data set",
             found="others",
             todo="Name prediction and ground truth, or use --ablation 10.",
         )
@@ -331,20 +324,16 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
 
 def print_methods(scores: Sequence[MethodScore], form: TableForm, *, as_json: bool) -> None:
     """Print scores of methods as text, CSV or LaTeX, or in full as JSON."""
-    from flows.results.baselines import (
-        COLUMNS,
-        table_columns,
-        table_csv,
-        table_latex,
-        table_rows,
-    )
+    from flows.results import baselines
 
     if as_json:
         rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
-        print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})
+        print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
     elif form == "text":
         # Brackets would be parsed as markup.
-        titles = (f">{title.replace('[', '').replace(']', '')}" for title in COLUMNS.values())
-        print_table("", (*table_columns(scores), *titles), table_rows(scores))
+        titles = (
+            f">{title.replace('[', '').replace(']', '')}" for title in baselines.COLUMNS.values()
+        )
+        print_table("", (*baselines.table_columns(scores), *titles), baselines.table_rows(scores))
     else:
-        line((table_csv if form == "csv" else table_latex)(scores).rstrip())
+        line((baselines.table_csv if form == "csv" else baselines.table_latex)(scores).rstrip())
