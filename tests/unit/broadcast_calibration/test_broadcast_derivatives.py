@@ -73,8 +73,9 @@ def test_the_gradient_is_the_slope_of_the_cost():
             rotation_std=np.array([np.inf, *[2e-3] * 5]),
         ),
         TermWeights(field=1.3, player=0.4, flow=0.7),
-        np.array([np.inf] * 3 + [1e-3, 1e-2, 1e-2, 1e-2]),
-        2.0,
+        smoothness=np.array([np.inf] * 3 + [1e-3]),
+        lens_walk=np.linspace(0.1, 0.3, 5),
+        flow_loss=2.0,
     )
     camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
     beside = 0.3 * rng.standard_normal((problem.paint_count, 3))
