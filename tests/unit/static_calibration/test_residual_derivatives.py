@@ -7,13 +7,8 @@ import pytest
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.fit import build_problem
-from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.static_calibration.residuals import (
-    click_residuals,
-    drawn_residuals,
-    prior_residuals,
-)
+from worldpose.static_calibration.residuals import click_residuals, drawn_residuals, prior_residuals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 # Steps at which truncation and rounding of a central difference balance, by parameter.
@@ -101,17 +96,3 @@ def test_residuals_of_the_prior(k1):
 
     numeric = differences(lambda at: residual(at)[0], camera)
     np.testing.assert_allclose(residual(camera)[1], numeric, rtol=1e-5, atol=1e-6)
-
-
-def test_the_motion_of_the_ground_under_a_step():
-    camera, rng = people.seat(2)
-    places = people.on_the_pitch(rng, 40)
-    seen = camera.project(places)
-    places = places[((seen > 0) & (seen < np.array(people.SIZE))).all(axis=1)]
-    motion = surface_motion(camera, people.PITCH, places)
-    rng = np.random.default_rng(1)
-    step = 1e-6 * rng.standard_normal(12)
-    moved = people.ground_errors(step_camera(camera, step), camera, places)
-    predicted = np.linalg.norm(motion @ step, axis=1)
-    assert len(places) > 10
-    np.testing.assert_allclose(moved, predicted, rtol=1e-3, atol=1e-9)
