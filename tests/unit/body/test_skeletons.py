@@ -1,9 +1,6 @@
 import numpy as np
 
-from worldpose.body.keypoints import (
-    JOINT_OF_POINT,
-    VERTEX_OF_POINT,
-)
+from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT
 
 
 def test_left_points_are_on_the_left_of_the_open_body(open_body):
