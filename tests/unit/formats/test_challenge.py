@@ -130,18 +130,6 @@ def test_a_camera_file_has_the_pose_of_the_first_frame_alone(camera, tmp_path, e
     np.testing.assert_allclose(rows.camera().project(points)[0], camera.project(points)[0])
 
 
-def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path):
-    lost = Camera(
-        focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal),
-        principal_point=camera.principal_point,
-        distortion=camera.distortion,
-        cam_from_world=camera.cam_from_world,
-        image_size=camera.image_size,
-    )
-    with pytest.raises(InputError, match="first frame"):
-        write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)
-
-
 def test_a_submission_is_a_zip_with_one_array_a_clip(truth, tmp_path):
     write_submission(tmp_path / "submission.zip", {"A_1": truth.submission})
     with zipfile.ZipFile(tmp_path / "submission.zip") as file:
