@@ -48,8 +48,7 @@ def test_the_farthest_views_of_two_people_come_worst_first():
         else:
             seen[3, 0] += 900.0  # no person's
         run[f"ingest/{name}"] = xr.Dataset(
-            {"keypoints": (("frame", "detection", "joint", "axis"), seen)},
-            coords={"frame": FRAMES},
+            {"keypoints": (("frame", "detection", "joint", "axis"), seen)}, coords={"frame": FRAMES}
         )
     run["tracking/clip"] = xr.Dataset(
         {"detection_index": (("frame", "camera", "person"), index)},

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from joint_regions import region_counts
 
-from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 
 
@@ -25,33 +24,3 @@ def test_regions_of_the_true_size_hold_the_stated_share(level):
     inside, count = np.array(list(found.values())).sum(axis=0)
     assert count == 60 * 4 * 17
     assert inside / count == pytest.approx(level, abs=0.02)
-
-
-def test_missing_joints_frames_and_unseen_joints_do_not_count():
-    prediction, truth = people(frames=4, persons=2)
-    prediction.joints[0, 0, 0] = np.nan
-    views = np.full(truth.joints.shape[:3], 3)
-    views[1, 1, 1] = 1
-    some = JointTracks(
-        prediction.frames[:3],
-        prediction.person_ids,
-        prediction.joints[:3],
-        prediction.covariance[:3],
-    )
-    seen = JointTracks(truth.frames, truth.person_ids, truth.joints, views=views)
-    count = sum(total for _, total in region_counts(some, seen).values())
-    assert count == 3 * 2 * 17 - 2
-
-
-@pytest.mark.parametrize(("predicted", "true"), [(0, 3), (3, 0)])
-def test_without_common_frames_no_joint_counts(predicted, true):
-    prediction, _ = people(frames=predicted, persons=2)
-    _, truth = people(frames=true, persons=2)
-    assert set(region_counts(prediction, truth).values()) == {(0, 0)}
-
-
-def test_joints_without_covariance_are_refused():
-    prediction, truth = people(frames=2)
-    plain = JointTracks(prediction.frames, prediction.person_ids, prediction.joints)
-    with pytest.raises(InputError, match="covariance"):
-        region_counts(plain, truth)
