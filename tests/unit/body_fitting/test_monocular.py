@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.model import BodyParameters
@@ -19,7 +20,6 @@ from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
@@ -103,13 +103,7 @@ def broadcast(frames):
     z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
     rotation = np.stack([x, np.cross(z, x), z], axis=-2)
     center = np.array([0.0, -70.0, 15.0])
-    return Camera(
-        focal=np.array([4000.0, 4000.0]),
-        principal_point=np.array([959.5, 539.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(rotation, -(rotation @ center)),
-        image_size=np.array([1920, 1080]),
-    )
+    return plain_camera(4000.0, (959.5, 539.5), Rigid(rotation, -(rotation @ center)))
 
 
 def crowd(frames):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import fold_radius
@@ -9,13 +10,7 @@ from worldpose.geometry.rigid import Rigid
 
 def plane_camera(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0) -> Camera:
     """A camera whose pixels are the distorted coordinates on the plane z = 1."""
-    return Camera(
-        focal=np.ones(2),
-        principal_point=np.zeros(2),
-        distortion=np.array([k1, k2, p1, p2, k3]),
-        cam_from_world=Rigid.identity(),
-        image_size=np.array([2, 2]),
-    )
+    return plain_camera(1.0, (0.0, 0.0), Rigid.identity(), (2, 2), lens=(k1, k2, p1, p2, k3))
 
 
 def on_plane(points) -> np.ndarray:
