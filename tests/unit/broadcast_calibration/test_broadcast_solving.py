@@ -8,10 +8,7 @@ import turning_clip as clip
 from scipy.optimize import least_squares
 
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
-from worldpose.broadcast_calibration.evidence import (
-    FlowEvidence,
-    PointEvidence,
-)
+from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import solve
