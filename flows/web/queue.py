@@ -207,6 +207,7 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
             "state": latest.state,
             "finished_at": latest.finished_at,
             "gates": latest.gates,
+            "usability": latest.usability.model_dump(mode="json"),
             "failed": len(latest.failed),
         },
         "waiting": waiting,

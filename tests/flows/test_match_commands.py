@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.run import RunRecord, UnitFailure, WaitingUnit
+from data_contracts.usability import Usability
 from flows.cli import run as run_command
 from flows.cli.app import app
 from flows.registering import find_registration, open_for_review, register
@@ -126,6 +127,7 @@ def ended(state):
         failed=failed if state in ("failed", "partial") else (),
         blocked=("triangulation/clip",),
         waiting=waiting if state == "waiting" else (),
+        usability=Usability(verdict="usable"),
         started_at=datetime(2026, 5, 1, tzinfo=UTC),
         finished_at=datetime(2026, 5, 1, tzinfo=UTC),
     )
