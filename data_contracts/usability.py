@@ -30,6 +30,9 @@ class UsableLimits(Record):
     max_standard_deviation_m: Amount = 0.10
     """Median over joints of the root of the trace of their covariance [m]: with equal errors along
     all axes, sqrt(3) times the standard deviation along one."""
+    max_moved_deviations: Amount = 3.0
+    """Motion of a static camera in the adjustment, over the standard deviation that its calibration
+    states, of center or axes [1]: one in a hundred true cameras lies farther off."""
     max_body_excess_m: Amount = 0.01
     """Root mean square error of fitted joints beyond that of triangulated joints, as held-out
     cameras show it, its lower limit in the worst joint group [m]. A hundredth of a metre beyond a

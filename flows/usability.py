@@ -34,7 +34,7 @@ _REPLACED: Final = {"triangulation": "retriangulation"}
 
 @dataclass(frozen=True)
 class _Rule:
-    """Metric that is held against a limit; larger is worse.
+    """Metric with a limit; larger is worse.
 
     Attributes:
         stage: the stage of the metric.
@@ -93,6 +93,13 @@ _RULES: Final = (
         "{value} at a time{when}. Look at the video there.",
     ),
     _Rule(
+        "bundle_adjustment",
+        "moved_deviations",
+        "max_moved_deviations",
+        "the people contradict the calibration of {part}: the adjustment moves it by {value} "
+        "standard deviations. Check its clicks, and calibrate its lens.",
+    ),
+    _Rule(
         "body_fitting",
         "held_out_certain_excess_m",
         "max_body_excess_m",
@@ -117,7 +124,7 @@ _RULES: Final = (
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What a run leaves.
+    """Results of a run, as they are judged.
 
     Attributes:
         figures: unit, as `stage/unit`, to its metrics.

@@ -66,6 +66,12 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             "the keypoints of cam3, cam2 depart from the people in clip, or its images are bad, "
             "for 3 s (limit 2 s) at a time, longest in frames 0 to 74.",
         ),
+        (
+            "bundle_adjustment/cameras",
+            {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1},
+            "the people contradict the calibration of cam4: the adjustment moves it by 7.1 (limit "
+            "3) standard deviations.",
+        ),
         ("body_fitting/clip", {"offset_rms_m": 0.05}, "bodies in clip lie 5 cm (limit 3 cm) off"),
         (
             "body_fitting/clip",
