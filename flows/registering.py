@@ -82,8 +82,8 @@ def _registered_folder(store: Store, match_id: str) -> Path:
             f"match {match_id}",
             expected=f"its folder, registered as {folder}",
             found="nothing there",
-            todo="If it was moved, or restored elsewhere, tell where it is now, which keeps all "
-            "results: worldpose ingest FOLDER.",
+            todo="Mount its disk. If it was moved, or restored elsewhere, register it there, and "
+            "its results stay: worldpose ingest FOLDER.",
         )
     return folder
 
