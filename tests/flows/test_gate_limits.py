@@ -92,17 +92,3 @@ def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
 )
 def test_how_bad_a_result_is_goes_by_its_worst_figure(gate, figures, excess):
     assert gate.excess(figures) == pytest.approx(excess, abs=1e-12)
-
-
-def test_runs_without_gates_warn_of_figures_that_say_that_a_result_is_wrong():
-    good = {"unmatched_share": 0.15, "mean_ray_distance_m": 0.05, "undecided": 3.0}
-    assert IDENTITIES.warnings(good) == ()  # an undecided join is no wrong result
-    beyond = IDENTITIES.warnings(good | {"unmatched_share": 0.5})
-    assert beyond == ("unmatched_share is 0.5, at most 0.15 passes",)
-    assert IDENTITIES.warnings({"undecided": 0.0}) == ()
-    assert CAMERAS.warnings(GOOD_CAMERA | {"expected_ground_error_p95_m": 9.0}) == ()
-
-
-def test_what_a_gate_warns_of_is_held_against_its_limits():
-    for gate in GATES.values():
-        assert set(gate.warned) <= set(type(gate.limits).model_fields)

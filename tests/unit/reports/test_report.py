@@ -10,6 +10,7 @@ import numpy as np
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.run import RunRecord, UnitFailure
+from data_contracts.usability import Usability
 from worldpose.reports.html_page import (
     CaptionedImage,
     EmbeddedPage,
@@ -40,6 +41,7 @@ def run(**changes):
         ),
         "blocked": (),
         "figures": {"tracking/clip": {"persons": 5.0, "mean_views": 5.8125}},
+        "usability": Usability(verdict="usable"),
         "versions": {"numpy": "2.4.0"},
         "started_at": datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC),
         "finished_at": datetime(2025, 1, 2, 3, 4, 15, tzinfo=UTC),
