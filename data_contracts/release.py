@@ -23,6 +23,7 @@ from data_contracts.records import (
     Share,
 )
 from data_contracts.run import StoredFile
+from data_contracts.usability import Usability
 
 EXPORT_PURPOSES: Final[Mapping[str, str]] = {
     "joints": "joints with covariances for numpy",
@@ -84,6 +85,8 @@ class ReleaseManifest(Record):
     conventions: Conventions = CONVENTIONS
     licence: str = Field(min_length=1)
     """Licence text of the data."""
+    usability: Usability
+    """Verdict on the results."""
     worldpose: str
     """Version that wrote the release."""
     versions: dict[str, str]

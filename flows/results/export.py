@@ -483,6 +483,7 @@ def _write_release(
         },
         pitch=spec.pitch != NO_PITCH,
         body_model=models.pop() if len(models) == 1 else None,
+        usability=record.usability,
         worldpose=version("worldpose"),
         versions=record.versions,
         settings=record.settings,

@@ -11,7 +11,6 @@ from threading import Lock
 from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival
-from flows.review.metric_words import all_reasons
 from flows.service.channels import Channel
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, age
@@ -92,15 +91,17 @@ def alerts_now(
 def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
     run = "" if match.latest is None else match.latest.run_id
     link = f"{plan.pages}/#/match/{match.match_id}"
+    if match.latest is not None and match.latest.state in ("complete", "partial"):
+        judged = match.latest.usability
+        text = f"{match.match_id} is {judged.verdict}: {' '.join(judged.reservations)}"
+        if judged.reservations:
+            yield Alert(f"quality/{match.match_id}/{text}", "quality", text, link, match.match_id)
     for stage, unit in match.units:
         name = f"{match.match_id}/{stage}/{unit.unit}"
         hours = age(unit.waiting_since) / 3600.0
         if unit.state == "waiting" and hours >= plan.gate_hours:
             text = f"{name} has waited for a person for {hours:.1f} h: {unit.why}"
             yield Alert(f"gate_waiting/{name}/{run}", "gate_waiting", text, link, match.match_id)
-        if unit.objections:
-            text = f"{name}: {all_reasons(unit.objections)}"
-            yield Alert(f"quality/{name}/{text}", "quality", text, link, match.match_id)
 
 
 class AlertDispatcher:

@@ -5,12 +5,14 @@ import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
 from threading import Thread
+from types import SimpleNamespace
 
 import apprise
 import pytest
 from command_line import worldpose
 
 from data_contracts.operations import Arrival
+from data_contracts.usability import Usability
 from flows.service import watching
 from flows.service.alerts import LONGEST_PAUSE, Alert, AlertDispatcher, FailedRun, alerts_now
 from flows.service.channels import Channel, apprise_mail, channels_of
@@ -266,17 +268,17 @@ def test_a_question_is_no_alert_before_its_time(plan):
 
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
-    def body(**unit):
-        return MatchStatus("m", stages={"body_fitting": (UnitSummary("clip", "done", **unit),)})
+    def judged(state, *reservations):
+        verdict = "usable with reservations" if reservations else "usable"
+        usability = Usability(verdict=verdict, reservations=reservations)
+        latest = SimpleNamespace(run_id="0001", state=state, usability=usability)
+        return MatchStatus("m", latest)
 
-    assert alerts_now(plan, [body(figures={"offset_rms_m": 0.01})], [], []) == []
-    (poor,) = alerts_now(
-        plan, [body(objections=("offset_rms_m is 0.05, at most 0.03 passes",))], [], []
-    )
-    assert (poor.alert, poor.text) == (
-        "quality",
-        "m/body_fitting/clip: distance of bodies from the seen joints: 5 cm, limit 3 cm",
-    )
+    assert alerts_now(plan, [judged("complete")], [], []) == []
+    assert alerts_now(plan, [judged("waiting", "cam1 is bad.")], [], []) == []  # it asks already
+    (poor,) = alerts_now(plan, [judged("complete", "cam1 is bad.", "cam2 is.")], [], [])
+    text = "m is usable with reservations: cam1 is bad. cam2 is."
+    assert (poor.alert, poor.text) == ("quality", text)
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
         for state in ("arriving", "incomplete", "refused", "taken")

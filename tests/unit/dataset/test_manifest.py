@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from data_contracts.release import ReleasedClip, ReleaseManifest
+from data_contracts.usability import Usability
 from worldpose.dataset.manifest import (
     ORIGINS,
     changed_files,
@@ -37,6 +38,7 @@ def manifest_of(folder, **changes):
         "pitch": True,
         "body_model": "open-neutral/2",
         "licence": "For tests.",
+        "usability": Usability(verdict="usable"),
         "worldpose": "0.1.0",
         "versions": {"numpy": "2.4"},
         "settings": {"tracking": {"a": 1}},
