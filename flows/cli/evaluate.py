@@ -144,23 +144,17 @@ def evaluate(
 
 
 def named_folders(given: Sequence[str]) -> dict[str, Path]:
-    """Parse [NAME=]FOLDER arguments; a folder without a name has its own.
-
-    Raises:
-        UsageError: a folder does not exist, or two have the same name.
-    """
+    """Parse [NAME=]FOLDER arguments; raise UsageError if a folder is absent or a name is twice."""
     folders: dict[str, Path] = {}
     for item in given:
         name, equals, path = item.partition("=")
         if not equals or Path(item).exists():
             name, path = Path(item).resolve().name, item
         if name in folders or not Path(path).is_dir():
-            raise UsageError(
-                f"--prediction {item}",
-                expected="NAME=FOLDER of a method's clips, each name once",
-                found=f"{name} twice" if name in folders else f"no folder {path}",
-                todo="Give each method a name and its folder, such as --prediction glamr=results.",
-            )
+            found = f"{name} twice" if name in folders else f"no folder {path}"
+            todo = "Give each method a name and its folder, such as --prediction glamr=results."
+            expected = "NAME=FOLDER of a method's clips, each name once"
+            raise UsageError(f"--prediction {item}", expected=expected, found=found, todo=todo)
         folders[name] = Path(path)
     return folders
 

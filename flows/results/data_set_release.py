@@ -65,8 +65,8 @@ def write_data_set(
         subjects: YAML file with a list of MATCH/NAME or MATCH/CLIP/ID for each subject.
 
     Raises:
-        UsageError: a folder exists, the test part has no hidden folder, or a licence is missing.
-        InputError: a result or video is missing, or a subject is in two splits.
+        UsageError: a folder exists, or the test part has no hidden folder.
+        InputError: a result, video or licence is missing, or a subject is in two splits.
     """
     tested = any(split == "test" for _, split in origins)
     if tested != (hidden is not None) or (hidden and out.resolve() in hidden.resolve().parents):
@@ -75,11 +75,6 @@ def write_data_set(
     for place in (out, hidden or out):
         if place.exists():
             raise _refuse(f"{place}", "a new folder", "one that exists", "Choose another folder.")
-    needed = ASSETS[:-1] if footage == "none" else ASSETS
-    for asset in needed:
-        if not licences.get(asset, "").strip():
-            todo = f"Add --licence {asset}=FILE, or --licence FILE for all but footage."
-            raise _refuse("--licence", f"the licence of {asset}", "none", todo)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as workshop:
         draft, truth = Path(workshop) / "public", Path(workshop) / "hidden"
@@ -98,12 +93,15 @@ def write_data_set(
             release=name,
             worldpose=version("worldpose"),
             pitch=all(origin.spec.pitch != NO_PITCH for origin, _ in origins),
-            licences={asset: licences[asset] for asset in needed},
+            licences=dict(licences),
             clips=clips,
             statistics=data_set_statistics(counted, len(_splits_of(clips))),
             files=(),
             hidden=_listed(truth),
         )
+        for found in _statement_findings(manifest):
+            todo = "Add --licence KIND=FILE, or put all matches of a person into one split."
+            raise wrong(f"{out}: {found.where[0]}", "no contradiction", found.says, todo)
         from worldpose.reports.data_set import data_set_page  # late: it loads matplotlib, 0.5 s
 
         checks = {part.name: check(part, pitch=manifest.pitch) for part in parts}
@@ -208,7 +206,7 @@ def _name_subjects(
     """Return the clips with the subjects of a registry.
 
     Raises:
-        InputError: the registry has another form or unknown people, or puts one into two splits.
+        InputError: the registry has another form or unknown people.
     """
     registry = {} if file is None else read_yaml(file)
     known = {person for clip in clips.values() for person in clip.subjects}
@@ -224,10 +222,6 @@ def _name_subjects(
     for name, clip in clips.items():
         subjects = tuple(owner.get(person, person) for person in clip.subjects)
         named[name] = clip.model_copy(update={"subjects": subjects})
-    for subject, splits in _splits_of(named).items():
-        if len(splits) > 1:
-            todo = "Put all matches of a person into one split, or correct the registry."
-            raise wrong(f"{file}: {subject}", "one split", " and ".join(sorted(splits)), todo)
     return named
 
 
@@ -315,10 +309,10 @@ def _statement_findings(manifest: contracts.DataSetManifest) -> Iterator[contrac
     filmed = any(clip.footage for clip in manifest.clips.values())
     for asset in ASSETS if filmed else ASSETS[:-1]:
         if not manifest.licences.get(asset, "").strip():
-            yield _damage("missing_licence", "no licence is stated for these files", asset)
+            yield _damage("missing_licence", "no licence of these files is stated", asset)
     for subject, splits in _splits_of(manifest.clips).items():
         if len(splits) > 1:
-            says = f"it is in {' and '.join(sorted(splits))}"
+            says = f"the subject is in {' and '.join(sorted(splits))}"
             yield _damage("subject_in_two_splits", says, subject)
     stated = manifest.statistics
     whole = data_set_statistics(stated.clips, len(_splits_of(manifest.clips)))

@@ -111,12 +111,9 @@ def score_folders(
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
-                expected, found = (
-                    f"poses/{clip}.npz or its joints",
-                    ", ".join(list(parts[name])[:8]),
-                )
                 todo = "Write its poses, with NaN where the method found nobody."
-                raise wrong(f"{folder}: clip {clip}", expected, found, todo)
+                found = ", ".join(parts[name])
+                raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
             boxes = None if camera is None else _boxes(mine, truth, camera)
             clips[name][clip], persons = metrics.evaluate_joints(
@@ -174,10 +171,8 @@ def _read_people(
     first = truth.first if truth else int(numbered[0][0]) if numbered and len(numbered[0]) else 0
     rows = np.arange(len(source.points)) if source.frames is None else source.frames - first
     count = len(truth.tracks.frames) if truth else int(rows.max(initial=-1)) + 1
-    key = (
-        ": frames" if source.frames is not None else ": transl" if source.place is not None else ""
-    )
-    where = f"{folder}/{source.name}{key}"
+    key = "" if source.place is None else ": transl"
+    where = f"{folder}/{source.name}{key if source.frames is None else ': frames'}"
     low, high = int(rows.min(initial=0)), int(rows.max(initial=0))
     if (source.frames is None and len(rows) != count) or low < 0 or high >= count:
         expected = f"frames {first} to {first + count - 1} of the clip"
@@ -187,7 +182,7 @@ def _read_people(
     for place, name in enumerate(COCO17):
         if name in source.skeleton:
             joints[rows, :, place] = source.point(name)
-    own, _ = camera_files(folder, clip, clips)
+    own = camera_files(folder, clip, clips)[0]
     wanted = [each for each in own if match_in is None or each.stem.endswith(f".{match_in}")]
     if match_in is not None and truth is None and not wanted:
         raise wrong(f"{folder}/cameras/{clip}.{match_in}.npz", "a camera", "nothing", "Name it.")

@@ -331,9 +331,15 @@ def test_the_command_checks_a_data_set(written, tmp_path):
     ("changes", "told"),
     [
         ({"hidden": None}, "--hidden: expected a folder for the test part"),
-        ({"licences": {"poses": "x"}}, "--licence: expected the licence of joints"),
-        ({"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")}, "licence of footage"),
-        ({"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"}, "keeper: expected one split, found train"),
+        ({"licences": {"poses": "x"}}, "set: joints: expected no contradiction, found no licence"),
+        (
+            {"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")},
+            "footage: expected no contradiction, found no licence",
+        ),
+        (
+            {"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"},
+            "keeper: expected no contradiction, found the subject is in train and val",
+        ),
         ({"subjects": "keeper: [ann-1/A/77]"}, "keeper: expected a list of MATCH/NAME"),
         ({"subjects": "[keeper]"}, "expected a list of MATCH/NAME"),
     ],
