@@ -213,6 +213,8 @@ class ReleasedSequence(Record):
     match_id: Name
     run_id: Name
     clip_id: Name
+    usability: Usability
+    """Verdict on the run's results."""
     first_frame: Frame
     """Match frame of the first row of every array."""
     fps: FramesPerSecond

@@ -202,20 +202,23 @@ def release(
     if check is not None:
         _print_check(check_data_set(check, hidden), as_json=as_json)
         return
-    names = [each.partition("/")[0] for each in matches or ()]
+    runs: dict[str, str] = {}
+    for item in matches or ():
+        match, _, run = item.rpartition("/")
+        runs |= {match: run} if match and run.isdigit() else {item: "latest"}
     splits: dict[str, Split] = dict.fromkeys(test or (), "test")
     splits |= dict.fromkeys(val or (), "val")
-    twice = len(splits) < len([*(test or ()), *(val or ())])
-    if out is None or name is None or not names or twice or not splits.keys() <= {*names}:
+    twice = len(splits) < len([*(test or ()), *(val or ())]) or len(runs) < len(matches or ())
+    if out is None or name is None or not runs or twice or not splits.keys() <= runs.keys():
         raise UsageError(
             "worldpose release",
             expected="--out, --name and matches, of which --val and --test name some, each once",
-            found=f"matches {', '.join(names) or 'none'}; splits of {', '.join(splits) or 'none'}",
+            found=f"matches {', '.join(runs) or 'none'}; splits of {', '.join(splits) or 'none'}",
             todo="worldpose release --out set --name first --licence TERMS.txt MATCH MATCH2.",
         )
     from flows.cli.results import read_licence
     from flows.registering import find_registration
-    from flows.results.best_results import Origin, open_results
+    from flows.results.best_results import Origin, describe_later_run, open_results
     from worldpose.store.store import Store
 
     licences: dict[str, str] = {}
@@ -225,10 +228,12 @@ def release(
             raise unknown_name(f"--licence {item}", kind, ASSETS)
         licences |= dict.fromkeys([kind] if equals else ASSETS[:-1], read_licence(Path(file)))
     store, origins = Store.open(project), []
-    for item, match in zip(matches or (), names, strict=True):
-        registration, run = find_registration(store, match), item.partition("/")[2] or "latest"
-        origin = Origin(open_results(store, registration.spec.match_id, run), registration)
-        origins.append((origin, splits.get(match, "train")))
+    for match, run in runs.items():
+        registration = find_registration(store, match)
+        opened = open_results(store, registration.spec.match_id, run)
+        if run == "latest" and (later := describe_later_run(store, opened.record)):
+            line(later, to=errors)
+        origins.append((Origin(opened, registration), splits.get(match, "train")))
     manifest = write_data_set(
         *(store, origins, out, name, licences), hidden=hidden, footage=footage, subjects=subjects
     )

@@ -158,6 +158,7 @@ def _write_clip(
         match_id=spec.match_id,
         run_id=origin.run.record.run_id,
         clip_id=clip,
+        usability=origin.run.record.usability,
         first_frame=int(tracks.frames[0]),
         fps=spec.fps,
         body_model=model.name,

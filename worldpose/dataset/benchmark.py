@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,28 +27,23 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """People of one image of a clip, true and predicted after the shared alignment, for a plot."""
+class Sample(NamedTuple):
+    """People (persons, 17, 3) [m] of one image, true and as methods found and aligned them."""
 
     clip: str
     frame: int
     camera: Camera | None
     true: Floats
-    """(persons, 17, 3) [m]."""
     found: Mapping[str, Floats]
-    """The same people as each method found them; NaN where missing."""
 
 
-@dataclass(frozen=True, eq=False)
-class _People:
-    """People of one clip as a folder has them; frames of tracks count images of the clip from 0."""
+class _People(NamedTuple):
+    """People of one clip as a folder has them; `first` is the match frame of its image 0."""
 
     folder: Path
     where: str
     tracks: JointTracks
     first: int
-    """Match frame of image 0; 0 if no file numbers frames."""
     clip: ShippedClip
     camera: Path | None
     bodies: tuple[str, ...]

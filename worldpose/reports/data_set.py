@@ -51,7 +51,8 @@ def _composition(manifest: DataSetManifest) -> Section:
     splits, clips_of = [], dict[str, list[str]]()
     for split in dict.fromkeys(clip.split for clip in clips.values()):
         own = {name: clip for name, clip in clips.items() if clip.split == split}
-        runs = dict.fromkeys(f"{clip.match_id}, run {clip.run_id}" for clip in own.values())
+        said = (f"{c.match_id}, run {c.run_id}: {c.usability.verdict}" for c in own.values())
+        runs = dict.fromkeys(said)
         people = {subject for clip in own.values() for subject in clip.subjects}
         frames, poses = (sum(getattr(found[n], key) for n in own) for key in ("frames", "poses"))
         metres = sum(sum(found[name].trajectories_m) for name in own)

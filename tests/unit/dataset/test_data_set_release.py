@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.usability import Usability
 from flows.cli.app import app
 from flows.results.best_results import Origin
 from flows.results.data_set_release import (
@@ -43,6 +44,7 @@ class StubRun(Mapping):
             run_id="0001",
             match_id=match,
             state="complete",
+            usability=Usability(verdict="usable"),
             results=results,
             left_out={},
             body_folder=None,
@@ -171,6 +173,7 @@ def test_a_sound_data_set_passes_and_hides_the_truth(written):
     assert hashlib.sha256(copied.read_bytes()).hexdigest() == video.sha256
     page = (written / "set" / "datasheet.html").read_text()
     assert "keeper" in page and "For tests alone." in page and "data:image" in page
+    assert "ann-1, run 0001: usable" in page
 
 
 def test_boxes_show_whom_the_camera_sees(written):
