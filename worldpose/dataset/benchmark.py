@@ -217,10 +217,8 @@ def _read_camera(path: Path, truth: _People) -> Camera:
 
 def _convention(path: Path, says: str) -> InputError:
     todo = "Write it again; worldpose check names faults of a whole folder."
-    key = says.split()[0]  # most faults of cameras begin with the member
-    return wrong(
-        f"{path}: {key if key in 'Rtk' else 'R'}", "x_cam = R x_world + t in metres", says, todo
-    )
+    key = says[0] if says[1] == " " else "R"  # most faults of cameras begin with the member
+    return wrong(f"{path}: {key}", "x_cam = R x_world + t in metres", says, todo)
 
 
 def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
@@ -239,16 +237,13 @@ def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
         return boxes
     if mine.camera is None:
         return None
-    own, places = (
-        _read_camera(mine.camera, truth),
-        matching.joint_boxes(truth.tracks.joints, camera),
-    )
+    own = _read_camera(mine.camera, truth)
+    places = matching.joint_boxes(truth.tracks.joints, camera)
+    least = matching.EvaluationSettings().min_overlap
 
     def count_matches(seen: Camera) -> int:
         overlap = matching.box_overlaps(matching.joint_boxes(joints, seen), places)
-        return int(
-            (matching.match_boxes(overlap, matching.EvaluationSettings().min_overlap) >= 0).sum()
-        )
+        return int((matching.match_boxes(overlap, least) >= 0).sum())
 
     matches = count_matches(own)
     if 2 * matches < int(np.isfinite(places).all(-1).sum()):
@@ -267,8 +262,10 @@ def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
     for late in range(-3, 4):
         mine = found[max(late, 0) : len(found) + min(late, 0)]
         theirs = true[max(-late, 0) : len(true) - max(late, 0)]
-        away = metrics.aligned_errors(mine, theirs, with_scale=True, min_joints=7).shared
-        errors[late] = float(away[np.isfinite(away)].mean()) if np.isfinite(away).any() else np.inf
+        source, target = (metrics.paper_joints(each).reshape(-1, 3) for each in (mine, theirs))
+        away = align(source, target, with_scale=True).apply(source) - target
+        known = np.linalg.norm(away[np.isfinite(away).all(-1)], axis=-1)
+        errors[late] = float(known.mean()) if len(known) else np.inf
     best = min(errors, key=lambda late: (errors[late], abs(late)))
     if not errors[best] < CheckSettings().max_share_left * errors[0]:
         return {}
