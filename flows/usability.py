@@ -93,6 +93,13 @@ _RULES: Final = (
         "{value} at a time{when}. Look at the video there.",
     ),
     _Rule(
+        "triangulation",
+        "misplacement_m",
+        "max_misplacement_m",
+        "the calibration of {part} displaces people in {unit} by {value}. Click more markings, "
+        "where there are none.",
+    ),
+    _Rule(
         "bundle_adjustment",
         "moved_deviations",
         "max_moved_deviations",
