@@ -41,36 +41,12 @@ GOOD_BODIES = {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}
     [
         (CAMERAS, GOOD_CAMERA, []),
         (CAMERAS, {}, []),  # a given one was judged by who gave it
-        (
-            CAMERAS,
-            GOOD_CAMERA | {"expected_ground_error_p95_m": 0.6},
-            [],
-        ),  # the limit itself
-        (
-            CAMERAS,
-            GOOD_CAMERA | {"clicks_wrong": 1.0},
-            ["clicks_wrong is 1, at most 0 passes"],
-        ),
-        (
-            CAMERAS,
-            {"clicks_wrong": 0.0, "weak": 0.0},
-            ["expected_ground", "expected_ground"],
-        ),
-        (
-            PEOPLE,
-            GOOD_VIDEO | {"stride": 2.0},
-            [],
-        ),  # filled in between two looks on purpose
-        (
-            PEOPLE,
-            GOOD_VIDEO | {"stride": 1.0},
-            ["bridged_share is 0.5, at most 0.25 passes"],
-        ),
-        (
-            ADJUSTMENT,
-            {"held_out_error_before_px": 2.0, "held_out_error_after_px": 1.9},
-            [],
-        ),
+        (CAMERAS, GOOD_CAMERA | {"expected_ground_error_p95_m": 0.6}, []),  # the limit itself
+        (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 1.0}, ["clicks_wrong is 1, at most 0 passes"]),
+        (CAMERAS, {"clicks_wrong": 0.0, "weak": 0.0}, ["expected_ground", "expected_ground"]),
+        (PEOPLE, GOOD_VIDEO | {"stride": 2.0}, []),  # filled in between two looks on purpose
+        (PEOPLE, GOOD_VIDEO | {"stride": 1.0}, ["bridged_share is 0.5, at most 0.25 passes"]),
+        (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 1.9}, []),
         (
             ADJUSTMENT,
             {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.1},
@@ -78,16 +54,8 @@ GOOD_BODIES = {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}
         ),
         # A growth that reads as the limit is none.
         (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.00035}, []),
-        (
-            ADJUSTMENT,
-            {"cameras_changed": 0.0},
-            ["held_out_error_after_px", "held_out_growth"],
-        ),
-        (
-            ACCEPTANCE,
-            {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01},
-            ["filled_share"],
-        ),
+        (ADJUSTMENT, {"cameras_changed": 0.0}, ["held_out_error_after_px", "held_out_growth"]),
+        (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
         (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
         (ACCEPTANCE, GOOD_BODIES | {"held_out_certain_excess_m.knee": 0.01}, []),
         (
@@ -118,11 +86,7 @@ def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
         (CAMERAS, GOOD_CAMERA | {"expected_ground_error_median_m": 0.3}, 1.0),
         (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 3.0}, 3.0),  # none passes
         (PEOPLE, GOOD_VIDEO | {"stride": 1.0}, 1.0),  # 0.5 where 0.25 passes
-        (
-            ADJUSTMENT,
-            {"held_out_error_before_px": 2.0, "held_out_error_after_px": 3.0},
-            0.5,
-        ),
+        (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 3.0}, 0.5),
         (ACCEPTANCE, {"bodies": 100.0, "filled": 20.0, "offset_rms_m": 0.01}, 3.0),
     ],
 )
