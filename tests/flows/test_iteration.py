@@ -122,6 +122,7 @@ def record(number, error, state="complete"):
             "figures": {"filtering/clip": figures},
             "started_at": "2024-01-01T00:00:00Z",
             "finished_at": "2024-01-01T00:00:00Z",
+            "usability": {"verdict": "usable"},
             "seconds": 1.0,
         }
     )

@@ -22,6 +22,7 @@ def record(figures):
             "figures": figures,
             "started_at": "2024-01-01T00:00:00Z",
             "finished_at": "2024-01-01T00:00:00Z",
+            "usability": {"verdict": "usable"},
             "seconds": 1.0,
         }
     )

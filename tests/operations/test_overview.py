@@ -39,6 +39,7 @@ def record():
             "waiting": (WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,)),),
             "started_at": ASKED,
             "finished_at": ENDED,
+            "usability": {"verdict": "usable"},
             "seconds": 300.0,
         }
     )
