@@ -14,7 +14,7 @@ class UsableLimits(Record):
 
     max_unreadable_share: Share = 0.01
     """Share of a video's frames of a clip without a readable image [1]: a recorder loses single
-    frames, not a second of every two minutes."""
+    frames, not one second of a hundred."""
     max_absent_share: Share = 0.05
     """Share of the time in which tracked people, or all people, are missing for a second or more
     [1]: shorter absences are occlusions."""
