@@ -12,7 +12,6 @@ from data_contracts.records import (
     CONTRACT_VERSION,
     Amount,
     Count,
-    Digest,
     Frame,
     FramesPerSecond,
     ImageLength,
@@ -207,19 +206,6 @@ Split = Literal["train", "val", "test"]
 """Part of a data set; a match is in one."""
 
 
-class ReleasedVideo(Record):
-    """Footage of one broadcast view."""
-
-    path: str | None
-    """The copy in the release; None = the release has the digest alone."""
-    source: str
-    """The file in the match folder."""
-    sha256: Digest
-    """Of the file, or of the names and contents of a folder of images."""
-    first_image: Frame
-    """Image of the clip's first frame, from 0."""
-
-
 class ReleasedSequence(Record):
     """One clip of a data set of several matches."""
 
@@ -227,6 +213,8 @@ class ReleasedSequence(Record):
     match_id: Name
     run_id: Name
     clip_id: Name
+    usability: Usability
+    """Verdict on the run's results."""
     first_frame: Frame
     """Match frame of the first row of every array."""
     fps: FramesPerSecond
@@ -237,8 +225,10 @@ class ReleasedSequence(Record):
     """The person of each row of poses, joints and boxes: the same name is the same person."""
     views: dict[str, tuple[ImageLength, ImageLength]]
     """Width and height [px] of each broadcast camera's images, by the name of its files."""
-    footage: dict[str, ReleasedVideo]
-    """By the same names; empty without footage."""
+    footage: dict[str, StoredFile]
+    """Video by the same names: the copy, or the file in the match folder."""
+    first_images: dict[str, Frame]
+    """Image of the video in the clip's first frame, from 0."""
 
 
 class DataSetManifest(Record):

@@ -197,48 +197,47 @@ def release(
         subjects: YAML file of people in several clips: subject: [MATCH/NAME, MATCH/CLIP/ID].
         check: Verify this data set instead: files, splits, licences, numbers, poses, boxes.
     """
-    from flows.results.data_set_release import (
-        ASSETS,
-        ReleaseOptions,
-        check_data_set,
-        write_data_set,
-    )
+    from flows.results.data_set_release import ASSETS, check_data_set, write_data_set
 
     if check is not None:
         _print_check(check_data_set(check, hidden), as_json=as_json)
         return
-    names = [each.partition("/")[0] for each in matches or ()]
-    unknown = [each for each in (*(val or ()), *(test or ())) if each not in names]
-    if out is None or name is None or not names or unknown or {*(val or ())} & {*(test or ())}:
+    runs: dict[str, str] = {}
+    for item in matches or ():
+        match, _, run = item.rpartition("/")
+        runs |= {match: run} if match and run.isdigit() else {item: "latest"}
+    splits: dict[str, Split] = dict.fromkeys(test or (), "test")
+    splits |= dict.fromkeys(val or (), "val")
+    twice = len(splits) < len([*(test or ()), *(val or ())]) or len(runs) < len(matches or ())
+    if out is None or name is None or not runs or twice or not splits.keys() <= runs.keys():
         raise UsageError(
             "worldpose release",
             expected="--out, --name and matches, of which --val and --test name some, each once",
-            found=f"matches {', '.join(names) or 'none'}; {', '.join(unknown) or 'all'} known",
+            found=f"matches {', '.join(runs) or 'none'}; splits of {', '.join(splits) or 'none'}",
             todo="worldpose release --out set --name first --licence TERMS.txt MATCH MATCH2.",
         )
     from flows.cli.results import read_licence
     from flows.registering import find_registration
-    from flows.results.best_results import Origin, open_results
+    from flows.results.best_results import Origin, describe_later_run, open_results
     from worldpose.store.store import Store
 
     licences: dict[str, str] = {}
     for item in sorted(licence or (), key=lambda item: "=" in item):
         kind, equals, file = item.rpartition("=")
-        text = read_licence(Path(file))
-        licences |= dict.fromkeys([kind] if equals else ASSETS[:-1], text)
-    if unknown := [kind for kind in licences if kind not in ASSETS]:
-        raise unknown_name(f"--licence {unknown[0]}", unknown[0], ASSETS)
+        if equals and kind not in ASSETS:
+            raise unknown_name(f"--licence {item}", kind, ASSETS)
+        licences |= dict.fromkeys([kind] if equals else ASSETS[:-1], read_licence(Path(file)))
     store, origins = Store.open(project), []
-    for item in matches or ():
-        match, _, run = item.partition("/")
+    for match, run in runs.items():
         registration = find_registration(store, match)
-        split: Split = (
-            "test" if match in (test or ()) else "val" if match in (val or ()) else "train"
-        )
-        opened = open_results(store, registration.spec.match_id, run or "latest")
-        origins.append((Origin(opened, registration), split))
-    options = ReleaseOptions(name, licences, hidden, footage, subjects)
-    found = write_data_set(store, origins, out, options).statistics
+        opened = open_results(store, registration.spec.match_id, run)
+        if run == "latest" and (later := describe_later_run(store, opened.record)):
+            line(later, to=errors)
+        origins.append((Origin(opened, registration), splits.get(match, "train")))
+    manifest = write_data_set(
+        *(store, origins, out, name, licences), hidden=hidden, footage=footage, subjects=subjects
+    )
+    found = manifest.statistics
     if as_json:
         print_json({"out": str(out), "statistics": found.model_dump(mode="json")})
         return

@@ -100,14 +100,7 @@ def evaluate(
                 line(f"{place}: {note}", to=errors)
             print_methods(results, table, as_json=as_json)
             return
-    if picture is not None:
-        raise UsageError(
-            f"--picture {picture}",
-            expected="--reference with a data set, and --prediction folders",
-            found=f"--reference {reference}",
-            todo="Name the folder that holds poses/ and cameras/, or leave out --picture.",
-        )
-    if method and reference is not None and not prediction:
+    if method and reference is not None and not prediction and picture is None:
         from flows.results.baselines import score_methods
 
         found = score_methods(
@@ -121,10 +114,10 @@ def evaluate(
         )
         print_methods(found, table, as_json=as_json)
         return
-    if not prediction or reference is None:
+    if not prediction or reference is None or picture is not None:
         raise UsageError(
             "worldpose evaluate",
-            expected="--prediction or --method, and --reference",
+            expected="--prediction or --method, and --reference; --picture only with a data set",
             found="others",
             todo="Name prediction and ground truth, or use --ablation 10.",
         )
@@ -151,23 +144,17 @@ def evaluate(
 
 
 def named_folders(given: Sequence[str]) -> dict[str, Path]:
-    """Parse [NAME=]FOLDER arguments; a folder without a name has its own.
-
-    Raises:
-        UsageError: a folder does not exist, or two have the same name.
-    """
+    """Parse [NAME=]FOLDER arguments; raise UsageError if a folder is absent or a name is twice."""
     folders: dict[str, Path] = {}
     for item in given:
         name, equals, path = item.partition("=")
         if not equals or Path(item).exists():
             name, path = Path(item).resolve().name, item
         if name in folders or not Path(path).is_dir():
-            raise UsageError(
-                f"--prediction {item}",
-                expected="NAME=FOLDER of a method's clips, each name once",
-                found=f"{name} twice" if name in folders else f"no folder {path}",
-                todo="Give each method a name and its folder, such as --prediction glamr=results.",
-            )
+            found = f"{name} twice" if name in folders else f"no folder {path}"
+            todo = "Give each method a name and its folder, such as --prediction glamr=results."
+            expected = "NAME=FOLDER of a method's clips, each name once"
+            raise UsageError(f"--prediction {item}", expected=expected, found=found, todo=todo)
         folders[name] = Path(path)
     return folders
 
@@ -331,20 +318,16 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
 
 def print_methods(scores: Sequence[MethodScore], form: TableForm, *, as_json: bool) -> None:
     """Print scores of methods as text, CSV or LaTeX, or in full as JSON."""
-    from flows.results.baselines import (
-        COLUMNS,
-        table_columns,
-        table_csv,
-        table_latex,
-        table_rows,
-    )
+    from flows.results import baselines
 
     if as_json:
         rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
-        print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})
+        print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
     elif form == "text":
         # Brackets would be parsed as markup.
-        titles = (f">{title.replace('[', '').replace(']', '')}" for title in COLUMNS.values())
-        print_table("", (*table_columns(scores), *titles), table_rows(scores))
+        titles = (
+            f">{title.replace('[', '').replace(']', '')}" for title in baselines.COLUMNS.values()
+        )
+        print_table("", (*baselines.table_columns(scores), *titles), baselines.table_rows(scores))
     else:
-        line((table_csv if form == "csv" else table_latex)(scores).rstrip())
+        line((baselines.table_csv if form == "csv" else baselines.table_latex)(scores).rstrip())

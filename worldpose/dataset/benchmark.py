@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,58 +19,31 @@ from worldpose.dataset.contents import ShippedClip, camera_files, list_clips, re
 from worldpose.dataset.faults import CheckSettings, camera_faults
 from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
 from worldpose.errors import InputError
-from worldpose.evaluation.matching import (
-    EvaluationSettings,
-    box_overlaps,
-    joint_boxes,
-    joint_distances,
-    match_boxes,
-    match_people,
-    match_tracks,
-    take_matched,
-)
-from worldpose.evaluation.metrics import (
-    PersonScore,
-    aligned_errors,
-    evaluate_joints,
-    paper_joints,
-    pool_people,
-)
-from worldpose.formats.archives import wrong
-from worldpose.formats.challenge import CameraRows, read_boxes, read_camera
+from worldpose.evaluation import matching, metrics
+from worldpose.formats.archives import ARRAY_BYTES, read_npz, wrong
+from worldpose.formats.challenge import CameraRows, read_camera
 from worldpose.formats.joints_file import PLURALS, JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
 
-_KEYS: Final = {
-    **dict.fromkeys(("translation_is_center", "negated_translation", "camera_in_millimetres"), "t"),
-    "distortion_order": "k",
-}
-"""Member of a camera file that a fault is in; R otherwise."""
 
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """People of one image of a clip, true and predicted after the shared alignment, for a plot."""
+class Sample(NamedTuple):
+    """People (persons, 17, 3) [m] of one image, true and as methods found and aligned them."""
 
     clip: str
     frame: int
     camera: Camera | None
     true: Floats
-    """(persons, 17, 3) [m]."""
     found: Mapping[str, Floats]
-    """The same people as each method found them; NaN where missing."""
 
 
-@dataclass(frozen=True, eq=False)
-class _People:
-    """People of one clip as a folder has them; frames of tracks count images of the clip from 0."""
+class _People(NamedTuple):
+    """People of one clip as a folder has them; `first` is the match frame of its image 0."""
 
     folder: Path
     where: str
     tracks: JointTracks
     first: int
-    """Match frame of image 0; 0 if no file numbers frames."""
     clip: ShippedClip
     camera: Path | None
     bodies: tuple[str, ...]
@@ -111,18 +83,18 @@ def score_folders(
 
     Args:
         reference: true clips.
-        predictions: folder of each method, by title; clips that the reference lacks do not count.
+        predictions: folder of each method, by title; further clips do not count.
         body: body model of pose files that name none.
-        match_in: broadcast camera, for clips with `<clip>.<camera>` of several; None = the first.
+        match_in: broadcast camera of clips with several; None = the first.
         fps: frames per second [1/s]; None = what the reference states.
 
     Raises:
         InputError: a clip is missing, has other frames, or its camera has another convention; the
             error names file and key.
     """
-    settings = EvaluationSettings()
+    settings = matching.EvaluationSettings()
     clips: dict[str, dict[str, Evaluation]] = {name: {} for name in predictions}
-    people: dict[str, list[PersonScore]] = {name: [] for name in predictions}
+    people: dict[str, list[metrics.PersonScore]] = {name: [] for name in predictions}
     bodies: dict[str, set[str]] = {name: set() for name in predictions}
     notes: dict[str, dict[str, str]] = {name: {} for name in predictions}
     samples: list[Sample] = []
@@ -134,22 +106,19 @@ def score_folders(
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
-                expected, found = (
-                    f"poses/{clip}.npz or its joints",
-                    ", ".join(list(parts[name])[:8]),
-                )
                 todo = "Write its poses, with NaN where the method found nobody."
-                raise wrong(f"{folder}: clip {clip}", expected, found, todo)
+                found = ", ".join(parts[name])
+                raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
             boxes = None if camera is None else _boxes(mine, truth, camera)
-            clips[name][clip], persons = evaluate_joints(
+            clips[name][clip], persons = metrics.evaluate_joints(
                 mine.tracks, truth.tracks, settings, fps=rate, camera=camera, boxes=boxes
             )
-            distances = joint_distances(mine.tracks.joints, true)
-            match = match_people(distances, settings.match_gate_m)
+            distances = matching.joint_distances(mine.tracks.joints, true)
+            match = matching.match_people(distances, settings.match_gate_m)
             sides = mine.tracks.joints, true
-            tracks = match_tracks(*sides, distances, match, camera, boxes, settings)
-            shown[name] = take_matched(mine.tracks.joints, tracks)
+            tracks = matching.match_tracks(*sides, distances, match, camera, boxes, settings)
+            shown[name] = matching.take_matched(mine.tracks.joints, tracks)
             people[name] += persons
             bodies[name].update(mine.bodies)
             notes[name] |= {**mine.notes, **_describe_shift(mine.where, shown[name], true)}
@@ -157,7 +126,7 @@ def score_folders(
     scores = []
     for name, folder in predictions.items():
         frames = sum(each.frames or 0 for each in clips[name].values())
-        pooled = pool_people(people[name], settings).model_copy(update={"frames": frames})
+        pooled = metrics.pool_people(people[name], settings).model_copy(update={"frames": frames})
         scores.append(
             MethodScore(
                 method=name,
@@ -197,10 +166,8 @@ def _read_people(
     first = truth.first if truth else int(numbered[0][0]) if numbered and len(numbered[0]) else 0
     rows = np.arange(len(source.points)) if source.frames is None else source.frames - first
     count = len(truth.tracks.frames) if truth else int(rows.max(initial=-1)) + 1
-    key = (
-        ": frames" if source.frames is not None else ": transl" if source.place is not None else ""
-    )
-    where = f"{folder}/{source.name}{key}"
+    key = "" if source.place is None else ": transl"
+    where = f"{folder}/{source.name}{key if source.frames is None else ': frames'}"
     low, high = int(rows.min(initial=0)), int(rows.max(initial=0))
     if (source.frames is None and len(rows) != count) or low < 0 or high >= count:
         expected = f"frames {first} to {first + count - 1} of the clip"
@@ -210,7 +177,7 @@ def _read_people(
     for place, name in enumerate(COCO17):
         if name in source.skeleton:
             joints[rows, :, place] = source.point(name)
-    own, _ = camera_files(folder, clip, clips)
+    own = camera_files(folder, clip, clips)[0]
     wanted = [each for each in own if match_in is None or each.stem.endswith(f".{match_in}")]
     if match_in is not None and truth is None and not wanted:
         raise wrong(f"{folder}/cameras/{clip}.{match_in}.npz", "a camera", "nothing", "Name it.")
@@ -236,7 +203,7 @@ def _true_camera(truth: _People) -> Camera | None:
     known = {fault.name for fault in camera_faults()} | {"frame_offset", "sees_nobody"}
     for finding in check_clip(truth.clip, CheckSettings())[1]:
         if f"cameras/{truth.camera.stem}" in finding.where and finding.fault in known:
-            raise _convention(truth.camera, finding.fault, finding.says)
+            raise _convention(truth.camera, finding.says)
     return _read_camera(truth.camera, truth)
 
 
@@ -248,9 +215,10 @@ def _read_camera(path: Path, truth: _People) -> Camera:
     return camera
 
 
-def _convention(path: Path, fault: str, says: str) -> InputError:
+def _convention(path: Path, says: str) -> InputError:
     todo = "Write it again; worldpose check names faults of a whole folder."
-    return wrong(f"{path}: {_KEYS.get(fault, 'R')}", "x_cam = R x_world + t in metres", says, todo)
+    key = says[0] if says[1] == " " else "R"  # most faults of cameras begin with the member
+    return wrong(f"{path}: {key}", "x_cam = R x_world + t in metres", says, todo)
 
 
 def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
@@ -263,17 +231,19 @@ def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
     name = mine.clip.name if truth.camera is None else truth.camera.stem
     file, joints = mine.folder / "boxes" / f"{name}.npz", mine.tracks.joints
     if file.is_file():
-        boxes = read_boxes(file)["boxes"]
-        if boxes.shape[:2] != joints.shape[:2]:
-            raise wrong(f"{file}: boxes", f"{joints.shape[:2]} of {mine.where}", f"{boxes.shape}")
+        boxes = read_npz(file, ARRAY_BYTES).get("boxes", np.empty(0)).astype(np.float64)
+        if boxes.shape != (expected := (*joints.shape[:2], 4)):
+            raise wrong(f"{file}: boxes", f"{expected}, as {mine.where} has", f"{boxes.shape}")
         return boxes
     if mine.camera is None:
         return None
-    own, places = _read_camera(mine.camera, truth), joint_boxes(truth.tracks.joints, camera)
+    own = _read_camera(mine.camera, truth)
+    places = matching.joint_boxes(truth.tracks.joints, camera)
+    least = matching.EvaluationSettings().min_overlap
 
     def count_matches(seen: Camera) -> int:
-        overlap = box_overlaps(joint_boxes(joints, seen), places)
-        return int((match_boxes(overlap, EvaluationSettings().min_overlap) >= 0).sum())
+        overlap = matching.box_overlaps(matching.joint_boxes(joints, seen), places)
+        return int((matching.match_boxes(overlap, least) >= 0).sum())
 
     matches = count_matches(own)
     if 2 * matches < int(np.isfinite(places).all(-1).sum()):
@@ -282,18 +252,20 @@ def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
             repaired: CameraRows = rows if fault.camera is None else fault.camera(rows)
             seen = repaired.camera() if own.batch_shape else repaired.camera()[0]
             if count_matches(seen) > max(2 * matches, len(places)):
-                raise _convention(mine.camera, fault.name, fault.says)
-    return joint_boxes(joints, own)
+                raise _convention(mine.camera, fault.says)
+    return matching.joint_boxes(joints, own)
 
 
 def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
     """Return a note if a prediction fits the reference much better some frames earlier or later."""
-    errors = {0: np.inf}
+    errors = {}
     for late in range(-3, 4):
         mine = found[max(late, 0) : len(found) + min(late, 0)]
         theirs = true[max(-late, 0) : len(true) - max(late, 0)]
-        away = aligned_errors(mine, theirs, with_scale=True, min_joints=7).shared
-        errors[late] = float(away[np.isfinite(away)].mean()) if np.isfinite(away).any() else np.inf
+        source, target = (metrics.paper_joints(each).reshape(-1, 3) for each in (mine, theirs))
+        away = align(source, target, with_scale=True).apply(source) - target
+        known = np.linalg.norm(away[np.isfinite(away).all(-1)], axis=-1)
+        errors[late] = float(known.mean()) if len(known) else np.inf
     best = min(errors, key=lambda late: (errors[late], abs(late)))
     if not errors[best] < CheckSettings().max_share_left * errors[0]:
         return {}
@@ -307,7 +279,7 @@ def _sample(clip: str, camera: Camera | None, true: Floats, found: Mapping[str, 
     frame = int(np.sum(both, axis=0).argmax())
     moved = {}
     for name, people in found.items():
-        source, target = (paper_joints(each).reshape(-1, 3) for each in (people, true))
+        source, target = (metrics.paper_joints(each).reshape(-1, 3) for each in (people, true))
         moved[name] = align(source, target, with_scale=True).apply(people[frame])
     here = camera[frame] if camera is not None and camera.batch_shape else camera
     return Sample(clip, frame, here, true[frame], moved)

@@ -256,19 +256,21 @@ def pool_people(
     """
     least = (settings or EvaluationSettings()).min_trajectory_m
     rows = [one.model_dump() for one in people]
+    known = [row for row in rows if row["track_joints"]]
+    far = [row for row in known if row["path_m"] >= least]
 
-    def pool(name: str, weight: str) -> float | None:
-        known = [row for row in rows if row[weight] and row[name] is not None]
-        return _ratio(sum(r[name] * r[weight] for r in known), sum(r[weight] for r in known))
+    def mean(name: str, weight: str) -> float | None:
+        return _ratio(
+            sum((r[name] or 0.0) * r[weight] for r in known), sum(r[weight] for r in known)
+        )
 
     def drift(name: str) -> float | None:
-        far = [r for r in rows if r["track_joints"] and (r["path_m"] or 0.0) >= least]
-        return _ratio(sum(0.1 * r[name] / r["path_m"] for r in far), len(far))
+        return _ratio(sum(0.1 * row[name] / row["path_m"] for row in far), len(far))
 
     return Evaluation(
-        g_mpjpe_mm=pool("g_mpjpe_mm", "track_joints"),
-        per_person_g_mpjpe_mm=pool("per_person_g_mpjpe_mm", "track_joints"),
-        pa_mpjpe_mm=pool("pa_mpjpe_mm", "aligned_joints"),
+        g_mpjpe_mm=mean("g_mpjpe_mm", "track_joints"),
+        per_person_g_mpjpe_mm=mean("per_person_g_mpjpe_mm", "track_joints"),
+        pa_mpjpe_mm=mean("pa_mpjpe_mm", "aligned_joints"),
         per_meter_drift_cm_per_m=drift("g_mpjpe_mm"),
         per_person_drift_cm_per_m=drift("per_person_g_mpjpe_mm"),
         track_coverage=_ratio(sum(r["track_frames"] for r in rows), sum(r["frames"] for r in rows)),

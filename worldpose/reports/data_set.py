@@ -46,32 +46,25 @@ def data_set_page(
 
 
 def _composition(manifest: DataSetManifest) -> Section:
-    """Return the splits, the sources of clips, and the subjects of several clips."""
-    statistics, clips = manifest.statistics.clips, manifest.clips
+    """Return the splits with their runs, and the subjects of several clips."""
+    found, clips = manifest.statistics.clips, manifest.clips
     splits, clips_of = [], dict[str, list[str]]()
     for split in dict.fromkeys(clip.split for clip in clips.values()):
-        own = [name for name, clip in clips.items() if clip.split == split]
-        counts = (
-            len({clips[name].match_id for name in own}),
-            len(own),
-            len({subject for name in own for subject in clips[name].subjects}),
-            sum(statistics[name].frames for name in own),
-            sum(statistics[name].poses for name in own),
-        )
-        metres = sum(sum(statistics[name].trajectories_m) for name in own)
-        splits.append((split, *(f"{each:,}" for each in counts), f"{metres:,.1f}"))
-    sources = []
-    for name, clip in clips.items():
-        for subject in clip.subjects:
-            clips_of.setdefault(subject, []).append(name)
-        videos = [f"{v.path or v.source} from image {v.first_image}" for v in clip.footage.values()]
-        run = f"{clip.match_id}, run {clip.run_id}, from frame {clip.first_frame}"
-        sources.append((name, clip.split, run, clip.body_model, "; ".join(videos) or "-"))
+        own = {name: clip for name, clip in clips.items() if clip.split == split}
+        said = (f"{c.match_id}, run {c.run_id}: {c.usability.verdict}" for c in own.values())
+        runs = dict.fromkeys(said)
+        people = {subject for clip in own.values() for subject in clip.subjects}
+        frames, poses = (sum(getattr(found[n], key) for n in own) for key in ("frames", "poses"))
+        metres = sum(sum(found[name].trajectories_m) for name in own)
+        counts = (len(own), len(people), frames, poses, metres)
+        models = ", ".join({clip.body_model for clip in own.values()})
+        splits.append((split, "; ".join(runs), models, *(f"{each:,.0f}" for each in counts)))
+        for name, clip in own.items():
+            for subject in clip.subjects:
+                clips_of.setdefault(subject, []).append(name)
+    numbers = (">clips", ">subjects", ">frames", ">poses", ">metres")
     several = tuple((s, ", ".join(names)) for s, names in clips_of.items() if len(names) > 1)
-    columns = ("split", ">matches", ">clips", ">subjects", ">frames", ">poses", ">metres")
-    blocks = [Table("", columns, tuple(splits))]
-    titles = ("clip", "split", "source", "body model", "footage")
-    blocks.append(Table("Clips", titles, tuple(sources)))
+    blocks = [Table("", ("split", "matches", "body model", *numbers), tuple(splits))]
     if several:
         blocks.append(Table("Subjects of several clips", ("subject", "clips"), several))
     lead = (

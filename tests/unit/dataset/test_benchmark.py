@@ -288,11 +288,14 @@ def test_wrong_files_are_told_with_file_and_key(reference, tmp_path, side, file,
         score_folders(tmp_path / "true", {"mine": tmp_path / "mine"})
 
 
-def test_plural_keys_and_shifted_frames_are_told(reference, tmp_path):
+def test_plural_keys_and_shifted_frames_are_told(reference, model, tmp_path):
     shutil.copytree(reference, tmp_path / "mine")
     edit(tmp_path / "mine" / "poses" / "A_1.npz", plural)
     edit(tmp_path / "mine" / "poses" / "B_2.npz", late)
-    (score,), _ = score_folders(reference, {"mine": tmp_path / "mine"})
+    edit(tmp_path / "mine" / "poses" / "C_3.npz", without_model)
+    (score,), _ = score_folders(reference, {"mine": tmp_path / "mine"}, body=model.name)
+    for clip in ("A_1", "C_3"):
+        assert score.clips[clip].g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
     places = tmp_path / "mine" / "poses"
     read, shift = score.notes[f"{places}/A_1.npz"], score.notes[f"{places}/B_2.npz: transl"]
     assert "read global_orients as global_orient, body_poses as body_pose" in read

@@ -4,7 +4,6 @@ import hashlib
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,11 +14,11 @@ from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.usability import Usability
 from flows.cli.app import app
 from flows.results.best_results import Origin
 from flows.results.data_set_release import (
     ASSETS,
-    ReleaseOptions,
     check_data_set,
     write_data_set,
 )
@@ -45,6 +44,7 @@ class StubRun(Mapping):
             run_id="0001",
             match_id=match,
             state="complete",
+            usability=Usability(verdict="usable"),
             results=results,
             left_out={},
             body_folder=None,
@@ -145,8 +145,8 @@ def written(origins, tmp_path_factory):
     folder = tmp_path_factory.mktemp("released")
     registry = folder / "subjects.yaml"
     registry.write_text("keeper: [ann-1/A/0, ann-1/B/0]\nstriker: [bea-1/A/2, bea-1/B/1]\n")
-    options = ReleaseOptions("first", LICENCES, folder / "truth", "copy", registry)
-    write_data_set(*origins, folder / "set", options)
+    options = {"hidden": folder / "truth", "footage": "copy", "subjects": registry}
+    write_data_set(*origins, folder / "set", "first", LICENCES, **options)
     return folder
 
 
@@ -166,11 +166,14 @@ def test_a_sound_data_set_passes_and_hides_the_truth(written):
     # Two people have two clips each; all others count once per clip.
     assert manifest.statistics.subjects == 6 * PERSONS - 2
     assert manifest.statistics.frames == 6 * HALF
-    video = manifest.clips["ann-1_B"].footage["ann-1_B"]
+    clip = manifest.clips["ann-1_B"]
+    assert clip.first_images == {"ann-1_B": 0}
+    video = clip.footage["ann-1_B"]
     copied = written / "set" / video.path
     assert hashlib.sha256(copied.read_bytes()).hexdigest() == video.sha256
     page = (written / "set" / "datasheet.html").read_text()
     assert "keeper" in page and "For tests alone." in page and "data:image" in page
+    assert "ann-1, run 0001: usable" in page
 
 
 def test_boxes_show_whom_the_camera_sees(written):
@@ -331,9 +334,15 @@ def test_the_command_checks_a_data_set(written, tmp_path):
     ("changes", "told"),
     [
         ({"hidden": None}, "--hidden: expected a folder for the test part"),
-        ({"licences": {"poses": "x"}}, "--licence: expected the licence of joints"),
-        ({"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")}, "licence of footage"),
-        ({"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"}, "keeper: expected one split, found train"),
+        ({"licences": {"poses": "x"}}, "set: joints: expected no contradiction, found no licence"),
+        (
+            {"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")},
+            "footage: expected no contradiction, found no licence",
+        ),
+        (
+            {"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"},
+            "keeper: expected no contradiction, found the subject is in train and val",
+        ),
         ({"subjects": "keeper: [ann-1/A/77]"}, "keeper: expected a list of MATCH/NAME"),
         ({"subjects": "[keeper]"}, "expected a list of MATCH/NAME"),
     ],
@@ -342,17 +351,15 @@ def test_a_data_set_that_would_be_wrong_is_refused(origins, tmp_path, changes, t
     if "subjects" in changes:
         changes = {"subjects": tmp_path / "subjects.yaml"} | {"text": changes["subjects"]}
         changes["subjects"].write_text(changes.pop("text"))
-    options = replace(ReleaseOptions("first", LICENCES, tmp_path / "truth"), **changes)
+    options = {"licences": LICENCES, "hidden": tmp_path / "truth"} | changes
     with pytest.raises((InputError, UsageError), match=told):
-        write_data_set(*origins, tmp_path / "set", options)
+        write_data_set(*origins, tmp_path / "set", "first", **options)
     assert not (tmp_path / "set").exists() and not (tmp_path / "truth").exists()
 
 
-def test_a_folder_is_never_overwritten(origins, written):
+def test_a_folder_is_never_overwritten_and_no_truth_is_published(origins, written):
+    new = written / "new"
     with pytest.raises(UsageError, match="expected a new folder"):
-        write_data_set(
-            *origins, written / "set", ReleaseOptions("first", LICENCES, written / "new")
-        )
-    inside = ReleaseOptions("first", LICENCES, written / "new" / "test")
+        write_data_set(*origins, written / "set", "first", LICENCES, hidden=new)
     with pytest.raises(UsageError, match="not in --out"):
-        write_data_set(*origins, written / "new", inside)
+        write_data_set(*origins, new, "first", LICENCES, hidden=new / "test")
