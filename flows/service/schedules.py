@@ -92,10 +92,10 @@ def set_schedule(
         prefect.ask(place, [{"schedule": schedule, "active": True, "slug": SLUG}])
 
 
-def list_missed(prefect: PrefectApi, deployments: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the runs of schedules whose time has passed, one for all with the same parameters.
+def collapse_missed(prefect: PrefectApi, deployments: Sequence[str]) -> None:
+    """Cancel runs of schedules whose time has passed, but the last of those with equal parameters.
 
-    The last one stands for the others, which are cancelled: what was missed runs once.
+    What was missed thus runs once.
     """
     passed = {"before_": datetime.now(UTC).isoformat()}
     waiting = {**of_types("SCHEDULED"), "name": {"any_": ["Scheduled", "Late"]}}
@@ -109,20 +109,3 @@ def list_missed(prefect: PrefectApi, deployments: Sequence[str]) -> list[dict[st
             LOG.info("%s: %s", found[same]["name"], why)
             prefect.set_state(found[same]["id"], "CANCELLED", why)
         found[same] = run
-    return list(found.values())
-
-
-def restore_missed(
-    prefect: PrefectApi, missed: Iterable[Mapping[str, Any]], fixed: Mapping[str, Sequence[str]]
-) -> None:
-    """Create missed runs again that an update of their deployment removed with the planned ones.
-
-    `fixed` has the names of the parameters, by deployment id, that the deployment decides.
-    """
-    for run in missed:
-        if prefect.find(f"/flow_runs/{run['id']}") is not None:
-            continue
-        deployment = run["deployment_id"]
-        kept = {n: it for n, it in run["parameters"].items() if n not in fixed[deployment]}
-        given = {"name": run["name"], "parameters": kept, "idempotency_key": f"missed-{run['id']}"}
-        prefect.ask(f"/deployments/{deployment}/create_flow_run", given)
