@@ -12,6 +12,7 @@ from data_contracts.records import (
     CONTRACT_VERSION,
     Amount,
     Count,
+    Digest,
     Frame,
     FramesPerSecond,
     ImageLength,
@@ -23,6 +24,7 @@ from data_contracts.records import (
     Share,
 )
 from data_contracts.run import StoredFile
+from data_contracts.usability import Usability
 
 EXPORT_PURPOSES: Final[Mapping[str, str]] = {
     "joints": "joints with covariances for numpy",
@@ -84,6 +86,8 @@ class ReleaseManifest(Record):
     conventions: Conventions = CONVENTIONS
     licence: str = Field(min_length=1)
     """Licence text of the data."""
+    usability: Usability
+    """Verdict on the results."""
     worldpose: str
     """Version that wrote the release."""
     versions: dict[str, str]
@@ -185,6 +189,8 @@ class DataSetStatistics(Record):
     minutes: Amount
     """[min]"""
     poses: Count
+    subjects: Count | None = None
+    """Different people; None if nothing tells who is who."""
     distance_km: Amount
     """Path length of all people while they are in the data [km]."""
     subjects_per_frame: Amount | None
@@ -195,3 +201,61 @@ class DataSetStatistics(Record):
     """[m]"""
     camera: Literal["S", "M", "M+Z"] | None
     """The most general motion among the clips' cameras."""
+
+
+Split = Literal["train", "val", "test"]
+"""Part of a data set; a match is in one."""
+
+
+class ReleasedVideo(Record):
+    """Footage of one broadcast view."""
+
+    path: str | None
+    """The copy in the release; None = the release has the digest alone."""
+    source: str
+    """The file in the match folder."""
+    sha256: Digest
+    """Of the file, or of the names and contents of a folder of images."""
+    first_image: Frame
+    """Image of the clip's first frame, from 0."""
+
+
+class ReleasedSequence(Record):
+    """One clip of a data set of several matches."""
+
+    split: Split
+    match_id: Name
+    run_id: Name
+    clip_id: Name
+    first_frame: Frame
+    """Match frame of the first row of every array."""
+    fps: FramesPerSecond
+    """[1/s]"""
+    body_model: str
+    """Body model of the poses."""
+    subjects: tuple[str, ...]
+    """The person of each row of poses, joints and boxes: the same name is the same person."""
+    views: dict[str, tuple[ImageLength, ImageLength]]
+    """Width and height [px] of each broadcast camera's images, by the name of its files."""
+    footage: dict[str, ReleasedVideo]
+    """By the same names; empty without footage."""
+
+
+class DataSetManifest(Record):
+    """release.json: what a data set of several matches has, and what it hides."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    release: Name
+    worldpose: str
+    """Version that wrote the data set."""
+    conventions: Conventions = CONVENTIONS
+    pitch: bool
+    """Whether all worlds are those of a pitch."""
+    licences: dict[str, str]
+    """Licence text by kind of file: poses, joints, cameras, boxes, footage."""
+    clips: dict[str, ReleasedSequence]
+    statistics: DataSetStatistics
+    files: tuple[StoredFile, ...]
+    """Relative to this file."""
+    hidden: tuple[StoredFile, ...]
+    """The truth of the test part, relative to its own folder."""

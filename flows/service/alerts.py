@@ -12,7 +12,6 @@ from threading import Lock
 from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival, QueuedRun
-from flows.review.metric_words import all_reasons
 from flows.service.channels import Channel
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, age
@@ -117,22 +116,21 @@ def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
     """Yield one alert about pending reviews of a match, and one about its quality."""
     run = "" if match.latest is None else match.latest.run_id
     link = f"{plan.pages}/#/match/{match.match_id}"
-    waiting, poor = [], []
+    waiting = []
     for stage, unit in match.units:
-        name = f"{match.match_id}/{stage}/{unit.unit}"
         hours = age(unit.waiting_since) / 3600.0
         if unit.state == "waiting" and hours >= plan.gate_hours:
+            name = f"{match.match_id}/{stage}/{unit.unit}"
             waiting.append(f"{name} has waited for a person for {hours:.1f} h: {unit.why}")
-        if unit.objections:
-            poor.append(f"{name}: {all_reasons(unit.objections)}")
-    kinds: tuple[tuple[AlertKind, str, list[str]], ...] = (
-        ("gate_waiting", f"gate_waiting/{match.match_id}/{run}", waiting),
-        ("quality", f"quality/{match.match_id}", poor),
-    )
-    for kind, key, texts in kinds:
-        if texts:
-            more = f"; and {len(texts) - 1} more results" if len(texts) > 1 else ""
-            yield Alert(key, kind, texts[0] + more, link, match.match_id)
+    if waiting:
+        text = waiting[0] + f"; and {len(waiting) - 1} more results" * (len(waiting) > 1)
+        key = f"gate_waiting/{match.match_id}/{run}"
+        yield Alert(key, "gate_waiting", text, link, match.match_id)
+    if match.latest is not None and match.latest.state in ("complete", "partial"):
+        judged = match.latest.usability
+        text = f"{match.match_id} is {judged.verdict}: {' '.join(judged.reservations)}"
+        if judged.reservations:
+            yield Alert(f"quality/{match.match_id}/{text}", "quality", text, link, match.match_id)
 
 
 class AlertDispatcher:

@@ -16,12 +16,7 @@ from data_contracts.run import WaitingUnit
 from flows.cli.app import app
 from flows.results.best_results import fitted_bodies
 from flows.results.evaluation import score
-from worldpose.formats.viewer_file import (
-    decode_bodies,
-    decode_part,
-    encode_spread,
-    read_viewer,
-)
+from worldpose.formats.viewer_file import decode_bodies, decode_part, encode_spread, read_viewer
 from worldpose.store.store import Store, open_run
 
 

@@ -115,11 +115,7 @@ def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
 
 
 @pytest.mark.parametrize(
-    ("error", "again"),
-    [
-        ("CorruptionError", False),
-        ("ConnectionResetError", True),
-    ],
+    ("error", "again"), [("CorruptionError", False), ("ConnectionResetError", True)]
 )
 def test_what_failed_is_tried_again_when_something_is_another(store, error, again):
     tracking = store.run(TINY).results["tracking/clip"]

@@ -5,12 +5,14 @@ import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
 from threading import Thread
+from types import SimpleNamespace
 
 import apprise
 import pytest
 from command_line import worldpose
 
 from data_contracts.operations import Arrival, QueuedRun
+from data_contracts.usability import Usability
 from flows.service.alerts import (
     LONGEST_PAUSE,
     MAX_SINGLE,
@@ -272,17 +274,17 @@ def test_a_question_is_no_alert_before_its_time(plan):
 
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
-    def body(**unit):
-        return MatchStatus("m", stages={"body_fitting": (UnitSummary("clip", "done", **unit),)})
+    def judged(state, *reservations):
+        verdict = "usable with reservations" if reservations else "usable"
+        usability = Usability(verdict=verdict, reservations=reservations)
+        latest = SimpleNamespace(run_id="0001", state=state, usability=usability)
+        return MatchStatus("m", latest)
 
-    assert alerts_now(plan, [body(figures={"offset_rms_m": 0.01})], [], []) == []
-    (poor,) = alerts_now(
-        plan, [body(objections=("offset_rms_m is 0.05, at most 0.03 passes",))], [], []
-    )
-    assert (poor.alert, poor.text) == (
-        "quality",
-        "m/body_fitting/clip: distance of bodies from the seen joints: 5 cm, limit 3 cm",
-    )
+    assert alerts_now(plan, [judged("complete")], [], []) == []
+    assert alerts_now(plan, [judged("waiting", "cam1 is bad.")], [], []) == []  # it asks already
+    (poor,) = alerts_now(plan, [judged("complete", "cam1 is bad.", "cam2 is.")], [], [])
+    text = "m is usable with reservations: cam1 is bad. cam2 is."
+    assert (poor.alert, poor.text) == ("quality", text)
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
         for state in ("arriving", "incomplete", "refused", "taken")
@@ -336,13 +338,14 @@ def test_a_run_that_was_ended_for_lack_of_progress_is_an_alert_until_it_ends(pla
 
 def test_a_match_is_one_alert_however_many_of_its_results_are_poor_or_wait(plan):
     since = datetime.now(UTC) - timedelta(hours=2)
-    poor = [UnitSummary(f"c{it}", "done", objections=("a is 2, at most 1",)) for it in range(6)]
+    usability = Usability(verdict="usable with reservations", reservations=("cam1 is bad.",))
+    latest = SimpleNamespace(run_id="0001", state="partial", usability=usability)
     waits = [UnitSummary(f"d{it}", "waiting", waiting_since=since, why="b") for it in range(6)]
-    match = MatchStatus("m", stages={"static_calibration": (*poor, *waits)})
+    match = MatchStatus("m", latest, stages={"static_calibration": tuple(waits)})
     runs = [ended("m", "failed", "dark")]
     (alert,) = alerts_now(plan, [match], [], runs)
     assert (alert.alert, alert.match_id) == ("run_failed", "m")
-    assert alert.text.count("and 5 more results") == 2
+    assert "and 5 more results" in alert.text and alert.text.endswith("cam1 is bad.")
 
 
 def test_a_flood_of_alerts_is_one_message(webhook, tmp_path):

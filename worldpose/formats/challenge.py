@@ -261,6 +261,23 @@ def _boxes(camera: Camera, surface: Floats) -> Floats:
     return boxes
 
 
+BOX_MEMBERS: Final = {
+    "boxes": Member(("frames", "persons", 4), "float"),
+    "visibility": Member(("frames", "persons"), "float", required=False),
+}
+"""Arrays of a box file: x0, y0, x1, y1 [px] within the image, and the visible share of joints."""
+
+
+def read_boxes(path: Path) -> dict[str, Floats]:
+    """Read `boxes/<camera>.npz`; rows are those of the clip's poses, NaN outside the image.
+
+    Raises:
+        InputError: the file is absent, or has other members or shapes.
+    """
+    found: dict[str, Any] = read_archive(path, BOX_MEMBERS)
+    return found
+
+
 Edition = Literal[2025, 2026]
 
 SUBMISSION: Final = "submission.npz"

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from data_contracts.broadcast_calibration import (
-    FRAME_STATUS,
-    KeyFrame,
-)
+from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.given_camera import GivenCamera
@@ -150,12 +147,7 @@ def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true,
     said, corrected = (
         calibrate_broadcast(
             clip.PITCH,
-            BroadcastClip(
-                [clicks(true, 8)],
-                lambda: iter(pictures),
-                FPS,
-                people=people,
-            ),
+            BroadcastClip([clicks(true, 8)], lambda: iter(pictures), FPS, people=people),
             SETTINGS.model_copy(update={"feed_offset": what}),
         )
         for what in ("report", "correct")

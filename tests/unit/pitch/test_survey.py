@@ -171,7 +171,6 @@ def test_a_file_is_read_by_its_header(tmp_path):
     ("text", "place", "told"),
     [
         ("", "", "nothing"),
-        ("name,x\n", "row 1", "columns name, x, y"),
         ("name,x,y,easting\n", "row 1", "columns name, x, y"),
         ("name,x,y\ncenter_mrk,1,2\n", "row 2: name", "Did you mean 'center_mark'"),
         ("name,x,y\ncenter_mark,1,2\ncenter_mark,1,2\n", "row 3: name", "again"),
@@ -183,7 +182,6 @@ def test_a_file_is_read_by_its_header(tmp_path):
         ("name,x,y\ncenter_mark,1\n", "row 2", "3 columns"),
         ('name,x,y\ncenter_mark,"1,500",2\n', "row 2: x", "'1,500'"),  # or 1500
         ("name,x,y\ncenter_mark,nan,2\n", "row 2: x", "number"),
-        ("name,x,y\ncenter_mark,,2\n", "row 2: x", "number"),
     ],
 )
 def test_a_wrong_file_is_refused_by_row(tmp_path, text, place, told):

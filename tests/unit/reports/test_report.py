@@ -10,6 +10,7 @@ import numpy as np
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.run import RunRecord, UnitFailure
+from data_contracts.usability import Usability
 from worldpose.reports.html_page import (
     CaptionedImage,
     EmbeddedPage,
@@ -17,12 +18,7 @@ from worldpose.reports.html_page import (
     Section,
     compress_image,
 )
-from worldpose.reports.run_report import (
-    CAMERA_MEANINGS,
-    MEANINGS,
-    report_page,
-    score_rows,
-)
+from worldpose.reports.run_report import CAMERA_MEANINGS, MEANINGS, report_page, score_rows
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
@@ -45,6 +41,7 @@ def run(**changes):
         ),
         "blocked": (),
         "figures": {"tracking/clip": {"persons": 5.0, "mean_views": 5.8125}},
+        "usability": Usability(verdict="usable"),
         "versions": {"numpy": "2.4.0"},
         "started_at": datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC),
         "finished_at": datetime(2025, 1, 2, 3, 4, 15, tzinfo=UTC),
@@ -101,11 +98,7 @@ def test_every_score_has_a_meaning():
     scores = Evaluation(g_mpjpe_mm=80.04, cameras=CameraEvaluation(broadcast=errors))
     assert [row[:3] for row in score_rows(scores)] == [
         ("g_mpjpe_mm", "G-MPJPE", "80.04 mm"),
-        (
-            "cameras.broadcast.ground_error_p95_m",
-            "Broadcast cameras: ground error, 95 %",
-            "0.25 m",
-        ),
+        ("cameras.broadcast.ground_error_p95_m", "Broadcast cameras: ground error, 95 %", "0.25 m"),
         ("cameras.broadcast.coverage", "Broadcast cameras: frames", "50 %"),
     ]
 

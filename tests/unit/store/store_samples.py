@@ -15,6 +15,7 @@ import data_contracts.arrays
 from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
 from data_contracts.run import RunRecord
+from data_contracts.usability import Usability
 from data_contracts.work import Recipe, Work
 from worldpose.store.blobs import install_fault_hook
 from worldpose.store.recipes import recipe_key
@@ -127,6 +128,7 @@ def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
         "failed": (),
         "blocked": (),
         "figures": {},
+        "usability": Usability(verdict="usable"),
         "versions": {"worldpose": "0.1.0"},
         "started_at": now,
         "finished_at": now,

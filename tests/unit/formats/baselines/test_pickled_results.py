@@ -41,12 +41,6 @@ class Hostile:
         return os.system, (f"touch {self.path}",)
 
 
-@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-def test_pickles_of_every_protocol_give_what_was_written(protocol, tmp_path):
-    (tmp_path / "a.pkl").write_bytes(pickle.dumps(CONTENT, protocol))
-    same(read_pickled(tmp_path / "a.pkl").value)
-
-
 @pytest.mark.parametrize("compress", [0, 3, ("gzip", 3)])
 def test_joblib_files_give_what_joblib_wrote(compress, tmp_path):
     content = defaultdict(dict)
