@@ -6,6 +6,7 @@ tell a suspended run from a killed one. Prefect's database may lack any run.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import platform
@@ -27,8 +28,7 @@ from flows.service.health import check_worker
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan, deployment_names
-from flows.service.run_queue import process_of, queued_run
-from flows.service.schedules import collapse_missed
+from flows.service.run_queue import find_process, queued_run
 from worldpose.errors import InputError
 from worldpose.store.run_queue import ENDED, RunQueue, queue_of
 
@@ -37,14 +37,6 @@ STARTING: Final = timedelta(minutes=5)
 machine."""
 SOON: Final = timedelta(minutes=1)
 """A run that is due later waits for its time; if it was due before, the clock was set back."""
-END_SECONDS: Final = 5.0
-"""Time in which a killed process ends, unless a disk does not answer [s]."""
-ASLEEP_SECONDS: Final = 120.0
-"""After so long without a look, runs have their whole time again [s]."""
-CLOCK_STEP_SECONDS: Final = 60.0
-"""A larger change of the machine's clock, compared with one that nobody sets, is an alert [s]."""
-CLOCK_HOLD_SECONDS: Final = 86400.0
-"""Time for which it is one [s]."""
 KILLED: Final = "its process was killed"
 ACTIVE: Final = ("SCHEDULED", "PENDING", "RUNNING", "CANCELLING", "PAUSED")
 
@@ -80,13 +72,26 @@ def recover(plan: ServePlan, *, at_start: bool = False) -> list[str]:
 
 
 def adopt_due(runs: MatchRuns) -> None:
-    """Take runs into the queue that schedules and people made at Prefect, and that are due."""
-    deployments = deployment_names(runs.name)
-    collapse_missed(runs, deployments)  # of a machine that slept: each schedule runs once
-    due = {"before_": datetime.now(UTC).isoformat()}
+    """Take runs into the queue that schedules and people made at Prefect, and that are due.
+
+    Of runs that a schedule missed, the last one with the same parameters stands for all.
+    """
     kinds = of_types("SCHEDULED", "PENDING", "RUNNING")
+    passed = {"before_": datetime.now(UTC).isoformat()}
+    due = runs.runs(deployment_names(runs.name), state=kinds, expected_start_time=passed)
+    last: dict[object, dict[str, Any]] = {}
+    for run in sorted(due, key=lambda run: parse_time(run["expected_start_time"])):
+        if "auto-scheduled" in run["tags"] and run["state_name"] in ("Scheduled", "Late"):
+            same = (run["deployment_id"], json.dumps(run["parameters"], sort_keys=True))
+            if (missed := last.get(same)) is not None:
+                why = "it was missed; a later run stands for it"
+                LOG.info("%s: %s", missed["name"], why)
+                runs.set_state(missed["id"], "CANCELLED", why)
+            last[same] = run
+        else:
+            last[run["id"]] = run
     known = {run.flow_run: run for run in runs.queue.runs()}
-    for run in runs.runs(deployments, state=kinds, expected_start_time=due):
+    for run in last.values():
         ended = known.get(run["id"])
         if ended is None:
             try:
@@ -108,12 +113,13 @@ def _recover(
     killed: QueuedRun | None = run
     if run.state == "begun":
         is_elsewhere = not plan.owns_prefect and run.host != platform.node()
-        if is_elsewhere or process_of(run) is not None:
+        if is_elsewhere or find_process(run.pid, run.flow_run) is not None:
             return False
         if kind == "CANCELLING":
             runs.set_state(run.flow_run, kind := "CANCELLED", KILLED)
         else:
-            killed = runs.queue.kill(run, KILLED, by_service=not _is_worker(run.worker_pid))
+            has_worker = find_process(run.worker_pid, "flows.service.child") is not None
+            killed = runs.queue.kill(run, KILLED, by_service=not has_worker)
     elif run.state == "asked" and is_over and kind != "CANCELLED":
         killed = runs.queue.kill(run, str((there or {})["state"]["message"]))
     if killed is None:
@@ -166,13 +172,6 @@ def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> 
     return not has_process and parse_time(there["state"]["timestamp"]) < now - patience
 
 
-def _is_worker(pid: int | None) -> bool:
-    try:
-        return pid is not None and "flows.service.child" in psutil.Process(pid).cmdline()
-    except psutil.Error:
-        return False
-
-
 @dataclass
 class Liveness:
     """Notices runs without progress and steps of the clock, and ends what hangs.
@@ -200,14 +199,14 @@ class Liveness:
             wall: of the machine's clock [s].
         """
         self._held = {key: each for key, each in self._held.items() if each[1] > now}
-        if now - self._looked > ASLEEP_SECONDS:  # then the runs were probably asleep, too
+        if now - self._looked > 120.0:  # the machine was asleep, and so were the runs
             self._since.clear()
         self._looked = now
         step, self._ahead = wall - now - (self._ahead or wall - now), wall - now
-        if abs(step) > CLOCK_STEP_SECONDS:
+        if abs(step) > 60.0:  # a time service slews smaller ones
             text = f"the clock of this machine was set {'back' if step < 0 else 'forward'} by "
             text += f"{format_duration(abs(step))}; is its time service at work?"
-            self._hold("clock_stepped", f"clock_stepped/{wall:.0f}", text, now + CLOCK_HOLD_SECONDS)
+            self._hold("clock_stepped", f"clock_stepped/{wall:.0f}", text, now + 86400.0)
         queue, limit = queue_of(self.plan.project), 60.0 * self.plan.stall_minutes
         with self.plan.state_folder.only_one("recovery", wait=True):
             open_runs, before = queue.open_runs(), self._since
@@ -261,7 +260,7 @@ class Liveness:
 
 def _end_stalled(queue: RunQueue, run: QueuedRun, minutes: float) -> None:
     """Kill a run that makes no progress: it restarts, or has failed for good."""
-    beat, process = queue.beat(run), process_of(run)
+    beat, process = queue.beat(run), find_process(run.pid, run.flow_run)
     doing = (beat.doing if beat is not None else "") or "before its first stage"
     why = f"no progress for {minutes:g} min, {doing}: does a disk, or the network, not answer?"
     killed = queue.kill(run, why, stalled=why)
@@ -275,6 +274,6 @@ def _end_stalled(queue: RunQueue, run: QueuedRun, minutes: float) -> None:
         for each in family:
             with suppress(psutil.NoSuchProcess):
                 each.kill()
-        _, left = psutil.wait_procs(family[:1], timeout=END_SECONDS)
+        _, left = psutil.wait_procs(family[:1], timeout=5.0)
         if left and killed.state != "failed":
             queue.change(killed, "failed", f"{why} Process {process.pid} cannot be killed")

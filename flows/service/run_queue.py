@@ -59,12 +59,12 @@ def queue_of_parameters(parameters: Mapping[str, Any]) -> RunQueue:
     return queue_of(str(project))
 
 
-def process_of(run: QueuedRun) -> psutil.Process | None:
-    """Return the process of a run on this machine; None if it has ended."""
+def find_process(pid: int | None, argument: str) -> psutil.Process | None:
+    """Return a process of this machine that was started with an argument; None if it has ended."""
     try:
-        process = psutil.Process(run.pid)
-        is_own = run.flow_run in process.cmdline()
-        return process if is_own and process.status() != psutil.STATUS_ZOMBIE else None
+        process = psutil.Process(pid or 0)
+        is_it = argument in process.cmdline() and process.status() != psutil.STATUS_ZOMBIE
+        return process if is_it else None
     except psutil.Error:
         return None
 
@@ -95,8 +95,7 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
             if ended.wait(BEAT_SECONDS):
                 return
 
-    thread = threading.Thread(target=write, name="heartbeat", daemon=True)
-    thread.start()
+    threading.Thread(target=write, name="heartbeat", daemon=True).start()
     try:
         yield
     finally:

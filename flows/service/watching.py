@@ -32,8 +32,6 @@ ALERT_SECONDS: Final = 20.0
 """Between two checks for alerts."""
 RECOVERY_SECONDS: Final = 10.0
 """Between two checks for lost runs, and for runs without progress."""
-FORGET_SECONDS: Final = 3600.0
-"""Between two removals of runs that ended long ago."""
 DELIVERY_SECONDS: Final = 2.0
 """Between two checks of a channel for outstanding alerts."""
 TROUBLE_SECONDS: Final = 3600.0
@@ -63,10 +61,11 @@ def watch(plan: ServePlan) -> None:
         fetch = lambda: bucket.fetch(time.monotonic(), settle)  # noqa: E731
         _start(BUCKET, BUCKET_SECONDS, fetch)
     liveness, age = Liveness(plan), timedelta(days=plan.history_days)
-    look = lambda: liveness.look(_unset_clock(), time.time())  # noqa: E731
+    unset = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # macOS has the second alone
+    look = lambda: liveness.look(time.clock_gettime(unset), time.time())  # noqa: E731
     _start("recovering runs", RECOVERY_SECONDS, lambda: recover(plan))
     _start("looking for progress", RECOVERY_SECONDS, look)
-    _start("forgetting runs", FORGET_SECONDS, lambda: queue_of(plan.project).forget_ended(age))
+    _start("forgetting runs", 3600.0, lambda: queue_of(plan.project).forget_ended(age))
     _start("looking for alerts", ALERT_SECONDS, _hold_alerts(plan, store, dispatcher, liveness))
     _start("watching the steps", ALERT_SECONDS, lambda: _watch_steps(plan, dispatcher))
     for channel in dispatcher.channels:
@@ -132,12 +131,6 @@ def _look_at_inbox(plan: ServePlan) -> None:
     runs = MatchRuns.of_plan(plan)
     if ready and all(run.state in ENDED for run in runs.queue.runs("queue/ingest")):
         runs.ask_for("ingest", {}, what="arrivals")
-
-
-def _unset_clock() -> float:
-    """Return the time of a clock that nobody sets, and that also runs while the machine sleeps."""
-    clock = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # macOS has the second alone
-    return time.clock_gettime(clock)
 
 
 def _hold_alerts(

@@ -14,12 +14,13 @@ import pytest
 from service import wait_until
 
 from data_contracts.operations import Heartbeat, QueuedRun
+from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
 from flows.service import run_queue
 from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
-from flows.service.run_queue import beating, process_of
+from flows.service.run_queue import beating, find_process
 from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import seal
 from worldpose.store.integrity import repair, verify
@@ -181,7 +182,7 @@ def test_a_frozen_run_is_ended_with_its_reason_and_restarts(queue, plan):
         for minute in (0, 8, 16):  # it makes progress
             time.sleep(0.3)
             look(liveness, minute, minute + 8)
-        assert process_of(queue.latest(run)).pid == process.pid
+        assert find_process(queue.latest(run).pid, run.flow_run).pid == process.pid
         time.sleep(0.3)
         os.kill(process.pid, signal.SIGSTOP)
         look(liveness, 25, 33)
@@ -200,8 +201,8 @@ def test_a_frozen_run_is_ended_with_its_reason_and_restarts(queue, plan):
 
 def test_a_process_with_the_number_of_a_run_is_not_taken_for_it(queue):
     begun = queue.change(queue.take(a_run()), "begun", pid=os.getpid(), host=platform.node())
-    assert process_of(begun) is None
-    assert process_of(begun.model_copy(update={"pid": 2**22 + 1})) is None
+    assert find_process(begun.pid, begun.flow_run) is None
+    assert find_process(2**22 + 1, begun.flow_run) is None
     assert psutil.pid_exists(os.getpid())
 
 
@@ -250,3 +251,24 @@ def test_what_stands_still_is_unhealthy(plan):
     state.alerts.write_text(f"{{{', '.join(entries)}}}")
     (finding,) = _check_progress(state)
     assert (finding.is_well, finding.state) == (False, "why")
+
+
+def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp_path):
+    monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
+    monkeypatch.setattr(suspension, "SUSPENDING", 5.0)
+    run = {"id": "1", "name": "m, 1", "deployment_id": "d"}
+    run["parameters"] = {"match_id": "m", "project": str(tmp_path)}
+    states = iter(["RUNNING", "PAUSED", "PAUSED", "SCHEDULED"])
+    answers = iter(
+        [
+            {"status": "REJECT", "details": {"reason": "Run input schema not found."}},
+            {"status": "ACCEPT"},
+        ]
+    )
+    listed = lambda *args, **more: [{**run, "state_type": next(states)}]  # noqa: E731
+    monkeypatch.setattr(suspension.PrefectApi, "list_all", listed)
+    monkeypatch.setattr(suspension.PrefectApi, "ask", lambda *args: next(answers))
+    assert suspension.resume_suspended(str(tmp_path), "m") == ["m, 1"]
+    assert next(states) == "SCHEDULED"
+    monkeypatch.setattr(suspension.PrefectApi, "list_all", lambda *args, **more: [])
+    assert suspension.resume_suspended(str(tmp_path), "m") == []

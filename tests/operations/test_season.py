@@ -13,7 +13,7 @@ from service import Browser, wait_until
 
 from flows.orchestration.prefect_api import PrefectApi
 from flows.registering import register
-from flows.service.run_queue import process_of
+from flows.service.run_queue import find_process
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.blobs import LocalBlobs
@@ -46,7 +46,11 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     def at_work(match, since=0):
         """Return the match's run when a later process than that of a state computes it."""
         found = [it for it in runs_of(match) if it.state == "begun" and it.number > since]
-        return found[0] if found and process_of(found[0]) is not None else None
+        return (
+            found[0]
+            if found and find_process(found[0].pid, found[0].flow_run) is not None
+            else None
+        )
 
     def deployment(flow):
         return served.ask(f"/deployments/name/{flow}/worldpose-{flow}")
