@@ -16,7 +16,8 @@ from service import wait_until
 from data_contracts.operations import Heartbeat, QueuedRun
 from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
-from flows.service import run_queue
+from flows.service import run_queue, watching
+from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
@@ -151,7 +152,8 @@ def test_heartbeats_tell_progress_and_stop_without_it(queue, monkeypatch):
 
 COMPUTE = """
 import sys, time
-from flows.service import run_queue
+from flows.service import run_queue, watching
+from flows.service.alerts import AlertDispatcher, kept_alerts
 from worldpose.store.run_queue import queue_of
 run_queue.BEAT_SECONDS = 0.1
 queue = queue_of(sys.argv[1])
@@ -239,6 +241,23 @@ def test_a_step_of_the_clock_is_an_alert_for_a_day(queue, plan, hours, how):
     assert liveness.alerts == [alert]
     liveness.look(3600.0 + 86401.0, wall + 3600.0 + 86401.0)
     assert liveness.alerts == []
+
+
+def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
+    """As a scan of an inbox on a network disk that is gone; copies from a bucket take long."""
+    plan.state.mkdir()
+    dispatcher, now = AlertDispatcher(plan.state_folder, []), time.monotonic()
+    steps = {"looking at the inbox": now - 590.0, watching.BUCKET: now - 9000.0}
+    monkeypatch.setattr(watching, "STEPS", steps)
+    watching._watch_steps(plan, dispatcher)
+    assert kept_alerts(plan.state_folder) == {}
+    steps["looking at the inbox"] -= 20.0
+    watching._watch_steps(plan, dispatcher)
+    (alert,) = kept_alerts(plan.state_folder).values()
+    assert "looking at the inbox: no end in 10 min" in alert["text"]
+    del steps["looking at the inbox"]
+    watching._watch_steps(plan, dispatcher)
+    assert kept_alerts(plan.state_folder) == {}
 
 
 def test_what_stands_still_is_unhealthy(plan):
