@@ -14,7 +14,7 @@ class UsableLimits(Record):
 
     max_unreadable_share: Share = 0.01
     """Share of a video's frames of a clip without a readable image [1]: a recorder loses single
-    frames, not a second of every two minutes."""
+    frames, not one second of a hundred."""
     max_absent_share: Share = 0.05
     """Share of the time in which tracked people, or all people, are missing for a second or more
     [1]: shorter absences are occlusions."""
@@ -30,6 +30,9 @@ class UsableLimits(Record):
     max_standard_deviation_m: Amount = 0.10
     """Median over joints of the root of the trace of their covariance [m]: with equal errors along
     all axes, sqrt(3) times the standard deviation along one."""
+    max_misplacement_m: Amount = 0.05
+    """Displacement of people by the uncertainty of a camera's calibration, root mean square per
+    axis at the median person [m]: as large as the error of a joint."""
     max_moved_deviations: Amount = 3.0
     """Motion of a static camera in the adjustment, over the standard deviation that its calibration
     states, of center or axes [1]: one in a hundred true cameras lies farther off."""

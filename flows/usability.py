@@ -93,6 +93,13 @@ _RULES: Final = (
         "{value} at a time{when}. Look at the video there.",
     ),
     _Rule(
+        "triangulation",
+        "misplacement_m",
+        "max_misplacement_m",
+        "the calibration of {part} displaces people in {unit} by {value}. Click more markings, "
+        "where there are none.",
+    ),
+    _Rule(
         "bundle_adjustment",
         "moved_deviations",
         "max_moved_deviations",
@@ -200,8 +207,9 @@ def _when(subject: str, part: str, figures: Figures) -> str:
     if first is None or last is None:
         return ""
     person = figures.get(f"{subject}_person")
-    longest = "" if person is None else f"person {person:.0f} "
-    return f", longest {longest}in frames {first:.0f} to {last:.0f}"
+    whose = "" if person is None else f"person {person:.0f} "
+    frames = f"frame {first:.0f}" if first == last else f"frames {first:.0f} to {last:.0f}"
+    return f", longest {whose}in {frames}"
 
 
 def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]:

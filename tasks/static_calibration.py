@@ -73,7 +73,7 @@ def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         attributes=calibration_attributes(inputs.unit, calibration),
     )
     result.figures.update(_figures(calibration.report))
-    if reasons := calibration.report.reasons:
+    if reasons := calibration.report.contradictions:
         result.warnings.append(f"camera {inputs.unit} is weak: {'; '.join(reasons)}.")
 
 

@@ -99,6 +99,8 @@ def export(
     opened = open_results(store, name, run)
     if run == LATEST and (later := describe_later_run(store, opened.record)):
         line(later, to=errors)
+    for text in opened.record.usability.reservations:
+        line(f"reservation: {text}", to=errors)
     origin = Origin(
         opened,
         registration,

@@ -2,16 +2,15 @@
 
 import json
 import shutil
-from datetime import UTC, datetime
 
 import pytest
 import yaml
+from run_records import run_record
 from typer.testing import CliRunner
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.run import RunRecord, UnitFailure, WaitingUnit
-from data_contracts.usability import Usability
+from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import app
 from flows.registering import find_registration, open_for_review, register
@@ -119,17 +118,13 @@ def ended(state):
         for name in ("cam0", "cam1", "cam2")
     )
     failed = (UnitFailure(unit="tracking/clip", error="InputError", message="nobody"),)
-    return RunRecord(
-        **{"run_id": "0001", "match_id": "a", "parent": None, "state": state, "seconds": 1.0},
-        **{name: {} for name in ("results", "settings", "overrides", "versions", "figures")},
+    return run_record(
+        match_id="a",
+        state=state,
         executed=("ingest/cam0",),
-        reused=(),
         failed=failed if state in ("failed", "partial") else (),
         blocked=("triangulation/clip",),
         waiting=waiting if state == "waiting" else (),
-        usability=Usability(verdict="usable"),
-        started_at=datetime(2026, 5, 1, tzinfo=UTC),
-        finished_at=datetime(2026, 5, 1, tzinfo=UTC),
     )
 
 

@@ -214,10 +214,10 @@ class Runs:
     """A service's runs, one of which has not ended."""
 
     def __init__(self, *at_work):
-        self.at_work, self.started = at_work, []
+        self.at_work, self.started, self.queue = at_work, [], self
 
-    def active(self):
-        return [SimpleNamespace(match_id=each) for each in self.at_work]
+    def open_runs(self):
+        return [SimpleNamespace(match_id=each, flow="match") for each in self.at_work]
 
     def start(self, match_id, **given):
         self.started.append((match_id, given))

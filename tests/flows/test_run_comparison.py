@@ -3,28 +3,15 @@
 import numpy as np
 import pytest
 from camera_builders import plain_camera
+from run_records import run_record
 
-from data_contracts.run import RunRecord
 from flows.results import comparison
 from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
 from worldpose.geometry.rigid import Rigid
 
 
 def record(figures):
-    return RunRecord.model_validate(
-        {
-            "run_id": "0001",
-            "match_id": "m",
-            "parent": None,
-            "state": "complete",
-            **{name: {} for name in ("results", "settings", "overrides", "versions")},
-            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
-            "figures": figures,
-            "started_at": "2024-01-01T00:00:00Z",
-            "finished_at": "2024-01-01T00:00:00Z",
-            "seconds": 1.0,
-        }
-    )
+    return run_record(figures=figures)
 
 
 @pytest.fixture

@@ -100,7 +100,7 @@ def test_a_run_is_judged_by_the_limits_of_its_match_and_anew_when_they_change(st
     assert (done.code, done.json["executed"]) == (0, 0)
     (said,) = done.json["usability"]["reservations"]
     assert done.json["usability"]["verdict"] == "usable with reservations"
-    assert "cameras disagree about the people in clip by 6" in said
+    assert "cameras disagree about the people in clip by 5.89 cm" in said
     assert "(limit 0.1 cm)" in said
     assert said in done.json["warnings"]
     assert f"reservation: {said}" in " ".join(done.err.split())

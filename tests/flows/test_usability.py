@@ -67,6 +67,11 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             "for 3 s (limit 2 s) at a time, longest in frames 0 to 74.",
         ),
         (
+            "retriangulation/clip",
+            {"misplacement_m.cam1": 0.05, "misplacement_m.cam4": 0.08},
+            "the calibration of cam4 displaces people in clip by 8 cm (limit 5 cm).",
+        ),
+        (
             "bundle_adjustment/cameras",
             {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1},
             "the people contradict the calibration of cam4: the adjustment moves it by 7.1 (limit "

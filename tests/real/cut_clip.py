@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import static_pair
-from camera_builders import plain_camera
 
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -63,8 +62,12 @@ def look_at(center, place, focal):
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(ahead, right), ahead])
-    return plain_camera(
-        focal, 0.5 * (np.array(SIZE) - 1.0), Rigid(rotation, -rotation @ center), SIZE
+    return Camera(
+        focal=np.full(2, focal),
+        principal_point=0.5 * (np.array(SIZE) - 1.0),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, -rotation @ center),
+        image_size=np.array(SIZE),
     )
 
 

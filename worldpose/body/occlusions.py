@@ -85,5 +85,6 @@ def visible_shares(joints: Floats, camera: Camera) -> Floats:
     size = stature * camera.focal.mean(axis=-1)[..., None] / depth
     seen = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)
     seen = seen.all(-1) & (find_hiders(pixels, depth, size) < 0)
-    known = np.isfinite(joints).all((-1, -2)) & np.isfinite(camera.center).all(-1)[..., None]
+    placed = np.asarray(np.isfinite(camera.center).all(axis=-1))
+    known = np.isfinite(joints).all((-1, -2)) & placed[..., None]
     return np.where(known, seen.mean(-1), np.nan)

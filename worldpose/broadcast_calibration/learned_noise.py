@@ -155,7 +155,7 @@ class LearnedNoise:
             points={names[point]: place for point, place in zip(points, places, strict=True)},
             size=np.array([getattr(pitch, name) for name in SIZES]) + self.errors.size_m * offset,
             size_std=self.errors.size_m * std,
-            paint_m=0.0 if self.errors.surveyed.all() else self.errors.paint_m,
+            paint_m=0.0 if self.errors.surveyed.all() else self.errors.shown_m,
             line_noise=self.lines,
             click_noise=self.clicks,
         )

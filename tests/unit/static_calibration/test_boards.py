@@ -102,7 +102,7 @@ def test_boards_of_the_pattern_before_opencv_4_6_and_exchanged_sides_are_found(s
     page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
     image, _ = drawn(page, np.random.default_rng(1))
     tried = [(stated, ""), *([] if stated.find(image) else stated.others(image))]
-    found, told = next((board.find(image), note) for board, note in tried if board.find(image))
+    found, told = next((found, note) for board, note in tried if (found := board.find(image)))
     assert len(found.pixels) == 35
     assert found.bend < 0.02
     assert said in told
