@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from worldpose.detection.suppression import suppress
 from worldpose.geometry.boxes import box_iou
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
+
+if TYPE_CHECKING:
+    from worldpose.detection.sampling import Frame
 
 STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
 """Heights below which people are seen enlarged [px], and the enlargement [1]."""
@@ -55,8 +58,10 @@ class Part:
     heights: tuple[float, float]
     replaced: tuple[float, float] = (0.0, 0.0)
 
-    def crop(self, image: Image) -> Image:
+    def crop(self, image: Frame) -> Frame:
         """Return the resized crop of the frame."""
+        from worldpose.detection.sampling import resize  # late: planning does not need torch
+
         (left, top), (right, bottom) = self.corner, self.end
         return resize(image[top:bottom, left:right], self.zoom)
 
@@ -88,23 +93,13 @@ class SeesParts(Detector, Protocol):
         """Return the people in each image, as `detect`."""
 
 
-def resize(image: Image, zoom: float) -> Image:
-    """Return an image enlarged or reduced by a factor."""
-    import cv2  # late: it takes 0.2 s, and planning a run does not need it
-
-    height, width = image.shape[:2]
-    size = (max(1, round(zoom * width)), max(1, round(zoom * height)))
-    method = cv2.INTER_LINEAR if zoom >= 1.0 else cv2.INTER_AREA
-    return np.asarray(cv2.resize(image, size, interpolation=method), dtype=np.uint8)
-
-
 def restore_size(people: People, size: Sequence[int] | NDArray[np.integer], zoom: float) -> People:
     """Return people of a resized image in the pixels of the original.
 
     Args:
-        people: people in the image that `resize` returned.
+        people: people in the resized image.
         size: width, height of the original [px].
-        zoom: its factor.
+        zoom: factor of `sampling.resize`.
     """
     sides = np.asarray(size)
     scale = np.tile(sides / np.maximum(1, np.round(zoom * sides)), 2)
@@ -225,7 +220,7 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
     count, member = connected_components(box_iou(boxes, boxes) > 0.15, directed=False)
     size = np.array([shape[1], shape[0]])
     found = []
-    for number in range(count):
+    for number in np.flatnonzero(np.bincount(member, minlength=count) > 1):
         own = boxes[member == number]
         tall = float(np.median(own[:, 3] - own[:, 1]))
         low, high = own[:, :2].min(axis=0), own[:, 2:].max(axis=0)
@@ -236,7 +231,7 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
         # No second pass costs more than the first.
         widest = float(np.sqrt(np.prod(size) / np.prod(end - corner)))
         # One pass per enlarged height [px]: the detector is trained on heights up to 160.
-        zooms = {min(height / tall, 3.0, widest) for height in (100.0, 160.0) if len(own) > 1}
+        zooms = {min(height / tall, 3.0, widest) for height in (100.0, 160.0)}
         heights = (0.5 * tall, 2.0 * tall)  # of boxes in the group
         found += [
             Part((corner[0], corner[1]), (end[0], end[1]), zoom, inner, heights)

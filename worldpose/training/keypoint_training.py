@@ -24,9 +24,9 @@ from worldpose.detection.bundled_nets import (
     normalize,
     peaks,
 )
-from worldpose.detection.bundled_pose import (
+from worldpose.detection.bundled_pose import SAME_PERSON_IOU
+from worldpose.detection.sampling import (
     MAP_CELL,
-    SAME_PERSON_IOU,
     crops_around,
     cut_crop,
     frame_from_crop,
@@ -166,7 +166,7 @@ def keypoint_batch(
         turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0
         mapping = frame_from_crop(crop, CROP, turn, mirrored)
         others = _neighbour_boxes(labelled, -1 if elsewhere else person, given, settings, rng)
-        around[index] = surroundings(given, others, mapping, CROP)
+        around[index] = surroundings(given[None], [others], mapping[None], CROP)[0]
         tall = float(sides.max())
         farther = 1.0
         if rng.random() < settings.smaller and tall > settings.min_height:
