@@ -21,6 +21,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from worldpose.detection.crops import MAP_COUNT
 from worldpose.errors import InputError
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -29,13 +30,8 @@ STRIDE: Final = 4
 """Pixels of the frame per cell of the people map [px]."""
 COARSEST: Final = 32
 """Frames are padded to multiples of this [px]."""
-CROP: Final = (96, 128)
-"""Width, height of the crops that the keypoint net takes [px]."""
 CELL: Final = 2
 """Pixels of the crop per cell of the keypoint maps [px]."""
-MAP_COUNT: Final = 3
-"""The target box, boxes of people in front of the target, and of people behind it: maps that the
-keypoint net takes with a crop."""
 JOINTS: Final = 17
 GREY_MEAN: Final = 115.0
 GREY_SPREAD: Final = 58.0
@@ -206,19 +202,12 @@ def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Keypoints (batch, joints, 2) [px of the crop], and mass (batch, joints).
     """
-    rows, columns = maps.shape[-2:]
-    chance = functional.softmax(maps.flatten(2), dim=-1)
-    best = chance.argmax(dim=-1)
-    row, column = best // columns, best % columns
-    around = torch.arange(-2, 3, device=maps.device)
-    y = (row[..., None, None] + around[:, None]).expand(*best.shape, 5, 5)
-    x = (column[..., None, None] + around[None, :]).expand(*best.shape, 5, 5)
-    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
-    cell = (y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)).flatten(2)
-    near = chance.gather(-1, cell) * inside.flatten(2)
-    mass = near.sum(dim=-1)
-    at = torch.stack([(near * x.flatten(2)).sum(-1), (near * y.flatten(2)).sum(-1)], dim=-1)
-    return CELL * (at / mass[..., None]) + 0.5 * (CELL - 1), mass
+    columns = maps.shape[-1]
+    chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, *maps.shape[2:])
+    best = chance.flatten(1).argmax(dim=1)
+    cells = torch.arange(len(best), device=maps.device), best // columns, best % columns
+    places, mass = _means(chance, cells)
+    return places.view(*maps.shape[:2], 2), mass.view(maps.shape[:2])
 
 
 def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
@@ -287,6 +276,21 @@ def _around(maps: Tensor, cells: Sequence[Tensor], step: Tensor, beyond: float =
     return values
 
 
+def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return mean positions (cells, 2) [px of the crop] and mass of the 5 x 5 cells around cells.
+
+    Args:
+        chance: (maps, rows, columns) probabilities.
+        cells: index of the map, row and column of each cell.
+    """
+    step = torch.arange(-2, 3, device=chance.device)
+    near = _around(chance, cells, step, 0.0)
+    mass = near.sum(dim=(1, 2))
+    x = cells[2] + (near * step).sum(dim=(1, 2)) / mass
+    y = cells[1] + (near * step[:, None]).sum(dim=(1, 2)) / mass
+    return CELL * torch.stack([x, y], dim=1) + 0.5 * (CELL - 1), mass
+
+
 MIN_MASS: Final = 0.01
 """Candidate positions of less probability are dropped, except the likeliest of a joint [1]."""
 
@@ -321,11 +325,7 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
         near = _around(chance, (index, row, column), step[3 - reach : 4 + reach])
         peak = high == near.flatten(1).amax(dim=1)
         index, row, column, high = index[peak], row[peak], column[peak], high[peak]
-    step = step[1:-1]
-    about = _around(chance, (index, row, column), step, 0.0)
-    mass = about.sum(dim=(1, 2))
-    x = column + (about * step).sum(dim=(1, 2)) / mass
-    y = row + (about * step[:, None]).sum(dim=(1, 2)) / mass
+    at, mass = _means(chance, (index, row, column))
     order = torch.argsort(mass, descending=True, stable=True)
     order = order[torch.argsort(index[order], stable=True)]
     index = index[order]
@@ -333,7 +333,7 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     order, index, rank = order[rank < count], index[rank < count], rank[rank < count]
     places = maps.new_zeros(len(chance), count, 2)
     masses = maps.new_zeros(len(chance), count)
-    places[index, rank] = CELL * torch.stack([x, y], dim=1)[order] + 0.5 * (CELL - 1)
+    places[index, rank] = at[order]
     masses[index, rank] = mass[order]
     return places.view(*shape, count, 2), masses.view(*shape, count)
 

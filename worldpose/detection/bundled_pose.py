@@ -14,16 +14,14 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.special import expit
 from torch import Tensor
 
-from data_contracts.arrays import Flags, Floats, Image, Integers
+from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.bundled_nets import (
-    CROP,
     JOINTS,
     KeypointNet,
     Seen,
@@ -31,14 +29,7 @@ from worldpose.detection.bundled_nets import (
 )
 from worldpose.detection.interfaces import People
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet, run_together
-from worldpose.detection.sampling import (
-    Frame,
-    crops_around,
-    frame_from_crop,
-    place_frames,
-    sample_crops,
-    surroundings,
-)
+from worldpose.detection.sampling import sample_crops
 from worldpose.detection.suppression import nms_indices, suppress, surest_confidence
 from worldpose.geometry.boxes import box_iou
 
@@ -128,37 +119,30 @@ class BundledPoseEstimator:
         return self._run(images, [find_occluded_people(each) for each in people])
 
     def _run(self, images: Sequence[Image], steps: Sequence[Steps]) -> list[KeypointDetections]:
-        frames = place_frames(images, self._net.device)
-
         def see(numbers: list[int], asked: list[Crops]) -> list[CropEstimates]:
-            counts = [len(boxes) for boxes, _ in asked]
-            boxes = np.concatenate([np.empty((0, 4)), *(boxes for boxes, _ in asked)])
-            others = [one for _, each in asked for one in each]
-            seen = self._estimate_crops(frames, np.repeat(numbers, counts), boxes, others)
-            ends = np.cumsum([0, *counts])
+            ends = np.cumsum([0, *(len(boxes) for boxes, _ in asked)])
+            seen = self._estimate_crops([images[number] for number in numbers], asked)
             return [seen.select(slice(*each)) for each in pairwise(ends)]
 
         return run_together(steps, see)
 
-    def _estimate_crops(
-        self, frames: Sequence[Frame], frame: Integers, boxes: Floats, others: Sequence[Floats]
-    ) -> CropEstimates:
-        """Return the net's output for a crop around each box."""
-        if not len(boxes):
+    def _estimate_crops(self, images: Sequence[Image], asked: Sequence[Crops]) -> CropEstimates:
+        """Return the net's output for the crops of some frames."""
+        others = [one for _, each in asked for one in each]
+        if not others:
             shape = (0, JOINTS, CANDIDATES)
             flat = np.empty(shape)
             return CropEstimates(np.empty((*shape, 2)), flat, flat, np.empty((0, 4)), np.empty(0))
-        mappings = frame_from_crop(crops_around(boxes), CROP)
-        outputs = self._net(
-            sample_crops(frames, frame, mappings),
-            torch.from_numpy(surroundings(boxes, others, mappings, CROP)),
+        boxes = [each for each, _ in asked]
+        mappings, *given = sample_crops(images, boxes, others, self._net.device)
+        places, corners, mass, sure, fit = (
+            each.double().cpu().numpy() for each in self._net(*given)
         )
-        pixels, corners, mass, sure, fit = (each.double().cpu().numpy() for each in outputs)
         scale, corner = mappings[:, [0, 1], [0, 1]], mappings[:, :, 2]
-        height, width = frames[0].shape[:2]
+        height, width = images[0].shape[:2]
         sides = corners.reshape(-1, 2, 2) * scale[:, None] + corner[:, None]
         return CropEstimates(
-            places=pixels * scale[:, None, None] + corner[:, None, None],
+            places=places * scale[:, None, None] + corner[:, None, None],
             # PyTorch rounds the last numbers of an array otherwise than the others.
             mass=mass,
             sure=np.clip(expit(sure), 1e-3, 1.0),

@@ -24,21 +24,14 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
 from worldpose.detection.bundled_nets import (
     CELL,
-    CROP,
-    MAP_COUNT,
     Block,
     Pyramid,
     peaks,
 )
 from worldpose.detection.bundled_pose import SAME_PERSON_IOU
+from worldpose.detection.crops import MAP_COUNT
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet
-from worldpose.detection.sampling import (
-    crops_around,
-    frame_from_crop,
-    place_frames,
-    sample_crops,
-    surroundings,
-)
+from worldpose.detection.sampling import sample_crops
 from worldpose.geometry.boxes import box_iou
 
 POINTS: Final = (*LANDMARKS, *FEET)
@@ -173,22 +166,16 @@ class LandmarkEstimator:
             images: the whole frames, of one size.
             boxes: (people, 4) x0, y0, x1, y1 [px], for each frame.
         """
-        all_boxes = np.concatenate([np.empty((0, 4)), *boxes])
-        shape, counts = (len(all_boxes), len(POINTS)), [len(each) for each in boxes]
+        others = [each[row <= SAME_PERSON_IOU] for each in boxes for row in box_iou(each, each)]
+        shape = (len(others), len(POINTS))
         places, std, visible = np.empty((*shape, 2)), np.empty(shape), np.empty(shape)
-        if len(all_boxes):
-            others = [each[row <= SAME_PERSON_IOU] for each in boxes for row in box_iou(each, each)]
-            mappings = frame_from_crop(crops_around(all_boxes), CROP)
-            frames = place_frames(images, self._net.device)
-            outputs = self._net(
-                sample_crops(frames, np.repeat(np.arange(len(counts)), counts), mappings),
-                torch.from_numpy(surroundings(all_boxes, others, mappings, CROP)),
-            )
-            places, std, visible = (each.double().cpu().numpy() for each in outputs)
+        if others:
+            mappings, *given = sample_crops(images, boxes, others, self._net.device)
+            places, std, visible = (each.double().cpu().numpy() for each in self._net(*given))
             scale = mappings[:, None, [0, 1], [0, 1]]
             places = places * scale + mappings[:, None, :, 2]
             std, visible = std * scale[..., 0], expit(visible)
-        ends = pairwise(np.cumsum([0, *counts]))
+        ends = pairwise(np.cumsum([0, *map(len, boxes)]))
         return [Landmarks(places[a:b], std[a:b], visible[a:b]) for a, b in ends]
 
 

@@ -97,7 +97,7 @@ class PlacedNet:
                 torch.cuda.empty_cache()
                 warnings.warn(
                     f"the GPU's memory is too small: {self.batch} images per batch from now on",
-                    ResourceWarning,
+                    RuntimeWarning,
                     stacklevel=2,
                 )
                 continue
@@ -108,7 +108,7 @@ class PlacedNet:
         if isinstance(self._net, QuantizedNet):
             return self._net(*given)
         count = len(given[0])
-        images, *maps = (_fill(each, -count % self._fill) for each in given)
+        images, *maps = (_fill(each, -count % min(self._fill, self.batch)) for each in given)
         images = normalize(images.permute(0, 2, 3, 1).contiguous())
         outputs: Tensors = self._net(*(each.to(self._kind) for each in (images, *maps)))
         if count == len(images):
@@ -172,11 +172,11 @@ class QuantizedNet:
         return tuple(torch.from_numpy(each) for each in found)
 
 
-def place_net(net: Net, device: str) -> Net:
-    """Return the net on a device, its batch normalisations folded into convolutions.
+def require_gpu(device: str) -> None:
+    """Refuse `cuda` where torch finds no GPU.
 
     Raises:
-        InputError: torch finds no GPU.
+        InputError: torch finds none.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError(
@@ -185,6 +185,15 @@ def place_net(net: Net, device: str) -> Net:
             found="none that torch can use",
             todo="Set detection.device=cpu, or install the build of torch for the GPU.",
         )
+
+
+def place_net(net: Net, device: str) -> Net:
+    """Return the net on a device, its batch normalisations folded into convolutions.
+
+    Raises:
+        InputError: torch finds no GPU.
+    """
+    require_gpu(device)
     placed = fold_normalisations(net.eval()).to(device)
     placed.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return placed

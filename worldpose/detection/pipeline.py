@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
+from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -101,6 +103,7 @@ class DetectionReport:
         beside: occluded people found next to others; later steps may drop some.
         is_given: whether the boxes were given, not detected.
         quarters: turns of the images by 90 degrees, counterclockwise, for the nets.
+        seconds: of the clock, in all, waiting for images, finding boxes, and finding poses.
     """
 
     frames: int = 0
@@ -115,6 +118,24 @@ class DetectionReport:
     beside: int = 0
     is_given: bool = False
     quarters: int = 0
+    seconds: dict[str, float] = field(
+        default_factory=lambda: dict.fromkeys(("all", "images", "boxes", "poses"), 0.0)
+    )
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the time of a block to that of a part."""
+        begun = perf_counter()
+        yield
+        self.seconds[part] += perf_counter() - begun
+
+    def speed(self) -> dict[str, float]:
+        """Return images per second, and the share of the time of each part [1]."""
+        whole = max(self.seconds["all"], 1e-9)
+        shares = {
+            f"{part}_share": self.seconds[part] / whole for part in ("images", "boxes", "poses")
+        }
+        return {"images_per_s": self.frames / whole, **shares}
 
     def why_no_person(self) -> str | None:
         """Return the likely reason why a clip of 20 frames or more shows no person.
@@ -254,8 +275,9 @@ class PeopleFinder:
         given: Mapping[int, People] | None,
     ) -> Iterator[KeypointDetections]:
         """Yield the people of upright images as `find` does."""
+        begun = perf_counter()
         # Frames decoded while earlier ones are searched.
-        frames = read_ahead(frames, 8)
+        frames = self._wait_for(read_ahead(frames, 8))
         cleaner = BoxCleaner(self._settings)
         self._parts = None
         if (
@@ -281,7 +303,8 @@ class PeopleFinder:
         numbers: list[int] = []
         while batch := list(islice(found, self._settings.batch)):
             numbers += [number for number, _, _ in batch]
-            rows += self._find_poses([(image, people) for _, image, people in batch], place)
+            with self.report.timed("poses"):
+                rows += self._find_poses([(image, people) for _, image, people in batch], place)
             self.report.unreadable += [number for number, image, _ in batch if image is None]
             # Frames per chunk.
             if len(rows) >= 64:
@@ -290,16 +313,28 @@ class PeopleFinder:
         if rows:
             yield self._chunk(numbers, rows)
         self.report.bridged, self.report.flickers = cleaner.bridged, cleaner.flickers
+        self.report.seconds["all"] += perf_counter() - begun
+
+    def _wait_for(
+        self, frames: Iterator[tuple[int, Image | None]]
+    ) -> Iterator[tuple[int, Image | None]]:
+        while True:
+            with self.report.timed("images"):
+                frame = next(frames, None)
+            if frame is None:
+                return
+            yield frame
 
     def _people(self, images: list[Image], place: Place | None) -> list[People]:
         """Return the people on the pitch in each frame."""
         settings = self._settings
-        found = [
-            detector.detect(images)
-            if self._parts is None or not isinstance(detector, SeesParts)
-            else detector.detect_parts(images, self._parts)
-            for detector in self._detectors
-        ]
+        with self.report.timed("boxes"):
+            found = [
+                detector.detect(images)
+                if self._parts is None or not isinstance(detector, SeesParts)
+                else detector.detect_parts(images, self._parts)
+                for detector in self._detectors
+            ]
         people_by_frame = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":

@@ -39,7 +39,7 @@ class TransformersDetector:
         named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
         self._processor = _load_net(folder, named)
         net = _load_net(folder, library.AutoModelForObjectDetection, use_safetensors=True)
-        self._net = _place_net(net, self._torch, folder, device, half)
+        self._net = _place_net(net, device, half)
         self._device, self._half = device, half
         self._person = next(
             (number for number, name in net.config.id2label.items() if name.lower() == "person"),
@@ -82,7 +82,7 @@ class TransformersPose:
         _kind(folder, library, ("vitpose",))
         self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
         net = _load_net(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
-        self._net = _place_net(net, self._torch, folder, device, half)
+        self._net = _place_net(net, device, half)
         self._device, self._half = device, half
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
@@ -152,14 +152,10 @@ def _load_net(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _place_net(net: Any, torch: ModuleType, folder: Path, device: str, half: bool) -> Any:  # noqa: ANN401
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            str(folder),
-            expected="a GPU, because detection.device is cuda",
-            found="no GPU",
-            todo="Set detection.device=cpu.",
-        )
+def _place_net(net: Any, device: str, half: bool) -> Any:  # noqa: ANN401
+    from worldpose.detection.net_inference import require_gpu  # late: it needs torch
+
+    require_gpu(device)
     net = net.eval().to(device)
     return net.half() if half and device == "cuda" else net
 

@@ -17,16 +17,16 @@ from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
 from worldpose.detection.bundled_nets import (
     CELL,
-    CROP,
-    MAP_COUNT,
     KeypointNet,
     Seen,
     normalize,
     peaks,
 )
 from worldpose.detection.bundled_pose import SAME_PERSON_IOU
-from worldpose.detection.sampling import (
+from worldpose.detection.crops import (
+    CROP,
     MAP_CELL,
+    MAP_COUNT,
     crops_around,
     cut_crop,
     frame_from_crop,

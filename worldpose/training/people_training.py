@@ -13,7 +13,7 @@ from torch.nn import functional
 from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
 from worldpose.detection.bundled_nets import STRIDE, PeopleNet, cell_centres, normalize
-from worldpose.detection.sampling import cut_crop, frame_from_crop
+from worldpose.detection.crops import cut_crop, frame_from_crop
 from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.labels import LabelledPicture, PictureCache
 

@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
-from worldpose.detection.bundled_nets import CELL, CROP, load_weights
+from worldpose.detection.bundled_nets import CELL, load_weights
+from worldpose.detection.crops import CROP
 from worldpose.detection.interfaces import People
 from worldpose.detection.landmark_net import (
     POINTS,
