@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Generator, Sequence
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from typing import Final
 
 import numpy as np
@@ -25,7 +25,7 @@ from worldpose.detection.enlargement import (
     restore_size,
 )
 from worldpose.detection.interfaces import MIN_SCORE, People
-from worldpose.detection.net_inference import PlacedNet, QuantizedNet, run_together
+from worldpose.detection.net_inference import PlacedNet, QuantizedNet, Tensors, run_together
 from worldpose.detection.sampling import Frame, pad, place_frames, resize
 from worldpose.detection.suppression import suppress
 
@@ -70,43 +70,38 @@ class BundledDetector:
         steps = [_search(frame, parts) for frame in frames]
 
         def see(_: list[int], asked: list[Sequence[View]]) -> list[list[People]]:
-            found = iter(self._detect(list(chain.from_iterable(asked))))
-            return [[next(found) for _ in each] for each in asked]
+            views = list(chain.from_iterable(asked))
+            most = 16 * self._net.batch  # bounds the memory of their maps
+            starts = range(0, len(views), most)
+            found = chain.from_iterable(self._detect(views[k : k + most]) for k in starts)
+            return [list(islice(found, len(each))) for each in asked]
 
         return run_together(steps, see)
 
     def _detect(self, views: Sequence[View]) -> list[People]:
         """Return the detections in images; the same person may be there twice."""
+        images = [view() for view in views]
+        same = defaultdict[tuple[int, ...], list[int]](list)
+        for number, image in enumerate(images):
+            sides = (-(-side // self._multiple) * self._multiple for side in image.shape[:2])
+            same[tuple(sides)].append(number)
+        order, maps = list[int](), list[Tensors]()
+        for shape, numbers in same.items():
+            for start in range(0, len(numbers), self._net.batch):
+                some = numbers[start : start + self._net.batch]
+                order += some
+                maps.append(self._net(pad([images[number] for number in some], shape)))
+        rows = decode_boxes(maps, MIN_SCORE).cpu().numpy().astype(np.float64)
         found: dict[int, People] = {}
-        waiting = defaultdict[tuple[int, int], list[tuple[int, Frame]]](list)
-        for number, view in enumerate(views):
-            image = view()
-            tall, wide = (-(-side // self._multiple) * self._multiple for side in image.shape[:2])
-            same = waiting[tall, wide]
-            same.append((number, image))
-            if len(same) >= self._net.batch:
-                found |= self._run(waiting.pop((tall, wide)), (tall, wide))
-        for shape, same in waiting.items():
-            found |= self._run(same, shape)
-        return [found[number] for number in range(len(views))]
-
-    def _run(
-        self, images: Sequence[tuple[int, Frame]], shape: tuple[int, int]
-    ) -> dict[int, People]:
-        """Return the people of images by their numbers, padded to a shape [px]."""
-        padded = pad([image for _, image in images], shape)
-        logits, sides = self._net(padded)
-        rows = decode_boxes(logits, sides, MIN_SCORE).cpu().numpy().astype(np.float64)
-        found = {}
-        for index, (number, image) in enumerate(images):
+        for index, number in enumerate(order):
             own = rows[rows[:, 0] == index]
             if len(own) > 300:  # most people
                 own = own[np.argsort(-own[:, 5], kind="stable")[:300]]
-            height, width = image.shape[:2]
+            height, width = images[number].shape[:2]
             boxes = np.clip(own[:, 1:5], -0.5, np.array([width, height, width, height]) - 0.5)
             real = np.all(boxes[:, 2:] - boxes[:, :2] > 1.0, axis=1)
             found[number] = People(boxes[real], own[real, 5])
-        return found
+        return [found[number] for number in range(len(images))]
 
 
 def _search(frame: Frame, parts: Sequence[Part] | None) -> Steps:

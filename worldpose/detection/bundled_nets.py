@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from functools import reduce
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
@@ -238,23 +238,41 @@ def cell_centres(count: int, device: torch.device) -> Tensor:
     return torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
 
 
-def decode_boxes(logits: Tensor, sides: Tensor, least: float) -> Tensor:
-    """Return people as rows of the index of the frame, box [px] and score (people, 6).
+def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
+    """Return people as rows of the index of the image, box [px] and score (people, 6).
 
     Args:
-        logits: (batch, rows, columns) that a cell is a person's centre.
-        sides: (batch, 4, rows, columns) distances from there to left, top, right and bottom [px].
+        maps: of images of some sizes, logits (batch, rows, columns) that a cell is a person's
+            centre, and distances (batch, 4, rows, columns) from there to left, top, right and
+            bottom [px].
         least: lowest score reported.
     """
-    chance = torch.sigmoid(logits)
-    cells = torch.nonzero(chance >= least, as_tuple=True)
-    near = _around(chance, cells, torch.arange(-1, 2, device=chance.device)).flatten(1)
+    chance = torch.sigmoid(torch.cat([logits.flatten() for logits, _ in maps]))
+    cell = torch.nonzero(chance >= least)[:, 0]
+    sizes = [one.shape for logits, _ in maps for one in logits]
+    rows, columns = torch.tensor(sizes, device=cell.device).unbind(dim=1)
+    first = (rows * columns).cumsum(0) - rows * columns
+    image = torch.searchsorted(first, cell, right=True) - 1
+    rows, columns, first = rows[image, None], columns[image, None], first[image]
+    place = cell - first
+    row, column = place // columns[:, 0], place % columns[:, 0]
+    step = torch.arange(-1, 2, device=cell.device)
+    y = (row[:, None] + step).clamp(min=0).minimum(rows - 1) * columns + first[:, None]
+    x = (column[:, None] + step).clamp(min=0).minimum(columns - 1)
+    near = chance.take(y[:, :, None] + x[:, None, :]).flatten(1)
     peak = near[:, 4] == near.amax(dim=1)
-    frame, row, column = (each[peak] for each in cells)
-    x = cell_centres(chance.shape[2], chance.device)[column]
-    y = cell_centres(chance.shape[1], chance.device)[row]
-    left, top, right, bottom = sides[frame, :, row, column].unbind(dim=1)
-    return torch.stack([frame, x - left, y - top, x + right, y + bottom, near[peak, 4]], dim=1)
+    image, row, column, place, score = (
+        each[peak] for each in (image, row, column, place, near[:, 4])
+    )
+    ends = [0, *accumulate(len(logits) for logits, _ in maps)]
+    cuts = torch.searchsorted(image, torch.tensor(ends, device=image.device)).tolist()
+    sides = [
+        each.flatten(2)[image[a:b] - end, :, place[a:b]]
+        for (_, each), end, (a, b) in zip(maps, ends, pairwise(cuts), strict=False)
+    ]
+    left, top, right, bottom = torch.cat(sides).unbind(dim=1)
+    x, y = (STRIDE * at + 0.5 * (STRIDE - 1) for at in (column, row))
+    return torch.stack([image, x - left, y - top, x + right, y + bottom, score], dim=1)
 
 
 def _around(maps: Tensor, cells: Sequence[Tensor], step: Tensor, beyond: float = 1.0) -> Tensor:

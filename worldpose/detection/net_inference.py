@@ -102,6 +102,8 @@ class PlacedNet:
                 )
                 continue
             start += len(part[0])
+        if len(found) == 1:
+            return found[0]
         return tuple(torch.cat(each) for each in zip(*found, strict=True))
 
     def _compute(self, given: Sequence[Tensor]) -> Tensors:

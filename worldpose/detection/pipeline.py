@@ -119,7 +119,7 @@ class DetectionReport:
     is_given: bool = False
     quarters: int = 0
     seconds: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("all", "images", "boxes", "poses"), 0.0)
+        default_factory=lambda: dict.fromkeys(("images", "boxes", "poses", "all"), 0.0)
     )
 
     @contextmanager
@@ -132,9 +132,8 @@ class DetectionReport:
     def speed(self) -> dict[str, float]:
         """Return images per second, and the share of the time of each part [1]."""
         whole = max(self.seconds["all"], 1e-9)
-        shares = {
-            f"{part}_share": self.seconds[part] / whole for part in ("images", "boxes", "poses")
-        }
+        parts = ("images", "boxes", "poses")
+        shares = {f"{part}_share": self.seconds[part] / whole for part in parts}
         return {"images_per_s": self.frames / whole, **shares}
 
     def why_no_person(self) -> str | None:

@@ -66,7 +66,7 @@ def resize(image: Frame, zoom: float) -> Frame:
     return np.asarray(cv2.resize(image, size, interpolation=method), dtype=np.uint8)
 
 
-def pad(images: Sequence[Frame], shape: tuple[int, int]) -> Tensor:
+def pad(images: Sequence[Frame], shape: Sequence[int]) -> Tensor:
     """Return the planes of images (n, 3, height, width), grey to the right of and below each.
 
     On a CPU the thread's next call overwrites them.
