@@ -103,7 +103,7 @@ class DetectionReport:
         beside: occluded people found next to others; later steps may drop some.
         is_given: whether the boxes were given, not detected.
         quarters: turns of the images by 90 degrees, counterclockwise, for the nets.
-        seconds: of the clock, in all, waiting for images, finding boxes, and finding poses.
+        seconds: of the clock, waiting for images, finding boxes, and finding poses.
     """
 
     frames: int = 0
@@ -119,7 +119,7 @@ class DetectionReport:
     is_given: bool = False
     quarters: int = 0
     seconds: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("images", "boxes", "poses", "all"), 0.0)
+        default_factory=lambda: dict.fromkeys(("images", "boxes", "poses"), 0.0)
     )
 
     @contextmanager
@@ -131,9 +131,8 @@ class DetectionReport:
 
     def speed(self) -> dict[str, float]:
         """Return images per second, and the share of the time of each part [1]."""
-        whole = max(self.seconds["all"], 1e-9)
-        parts = ("images", "boxes", "poses")
-        shares = {f"{part}_share": self.seconds[part] / whole for part in parts}
+        whole = max(sum(self.seconds.values()), 1e-9)
+        shares = {f"{part}_share": each / whole for part, each in self.seconds.items()}
         return {"images_per_s": self.frames / whole, **shares}
 
     def why_no_person(self) -> str | None:
@@ -274,7 +273,6 @@ class PeopleFinder:
         given: Mapping[int, People] | None,
     ) -> Iterator[KeypointDetections]:
         """Yield the people of upright images as `find` does."""
-        begun = perf_counter()
         # Frames decoded while earlier ones are searched.
         frames = self._wait_for(read_ahead(frames, 8))
         cleaner = BoxCleaner(self._settings)
@@ -312,7 +310,6 @@ class PeopleFinder:
         if rows:
             yield self._chunk(numbers, rows)
         self.report.bridged, self.report.flickers = cleaner.bridged, cleaner.flickers
-        self.report.seconds["all"] += perf_counter() - begun
 
     def _wait_for(
         self, frames: Iterator[tuple[int, Image | None]]
@@ -387,33 +384,25 @@ class PeopleFinder:
             kept.append(chosen)
         if self._landmarks is not None:
             kept = self._landmarks.add_points(images, kept)
-        rows = iter(kept)
-        return [KeypointDetections.empty() if image is None else next(rows) for image, _ in batch]
+        rows, nobody = iter(kept), KeypointDetections.empty()
+        if self._landmarks is not None:
+            points = self._landmarks.points
+            nobody = nobody.add_points(
+                points, np.empty((0, len(points), 2)), np.empty((0, len(points)))
+            )
+        return [nobody if image is None else next(rows) for image, _ in batch]
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
         """Return the detections of frames in one record, padded to `max_people` with NaN."""
-        shape = (len(rows), self._settings.max_people)
-        chunk = KeypointDetections(
-            keypoints=np.full((*shape, 17, 2), np.nan, dtype=np.float32),
-            confidence=np.full((*shape, 17), np.nan, dtype=np.float32),
-            boxes=np.full((*shape, 4), np.nan, dtype=np.float32),
-            score=np.full(shape, np.nan, dtype=np.float32),
-            frame=np.array(numbers, dtype=np.int64),
-        )
-        if self._landmarks is not None:
-            points = self._landmarks.points
-            chunk = chunk.add_points(
-                points,
-                np.full((*shape, len(points), 2), np.nan, dtype=np.float32),
-                np.full((*shape, len(points)), np.nan, dtype=np.float32),
-            )
-        for row, found in enumerate(rows):
-            count = len(found.score)
-            for name, values in found.arrays().items():
-                chunk.arrays()[name][row, :count] = values
-            self.report.detections += count
+        arrays = {}
+        for name, like in rows[0].arrays().items():
+            shape = (len(rows), self._settings.max_people, *like.shape[1:])
+            arrays[name] = np.full(shape, np.nan, dtype=np.float32)
+            for row, found in zip(arrays[name], rows, strict=True):
+                row[: len(found.score)] = found.arrays()[name]
+        self.report.detections += sum(len(found.score) for found in rows)
         self.report.frames += len(rows)
-        return chunk
+        return rows[0].with_arrays(arrays, np.array(numbers, dtype=np.int64))
 
 
 def detect_people(
