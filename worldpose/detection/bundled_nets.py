@@ -233,11 +233,6 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
 
 
-def cell_centres(count: int, device: torch.device) -> Tensor:
-    """Return the centres of the cells of a row in the frame (count,) [px]."""
-    return torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
-
-
 def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
     """Return people as rows of the index of the image, box [px] and score (people, 6).
 

@@ -103,7 +103,7 @@ def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
         InputError: onnxruntime or a GPU for it is missing, or the file is no net.
     """
     where = str(file)
-    runtime = _import_runtime(where)
+    runtime = import_library("onnxruntime", where)
     provider = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
     if provider not in runtime.get_available_providers():
         raise InputError(
@@ -129,17 +129,21 @@ def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _import_runtime(where: str) -> ModuleType:
+def import_library(name: str, where: str) -> ModuleType:
+    """Return a library that computes nets.
+
+    Raises:
+        InputError: it is not installed.
+    """
     try:
-        runtime: ModuleType = import_module("onnxruntime")
+        return import_module(name)
     except ImportError as error:
         raise InputError(
             where,
-            expected="onnxruntime, which runs ONNX files",
+            expected=f"{name}, which computes this net",
             found="it is not installed",
             todo='Install it: pip install "worldpose[detectors]".',
         ) from error
-    return runtime
 
 
 def load_onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:

@@ -15,6 +15,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import MIN_SCORE, People
+from worldpose.detection.onnx_nets import import_library
 from worldpose.errors import InputError
 
 
@@ -32,7 +33,7 @@ class TransformersDetector:
         Raises:
             InputError: transformers or a GPU is missing, or the folder holds no such net.
         """
-        self._torch, library = _libraries(folder)
+        self._torch, library = (import_library(n, str(folder)) for n in ("torch", "transformers"))
         # Kinds of detectors, by `model_type` of config.json.
         kind = _kind(folder, library, ("rt_detr", "rt_detr_v2", "d_fine", "detr"))
         # The processors without a suffix need torchvision.
@@ -77,7 +78,7 @@ class TransformersPose:
 
     def __init__(self, folder: Path, device: str, half: bool) -> None:
         """Load a saved checkpoint; arguments and errors are those of `TransformersDetector`."""
-        self._torch, library = _libraries(folder)
+        self._torch, library = (import_library(n, str(folder)) for n in ("torch", "transformers"))
         # Kinds of pose estimators.
         _kind(folder, library, ("vitpose",))
         self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
@@ -112,20 +113,6 @@ class TransformersPose:
         ((pose,),) = self._processor.post_process_pose_estimation(outputs, boxes=corner)
         points = pose["keypoints"].numpy().astype(np.float64)
         return points, pose["scores"].numpy().astype(np.float64).reshape(-1)
-
-
-def _libraries(folder: Path) -> tuple[ModuleType, ModuleType]:
-    try:
-        import torch
-        import transformers
-    except ImportError as error:
-        raise InputError(
-            str(folder),
-            expected="torch and transformers, which run this checkpoint",
-            found=f"no {error.name}",
-            todo='Install them: pip install "worldpose[detectors]".',
-        ) from error
-    return torch, transformers
 
 
 def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
