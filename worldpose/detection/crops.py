@@ -1,4 +1,4 @@
-"""Crops of people, as nets take them, and what nets are told of the people around."""
+"""Crops of people, as nets take them, with maps of the people around."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ class EstimatesFrames(PoseEstimator, Protocol):
     def find_occluded(
         self, images: Sequence[Image], people: Sequence[People]
     ) -> list[KeypointDetections]:
-        """Return people whom a detector missed next to the detected ones, who occlude them."""
+        """Return people occluded by the detected ones, which a detector missed."""
 
 
 class PointEstimator(Protocol):

@@ -45,7 +45,7 @@ def _copy(image: Image, device: str) -> Tensor:
     known = _COPIES.get(key)
     if known is None or known[0]() is not image:
         host = torch.from_numpy(image)
-        # From pinned memory the copy is made while the processor goes on.
+        # From pinned memory the copy runs beside other work.
         host = host.pin_memory() if torch.cuda.is_available() else host
         copy = host.to(device, non_blocking=True)
         known = weakref.ref(image, lambda _: _COPIES.pop(key, None)), copy
