@@ -28,7 +28,7 @@ from worldpose.broadcast_calibration.evidence import (
     whiten_points,
 )
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.priors import build_prior, lens_walk
 from worldpose.broadcast_calibration.residuals import linearize
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import solve as solve_clip
@@ -84,7 +84,7 @@ Run = Callable[[], Solution]
 FREE = len(PARAMETERS) - 1
 """All but k3, which the peers' lens does not have."""
 
-SMOOTH = np.array([np.inf, np.inf, np.inf, 1e-4, 1e-3, 1e-2, 1e-2])
+SMOOTH = np.array([np.inf, np.inf, np.inf, 1e-4])
 
 NOISE, OUTLIERS, LOSS = 2.0, 0.08, 4.0
 
@@ -461,8 +461,9 @@ def compare_solvers(options: Namespace) -> Tables:
     true, points = draw_clip(options.frames, rng)
     start = start_of(true, rng)
     prior = build_prior(BroadcastPrior(), start.focal, start.image_size)
-    problem = ClipProblem(points, FlowEvidence.none(), prior, smoothness=SMOOTH)
-    few = replace(problem, points=points[points.frame < 5])
+    walk = lens_walk(start.focal)
+    problem = ClipProblem(points, FlowEvidence.none(), prior, smoothness=SMOOTH, lens_walk=walk)
+    few = replace(problem, points=points[points.frame < 5], lens_walk=walk[:4])
     few = replace(few, prior=build_prior(BroadcastPrior(), start.focal[:5], start.image_size))
     solve_clip(start.frames(slice(0, 5)), few, 2)  # compiles
     first = linearize(start, np.zeros((0, 4)), problem).cost

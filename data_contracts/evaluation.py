@@ -129,3 +129,5 @@ class MethodScore(Record):
     settings: dict[str, JsonValue]
     """Settings of the evaluation."""
     evaluation: Evaluation
+    clips: dict[str, Evaluation] = {}
+    """Scores by clip of a data set; `evaluation` then has those of all clips together."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from data_contracts.records import CONTRACT_VERSION, Amount, Count, ProcessId, Record
+from pydantic import JsonValue
+
+from data_contracts.records import CONTRACT_VERSION, Amount, Count, Name, ProcessId, Record, Share
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]
 """arriving: changed recently; incomplete: something is missing; refused: invalid as a match; taken:
@@ -13,6 +15,10 @@ a registered match."""
 
 Priority = Literal["urgent", "normal", "background"]
 """Order in which matches run."""
+
+QueueState = Literal["asked", "begun", "waiting", "killed", "complete", "failed", "cancelled"]
+"""asked: due; begun: its process computes; waiting: for review; killed: it restarts; the others are
+ends."""
 
 
 class Arrival(Record):
@@ -67,3 +73,55 @@ class Serving(Record):
     services: dict[str, Service]
     """Name to process."""
     started_at: datetime
+
+
+class QueuedRun(Record):
+    """One state of a run that a served project was asked for; the one of the last number holds."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    id: Name
+    number: Count = 1
+    """Number of this state, from 1."""
+    flow: str
+    """Name of its deployment's flow."""
+    name: str
+    """What people read."""
+    match_id: str = ""
+    """Empty for a run that is not of a match."""
+    parameters: dict[str, JsonValue] = {}
+    """Those that the run was asked for with, without those of its deployment."""
+    priority: Priority | None = None
+    """None: that of its deployment."""
+    key: str = ""
+    """A second request with the same key is the same run; empty: none is."""
+    state: QueueState = "asked"
+    message: str = ""
+    """Reason of the state."""
+    stalled: str = ""
+    """Why an earlier process of the run was ended: what it did when progress stopped."""
+    flow_run: str
+    """Prefect's id of it."""
+    kills: Count = 0
+    """How often its process was killed, or its machines were lost."""
+    service_deaths: Count = 0
+    """How often its process ended with the whole service."""
+    host: str = ""
+    """Machine of its process."""
+    pid: ProcessId | None = None
+    worker_pid: ProcessId | None = None
+    """Process that started it."""
+    asked_at: datetime
+    changed_at: datetime
+
+
+class Heartbeat(Record):
+    """Progress of a run that is being computed; its process writes it, and replaces it."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    number: Count
+    """It grows while the run makes progress."""
+    share: Share
+    """Computed share of the run [0..1]."""
+    doing: str
+    """Stage with the units left, and the expected time left."""
+    at: datetime

@@ -23,6 +23,7 @@ from data_contracts.records import (
     Share,
 )
 from data_contracts.run import StoredFile
+from data_contracts.usability import Usability
 
 EXPORT_PURPOSES: Final[Mapping[str, str]] = {
     "joints": "joints with covariances for numpy",
@@ -84,6 +85,8 @@ class ReleaseManifest(Record):
     conventions: Conventions = CONVENTIONS
     licence: str = Field(min_length=1)
     """Licence text of the data."""
+    usability: Usability
+    """Verdict on the results."""
     worldpose: str
     """Version that wrote the release."""
     versions: dict[str, str]
@@ -185,6 +188,8 @@ class DataSetStatistics(Record):
     minutes: Amount
     """[min]"""
     poses: Count
+    subjects: Count | None = None
+    """Different people; None if nothing tells who is who."""
     distance_km: Amount
     """Path length of all people while they are in the data [km]."""
     subjects_per_frame: Amount | None
@@ -195,3 +200,52 @@ class DataSetStatistics(Record):
     """[m]"""
     camera: Literal["S", "M", "M+Z"] | None
     """The most general motion among the clips' cameras."""
+
+
+Split = Literal["train", "val", "test"]
+"""Part of a data set; a match is in one."""
+
+
+class ReleasedSequence(Record):
+    """One clip of a data set of several matches."""
+
+    split: Split
+    match_id: Name
+    run_id: Name
+    clip_id: Name
+    usability: Usability
+    """Verdict on the run's results."""
+    first_frame: Frame
+    """Match frame of the first row of every array."""
+    fps: FramesPerSecond
+    """[1/s]"""
+    body_model: str
+    """Body model of the poses."""
+    subjects: tuple[str, ...]
+    """The person of each row of poses, joints and boxes: the same name is the same person."""
+    views: dict[str, tuple[ImageLength, ImageLength]]
+    """Width and height [px] of each broadcast camera's images, by the name of its files."""
+    footage: dict[str, StoredFile]
+    """Video by the same names: the copy, or the file in the match folder."""
+    first_images: dict[str, Frame]
+    """Image of the video in the clip's first frame, from 0."""
+
+
+class DataSetManifest(Record):
+    """release.json: what a data set of several matches has, and what it hides."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    release: Name
+    worldpose: str
+    """Version that wrote the data set."""
+    conventions: Conventions = CONVENTIONS
+    pitch: bool
+    """Whether all worlds are those of a pitch."""
+    licences: dict[str, str]
+    """Licence text by kind of file: poses, joints, cameras, boxes, footage."""
+    clips: dict[str, ReleasedSequence]
+    statistics: DataSetStatistics
+    files: tuple[StoredFile, ...]
+    """Relative to this file."""
+    hidden: tuple[StoredFile, ...]
+    """The truth of the test part, relative to its own folder."""

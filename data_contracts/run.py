@@ -18,6 +18,7 @@ from data_contracts.records import (
     ProcessId,
     Record,
 )
+from data_contracts.usability import Usability
 from data_contracts.work import Recipe
 
 
@@ -164,6 +165,8 @@ class RunRecord(Record):
     """Static cameras that the run left out, by id, with the reason."""
     warnings: tuple[str, ...] = ()
     """Warnings about the results, one sentence each."""
+    usability: Usability
+    """Verdict on the results."""
     versions: dict[str, str]
     """Python and numeric libraries."""
     started_at: datetime

@@ -30,6 +30,7 @@ from data_contracts.records import Record, field_docstrings
 from data_contracts.release import (
     BaselineSettings,
     CheckReport,
+    DataSetManifest,
     DataSetStatistics,
     ReleaseManifest,
 )
@@ -63,6 +64,7 @@ RECORDS: dict[str, type[Record]] = {
     "evaluation": Evaluation,
     "method_score": MethodScore,
     "release_manifest": ReleaseManifest,
+    "data_set_manifest": DataSetManifest,
     "check_report": CheckReport,
     "data_set_statistics": DataSetStatistics,
     "baseline_settings": BaselineSettings,

@@ -10,9 +10,10 @@ from pydantic import AfterValidator, Field
 from data_contracts.cameras import LensCalibration
 from data_contracts.match import Side, one_error
 from data_contracts.pitch import PitchSpec
-from data_contracts.records import Name, Record
+from data_contracts.records import Name
 from data_contracts.release import EXPORT_PURPOSES
 from data_contracts.run import GatePolicy
+from data_contracts.usability import UsableLimits
 
 IterationCount = Annotated[
     Annotated[int, Field(ge=1, le=1000)] | Literal["auto"],
@@ -37,7 +38,7 @@ Folder = Annotated[str, AfterValidator(_absolute)]
 """Path of a folder, absolute or from the home folder (`~`)."""
 
 
-class RunSettings(Record):
+class RunSettings(UsableLimits):
     """The settings of a layer that are not of a stage; those of stages are named `stage.name`."""
 
     venue: Name | None = None

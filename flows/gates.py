@@ -16,6 +16,7 @@ from pydantic import Field
 from data_contracts.records import Record
 from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
+from data_contracts.usability import UsableLimits
 from flows.stage import Match
 from worldpose.review.journal import Journal, last_decision, requests_by_id, say
 from worldpose.static_calibration.settings import StaticCalibrationSettings
@@ -34,8 +35,6 @@ class Gate:
         limits: record of the largest metrics that `auto` lets pass.
         judged: maps a result's metrics to those that are compared with the limits.
         to_correct: what a person corrects after a rejection.
-        warned: metrics that a run without review warns of: beyond their limit, the result is
-            probably wrong. Beyond other limits it is less accurate than it could be.
     """
 
     stage: str
@@ -43,16 +42,6 @@ class Gate:
     limits: Record
     to_correct: str
     judged: Callable[[Figures], Figures] = lambda figures: figures
-    warned: tuple[str, ...] = ()
-
-    def warnings(self, figures: Figures) -> tuple[str, ...]:
-        """Return a line for each metric that indicates a probably wrong result."""
-        judged = self.judged(figures) if figures else {}
-        return tuple(
-            _beyond(name, judged, limit)
-            for name, limit in self.limits
-            if name in self.warned and _exceeds(judged.get(name, 0.0), limit)
-        )
 
     def objections(self, figures: Figures) -> tuple[str, ...]:
         """Return a line for each metric beyond its limit; none if `auto` lets the result pass.
@@ -102,6 +91,7 @@ def _beyond(name: str, judged: Figures, limit: float) -> str:
 
 
 _CALIBRATION: Final = StaticCalibrationSettings()
+_USABLE: Final = UsableLimits()
 
 
 class CameraLimits(Record):
@@ -149,12 +139,10 @@ class IdentityLimits(Record):
     undecided: float = Field(default=0, ge=0)
     """Joins of two tracks with ambiguous evidence [1]: a person decides these at once, and a
     wrong guess corrupts all that follows."""
-    unmatched_share: float = Field(default=0.15, ge=0)
-    """Share of detections without a track [1]: staff and crowd cause some, a camera with a wrong
-    clock or pose causes many."""
-    mean_ray_distance_m: float = Field(default=0.15, ge=0)
-    """Distance between the rays of matched detections [m]: beyond a shoulder's width of 0.4 m
-    people are mixed up; a third of it means that cameras disagree."""
+    unmatched_share: float = Field(default=_USABLE.max_unmatched_share, ge=0)
+    """Share of detections without a track [1]."""
+    mean_ray_distance_m: float = Field(default=_USABLE.max_ray_distance_m, ge=0)
+    """Distance between the rays of matched detections [m]."""
     corrections_refused: float = Field(default=0, ge=0)
     """Identity corrections that do not fit these tracks [1]; the tracks lack these corrections."""
 
@@ -162,9 +150,8 @@ class IdentityLimits(Record):
 class JointLimits(Record):
     """Metric limits of a clip's triangulated joints."""
 
-    standard_deviation_m: float = Field(default=0.10, ge=0)
-    """Root of the trace of a joint's covariance, over all three axes, median over joints [m]: with
-    equal errors along all axes, sqrt(3) times the standard deviation along one."""
+    standard_deviation_m: float = Field(default=_USABLE.max_standard_deviation_m, ge=0)
+    """Root of the trace of a joint's covariance, median over joints [m]."""
     filled_share: float = Field(default=0.05, ge=0)
     """Share of joints filled by the motion model alone [1]."""
     unhealthy_share: float = Field(default=0.05, ge=0)
@@ -188,24 +175,19 @@ class AdjustmentLimits(Record):
 class ClipLimits(Record):
     """Metric limits of the bodies of a clip before release."""
 
-    offset_rms_m: float = Field(default=0.03, ge=0)
-    """Offset of the detector's joints from the body's joints, along an axis [m]; 0.005 to 0.015
-    if the body fits."""
+    offset_rms_m: float = Field(default=_USABLE.max_body_offset_m, ge=0)
+    """Offset of the detector's joints from the body's joints, along an axis [m]."""
     filled_share: float = Field(default=0.05, ge=0)
     """Share of bodies in frames without any joint of the person [1]."""
-    held_out_certain_excess_m: float = Field(default=0.01, ge=0)
-    """Root mean square error of fitted joints beyond that of triangulated joints, as held-out
-    cameras show it, its lower limit in the worst joint group [m]: 0 where bodies are as near. A
-    hundredth of a metre beyond a triangulated joint's usual 0.03 to 0.05 is 1 to 2 mm in all."""
+    held_out_certain_excess_m: float = Field(default=_USABLE.max_body_excess_m, ge=0)
+    """Error of fitted joints beyond that of triangulated joints, of the worst joint group [m]."""
 
 
 class BroadcastLimits(Record):
     """Metric limits of a clip's calibrated broadcast camera."""
 
-    expected_error_median_px: float = Field(default=3.0, ge=0)
-    """Expected error of the pitch in the image, median over frames [px]. A painted line of 0.12
-    m is 4 px wide at 60 m with a focal length of 2000 px: beyond 3 px the drawn pitch is visibly
-    off."""
+    expected_error_median_px: float = Field(default=_USABLE.max_broadcast_error_px, ge=0)
+    """Expected error of the pitch in the image, median over frames [px]."""
     weak: float = Field(default=0, ge=0)
     """1 if the clip's report asks for a check [1]."""
 
@@ -259,14 +241,12 @@ GATES: Final[Mapping[str, Gate]] = {
             "Is every person one track over the whole clip?",
             IdentityLimits(),
             "the tracks: split, join",
-            warned=("unmatched_share", "mean_ray_distance_m"),
         ),
         Gate(
             "triangulation",
             "Are the joints where the images show them, and are the cameras healthy?",
             JointLimits(),
             "the keypoints in the images, or the cameras",
-            warned=("standard_deviation_m",),
         ),
         Gate(
             "bundle_adjustment",
@@ -281,7 +261,6 @@ GATES: Final[Mapping[str, Gate]] = {
             ClipLimits(),
             "the tracks and the keypoints that are off",
             _of_bodies,
-            warned=(EXCESS,),
         ),
         Gate(
             "broadcast_calibration",

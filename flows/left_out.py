@@ -41,12 +41,13 @@ def left_out_cameras(
 
 def left_out_warnings(match: Match, left_out: Mapping[str, str], needed: int) -> list[str]:
     """Return one sentence per camera, and one if fewer than `needed` cameras are left."""
-    said = [f"camera {camera} is left out: {reason}" for camera, reason in left_out.items()]
+    told = {camera: reason.rstrip(".") for camera, reason in left_out.items()}
+    said = [f"camera {camera} is left out: {reason}." for camera, reason in told.items()]
     left = [each.id for each in match.without(left_out).folder.spec.static_cameras]
     if left_out and len(left) < needed:
         said.append(
             f"{len(left)} of {len(left) + len(left_out)} static cameras can be used"
             f"{' (' + ', '.join(left) + ')' if left else ''}, and {needed} are needed to place "
-            "people: there are no tracks, joints or bodies"
+            "people: there are no tracks, joints or bodies."
         )
     return said

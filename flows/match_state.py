@@ -116,7 +116,10 @@ def _find(
     if units[UnitState.MISSING]:
         why = "The last run was asked to end earlier."
         return MatchState("stopped", "not run to the end", why, "Continue it.")
-    return MatchState("ready", "ready", todo="Download the results.")
+    usability = latest.usability
+    words = "ready" if usability.verdict == "usable" else usability.verdict
+    why = " ".join(usability.reservations)
+    return MatchState("ready", words, why, todo="Download the results.")
 
 
 def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[bool, str]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Self
+from typing import ClassVar, Final, Self
 
 from flows.review.metric_words import all_reasons, in_short
 
@@ -64,6 +64,8 @@ class Reporter:
     The command line installs its own reporter, which calls this one too.
     """
 
+    current: ClassVar[Reporter | None] = None
+    """The reporter of this process's run, for other threads."""
     left: int = 0
     every: int = 1
     _work: Mapping[str, float] = MappingProxyType({})
@@ -78,6 +80,11 @@ class Reporter:
         `work` is the expected computation time of each stage's missing units, all workers [s].
         """
         self._work, self._reached, self._missing, self._began = dict(work), (), 0, None
+
+    @property
+    def stage(self) -> str:
+        """The current stage; empty before the first."""
+        return self._reached[-1] if self._reached else ""
 
     @property
     def stage_progress(self) -> Progress:
@@ -152,8 +159,10 @@ def reporter() -> Reporter:
 @contextmanager
 def reporting_to(target: Reporter) -> Iterator[None]:
     """Send progress of runs started in this context to `target`."""
-    token = _reporter.set(target)
+    token, before = _reporter.set(target), Reporter.current
+    Reporter.current = target
     try:
         yield
     finally:
+        Reporter.current = before
         _reporter.reset(token)

@@ -62,13 +62,30 @@ def open_match(store: Store, match_id: str) -> Match:
     Raises:
         InputError: there is no such match, or its folder is invalid.
     """
-    return register(store, Path(find_registration(store, match_id).folder))[0]
+    return register(store, _registered_folder(store, match_id))[0]
 
 
 def open_for_review(store: Store, match_id: str) -> Match:
     """Open a registered match like `open_match`, even if cameras are missing."""
+    return register(store, _registered_folder(store, match_id), unfinished=True)[0]
+
+
+def _registered_folder(store: Store, match_id: str) -> Path:
+    """Return the folder of a registered match.
+
+    Raises:
+        InputError: there is no such match, or its folder is not where it was.
+    """
     folder = Path(find_registration(store, match_id).folder)
-    return register(store, folder, unfinished=True)[0]
+    if not _is_there(folder):
+        raise InputError(
+            f"match {match_id}",
+            expected=f"its folder, registered as {folder}",
+            found="nothing there",
+            todo="Mount its disk. If it was moved, or restored elsewhere, register it there, and "
+            "its results stay: worldpose ingest FOLDER.",
+        )
+    return folder
 
 
 def find_registration(store: Store, name: str) -> Registration:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from types import MappingProxyType
@@ -22,16 +22,18 @@ from data_contracts.run import (
     RunState,
     UnitFailure,
 )
-from flows.gates import GATES, Gatekeeper
+from data_contracts.usability import UsableLimits
+from flows.gates import Gatekeeper
+from flows.layers import merge_general
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD, unit_order
 from flows.progress import reporter
 from flows.review.edit_conflicts import EditedMeanwhileError
-from flows.review.metric_words import all_reasons
 from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
+from flows.usability import RunOutcome, exceeded_limits, judge_run
 from tasks.tracing import add_unit_span, stage_span
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
@@ -64,6 +66,12 @@ def describe_end(record: RunRecord) -> str:
         said = ["partial", *said]
     first = f". {record.failed[0].unit}: {record.failed[0].message}" if record.failed else ""
     return f"run {record.run_id} of {record.match_id}: {', '.join(said)}{first}"
+
+
+def usable_limits(match: Match) -> UsableLimits:
+    """Return the limits that the layers of a match state for the verdict on its results."""
+    stated = merge_general(match.layers).model_dump(include=set(UsableLimits.model_fields))
+    return UsableLimits.model_validate(stated)
 
 
 CLOCK_SECONDS: Final = 5.0
@@ -291,12 +299,25 @@ class RunLog:
             self._read_manifest(name)
         left_out = left_out_cameras(self.store, self.match, METHOD, self.plan.usable_results)
         settings, overrides = self._settings()
+        state, limits = self._state(), usable_limits(self.match)
+        figures = {name: self.figures[name] for name in self._in_order()}
+        lost = left_out_warnings(self.match, left_out, tracking.MIN_CAMERAS)
+        said = {name: self.warnings[name] for name in figures}
+        outcome = RunOutcome(
+            figures=figures,
+            warnings=said,
+            left_out=lost,
+            failed=self.failed,
+            lacks_results=state == "failed",
+            lacks_people=state == "partial" and not self.failed,
+            waiting=len(self.plan.waiting),
+        )
         record = RunRecord(
             run_id=self.run_id,
             match_id=self.match.match_id,
             parent=None if self.latest is None else self.latest.run_id,
             iteration=self.plan.iteration,
-            state=self._state(),
+            state=state,
             results=dict(sorted(self.plan.results.items())),
             settings=settings,
             overrides=overrides,
@@ -310,11 +331,12 @@ class RunLog:
             figures=dict(sorted(self.figures.items())),
             left_out=left_out,
             warnings=(
-                *left_out_warnings(self.match, left_out, tracking.MIN_CAMERAS),
+                *lost,
                 *broadcast_calibration.uncalibrated_warnings(self.match),
-                *(text for name in self._in_order() for text in self.warnings[name]),
-                *self._doubts(),
+                *(text for warnings in said.values() for text in warnings),
+                *exceeded_limits(figures, limits),
             ),
+            usability=judge_run(outcome, limits),
             versions=libraries(),
             started_at=self.started_at,
             finished_at=datetime.now(UTC),
@@ -327,19 +349,6 @@ class RunLog:
 
             tell_lineage(self.store, record)
         return record
-
-    def _doubts(self) -> Iterator[str]:
-        """Yield warnings of results that are probably wrong, at stages without an active gate."""
-        if self.gatekeeper.policy != "never":
-            return
-        for name in self._in_order():
-            gate = GATES.get(name.partition("/")[0])
-            lines = gate.warnings(self.figures[name]) if gate is not None else ()
-            if lines:
-                yield (
-                    f"{name} may be wrong: {all_reasons(lines)}. Check it on the pages: "
-                    "worldpose run --gates auto requests that."
-                )
 
     def _in_order(self) -> list[str]:
         return sorted(self.plan.results, key=unit_order)

@@ -154,10 +154,15 @@ def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, flo
         "held_out_significance": adjusted.evidence.significance,
         "people_shift_m": adjusted.evidence.shift,
     }
+    variance = np.diagonal(adjusted.clip.covariance, axis1=1, axis2=2)[:, :6]
+    stated = np.sqrt(variance.reshape(-1, 2, 3).sum(axis=2))[:, ::-1]  # of center and axes
     for c in np.flatnonzero(adjusted.accepted):
         center, rotation, _ = adjusted.motion[c].tolist()
         figures[f"moved_center_m.{camera_ids[c]}"] = center
         figures[f"moved_rotation_deg.{camera_ids[c]}"] = float(np.degrees(rotation))
+        if (stated[c] > 0.0).all():  # a given camera states none
+            away = float((adjusted.motion[c, :2] / stated[c]).max())
+            figures[f"moved_deviations.{camera_ids[c]}"] = away
     error = adjusted.verdict.error
     if np.isfinite(error).any():
         figures["held_out_error_before_px"] = float(np.nanmedian(error[:, 0]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -42,9 +41,9 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
     with inputs.open_spool() as spool:
         found = _open_uncorrected(inputs) if edits else None
         found = found or _detect_people(inputs, spool)
-        result.figures |= found.figures
+        result.figures |= found.figures | _longest_gap(found.unreadable)
         settings = inputs.settings(DetectionSettings)
-        warnings = [*found.warnings, *_warn_of_gaps(found), *_warn_of_size(found, settings)]
+        warnings = [*found.warnings, *_warn_of_size(found, settings)]
         result.warnings += [f"{inputs.recipe.name}: {each}." for each in warnings]
         detections = found.detections
         if edits:
@@ -82,21 +81,12 @@ class _Found:
     warnings: tuple[str, ...]
 
 
-MAX_UNREADABLE_SHARE: Final = 0.01
-"""Share of a clip's frames without an image from which the run warns [1]."""
-
-
-def _warn_of_gaps(found: _Found) -> list[str]:
-    """Return a sentence if the video lacks images of many frames, or cannot be decoded there."""
-    share = found.figures["unreadable_share"]
-    if share <= MAX_UNREADABLE_SHARE:
-        return []
-    gaps = [f"{first} to {last}" for first, last in found.unreadable]
-    more = f" and {len(gaps) - 3} more stretches" if len(gaps) > 3 else ""
-    return [
-        f"the video has no image, or none that can be decoded, for {share:.1%} of the frames: "
-        f"{', '.join(gaps[:3])}{more}. Check the video, and convert it with any video tool"
-    ]
+def _longest_gap(unreadable: list[list[int]]) -> dict[str, float]:
+    """Return the first and last frame of the longest time without an image; empty if none."""
+    if not unreadable:
+        return {}
+    first, last = max(unreadable, key=lambda gap: gap[1] - gap[0])
+    return {"unreadable_from_frame": first, "unreadable_to_frame": last}
 
 
 def _warn_of_size(found: _Found, settings: DetectionSettings) -> list[str]:

@@ -73,6 +73,8 @@ def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         attributes=calibration_attributes(inputs.unit, calibration),
     )
     result.figures.update(_figures(calibration.report))
+    if reasons := calibration.report.contradictions:
+        result.warnings.append(f"camera {inputs.unit} is weak: {'; '.join(reasons)}.")
 
 
 def _calibrate(inputs: UnitInputs) -> StaticCalibration:

@@ -54,8 +54,6 @@ from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.world import People, doubt_world
 
-MAX_ABSENT_SHARE: Final = 0.05
-"""Share of time in which people are missing from which the run warns [1]."""
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""
 
@@ -75,15 +73,8 @@ def tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     present = np.asarray((corrected.detection_index >= 0).any(axis=1), np.bool_)
     people = corrected.person.tolist()
     fps = float(inputs.sources["fps"])
-    figures["absent_share"], gaps = measure_absences(
-        present, np.asarray(corrected.frame, np.int64), people, fps
-    )
-    if figures["absent_share"] > MAX_ABSENT_SHARE and gaps:
-        more = f", and {len(gaps) - 3} more" if len(gaps) > 3 else ""
-        result.warnings.append(
-            f"{inputs.recipe.name} misses people for {figures['absent_share']:.1%} of the time: "
-            f"{'; '.join(gaps[:3])}{more}. Check the videos or 2D poses there."
-        )
+    figures = {name: value for name, value in figures.items() if not name.startswith("absent_")}
+    figures |= measure_absences(present, np.asarray(corrected.frame, np.int64), people, fps)
     result.write(
         TRACKING,
         arrays={

@@ -29,6 +29,7 @@ from tasks.clip_inputs import (
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.camera_consistency.changes import Change, Kind, find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
+from worldpose.ingest.footage import stretches
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.camera_changes import (
     change_record,
@@ -162,15 +163,24 @@ def _health_arrays(
     values = measure_health(health, measures)
     if len(rows) < len(frame):
         values[..., HEALTH_MEASURES.index("clock_frames")] = np.nan  # people move too far
-    shares = (judge_health(values) > 1.0).mean(axis=0).tolist()
+    begun = np.asarray(frame[rows][:: health.length], dtype=np.int64)
+    bad = judge_health(values) > 1.0
+    shares = bad.mean(axis=0).tolist()
     each = {
         f"{UNHEALTHY}.{name}": share for name, share in zip(clip.camera_ids, shares, strict=True)
     }
     result.figures |= {UNHEALTHY: max(shares, default=0.0), **each}
-    return {
-        "health": values.astype(np.float32),
-        "health_frame": np.asarray(frame[rows][:: health.length], dtype=np.int64),
-    }
+    ends = np.append(begun, frame[-1] + 1)[1:] - 1
+    for camera, name in enumerate(clip.camera_ids):
+        times = stretches(np.flatnonzero(bad[:, camera]))
+        if times:
+            first, last = max(times, key=lambda each: each[1] - each[0])
+            result.figures |= {
+                f"unhealthy_s.{name}": float(ends[last] + 1 - begun[first]) / clip.fps,
+                f"unhealthy_from_frame.{name}": float(begun[first]),
+                f"unhealthy_to_frame.{name}": float(ends[last]),
+            }
+    return {"health": values.astype(np.float32), "health_frame": begun}
 
 
 def _find_changes(

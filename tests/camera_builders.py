@@ -26,10 +26,13 @@ def look_at_camera(
     right /= np.linalg.norm(right)
     level = np.stack([right, np.cross(forward, right), forward])
     rotation = Rigid.from_rotvec(np.array([0.0, 0.0, roll]), np.zeros(3)).rotation @ level
-    return Camera(
-        focal=np.broadcast_to(np.array(focal, dtype=float), 2),
-        principal_point=0.5 * (np.array(size) - 1.0) if middle is None else np.array(middle),
-        distortion=np.array(lens),
-        cam_from_world=Rigid(rotation, -rotation @ center),
-        image_size=np.array(size),
-    )
+    middle = 0.5 * (np.array(size) - 1.0) if middle is None else middle
+    focal = np.broadcast_to(np.array(focal, dtype=float), 2)
+    pose = Rigid(rotation, -rotation @ center)
+    return Camera(focal, np.array(middle), np.array(lens), pose, np.array(size))
+
+
+def plain_camera(focal, middle, pose, size=(1920, 1080), *, lens=(0.0,) * 5):
+    """Return the cameras of focal lengths (...,) [px] and their poses, with square pixels."""
+    focal = np.repeat(np.array(focal, dtype=float)[..., None], 2, axis=-1)
+    return Camera(focal, np.array(middle), np.array(lens), pose, np.array(size))

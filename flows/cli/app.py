@@ -46,6 +46,7 @@ GROUPS: Final = {
         "status": "project:status",
         "report": "results:report",
         "export": "results:export",
+        "release": "data_set:release",
         "evaluate": "evaluate:evaluate",
         "check": "data_set:check",
         "statistics": "data_set:statistics",

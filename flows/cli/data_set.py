@@ -1,13 +1,25 @@
-"""Command statistics: size of a data set."""
+"""Commands statistics, check and release: data sets."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flows.cli.console import JsonOption, errors, line, print_json, print_table
+from flows.cli.console import (
+    DEFAULT_PROJECT,
+    JsonOption,
+    ProjectOption,
+    errors,
+    line,
+    print_json,
+    print_table,
+)
+from worldpose.errors import UsageError, unknown_name
+
+if TYPE_CHECKING:
+    from data_contracts.release import CheckReport, Split
 
 FpsOption = Annotated[
     float | None,
@@ -109,7 +121,11 @@ def check(
     from flows.results.dataset import check as check_data_set
 
     tell_unstated_rate(folder, fps)
-    report = check_data_set(folder, fps=fps, body=body, pitch=pitch)
+    _print_check(check_data_set(folder, fps=fps, body=body, pitch=pitch), as_json=as_json)
+
+
+def _print_check(report: CheckReport, *, as_json: bool) -> None:
+    """Print the outcome of a check, and end the command with an exit code if there are findings."""
     if as_json:
         print_json({**report.model_dump(mode="json"), "passed": not report.findings})
     else:
@@ -148,3 +164,84 @@ def tell_unstated_rate(folder: Path, fps: float | None) -> None:
 
 def _format_value(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
+
+
+def release(
+    matches: Annotated[list[str] | None, typer.Argument(metavar="MATCH[/RUN]...")] = None,
+    out: Path | None = None,
+    name: str | None = None,
+    licence: Annotated[list[str] | None, typer.Option(metavar="[KIND=]FILE")] = None,
+    val: Annotated[list[str] | None, typer.Option(metavar="MATCH")] = None,
+    test: Annotated[list[str] | None, typer.Option(metavar="MATCH")] = None,
+    hidden: Path | None = None,
+    footage: Literal["none", "digest", "copy"] = "none",
+    subjects: Path | None = None,
+    check: Annotated[Path | None, typer.Option(metavar="FOLDER")] = None,
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Write one data set from runs of several matches, or check one.
+
+    Example: worldpose release --out set --name first --licence TERMS.txt tiny-1 tiny-2
+
+    Options:
+        matches: Matches of the project; their latest runs, or those named.
+        out: New folder of the data set.
+        name: Name of the release; pins the runs as release-NAME.
+        licence: Text of the licence of all files but footage, or of one kind: poses, joints,
+            cameras, boxes or footage.
+        val: Match of the validation part; may be given more than once. Others are for training.
+        test: Match of the test part, whose truth is hidden; may be given more than once.
+        hidden: New folder of that truth, which you do not publish; also to check it.
+        footage: Broadcast videos: their digests, or copies.
+        subjects: YAML file of people in several clips: subject: [MATCH/NAME, MATCH/CLIP/ID].
+        check: Verify this data set instead: files, splits, licences, numbers, poses, boxes.
+    """
+    from flows.results.data_set_release import ASSETS, check_data_set, write_data_set
+
+    if check is not None:
+        _print_check(check_data_set(check, hidden), as_json=as_json)
+        return
+    runs: dict[str, str] = {}
+    for item in matches or ():
+        match, _, run = item.rpartition("/")
+        runs |= {match: run} if match and run.isdigit() else {item: "latest"}
+    splits: dict[str, Split] = dict.fromkeys(test or (), "test")
+    splits |= dict.fromkeys(val or (), "val")
+    twice = len(splits) < len([*(test or ()), *(val or ())]) or len(runs) < len(matches or ())
+    if out is None or name is None or not runs or twice or not splits.keys() <= runs.keys():
+        raise UsageError(
+            "worldpose release",
+            expected="--out, --name and matches, of which --val and --test name some, each once",
+            found=f"matches {', '.join(runs) or 'none'}; splits of {', '.join(splits) or 'none'}",
+            todo="worldpose release --out set --name first --licence TERMS.txt MATCH MATCH2.",
+        )
+    from flows.cli.results import read_licence
+    from flows.registering import find_registration
+    from flows.results.best_results import Origin, describe_later_run, open_results
+    from worldpose.store.store import Store
+
+    licences: dict[str, str] = {}
+    for item in sorted(licence or (), key=lambda item: "=" in item):
+        kind, equals, file = item.rpartition("=")
+        if equals and kind not in ASSETS:
+            raise unknown_name(f"--licence {item}", kind, ASSETS)
+        licences |= dict.fromkeys([kind] if equals else ASSETS[:-1], read_licence(Path(file)))
+    store, origins = Store.open(project), []
+    for match, run in runs.items():
+        registration = find_registration(store, match)
+        opened = open_results(store, registration.spec.match_id, run)
+        if run == "latest" and (later := describe_later_run(store, opened.record)):
+            line(later, to=errors)
+        origins.append((Origin(opened, registration), splits.get(match, "train")))
+    manifest = write_data_set(
+        *(store, origins, out, name, licences), hidden=hidden, footage=footage, subjects=subjects
+    )
+    found = manifest.statistics
+    if as_json:
+        print_json({"out": str(out), "statistics": found.model_dump(mode="json")})
+        return
+    line(
+        f"wrote {out}: {len(found.clips)} clips, {found.subjects} subjects, {found.frames} frames, "
+        f"{found.poses} poses, {found.distance_km:.3f} km. Verify it: worldpose release --check"
+    )

@@ -33,7 +33,9 @@ TableForm = Literal["text", "csv", "latex"]
 
 
 def evaluate(
-    prediction: str | None = None,
+    prediction: Annotated[
+        list[str] | None, typer.Option("--prediction", metavar="[NAME=]PATH")
+    ] = None,
     reference: str | None = None,
     run: RunOption = "latest",
     stage: StageOption = None,
@@ -48,6 +50,7 @@ def evaluate(
         list[str] | None, typer.Option("--method-fps", metavar="NAME=FPS")
     ] = None,
     table: TableForm = "text",
+    picture: Path | None = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -57,10 +60,11 @@ def evaluate(
 
     Options:
         prediction: A joints file, a folder with joints.npz and cameras/, a match of the
-            project, or a challenge submission.
+            project, or a challenge submission. With a data set, a folder of the same layout; may
+            be given more than once, as NAME=FOLDER, for one table.
         reference: A joints file, a folder with joints.npz, cameras/ or both, a .c3d or .trc, or a
             .csv of positions of a provider (a table of kloppy); true poses in the layout of a
-            submission for one.
+            submission for one. Or a data set with poses/ and cameras/, such as a release.
         match_in: Match whole tracks by their boxes in this camera of the reference, as the
             paper does; by distance by default.
         fps: Frames per second; the match's by default.
@@ -68,16 +72,35 @@ def evaluate(
             method and by the paper's own (worldpose/reference_method; needs torch).
         method: Score another method's result (docs/how-to/baselines.md) instead of
             --prediction; may be given more than once for one table.
-        body: Body model for the methods' poses; the open body by default.
+        body: Body model of poses whose files name none; for --method, the open body by default.
         markers: YAML file that maps markers of a reference to joints.
         first_frame: Match frame of the methods' first image, or of the first row of positions.
         method_fps: Frames per second of a method's input video, if not the clip's.
         table: Table of methods: text, csv or latex.
+        picture: With a data set, a PNG of each method's people in the camera and from the side.
     """
     if ablation:
         print_ablation(ablation, as_json=as_json)
         return
-    if method and reference is not None and prediction is None:
+    if reference is not None and prediction and not method:
+        from worldpose.dataset.benchmark import is_data_set, score_folders
+
+        if len(prediction) > 1 or is_data_set(Path(reference)):
+            folders = named_folders(prediction)
+            results, sample = score_folders(
+                Path(reference), folders, body=body, match_in=match_in, fps=fps
+            )
+            if picture is not None:
+                from worldpose.formats.files import whole_file
+                from worldpose.reports.data_set import plot_methods
+
+                with whole_file(picture) as draft:
+                    draft.write_bytes(plot_methods(sample))
+            for place, note in (each for score in results for each in score.notes.items()):
+                line(f"{place}: {note}", to=errors)
+            print_methods(results, table, as_json=as_json)
+            return
+    if method and reference is not None and not prediction and picture is None:
         from flows.results.baselines import score_methods
 
         found = score_methods(
@@ -91,22 +114,22 @@ def evaluate(
         )
         print_methods(found, table, as_json=as_json)
         return
-    if prediction is None or reference is None:
+    if not prediction or reference is None or picture is not None:
         raise UsageError(
             "worldpose evaluate",
-            expected="--prediction or --method, and --reference",
+            expected="--prediction or --method, and --reference; --picture only with a data set",
             found="others",
             todo="Name prediction and ground truth, or use --ablation 10.",
         )
     from worldpose.formats.challenge import is_submission
 
-    if is_submission(Path(prediction)) and is_submission(Path(reference)):
-        _print_challenge(Path(prediction), Path(reference), as_json=as_json)
+    if is_submission(Path(prediction[0])) and is_submission(Path(reference)):
+        _print_challenge(Path(prediction[0]), Path(reference), as_json=as_json)
         return
     from flows.results.evaluation import Reading, score
 
     scores = score(
-        prediction,
+        prediction[0],
         reference,
         project,
         run_id=run,
@@ -118,6 +141,22 @@ def evaluate(
     if scores.later_run:
         line(scores.later_run, to=errors)
     _print_scores(scores, as_json=as_json)
+
+
+def named_folders(given: Sequence[str]) -> dict[str, Path]:
+    """Parse [NAME=]FOLDER arguments; raise UsageError if a folder is absent or a name is twice."""
+    folders: dict[str, Path] = {}
+    for item in given:
+        name, equals, path = item.partition("=")
+        if not equals or Path(item).exists():
+            name, path = Path(item).resolve().name, item
+        if name in folders or not Path(path).is_dir():
+            found = f"{name} twice" if name in folders else f"no folder {path}"
+            todo = "Give each method a name and its folder, such as --prediction glamr=results."
+            expected = "NAME=FOLDER of a method's clips, each name once"
+            raise UsageError(f"--prediction {item}", expected=expected, found=found, todo=todo)
+        folders[name] = Path(path)
+    return folders
 
 
 def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:
@@ -279,14 +318,16 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
 
 def print_methods(scores: Sequence[MethodScore], form: TableForm, *, as_json: bool) -> None:
     """Print scores of methods as text, CSV or LaTeX, or in full as JSON."""
-    from flows.results.baselines import COLUMNS, table_csv, table_latex, table_rows
+    from flows.results import baselines
 
     if as_json:
         rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
-        print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})
+        print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
     elif form == "text":
         # Brackets would be parsed as markup.
-        titles = (f">{title.replace('[', '').replace(']', '')}" for title in COLUMNS.values())
-        print_table("", ("method", *titles), table_rows(scores))
+        titles = (
+            f">{title.replace('[', '').replace(']', '')}" for title in baselines.COLUMNS.values()
+        )
+        print_table("", (*baselines.table_columns(scores), *titles), baselines.table_rows(scores))
     else:
-        line((table_csv if form == "csv" else table_latex)(scores).rstrip())
+        line((baselines.table_csv if form == "csv" else baselines.table_latex)(scores).rstrip())

@@ -98,9 +98,14 @@ def status(
     for row in rows:
         if row["problem"]:
             line(f"{row['match']}: {row['problem']}")
-        for text in row["warnings"]:
+        judged = row["usability"] or {"verdict": "", "reservations": ()}
+        if judged["reservations"]:
+            line(f"{row['match']}: the results of run {row['run']} are {judged['verdict']}:")
+        for text in judged["reservations"]:
+            line(f"  {text}")
+        for text in (each for each in row["warnings"] if each not in judged["reservations"]):
             line(f"{row['match']}: {text}")
-        if row["why"]:
+        if row["why"] and row["now"] != judged["verdict"]:
             line(f"{row['match']}: {row['now']}. {row['why']} {row['todo']}")
         if row["waiting"]:
             line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
@@ -127,6 +132,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "failed": [],
         "left_out": {},
         "warnings": [],
+        "usability": None,
         "waiting": [],
         "settings": {},
         "unfinished_runs": [],
@@ -157,6 +163,7 @@ def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
             "failed": [failure.unit for failure in latest.failed],
             "left_out": latest.left_out,
             "warnings": list(latest.warnings),
+            "usability": latest.usability.model_dump(mode="json"),
         }
     return {
         **told,

@@ -99,6 +99,8 @@ def export(
     opened = open_results(store, name, run)
     if run == LATEST and (later := describe_later_run(store, opened.record)):
         line(later, to=errors)
+    for text in opened.record.usability.reservations:
+        line(f"reservation: {text}", to=errors)
     origin = Origin(
         opened,
         registration,
@@ -107,7 +109,7 @@ def export(
         surface=surface,
         definition=definition,
         footage=Footage(store, open_match(store, name)) if video else None,
-        licence=None if licence is None else _read_licence(licence),
+        licence=None if licence is None else read_licence(licence),
     )
     if release is None or origin.licence is None:
         written = export_formats(origin, forms, out, overwrite=overwrite)
@@ -123,7 +125,7 @@ def export(
     answer(as_json, {"match": name, "files": [str(path) for path in written]}, *told)
 
 
-def _read_licence(file: Path) -> str:
+def read_licence(file: Path) -> str:
     """Return the text of a data licence."""
     try:
         text = file.read_text(encoding="utf-8-sig").strip()

@@ -137,6 +137,7 @@ def run(
                 "reviews": [unit.model_dump() for unit in record.waiting],
                 "left_out": record.left_out,
                 "warnings": warned,
+                "usability": record.usability.model_dump(mode="json"),
                 **({"exports": [str(path) for path in exported]} if exported else {}),
                 **({} if passes is None else _iterations_json(store, passes)),
             }
@@ -147,8 +148,10 @@ def run(
         _print(record, store.url, seconds)
         for path in exported:
             line(f"exported {path}")
-    for text in warned:
-        line(f"warning: {text}", to=errors)
+    reservations = record.usability.reservations
+    for text in dict.fromkeys((*reservations, *warned)):
+        kind = "reservation" if text in reservations else "warning"
+        line(f"{kind}: {text}", to=errors)
     if problem is not None:
         line(f"error: the run is kept, and its exports failed: {problem}", to=errors)
     raise typer.Exit(EXIT_CODES[record.state] if problem is None else 1)
@@ -172,6 +175,9 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
         f"{len(record.executed)} computed, {len(record.reused)} reused, "
         f"{len(record.failed)} failed{blocked}, gates {record.gates}, {seconds:.1f} s"
     )
+    count = len(record.usability.reservations)
+    verdict = f"{record.usability.verdict}{f' ({count} below)' if count else ''}"
+    line(f"the results are {verdict}")
     _print_waiting(record)
     key = "median_stature_m"
     statures = sorted(each[key] for each in record.figures.values() if key in each)

@@ -54,6 +54,8 @@ def serve(
     schedule: Annotated[list[str] | None, typer.Option(metavar="FLOW=CRON")] = None,
     gate_hours: Annotated[float, typer.Option(min=0.001)] = 24.0,
     disk_gb: Annotated[float, typer.Option(min=0)] = 10.0,
+    stall_minutes: Annotated[float, typer.Option(min=0.5)] = 10.0,
+    history_days: Annotated[float, typer.Option(min=1)] = 30.0,
     state: Path | None = None,
     token: TokenOption = None,
     users: UsersOption = None,
@@ -87,6 +89,8 @@ def serve(
             or one that follows; repeatable. It stays until it is removed in Prefect's dashboard.
         gate_hours: Age of a pending review that triggers an alert [h].
         disk_gb: Free disk space below which an alert is sent [GB].
+        stall_minutes: Time without progress after which a run is ended and restarts [min].
+        history_days: Age at which ended runs are forgotten [d].
         state: Folder of logs and Prefect's database; PROJECT/operations by default.
     """
     # Imported here: no other command needs them.
@@ -142,6 +146,8 @@ def serve(
         schedules=parse_schedules(schedule) if schedule else {},
         gate_hours=gate_hours,
         disk_gb=disk_gb,
+        stall_minutes=stall_minutes,
+        history_days=history_days,
         users=None if users is None else users.resolve(),
     )
     access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)

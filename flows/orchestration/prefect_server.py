@@ -21,8 +21,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from starlette.datastructures import Headers
-
 from flows.orchestration.prefect_environment import SERVER_LOGIN
 from flows.web.host_guard import SAFE_METHODS, HostGuard
 from flows.web.http_server import serve_http
@@ -98,11 +96,11 @@ def serve(host: str, port: int, names: Iterable[str]) -> None:
 
 
 class RepeatBusy:
-    """ASGI middleware that repeats changes of browsers that Prefect refuses.
+    """ASGI middleware that repeats changes that Prefect refuses because its database is busy.
 
     SQLite has one writer. A transaction that reads and then writes fails at once if another one
-    wrote in between, and Prefect then answers 503. Prefect's clients retry; its dashboard reports
-    an error, and the run or schedule that a person submitted does not exist.
+    wrote in between, and Prefect then answers 503. Its dashboard reports that as an error, and the
+    run or schedule that a person submitted does not exist.
 
     Args:
         app: Prefect's server, which has undone all that a refused request had written.
@@ -113,9 +111,8 @@ class RepeatBusy:
         self.app, self.pause_s = app, pause_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request; only browsers send `Sec-Fetch-Mode`."""
-        is_change = scope["type"] == "http" and scope["method"] not in SAFE_METHODS
-        if not is_change or "sec-fetch-mode" not in Headers(scope=scope):
+        """Answer a request."""
+        if scope["type"] != "http" or scope["method"] in SAFE_METHODS:
             await self.app(scope, receive, send)
             return
         body: list[Message] = []

@@ -7,6 +7,7 @@ command line or in Prefect's own form. A resumed run restarts and finds all its 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
@@ -27,6 +28,9 @@ from worldpose.store.store import Store, open_blobs
 
 PATIENCE: Final = timedelta(days=90)
 """Prefect cannot resume a run after a longer suspension; a new run continues equally well."""
+OPEN: Final = ("PAUSED", "RUNNING")
+SUSPENDING: Final = 10.0
+"""Maximum time from a run's last look at verdicts until it is suspended [s]."""
 
 
 class Verdict(RunInput):
@@ -94,23 +98,36 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
         WorldposeError: Prefect does not answer, or refuses.
     """
     api = os.environ["PREFECT_API_URL"].rstrip("/")
-    prefect = PrefectApi(api, os.environ.get(CLIENT_LOGIN))
-    runs = [
-        run
-        for run in prefect.list_all("flow_runs", flow_runs={"state": of_types("PAUSED")})
-        if run["deployment_id"] is not None  # else no worker would take it up
-        and run["parameters"].get("match_id") == match_id
-        and open_blobs(str(run["parameters"].get("project"))).url == project
-    ]
-    for run in runs:
-        given = {"run_input": {"verdict": "recorded", "who": "worldpose review"}}
-        answer = prefect.ask(f"/flow_runs/{run['id']}/resume", given)
-        if answer["status"] == "REJECT":
-            raise WorldposeError(
-                f"Prefect does not resume {run['name']}: {answer['details'].get('reason')}. Start "
-                f"a new run of {match_id}: it continues equally well."
-            )
-    return [run["name"] for run in runs]
+    prefect, deadline = PrefectApi(api, os.environ.get(CLIENT_LOGIN)), time.monotonic() + SUSPENDING
+    resumed: list[str] = []
+    while True:
+        found = [
+            run
+            for run in prefect.list_all("flow_runs", flow_runs={"state": of_types(*OPEN)})
+            if run["deployment_id"] is not None  # else no worker would take it up
+            and run["parameters"].get("match_id") == match_id
+            and open_blobs(str(run["parameters"].get("project"))).url == project
+        ]
+        refused = ""
+        for run in found:
+            if run["state_type"] == "PAUSED":
+                given = {"run_input": {"verdict": "recorded", "who": "worldpose review"}}
+                answer = prefect.ask(f"/flow_runs/{run['id']}/resume", given)
+                if answer["status"] == "ACCEPT":
+                    resumed.append(run["name"])
+                else:
+                    refused = f"{run['name']}: {answer['details'].get('reason')}"
+        # A run at work can be about to ask, and one that asks has not yet said what.
+        is_suspending = refused or any(run["state_type"] == "RUNNING" for run in found)
+        if resumed or not is_suspending or time.monotonic() > deadline:
+            break
+        time.sleep(1.0)
+    if refused:
+        raise WorldposeError(
+            f"Prefect does not resume {refused}. Start a new run of {match_id}: it continues "
+            "equally well."
+        )
+    return resumed
 
 
 def question_key(waiting: Sequence[WaitingUnit]) -> str:

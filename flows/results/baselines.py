@@ -15,6 +15,7 @@ from data_contracts.evaluation import Evaluation, MethodScore
 from flows.results.evaluation import cameras_of, reference_side
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.errors import UsageError, unknown_name
+from worldpose.evaluation.challenge import ALL
 from worldpose.evaluation.matching import EvaluationSettings
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.baselines import Method, find_method
@@ -197,16 +198,21 @@ def table_rows(scores: Sequence[MethodScore]) -> list[tuple[str, ...]]:
     """Return the table: a title and the metrics, `N/A` where undefined.
 
     First local methods, then all others, then these with one alignment per person, as in the paper.
+    Scores by clip give such a table for each clip, then for all; each row begins with the clip.
     """
-    groups = _groups(scores)
-    return [row for group in groups for row in group]
+    return [row for group in _groups(scores) for row in group]
+
+
+def table_columns(scores: Sequence[MethodScore]) -> tuple[str, ...]:
+    """Return the titles of the columns before those of the metrics."""
+    return ("clip", "method") if any(score.clips for score in scores) else ("method",)
 
 
 def table_csv(scores: Sequence[MethodScore]) -> str:
     """Return the table as CSV with a header, with empty cells for undefined metrics."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("method", *COLUMNS))
+    writer.writerow((*table_columns(scores), *COLUMNS))
     for row in table_rows(scores):
         writer.writerow("" if cell == _ABSENT else cell for cell in row)
     return out.getvalue()
@@ -216,14 +222,14 @@ def table_latex(scores: Sequence[MethodScore]) -> str:
     """Return the table as LaTeX for the package booktabs."""
     arrows = ("$\\downarrow$", "$\\downarrow$", "$\\downarrow$", "$\\uparrow$")
     heads = [f"{title} {arrow}" for title, arrow in zip(COLUMNS.values(), arrows, strict=True)]
-    lines = [f"\\begin{{tabular}}{{l{'c' * len(heads)}}}", "  \\toprule"]
-    lines.append("  & " + " & ".join(heads).replace("%", "\\%") + " \\\\")
+    texts = len(table_columns(scores))
+    lines = [f"\\begin{{tabular}}{{{'l' * texts}{'c' * len(heads)}}}", "  \\toprule"]
+    lines.append("  " + texts * "& " + " & ".join(heads).replace("%", "\\%") + " \\\\")
     for group in _groups(scores):
         lines.append("  \\midrule")
-        lines += [
-            f"  {_escape(row[0])} & {' & '.join(map(_space_thousands, row[1:]))} \\\\"
-            for row in group
-        ]
+        for row in group:
+            cells = (*map(_escape, row[:texts]), *map(_space_thousands, row[texts:]))
+            lines.append(f"  {' & '.join(cells)} \\\\")
     return "\n".join([*lines, "  \\bottomrule", "\\end{tabular}"]) + "\n"
 
 
@@ -231,6 +237,15 @@ _ABSENT: Final = "N/A"
 
 
 def _groups(scores: Sequence[MethodScore]) -> list[list[tuple[str, ...]]]:
+    found = []
+    for clip in {clip: None for score in scores for clip in score.clips}:
+        own = [score.model_copy(update={"evaluation": score.clips[clip]}) for score in scores]
+        found += [[(clip, *row) for row in group] for group in _method_groups(own)]
+    lead = (ALL,) if found else ()
+    return found + [[(*lead, *row) for row in group] for group in _method_groups(scores)]
+
+
+def _method_groups(scores: Sequence[MethodScore]) -> list[list[tuple[str, ...]]]:
     local = [_row(score.title, score, {}) for score in scores if score.world == "camera"]
     placed = [score for score in scores if score.world != "camera"]
     whole = [_row(score.title, score, {}) for score in placed]

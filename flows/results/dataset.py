@@ -62,7 +62,7 @@ def check(
     """
     manifest = read_manifest(folder)
     findings = []
-    if manifest is not None and (changed := changed_files(folder, manifest)):
+    if manifest is not None and (changed := changed_files(folder, manifest.files)):
         findings.append(
             Finding(
                 fault="changed_files",

@@ -418,7 +418,7 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
     return written
 
 
-def _keep(store: Store, origin: Origin, name: str) -> None:
+def keep_run(store: Store, origin: Origin, name: str) -> None:
     """Pin the run of a release, so that its results are never garbage collected."""
     record = origin.run.record
     pin = Pin(
@@ -466,7 +466,7 @@ def release(
             todo="Choose another folder: a release is never overwritten.",
         )
     # First, so that the run cannot be collected while its files are written.
-    _keep(store, origin, name)
+    keep_run(store, origin, name)
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
         released = f"{RELEASE}{name} of {spec.match_id}"
@@ -511,6 +511,7 @@ def _write_release(
         },
         pitch=spec.pitch != NO_PITCH,
         body_model=models.pop() if len(models) == 1 else None,
+        usability=record.usability,
         worldpose=version("worldpose"),
         versions=record.versions,
         settings=record.settings,

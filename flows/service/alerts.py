@@ -6,19 +6,37 @@ import json
 import logging
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from threading import Lock
 from typing import Any, Final, Literal
 
-from data_contracts.operations import Arrival
-from flows.review.metric_words import all_reasons
+from data_contracts.operations import Arrival, QueuedRun
 from flows.service.channels import Channel
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, age
 from flows.service.plan import ServePlan
 from worldpose.formats.files import whole_file
+from worldpose.store.run_queue import ENDED, last_ended
 
-AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
+AlertKind = Literal[
+    "run_failed",
+    "run_stalled",
+    "run_late",
+    "clock_stepped",
+    "watch_stalled",
+    "gate_waiting",
+    "quality",
+    "disk_low",
+    "arrival_refused",
+    "digest",
+]
+STANDSTILLS: Final = ("run_stalled", "run_late", "clock_stepped", "watch_stalled")
+"""Alerts about what makes no progress."""
+FAILED_DAYS: Final = 7
+"""After so long, a failed run raises no alert."""
+MAX_SINGLE: Final = 10
+"""More new alerts than these are sent as one digest."""
 
 FIRST_PAUSE: Final = 30.0
 """After a channel's first failure; each further one doubles it [s]."""
@@ -42,36 +60,26 @@ class Alert:
     match_id: str = ""
 
 
-@dataclass(frozen=True)
-class FailedRun:
-    """A failed run at the Prefect server: its id, name, state, message, and match if it has one."""
-
-    id: str
-    name: str
-    state: str
-    message: str
-    match_id: str = ""
-
-
 def alerts_now(
     plan: ServePlan,
     matches: Iterable[MatchStatus],
     arrivals: Iterable[Arrival],
-    failed: Iterable[FailedRun],
+    runs: Sequence[QueuedRun],
 ) -> list[Alert]:
-    """Return all current alerts, sent before or not."""
-    found = [
-        Alert(
-            f"run_failed/{run.id}",
-            "run_failed",
-            f"run {run.name} is {run.state}: {run.message}",
-            f"{plan.dashboard}/runs/flow-run/{run.id}",
-            run.match_id,
-        )
-        for run in failed
-    ]
+    """Return all current alerts, sent before or not; at most one of each match.
+
+    `runs` are those of the queue, in the order of the requests.
+    """
+    found = [*_of_runs(plan, runs)]
     for match in matches:
         found += _of_match(plan, match)
+    by_match: dict[str, list[Alert]] = {}
+    for alert in found:
+        by_match.setdefault(alert.match_id or alert.key, []).append(alert)
+    found = [
+        replace(first, text="; ".join([first.text, *(each.text for each in others)]))
+        for first, *others in by_match.values()
+    ]
     found += [
         Alert(
             f"arrival_refused/{arrival.name}/{arrival.fingerprint}",
@@ -89,18 +97,40 @@ def alerts_now(
     return found
 
 
+def _of_runs(plan: ServePlan, runs: Sequence[QueuedRun]) -> Iterator[Alert]:
+    """Yield alerts of the last ended run of each match and flow, and of runs that were stalled."""
+    for run in last_ended(runs):
+        link = f"{plan.dashboard}/runs/flow-run/{run.flow_run}"
+        if run.state == "failed" and age(run.changed_at) < 86400.0 * FAILED_DAYS:
+            state = "partial" if ": partial" in run.message else "failed"
+            text = f"run {run.name} is {state}: {run.message}"
+            yield Alert(f"run_failed/{run.id}", "run_failed", text, link, run.match_id)
+    for run in runs:
+        if run.stalled and run.state not in ENDED:
+            text = f"run {run.name} was ended, and restarts: {run.stalled}"
+            key, link = f"run_stalled/{run.id}/{run.kills}", f"{plan.pages}/status"
+            yield Alert(key, "run_stalled", text, link, run.match_id)
+
+
 def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
+    """Yield one alert about pending reviews of a match, and one about its quality."""
     run = "" if match.latest is None else match.latest.run_id
     link = f"{plan.pages}/#/match/{match.match_id}"
+    waiting = []
     for stage, unit in match.units:
-        name = f"{match.match_id}/{stage}/{unit.unit}"
         hours = age(unit.waiting_since) / 3600.0
         if unit.state == "waiting" and hours >= plan.gate_hours:
-            text = f"{name} has waited for a person for {hours:.1f} h: {unit.why}"
-            yield Alert(f"gate_waiting/{name}/{run}", "gate_waiting", text, link, match.match_id)
-        if unit.objections:
-            text = f"{name}: {all_reasons(unit.objections)}"
-            yield Alert(f"quality/{name}/{text}", "quality", text, link, match.match_id)
+            name = f"{match.match_id}/{stage}/{unit.unit}"
+            waiting.append(f"{name} has waited for a person for {hours:.1f} h: {unit.why}")
+    if waiting:
+        text = waiting[0] + f"; and {len(waiting) - 1} more results" * (len(waiting) > 1)
+        key = f"gate_waiting/{match.match_id}/{run}"
+        yield Alert(key, "gate_waiting", text, link, match.match_id)
+    if match.latest is not None and match.latest.state in ("complete", "partial"):
+        judged = match.latest.usability
+        text = f"{match.match_id} is {judged.verdict}: {' '.join(judged.reservations)}"
+        if judged.reservations:
+            yield Alert(f"quality/{match.match_id}/{text}", "quality", text, link, match.match_id)
 
 
 class AlertDispatcher:
@@ -114,20 +144,30 @@ class AlertDispatcher:
     def __init__(self, state: StateFolder, channels: Sequence[Channel]) -> None:
         self.state, self.channels = state, tuple(channels)
         self._told = kept_alerts(state)
-        self._lock = Lock()
+        self._held: dict[str, list[Alert]] = {}
+        self._lock, self._writing = Lock(), Lock()
 
-    def hold(self, alerts: Iterable[Alert]) -> None:
-        """Replace the alerts to send."""
+    def hold(self, alerts: Iterable[Alert], source: str = "") -> None:
+        """Replace the alerts of a source, and add the day's digest of those that last."""
         with self._lock:
-            before, told = self._told, {}
-            for alert in alerts:
-                if alert.key not in before:
+            self._held[source] = list(alerts)
+            today, before = f"{datetime.now(UTC):%Y-%m-%d}", self._told
+            told: dict[str, dict[str, Any]] = {}
+            for alert in (each for held in self._held.values() for each in held):
+                known = before.get(alert.key)
+                if known is None:
                     LOG.warning("alert: %s", alert.text)
-                took = before.get(alert.key, {}).get("told_by", [])
-                told[alert.key] = {**_content(alert), "told_by": list(took)}
+                kept = known or {"since": today, "told_by": []}
+                told[alert.key] = {**kept, **_content(alert)}
+            lasting = [each["text"] for each in told.values() if each["since"] < today]
+            if lasting:
+                digest = Alert(f"digest/{today}", "digest", _digest(lasting, "last"))
+                told[digest.key] = before.get(
+                    digest.key, {**_content(digest), "since": today, "told_by": []}
+                )
             self._told = told
-            if told != before:
-                self._keep()
+        if told != before:
+            self._keep()
 
     def deliver(self, channel: Channel, pause: float = 0.0) -> float:
         """Send a channel's outstanding alerts until it fails.
@@ -138,7 +178,11 @@ class AlertDispatcher:
             The pause before the next call [s]; 0 = nothing failed.
         """
         while pending := self._pending(channel):
-            key, content = pending[0]
+            is_flood = len(pending) > MAX_SINGLE
+            keys, content = [pending[0][0]], pending[0][1]
+            if is_flood:
+                keys, texts = [key for key, _ in pending], [it["text"] for _, it in pending]
+                content = {**_content(Alert("", "digest", _digest(texts, "are new")))}
             try:
                 channel.send(content)
             except Exception as error:
@@ -153,22 +197,22 @@ class AlertDispatcher:
                 LOG.warning("%s takes alerts again", channel.name)
             pause = 0.0
             with self._lock:
-                if key in self._told:  # its cause can have ended in between
+                for key in self._told.keys() & keys:  # its cause can have ended in between
                     self._told[key]["told_by"].append(channel.name)
-                    self._keep()
+            self._keep()
         return 0.0
 
     def _pending(self, channel: Channel) -> list[tuple[str, dict[str, str]]]:
         with self._lock:
             return [
-                (key, {name: text for name, text in kept.items() if name != "told_by"})
+                (key, {name: kept[name] for name in CONTENT})
                 for key, kept in self._told.items()
                 if channel.name not in kept["told_by"]
             ]
 
     def _keep(self) -> None:
         try:
-            with whole_file(self.state.alerts) as draft:
+            with self._writing, whole_file(self.state.alerts) as draft:
                 draft.write_text(json.dumps(self._told, indent=2) + "\n")
         except OSError as error:  # the full disk can be the cause of the alert
             LOG.warning("%s cannot be written: %s", self.state.alerts, error.strerror)
@@ -179,13 +223,25 @@ def kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
     try:
         kept = json.loads(state.alerts.read_text())
         return {
-            key: {**each, "told_by": list(each.get("told_by", []))} for key, each in kept.items()
+            key: {**each, "told_by": list(each["told_by"]), "since": str(each["since"])}
+            for key, each in kept.items()
         }
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, AttributeError, TypeError):
+    except (OSError, ValueError, AttributeError, TypeError, KeyError):
         LOG.warning("%s cannot be read; alerts that hold are told once more", state.alerts)
         return {}
+
+
+def _digest(texts: Sequence[str], what: str) -> str:
+    """Return the text of one message about several alerts."""
+    more = f"\nand {len(texts) - MAX_SINGLE} more, on the status page"
+    return "\n".join([f"{len(texts)} alerts {what}:", *texts[:MAX_SINGLE]]) + more * (
+        len(texts) > MAX_SINGLE
+    )
+
+
+CONTENT: Final = ("alert", "match", "text", "link")
 
 
 def _content(alert: Alert) -> dict[str, str]:

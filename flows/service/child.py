@@ -45,11 +45,11 @@ def worker(plan: ServePlan) -> None:
     import anyio
 
     from flows.service.deployments import install, pools
-    from flows.service.recovery import restart_lost_runs
+    from flows.service.recovery import recover
     from flows.service.worker import work
 
     installed = install(plan)
-    restart_lost_runs(plan, at_start=True)
+    recover(plan, at_start=True)
     anyio.run(work, pools(plan), installed)
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, cast
+from urllib.parse import quote
 
 from prefect import flow
+from prefect.artifacts import create_link_artifact
 from prefect.context import FlowRunContext
 from prefect.runtime import flow_run
 from prefect.task_runners import TaskRunner
@@ -25,14 +28,13 @@ from flows.iterate import iterate_match
 from flows.match import require_complete, run_stages
 from flows.orchestration.prefect_environment import served_cluster
 from flows.orchestration.suspension import take_verdict
-from flows.progress import reporter
+from flows.progress import Reporter, reporter, reporting_to
 from flows.registering import open_match
 from flows.reprocess import reprocess_matches
 from flows.results.automatic_exports import export_after_run
 from flows.run_plan import plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
 from flows.running import RunRequest, settle
-from flows.service.artifacts import link_pages, show_at_prefect
 from flows.service.inbox import take_in
 from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name, title_of
 from flows.service.plan import ServePlan
@@ -54,6 +56,20 @@ def _name_run() -> str:
     what = title_of(str(flow_run.flow_name), flow_run.parameters)
     name = str(flow_run.name or "")
     return name if name.startswith(f"{what}, ") else run_name(what)
+
+
+def link_pages(pages: str, match_id: str) -> None:
+    """Link this flow run to the pages of its match, which have an address."""
+    name = re.sub(r"[^a-z0-9]+", "-", match_id.lower()).strip("-")  # as keys of Prefect are
+    match_page = f"{pages}/#/match/{quote(match_id, safe='')}"
+    for key, text, address in (
+        (f"review-{name}", f"Review {match_id}", match_page),
+        ("status", "Status of all matches", f"{pages}/status"),
+    ):
+        try:
+            create_link_artifact(address, text, key=key)
+        except Exception as error:  # it stops nothing
+            LOG.warning("not shown at Prefect: %s", error)
 
 
 @flow(name="match", flow_run_name=_name_run, task_runner=RUNNER, validate_parameters=False)
@@ -116,7 +132,7 @@ def _iterate_until_decided(store: Store, match_id: str, request: RunRequest) -> 
     """Iterate a match now and after each verdict."""
     request, most = _on_own_workers(request), request.most_iterations
     while True:
-        with show_at_prefect(match_id):
+        with reporting_to(Reporter()):
             record = iterate_match(store, open_match(store, match_id), request, most).record
         open_questions = waiting_for_verdicts(record.waiting)
         if record.failed or not open_questions:
@@ -139,7 +155,7 @@ def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunR
                 continue
             if latest.state == "complete":
                 return latest
-        with show_at_prefect(match_id):
+        with reporting_to(Reporter()):
             reporter().run_planned(expected_work(store, opened, plan.missing, latest))
             log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
             record = run_stages(log, request.time_limits)
@@ -170,7 +186,7 @@ def ingest(plan: dict[str, Any]) -> list[str]:
         # After a kill, or for a moved folder, a second call returns the existing run.
         key = f"arrival-{opened.registration.identity}"
         runs = MatchRuns.of_plan(served)
-        return runs.start(opened.match_id, priority=arrival.priority, key=key).id
+        return runs.start(opened.match_id, priority=arrival.priority, key=key).flow_run
 
     decided = take_in(
         Store.create(served.project),
@@ -216,7 +232,7 @@ def reprocess(
         raise WorldposeError(f"{project} is not served on this machine")
     request = RunRequest(settings or {})
     found = reprocess_matches(store, tuple(matches), request, retry=retry, is_rehearsal=True)
-    active = {run.match_id for run in runs.active()}
+    active = {run.match_id for run in runs.queue.open_runs() if run.flow == "match"}
     states: dict[str, str] = {each.match_id: each.state for each in found}
     for each in found:
         if each.status is None or each.state != "stale":

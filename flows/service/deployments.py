@@ -14,8 +14,9 @@ from prefect.utilities.callables import parameter_schema
 from flows.orchestration.prefect_api import PrefectApi
 from flows.service.layout import PRIORITIES
 from flows.service.match_runs import MatchRuns
-from flows.service.plan import Schedule, ServePlan, deployment_name, deployment_names
-from flows.service.schedules import list_missed, restore_missed, set_schedule
+from flows.service.plan import Schedule, ServePlan, deployment_name
+from flows.service.recovery import adopt_due
+from flows.service.schedules import set_schedule
 from flows.service.worker import JOB_TEMPLATE, Installed, ServedWorker
 from worldpose.errors import InputError
 
@@ -98,14 +99,12 @@ def install(plan: ServePlan) -> dict[str, Installed]:
         _install(prefect, "work_pools/", pool, values, type=ServedWorker.type, description=about)
     for rank, queue in enumerate(PRIORITIES, 1):
         _install(prefect, f"work_pools/{matches}/queues", queue, {"priority": rank})
-    missed = list_missed(prefect, deployment_names(plan.name))
+    adopt_due(prefect)  # an update of a deployment removes its planned runs
     polled = prefect.deployment(deployment_name(plan.name, "ingest"))
     before = {} if polled is None else polled["parameters"].get("plan") or {}
     # The polled one last: it keeps the options that all others were installed with.
     order = sorted(DEPLOYED, key=lambda each: each.is_polled)
-    installed = dict(_deploy(prefect, plan, deployed, before) for deployed in order)
-    restore_missed(prefect, missed, {name: [*each.fixed] for name, each in installed.items()})
-    return installed
+    return dict(_deploy(prefect, plan, deployed, before) for deployed in order)
 
 
 def _deploy(

@@ -6,15 +6,16 @@ import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from data_contracts.operations import Serving
 from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError, parse_time
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, problem_at
+from flows.service.alerts import STANDSTILLS, kept_alerts
 from flows.service.layout import StateFolder, is_alive
-from flows.service.plan import FLOWS, deployment_name, deployment_names
+from flows.service.plan import FLOWS, deployment_name
 
 WORKER_SECONDS: Final = 90.0
 """Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
@@ -47,6 +48,7 @@ def check(state: StateFolder) -> list[Finding]:
     found += _check_processes(state, serving)
     found += _check_servers(state, serving)
     found += at_prefect(serving, state.client_login(serving))
+    found += _check_progress(state)
     found.append(_check_inbox(state, serving))
     free = shutil.disk_usage(state.folder).free / 1e9
     remedy = "Free some: worldpose gc --keep-last 3 --delete."
@@ -81,7 +83,7 @@ def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
 
 
 def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
-    """Check that deployments exist, that a worker takes their runs, and that no run hangs."""
+    """Check that deployments exist, and that a worker takes their runs."""
     prefect = PrefectApi(serving.prefect, login, tries=1)
     try:
         names = {flow: deployment_name(serving.name, flow) for flow in FLOWS}
@@ -89,11 +91,7 @@ def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
         words = f"missing: {', '.join(missing)}" if missing else ", ".join(FLOWS)
         yield Finding("deployments", not missing, words, AGAIN)
         for pool in (serving.name, f"{serving.name}-arrivals"):
-            yield _check_worker(prefect, pool)
-        before = {"before_": (datetime.now(UTC) - timedelta(days=1)).isoformat()}
-        long = {"state": {"name": {"any_": ["Running"]}}, "expected_start_time": before}
-        named = {"name": {"any_": deployment_names(serving.name)}}
-        late = prefect.ask("/flow_runs/count", {"deployments": named, "flow_runs": long})
+            yield check_worker(prefect, pool)
     except UnreachablePrefectError as error:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
         remedy = "Fix prefect first."
@@ -101,13 +99,10 @@ def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
             remedy = f"Set {variable} as it was when the service began."
         yield Finding("deployments", False, f"Prefect {error.problem}", remedy)
         return
-    if late:
-        dashboard = serving.prefect.removesuffix("/api")
-        remedy = f"Look at them at {dashboard}, and cancel what hangs."
-        yield Finding("runs", False, f"{late} seem to run for more than a day", remedy)
 
 
-def _check_worker(prefect: PrefectApi, pool: str) -> Finding:
+def check_worker(prefect: PrefectApi, pool: str) -> Finding:
+    """Check that Prefect hears of the worker of a pool."""
     remedy = f"See the log worker.log. {AGAIN}"
     if prefect.find(f"/work_pools/{pool}") is None:
         return Finding(f"worker of {pool}", False, "its pool is missing", remedy)
@@ -116,6 +111,14 @@ def _check_worker(prefect: PrefectApi, pool: str) -> Finding:
     silent = (datetime.now(UTC) - max(seen)).total_seconds() if seen else float("inf")
     words = f"was heard of {silent:.0f} s ago" if seen else "never heard of"
     return Finding(f"worker of {pool}", silent < WORKER_SECONDS, words, remedy)
+
+
+def _check_progress(state: StateFolder) -> Iterator[Finding]:
+    """Tell the alerts about what makes no progress, as the watcher sees it."""
+    for alert in kept_alerts(state).values():
+        if alert["alert"] in STANDSTILLS:
+            remedy = f"See {alert['link']}, and the logs in {state.logs}."
+            yield Finding("progress", False, alert["text"], remedy)
 
 
 def _check_inbox(state: StateFolder, serving: Serving) -> Finding:

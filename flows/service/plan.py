@@ -82,6 +82,10 @@ class ServePlan(Record):
     """A result that waits longer for review raises an alert [h]."""
     disk_gb: float = Field(default=10.0, ge=0)
     """Less free space than this raises an alert [GB]."""
+    stall_minutes: float = Field(default=10.0, ge=0.5)
+    """A run or scan without progress for so long is ended, and raises an alert [min]."""
+    history_days: float = Field(default=30.0, ge=1.0)
+    """Ended runs are forgotten after so long, also by a Prefect server of our own [d]."""
     schedules: dict[str, Schedule] = Field(default_factory=dict)
     """Flow to its schedule, beside those that people make at the Prefect server."""
     users: Path | None = None

@@ -1,29 +1,58 @@
 """One run of an installed flow: `python -m flows.service.run_process FLOW RUN_ID`.
 
-The worker starts this program, never a command, code or folder that a server names. It ends when
-its standard input closes.
+The worker starts this program, never a command, code or folder that a server names. It records in
+the project's queue what becomes of the run. It ends when its standard input closes.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from threading import Thread
+from typing import Final
 from uuid import UUID
 
+import httpx
 from prefect.client.orchestration import get_client
 from prefect.engine import handle_engine_signals
+from prefect.exceptions import Abort, ObjectNotFound, Pause
 from prefect.flow_engine import run_flow
 
+from flows.orchestration.cluster_errors import LostWorkersError
+from flows.orchestration.prefect_api import UnreachablePrefectError
 from flows.service import deployed
 from flows.service.child import end_with_parent
+from flows.service.run_queue import beating, queue_of_parameters, queued_run
+from worldpose.store.store import Store
+
+LOST: Final = (LostWorkersError, UnreachablePrefectError, ObjectNotFound, httpx.HTTPError)
+"""Errors of a run whose Prefect server or Dask scheduler is gone or busy: it restarts."""
 
 
 def main(flow: str, run_id: UUID) -> None:
     """Run a flow of `flows.service.deployed` with the parameters of a run at the server."""
     with handle_engine_signals(run_id):
         with get_client(sync_client=True) as client:
-            run = client.read_flow_run(run_id)
-        run_flow(getattr(deployed, flow), flow_run=run)
+            at_prefect = client.read_flow_run(run_id)
+        queue = queue_of_parameters(at_prefect.parameters)
+        run = queue.take(queued_run(flow, at_prefect.model_dump(mode="json")))
+        run = queue.begin(run, str(run_id))
+        try:
+            known = Store(queue.blobs).registration(run.match_id) if run.match_id else None
+            with beating(queue, run, None if known is None else Path(known.folder)):
+                run_flow(getattr(deployed, flow), flow_run=at_prefect)
+        except Abort:  # it was cancelled at Prefect; the worker records that
+            raise
+        except Pause:
+            queue.change(run, "waiting", "for review")
+            raise
+        except LOST as error:
+            queue.kill(run, f"{type(error).__name__}: {error}")
+            raise
+        except Exception as error:
+            queue.change(run, "failed", str(error) or type(error).__name__)
+            raise
+        queue.change(run, "complete")
 
 
 if __name__ == "__main__":

@@ -1,19 +1,16 @@
-"""Schedules of deployments: those of `worldpose serve --schedule`, and runs that were missed.
+"""Schedules of deployments: those of `worldpose serve --schedule`.
 
 People also make schedules in Prefect's dashboard and through its API; nothing here changes those.
 """
 
 from __future__ import annotations
 
-import json
-import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from flows.orchestration.prefect_api import PrefectApi, of_types, parse_time
+from flows.orchestration.prefect_api import PrefectApi
 from flows.service.plan import Schedule
 from worldpose.errors import UsageError
 
@@ -22,8 +19,6 @@ SCHEDULED: Final = ("ingest", "reprocess")
 SLUG: Final = "serve-schedule"
 """Slug of the schedule of `--schedule` at its deployment; all others are the operator's."""
 CRON_FIELDS: Final = 5
-
-LOG = logging.getLogger("worldpose.operations")
 
 
 def parse_schedules(texts: Iterable[str]) -> dict[str, Schedule]:
@@ -90,39 +85,3 @@ def set_schedule(
         prefect.ask(f"{place}/{there[0]}", {"schedule": schedule}, method="PATCH")
     else:
         prefect.ask(place, [{"schedule": schedule, "active": True, "slug": SLUG}])
-
-
-def list_missed(prefect: PrefectApi, deployments: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the runs of schedules whose time has passed, one for all with the same parameters.
-
-    The last one stands for the others, which are cancelled: what was missed runs once.
-    """
-    passed = {"before_": datetime.now(UTC).isoformat()}
-    waiting = {**of_types("SCHEDULED"), "name": {"any_": ["Scheduled", "Late"]}}
-    wanted = {"tags": {"all_": ["auto-scheduled"]}, "expected_start_time": passed}
-    found: dict[tuple[str, str], dict[str, Any]] = {}
-    runs = prefect.runs(deployments, state=waiting, **wanted)
-    for run in sorted(runs, key=lambda run: parse_time(run["expected_start_time"])):
-        same = (run["deployment_id"], json.dumps(run["parameters"], sort_keys=True))
-        if same in found:
-            why = "it was missed; a later run stands for it"
-            LOG.info("%s: %s", found[same]["name"], why)
-            prefect.set_state(found[same]["id"], "CANCELLED", why)
-        found[same] = run
-    return list(found.values())
-
-
-def restore_missed(
-    prefect: PrefectApi, missed: Iterable[Mapping[str, Any]], fixed: Mapping[str, Sequence[str]]
-) -> None:
-    """Create missed runs again that an update of their deployment removed with the planned ones.
-
-    `fixed` has the names of the parameters, by deployment id, that the deployment decides.
-    """
-    for run in missed:
-        if prefect.find(f"/flow_runs/{run['id']}") is not None:
-            continue
-        deployment = run["deployment_id"]
-        kept = {n: it for n, it in run["parameters"].items() if n not in fixed[deployment]}
-        given = {"name": run["name"], "parameters": kept, "idempotency_key": f"missed-{run['id']}"}
-        prefect.ask(f"/deployments/{deployment}/create_flow_run", given)

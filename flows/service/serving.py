@@ -249,12 +249,7 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
         wait_for(pages, f"http://{local}:{plan.pages_port}/api/health")
     wait_for(watch, f"http://{local}:{plan.metrics_port}/health")
 
-    def is_at_work() -> bool:
-        """Return whether a worker takes runs; a hanging run is handled elsewhere."""
-        findings = at_prefect(serving, login)
-        return all(finding.is_well for finding in findings if finding.part != "runs")
-
-    worker.wait_until(is_at_work, told)
+    worker.wait_until(lambda: all(it.is_well for it in at_prefect(serving, login)), told)
 
 
 def environment_of(plan: ServePlan) -> dict[str, str]:
@@ -263,6 +258,10 @@ def environment_of(plan: ServePlan) -> dict[str, str]:
     values = served_environment(plan.prefect, home)
     workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.max_concurrent)
     values["WORLDPOSE_STATE"] = str(plan.state)
+    values |= {
+        "PREFECT_SERVER_SERVICES_DB_VACUUM_ENABLED": "events,flow_runs",
+        "PREFECT_SERVER_SERVICES_DB_VACUUM_RETENTION_PERIOD": f"{86400.0 * plan.history_days:.0f}",
+    }
     values["WORLDPOSE_WORKERS"] = str(workers)
     if plan.dask is not None:
         values["WORLDPOSE_DASK"] = plan.dask

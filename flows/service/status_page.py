@@ -60,7 +60,8 @@ def routes(context: PageContext) -> APIRouter:
         inbox = "" if serving is None else serving.inbox
         found = overview.look(BUDGET_SECONDS)
         rows = [StatusRow(*each) for each in _with_runs(context, found)]
-        alerts = kept_alerts(served_state(context.store.url)).values()
+        kept = kept_alerts(served_state(context.store.url)).values()
+        alerts = [each for each in kept if each["alert"] != "digest"]
         text = status_html(
             rows, _arrivals(context), dashboard, inbox=inbox, opened=match, alerts=alerts
         )

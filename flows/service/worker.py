@@ -14,17 +14,22 @@ from typing import Any, Final
 import anyio
 import anyio.abc
 import psutil
+from anyio import to_thread
 from prefect import Flow
 from prefect.client.orchestration import PrefectClient
 from prefect.client.schemas.objects import FlowRun, State, StateType
 from prefect.exceptions import ParameterTypeError, SignatureMismatchError
-from prefect.states import Cancelled, Failed
+from prefect.states import Cancelled, Crashed, Failed
 from prefect.workers.base import (
     BaseJobConfiguration,
     BaseVariables,
     BaseWorker,
     BaseWorkerResult,
 )
+
+from data_contracts.operations import QueuedRun
+from flows.service.run_queue import queue_of_parameters, queued_run
+from worldpose.store.run_queue import RunQueue
 
 LOG: Final = logging.getLogger("worldpose.operations")
 CANCEL_SECONDS: Final = 2.0
@@ -111,42 +116,69 @@ class ServedWorker(BaseWorker[_OwnJob, BaseVariables, BaseWorkerResult]):
         """Run an installed flow to its end; a refused run is set to failed, with the reason."""
         status = task_status or anyio.TASK_STATUS_IGNORED
         try:
-            flow = require_installed(flow_run, self.installed).flow
+            found = require_installed(flow_run, self.installed)
         except RefusedRunError as refusal:
             LOG.warning("run %r is refused: %s", flow_run.name, refusal)
-            refused: State[Any] = Failed(message=f"The worker refused this run: {refusal}")
+            why = f"The worker refused this run: {refusal}"
+            if (installed := self.installed.get(str(flow_run.deployment_id))) is not None:
+                queue, run = await to_thread.run_sync(_take, flow_run, installed)
+                await to_thread.run_sync(queue.change, run, "failed", why)
+            refused: State[Any] = Failed(message=why)
             await self.client.set_flow_run_state(flow_run.id, refused, force=True)
             status.started(0)
             return BaseWorkerResult(identifier="refused", status_code=0)
         process = await anyio.open_process(
-            [sys.executable, "-m", "flows.service.run_process", flow.name, str(flow_run.id)],
+            [sys.executable, "-m", "flows.service.run_process", found.flow.name, str(flow_run.id)],
             env={**os.environ, **{name: it for name, it in configuration.env.items() if it}},
             stdin=PIPE,  # the run ends when this process does
             stdout=None,  # the worker's log
             stderr=None,
         )
         status.started(process.pid)
-        code = await self._wait(process, flow_run)
-        return BaseWorkerResult(identifier=str(process.pid), status_code=code)
+        queue, run = await to_thread.run_sync(_take, flow_run, found)
+        await self._wait(process, flow_run, queue, run)
+        # With another code Prefect would set a state, maybe after the run has restarted.
+        return BaseWorkerResult(identifier=str(process.pid), status_code=0)
 
-    async def _wait(self, process: anyio.abc.Process, flow_run: FlowRun) -> int:
-        """Return the exit code of a run's process; end the process if the run is cancelled."""
+    async def _wait(
+        self, process: anyio.abc.Process, flow_run: FlowRun, queue: RunQueue, first: QueuedRun
+    ) -> None:
+        """Wait for the end of a run's process; record an end that it did not record itself.
+
+        A run that is cancelled is ended. One that was given up is left alone: its process can hang.
+        """
         while True:
             with anyio.move_on_after(CANCEL_SECONDS):
                 await process.wait()
-            code = process.returncode
+            code, kind = process.returncode, None
             try:
-                now = await self.client.read_flow_run(flow_run.id)
+                kind = (await self.client.read_flow_run(flow_run.id)).state_type
             except Exception as error:  # the server is gone, or the run was deleted: it goes on
                 LOG.debug("run %r: %s", flow_run.name, error)
-            else:
-                if now.state_type == StateType.CANCELLING:
-                    await _end(process)
-                    cancelled: State[Any] = Cancelled()
-                    await self.client.set_flow_run_state(flow_run.id, cancelled, force=True)
-                    return 0
-            if code is not None:
-                return code
+            run = await to_thread.run_sync(queue.latest, first)
+            is_open = run.number == first.number or (run.state, run.pid) == ("begun", process.pid)
+            if kind == StateType.CANCELLING or (run.state == "cancelled" and code is None):
+                await _end(process)
+                cancelled: State[Any] = Cancelled()
+                await self.client.set_flow_run_state(flow_run.id, cancelled, force=True)
+                code, kind = 0, StateType.CANCELLED
+            if code is not None and is_open:
+                if kind == StateType.CANCELLED:
+                    await to_thread.run_sync(queue.change, run, "cancelled", "cancelled at Prefect")
+                else:
+                    why = f"its process ended with code {code}"
+                    with suppress(Exception):  # without a server, the queue alone knows it
+                        crashed: State[Any] = Crashed(message=why)
+                        await self.client.set_flow_run_state(flow_run.id, crashed, force=True)
+                    await to_thread.run_sync(queue.kill, run, why)
+            if code is not None or (run.state == "failed" and run.stalled and not is_open):
+                return
+
+
+def _take(flow_run: FlowRun, installed: Installed) -> tuple[RunQueue, QueuedRun]:
+    """Return the queue of an installed flow, and in it a run that Prefect gave to the worker."""
+    queue = queue_of_parameters(installed.fixed)
+    return queue, queue.take(queued_run(installed.flow.name, flow_run.model_dump(mode="json")))
 
 
 async def _end(process: anyio.abc.Process) -> None:

@@ -9,18 +9,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock, Thread, Timer
 from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 
+from data_contracts.operations import QueuedRun
 from data_contracts.review import ReviewRequest
 from data_contracts.run import EXIT_CODES
 from data_contracts.static_calibration import ClickedMarkings
-from flows.orchestration.prefect_api import UnreachablePrefectError
 from flows.orchestration.prefect_environment import (
     CLIENT_LOGIN,
     CLOUD_LOGIN,
@@ -30,16 +29,12 @@ from flows.orchestration.prefect_environment import (
 from flows.registering import open_for_review
 from flows.review.verdicts import resume
 from flows.run_record import describe_end, latest_run
-from flows.service.match_runs import (
-    AT_WORK,
-    QUEUED,
-    MatchRun,
-    match_runs_of,
-)
+from flows.service.match_runs import MatchRuns, match_runs_of
 from flows.stage import Match
 from flows.web.access import Access
 from worldpose.review.journal import requests_by_id
 from worldpose.store.paths import is_name
+from worldpose.store.run_queue import ENDED, last_ended
 from worldpose.store.store import Store
 
 
@@ -102,10 +97,7 @@ LAST_LINES = 12
 PATIENCE_SECONDS = 15.0
 """Time in which a cancelled run ends by itself [s]."""
 FRESH_SECONDS = 2.0
-"""Maximum age of Prefect's answer that pages show [s]."""
-EPOCH = datetime.fromtimestamp(0, UTC)
-RECORDED_LATE = timedelta(minutes=1)
-"""Time after which Prefect's database surely has the end of a run."""
+"""Maximum age of the state of the queue that pages show [s]."""
 
 
 @dataclass
@@ -119,7 +111,6 @@ class Continuing:
     store: Store
     _local: LocalRuns = field(init=False)
     _seen: _Seen | None = None
-    _ended: dict[str, MatchRun] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     def __post_init__(self) -> None:
@@ -137,16 +128,22 @@ class Continuing:
             if served is None:
                 resumed = self._resume(match_id) if has_server() else None
                 return resumed or self._local.go_on(match_id, gates)
-            states = {run.state for run in served.active() if run.match_id == match_id}
-            self._seen = None
-            if "PAUSED" in states and (resumed := self._resume(match_id)):
+            own = _open_runs(served, match_id)
+            states, self._seen = {run.state for run in own}, None
+            # The process of a run that was suspended a moment ago ends its workers first.
+            kinds = {run["state_type"] for run in served.at_prefect(own).values()}
+            is_suspended = "waiting" in states or "PAUSED" in kinds
+            if is_suspended and (resumed := self._resume(match_id)):
+                for run in own:
+                    if run.state == "waiting":
+                        served.queue.change(run, "asked", "resumed")
                 return resumed
-            if states & set(QUEUED):
+            if states & {"asked", "killed"}:
                 return {"state": "running", "how": "a run of it waits for its turn already"}
             # A run at work may have missed what was decided or corrected a moment ago.
             run = served.start(match_id, gates=gates)
             how = "once more when the run at work has ended" if states else "the deployment"
-            return {"state": "running", "how": how, "prefect": run.link}
+            return {"state": "running", "how": how, "prefect": served.link(run)}
 
     def _resume(self, match_id: str) -> dict[str, Any] | None:
         """Resume the match's suspended runs; return None if there are none."""
@@ -167,28 +164,26 @@ class Continuing:
             if served is None:
                 return self._local.cancel(match_id)
             self._seen = None
-            own = [run for run in served.active() if run.match_id == match_id]
+            own = _open_runs(served, match_id)
             for run in own:
-                end = "CANCELLING" if run.state == "RUNNING" else "CANCELLED"
-                served.set_state(run.id, end, "cancelled on the page of the match")
+                served.cancel(run, "cancelled on the page of the match")
             return bool(own)
 
     def state(self, match_id: str) -> dict[str, Any] | None:
         """Return the state of the match's run, or of the last one if that failed; else None."""
-        try:
-            seen = self._look()
-        except UnreachablePrefectError as error:
-            return {"state": "unknown", "code": 1, "lines": [str(error)]}
+        seen = self._look()
         if seen is None:
             return self._local.state(match_id)
-        own = [run for run in seen.active if run.match_id == match_id and run.state != "PAUSED"]
+        own = [run for run in seen.open if run.match_id == match_id and run.state != "waiting"]
         if own:
-            run = next((each for each in own if each.state in AT_WORK), own[0])
-            percent, doing = seen.progress.get(run.id, (0.0, run.message))
-            lines = [doing] if doing else []
-            stage = re.match(r"[a-z_]+", doing)
-            if run.state in QUEUED:
-                ahead = [each for each in seen.active[: seen.active.index(run)] if each.is_ahead]
+            run = next((each for each in own if each.state == "begun"), own[0])
+            beat = seen.served.queue.beat(run) if run.state == "begun" else None
+            lines = [beat.doing] if beat is not None and beat.doing else []
+            stage = re.match(r"[a-z_]+", lines[0]) if lines else None
+            if run.state != "begun":
+                ahead = [
+                    each for each in seen.open[: seen.open.index(run)] if each.state != "waiting"
+                ]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
                 lines = ["The run starts in a moment."]
                 if ahead:
@@ -196,52 +191,47 @@ class Continuing:
             return {
                 "state": "running",
                 "lines": lines,
-                "percent": percent,
-                "prefect": run.link,
-                "stage": stage[0] if stage and run.state in AT_WORK else "",
+                "percent": 0.0 if beat is None else 100.0 * beat.share,
+                "prefect": seen.served.link(run),
+                "stage": stage[0] if stage else "",
             }
         last = seen.ended.get(match_id)
-        if last is None or last.state not in ("FAILED", "CRASHED"):
+        if last is None or last.state != "failed":
             return None
         code, message = 1, last.message
         record = latest_run(self.store, match_id)
         if record is not None and f"run {record.run_id} of {match_id}:" in message:
             # The flow failed because its run is not complete: the record says how it ended.
             code, message = EXIT_CODES[record.state], describe_end(record)
-        return {"state": "ended", "code": code, "lines": [message], "prefect": last.link}
+        link = seen.served.link(last)
+        return {"state": "ended", "code": code, "lines": [message], "prefect": link}
 
     def links(self) -> dict[str, str]:
-        """Return the page of each match's latest run at Prefect; empty without an answer."""
-        try:
-            seen = self._look()
-        except UnreachablePrefectError:
-            return {}
+        """Return the page of each match's latest run at Prefect; empty without a service."""
+        seen = self._look()
         if seen is None:
             return {}
-        latest = {**seen.ended, **{run.match_id: run for run in seen.active}}
-        return {match_id: run.link for match_id, run in latest.items()}
+        latest = {**seen.ended, **{run.match_id: run for run in seen.open}}
+        return {match_id: seen.served.link(run) for match_id, run in latest.items()}
 
     def _look(self) -> _Seen | None:
         """Return the runs of the service, of the last seconds; None without a service."""
         served = match_runs_of(self.store.url)
         if served is None:
             return None
-        if self._seen is None or time.monotonic() - self._seen.at > FRESH_SECONDS:
-            once = replace(served, tries=1)
-            try:
-                ends = [run.ended_at for run in self._ended.values() if run.ended_at is not None]
-                since = max(ends) - RECORDED_LATE if ends else EPOCH  # all only once
-                later = {run.match_id: run for run in once.ended_runs(since)}
-                self._ended = self._ended | later  # other threads read the former one
-                active = once.active()
-                progress = once.progress([run for run in active if run.state in AT_WORK])
-                seen = _Seen(time.monotonic(), active, self._ended, progress)
-            except UnreachablePrefectError as error:
-                seen = _Seen(time.monotonic(), [], {}, {}, error)
-            self._seen = seen
-        if self._seen.problem is not None:
-            raise self._seen.problem
-        return self._seen
+        seen = self._seen
+        if seen is None or time.monotonic() - seen.at > FRESH_SECONDS:
+            runs = served.queue.runs("queue/match")
+            running = [run for run in runs if run.state not in ENDED]
+            ended = {run.match_id: run for run in last_ended(runs)}
+            seen = self._seen = _Seen(time.monotonic(), served, running, ended)
+        return seen
+
+
+def _open_runs(served: MatchRuns, match_id: str) -> list[QueuedRun]:
+    """Return the runs of a match that have not ended."""
+    runs = served.queue.runs(f"queue/match/{match_id}")
+    return [run for run in runs if run.state not in ENDED]
 
 
 def read_progress(said: str) -> dict[str, Any]:
@@ -265,13 +255,15 @@ def read_progress(said: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Runs of the service at a time of the monotonic clock [s], and each match's last ended run."""
+    """Runs of matches of the service at a time of the monotonic clock [s].
+
+    Those that have not ended are in the order of the requests; `ended` has each match's last one.
+    """
 
     at: float
-    active: list[MatchRun]
-    ended: dict[str, MatchRun]
-    progress: dict[str, tuple[float, str]]
-    problem: UnreachablePrefectError | None = None
+    served: MatchRuns
+    open: list[QueuedRun]
+    ended: dict[str, QueuedRun]
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> None:

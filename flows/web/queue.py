@@ -207,6 +207,10 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
             "state": latest.state,
             "finished_at": latest.finished_at,
             "gates": latest.gates,
+            "usability": {
+                "verdict": latest.usability.verdict,
+                "reservations": [in_browser(each) for each in latest.usability.reservations],
+            },
             "failed": len(latest.failed),
         },
         "waiting": waiting,

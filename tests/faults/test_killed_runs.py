@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -78,23 +77,6 @@ def test_the_whole_process_group_killed_at_a_commit_point(point, tiny, tiny_run,
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20))
-def test_the_whole_process_group_killed_at_a_random_moment(seed, tiny, tiny_run, tmp_path):
-    project = tmp_path / "worldpose-data"
-    # A moment is a number of files in the project, so that it means the same on any machine.
-    moment = random.Random(seed).randrange(1, len(files_of(tiny_run)) - 1)
-    process = start_run(tiny, project, {})
-    while len(files_of(project)) < moment:
-        assert process.poll() is None, "the run ended before it was killed"
-        time.sleep(0.002)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    assert_nothing_half_written(project)
-    succeed("run", tiny, "--project", project)
-    assert_same_store(project, tiny_run)
-
-
 def start_run(match, project, environment):
     """A run of two workers, leading a process group of its own."""
     return subprocess.Popen(
@@ -104,16 +86,6 @@ def start_run(match, project, environment):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-
-
-def files_of(project):
-    """Return one entry per file of a project, without Prefect's; files may vanish meanwhile."""
-    return [
-        path
-        for path, _, names in os.walk(project)
-        for _ in names
-        if "prefect" not in Path(path).relative_to(project).parts
-    ]
 
 
 def assert_nothing_half_written(project):

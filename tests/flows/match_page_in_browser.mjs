@@ -7,7 +7,7 @@ const page = await open(seen, 1100);
 await logIn(page, task.base, "Ada");
 await page.click(`a.name[href="#/match/${encodeURIComponent(task.match)}"]`);
 await page.waitForSelector("table");
-seen.notes = await page.locator("p.note").allInnerTexts();
+seen.notes = await page.locator("p.note, [data-usability]").allInnerTexts();
 seen.rows = await page.locator("table tbody tr").allInnerTexts();
 await shoot(page, "match");
 

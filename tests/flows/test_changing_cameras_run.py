@@ -88,6 +88,11 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
     bad = {name: figures[f"unhealthy_share.cam{name}"] for name in range(4)}
     assert 0.4 < bad[2] == figures["unhealthy_share"] < 0.6
     assert max(bad[n] for n in (0, 1, 3)) < 0.05
+    assert 2.0 < figures["unhealthy_s.cam2"] < 2.8
+    assert 55 <= figures["unhealthy_from_frame.cam2"] <= 65
+    usability = opened.record.usability
+    assert usability.verdict == "usable with reservations"
+    assert any("camera cam2 moves at frame 60" in each for each in usability.reservations)
     after = judge_health(opened["retriangulation/clip"]["health"].values)
     assert (after > 1.0).mean() < 0.02  # corrected
     store = Store.open(match.parent / "project")

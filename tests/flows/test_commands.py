@@ -63,7 +63,7 @@ def test_a_shell_completes_the_names_of_commands():
         capture_output=True,
         text=True,
     )
-    assert sorted(answer.stdout.split()) == ["report", "reprocess", "review"]
+    assert sorted(answer.stdout.split()) == ["release", "report", "reprocess", "review"]
 
 
 def test_the_version_is_that_of_the_installed_package():

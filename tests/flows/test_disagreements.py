@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import xarray as xr
+from camera_builders import plain_camera
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.clips import worst_views
@@ -15,12 +16,8 @@ FRAMES = np.arange(20, 24)
 
 
 def camera(x):
-    return Camera(
-        focal=np.array([2000.0, 2000.0]),
-        principal_point=np.array([960.0, 540.0]),
-        distortion=np.zeros(5),
-        cam_from_world=look_at(np.array([x, -60.0, 20.0]), np.zeros(3), 0.0),
-        image_size=np.array([1920, 1080]),
+    return plain_camera(
+        2000.0, (960.0, 540.0), look_at(np.array([x, -60.0, 20.0]), np.zeros(3), 0.0)
     )
 
 
@@ -48,8 +45,7 @@ def test_the_farthest_views_of_two_people_come_worst_first():
         else:
             seen[3, 0] += 900.0  # no person's
         run[f"ingest/{name}"] = xr.Dataset(
-            {"keypoints": (("frame", "detection", "joint", "axis"), seen)},
-            coords={"frame": FRAMES},
+            {"keypoints": (("frame", "detection", "joint", "axis"), seen)}, coords={"frame": FRAMES}
         )
     run["tracking/clip"] = xr.Dataset(
         {"detection_index": (("frame", "camera", "person"), index)},

@@ -78,8 +78,7 @@ def test_tracks_can_be_matched_in_a_camera_of_the_reference(tiny):
 def test_nothing_in_common_is_refused(tiny, tmp_path):
     shutil.copytree(tiny / "reference" / "cameras", tmp_path / "cameras")
     answer = worldpose(
-        *("evaluate", "--prediction", tmp_path),
-        *("--reference", tiny / "reference" / "joints.npz"),
+        *("evaluate", "--prediction", tmp_path), *("--reference", tiny / "reference" / "joints.npz")
     )
     assert answer.code == 2
     assert "expected joints on both sides, or cameras of the same names" in answer.err

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 from command_line import succeed
+from run_records import run_record
 from test_refitting import halves
 
 from data_contracts.review import DeletedDetection
-from data_contracts.run import RunRecord
 from flows import iterate
 from flows.cli.run import parse_iterations
 from flows.iterate import held_out_error, iterate_match
@@ -110,21 +110,8 @@ def test_an_edit_recomputes_its_dependency_set_in_every_iteration(clips, edit):
 
 def record(number, error, state="complete"):
     figures = {} if error is None else {"held_out_error": error, "held_out_keypoints": 100.0}
-    return RunRecord.model_validate(
-        {
-            "run_id": f"{number:04}",
-            "match_id": "m",
-            "parent": None,
-            "iteration": number,
-            "state": state,
-            **{name: {} for name in ("results", "settings", "overrides", "versions")},
-            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
-            "figures": {"filtering/clip": figures},
-            "started_at": "2024-01-01T00:00:00Z",
-            "finished_at": "2024-01-01T00:00:00Z",
-            "seconds": 1.0,
-        }
-    )
+    figures = {"filtering/clip": figures}
+    return run_record(run_id=f"{number:04}", iteration=number, state=state, figures=figures)
 
 
 @pytest.fixture

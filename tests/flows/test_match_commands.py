@@ -2,15 +2,15 @@
 
 import json
 import shutil
-from datetime import UTC, datetime
 
 import pytest
 import yaml
+from run_records import run_record
 from typer.testing import CliRunner
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.run import RunRecord, UnitFailure, WaitingUnit
+from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import app
 from flows.registering import find_registration, open_for_review, register
@@ -88,7 +88,7 @@ def test_a_match_that_cannot_be_read_hides_no_other_review(store, tmp_path):
     shutil.rmtree(tmp_path / "aa")
     answer = said(store, "review", "list")
     assert answer.exit_code == 0
-    assert answer.stderr.startswith(f"aa: {tmp_path / 'aa' / 'match.yaml'}")
+    assert answer.stderr.startswith(f"aa: match aa: expected its folder, registered as {tmp_path}")
     assert "nothing waits" in answer.stdout  # though cam1 of b is not clicked yet
     as_json = json.loads(said(store, "review", "list", "--json").stdout)
     assert as_json["reviews"] == [] and list(as_json["problems"]) == ["aa"]
@@ -118,16 +118,13 @@ def ended(state):
         for name in ("cam0", "cam1", "cam2")
     )
     failed = (UnitFailure(unit="tracking/clip", error="InputError", message="nobody"),)
-    return RunRecord(
-        **{"run_id": "0001", "match_id": "a", "parent": None, "state": state, "seconds": 1.0},
-        **{name: {} for name in ("results", "settings", "overrides", "versions", "figures")},
+    return run_record(
+        match_id="a",
+        state=state,
         executed=("ingest/cam0",),
-        reused=(),
         failed=failed if state in ("failed", "partial") else (),
         blocked=("triangulation/clip",),
         waiting=waiting if state == "waiting" else (),
-        started_at=datetime(2026, 5, 1, tzinfo=UTC),
-        finished_at=datetime(2026, 5, 1, tzinfo=UTC),
     )
 
 
@@ -192,3 +189,12 @@ def test_a_misspelt_match_or_scenario_is_guessed(store, tmp_path):
         find_registration(store, "derby")
     words = ["simulate", "--scenario", "tinny", "--out", str(tmp_path / "out")]
     assert "Did you mean 'tiny'?" in str(CliRunner().invoke(app, words).exception)
+
+
+def test_a_match_whose_folder_has_moved_says_how_it_goes_on_and_does(store, tmp_path):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    (tmp_path / "a").rename(tmp_path / "b")
+    with pytest.raises(InputError, match=r"worldpose ingest FOLDER"):
+        open_for_review(store, "a")
+    register(store, tmp_path / "b", unfinished=True)
+    assert open_for_review(store, "a").folder.folder == tmp_path / "b"

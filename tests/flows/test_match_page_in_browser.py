@@ -30,7 +30,8 @@ def test_a_left_out_camera_and_groups_of_corrections_are_seen(tiny, tmp_path):
         task = {"base": base, "token": page_client.TOKEN, "match": TINY}
         seen = drive(SCRIPT, task, tmp_path, 600)
     (note,) = [text for text in seen["notes"] if "left out" in text]
-    assert note == f"cam01 is left out. {reason}"
+    assert note.startswith("The results of run 0001 are usable with reservations")
+    assert f"camera cam01 is left out: {reason.rstrip('.')}." in note
     (row,) = [text for text in seen["rows"] if text.startswith("cam01")]
     assert "left out" in row
     assert (seen["listed"], seen["more"]) == ([200, 400, 450], 0)

@@ -7,13 +7,13 @@ import numpy as np
 import page_client
 import pytest
 import yaml
+from camera_builders import plain_camera
 from chromium import IN_BROWSER, drive
 from command_line import TINY, succeed, worldpose
 from page_client import MATCH
 
 from flows.registering import open_match
 from worldpose.formats.challenge import read_camera
-from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
@@ -46,12 +46,11 @@ def write_image(folder, name, image, **further):
 
 def middle_of_the_pitch():
     """An image with one line and a part of a circle: no single camera explains them."""
-    camera = Camera(
-        focal=np.array([3600.0, 3600.0]),
-        principal_point=0.5 * (np.array(SIZE) - 1.0),
-        distortion=np.zeros(5),
-        cam_from_world=look_at(np.array([0.0, -60.0, 22.0]), np.array([0.0, -9.0, 0.0]), 0.005),
-        image_size=np.array(SIZE),
+    camera = plain_camera(
+        3600.0,
+        0.5 * (np.array(SIZE) - 1.0),
+        look_at(np.array([0.0, -60.0, 22.0]), np.array([0.0, -9.0, 0.0]), 0.005),
+        SIZE,
     )
     return render_pitch(camera, PITCH, None, 3)
 

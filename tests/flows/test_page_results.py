@@ -16,18 +16,15 @@ from data_contracts.run import WaitingUnit
 from flows.cli.app import app
 from flows.results.best_results import fitted_bodies
 from flows.results.evaluation import score
-from worldpose.formats.viewer_file import (
-    decode_bodies,
-    decode_part,
-    encode_spread,
-    read_viewer,
-)
+from worldpose.formats.viewer_file import decode_bodies, decode_part, encode_spread, read_viewer
 from worldpose.store.store import Store, open_run
 
 
 def test_a_complete_run_gives_its_report_and_its_exports(reader):
     found = reader.get(f"{MATCH}/results").json()
     assert (found["run"], found["formats"]) == ("0001", list(EXPORT_FORMATS))
+    judged = reader.get(MATCH).json()["run"]["usability"]
+    assert judged == {"verdict": "usable", "reservations": []}
     assert found["purposes"]["bvh"].startswith("a skeleton in motion for Blender")
     clip = {"id": "clip", "video": None, "without_joints": None}
     assert found["clips"] == [clip]  # given keypoints: nothing is filmed

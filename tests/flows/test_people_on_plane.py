@@ -47,9 +47,9 @@ def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch
     text = str(IncompleteRunError(record))
     assert why in text
     assert "0 " not in text
-    message = f"Flow run encountered an exception: IncompleteRunError: {text}"
-    last = SimpleNamespace(state="FAILED", message=message, link="http://prefect")
-    seen = SimpleNamespace(active=[], ended={match: last})
+    last = SimpleNamespace(state="failed", message=text)
+    served = SimpleNamespace(link=lambda run: "http://prefect")
+    seen = SimpleNamespace(open=[], ended={match: last}, served=served)
     monkeypatch.setattr(Continuing, "_look", lambda self: seen)
     state = Continuing(store).state(match)
     assert (state["code"], state["lines"]) == (4, [text])

@@ -43,6 +43,7 @@ def test_a_release_names_its_run_files_and_licence(released):
     manifest = json.loads((released / "manifest.json").read_text())
     assert manifest["release"] == "first"
     assert manifest["licence"] == "For tests alone."
+    assert manifest["usability"]["verdict"] == "usable"
     assert manifest["body_model"] == "open-neutral/2"
     assert "body_fitting/clip" in manifest["results"]
     on_disk = {path.relative_to(released).as_posix() for path in released.rglob("*.*")}

@@ -115,11 +115,7 @@ def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
 
 
 @pytest.mark.parametrize(
-    ("error", "again"),
-    [
-        ("CorruptionError", False),
-        ("ConnectionResetError", True),
-    ],
+    ("error", "again"), [("CorruptionError", False), ("ConnectionResetError", True)]
 )
 def test_what_failed_is_tried_again_when_something_is_another(store, error, again):
     tracking = store.run(TINY).results["tracking/clip"]
@@ -218,10 +214,10 @@ class Runs:
     """A service's runs, one of which has not ended."""
 
     def __init__(self, *at_work):
-        self.at_work, self.started = at_work, []
+        self.at_work, self.started, self.queue = at_work, [], self
 
-    def active(self):
-        return [SimpleNamespace(match_id=each) for each in self.at_work]
+    def open_runs(self):
+        return [SimpleNamespace(match_id=each, flow="match") for each in self.at_work]
 
     def start(self, match_id, **given):
         self.started.append((match_id, given))

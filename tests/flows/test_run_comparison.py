@@ -2,29 +2,16 @@
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
+from run_records import run_record
 
-from data_contracts.run import RunRecord
 from flows.results import comparison
 from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
 
 def record(figures):
-    return RunRecord.model_validate(
-        {
-            "run_id": "0001",
-            "match_id": "m",
-            "parent": None,
-            "state": "complete",
-            **{name: {} for name in ("results", "settings", "overrides", "versions")},
-            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
-            "figures": figures,
-            "started_at": "2024-01-01T00:00:00Z",
-            "finished_at": "2024-01-01T00:00:00Z",
-            "seconds": 1.0,
-        }
-    )
+    return run_record(figures=figures)
 
 
 @pytest.fixture
@@ -98,13 +85,7 @@ def test_who_stands_where_somebody_stood_is_that_person():
 
 def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):
     # Two metres in front of 1000 px: 2 cm are 10 px. The second person moves most, in frame 11.
-    camera = Camera(
-        focal=[1000.0, 1000.0],
-        principal_point=[500.0, 500.0],
-        distortion=np.zeros(5),
-        image_size=[1000, 1000],
-        cam_from_world=Rigid(np.eye(3), np.zeros(3)),
-    )
+    camera = plain_camera(1000.0, (500.0, 500.0), Rigid(np.eye(3), np.zeros(3)), (1000, 1000))
     before = np.zeros((3, 2, 17, 3))
     before[..., 2] = 2.0
     before[:, 1, :, 0] = 0.5

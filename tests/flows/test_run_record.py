@@ -1,13 +1,11 @@
 """A run's record when units fail, and when the match is edited during the run."""
 
-from dataclasses import replace
-
 import pytest
-from command_line import TINY
+from command_line import TINY, succeed, worldpose
 
 from data_contracts.review import MergedTracks
-from flows import iterate, run_record
-from flows.gates import GATES, IdentityLimits
+from data_contracts.usability import Usability
+from flows import iterate
 from flows.iterate import Iteration, iterate_match
 from flows.method import METHOD
 from flows.registering import open_match
@@ -95,12 +93,18 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
     assert begun == [(1, 0), (2, 0), (1, 1), (2, 1)]
 
 
-def test_a_run_that_asks_no_person_warns_of_a_result_that_is_probably_wrong(store, monkeypatch):
-    assert not [text for text in recorded(store, METHOD).warnings if "may be wrong" in text]
-    strict = replace(GATES["tracking"], limits=IdentityLimits(mean_ray_distance_m=0.0))
-    monkeypatch.setattr(run_record, "GATES", {"tracking": strict})
-    (text,) = (text for text in recorded(store, METHOD).warnings if "may be wrong" in text)
-    assert text.startswith(
-        "tracking/clip may be wrong: disagreement of the cameras about a person: "
-    )
-    assert "--gates auto" in text
+def test_a_run_is_judged_by_the_limits_of_its_match_and_anew_when_they_change(store):
+    assert store.run(TINY).usability == Usability(verdict="usable")
+    succeed("settings", TINY, "--set", "max_ray_distance_m=0.001", "--project", store.url)
+    done = worldpose("run", TINY, "--project", store.url, "--json")
+    assert (done.code, done.json["executed"]) == (0, 0)
+    (said,) = done.json["usability"]["reservations"]
+    assert done.json["usability"]["verdict"] == "usable with reservations"
+    assert "cameras disagree about the people in clip by 5.89 cm" in said
+    assert "(limit 0.1 cm)" in said
+    assert said in done.json["warnings"]
+    assert f"reservation: {said}" in " ".join(done.err.split())
+    (row,) = succeed("status", TINY, "--project", store.url, "--json").json["matches"]
+    assert (row["now"], row["usability"]) == ("usable with reservations", done.json["usability"])
+    again = succeed("run", TINY, "--project", store.url, "--json").json
+    assert again["run"] == done.json["run"]

@@ -24,6 +24,7 @@ from flows.settings import parse_overrides, resolve
 from flows.web import app_context
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.errors import InputError
+from worldpose.store.run_queue import queue_of
 from worldpose.store.store import Store
 
 BODY = "smpl-test"
@@ -107,14 +108,17 @@ class Runs:
     """The runs of a service: parameters of the deployment that processes matches."""
 
     def __init__(self, url):
-        self.url, self.started = url, []
+        self.url, self.started, self.queue = url, [], queue_of(url)
 
     def start(self, match_id, *, priority="normal", key=None, **given):
         self.started.append({"match_id": match_id, **{n: it for n, it in given.items() if it}})
-        return SimpleNamespace(id="run", link="")
+        return SimpleNamespace(flow_run="run")
 
-    def active(self):
-        return []
+    def at_prefect(self, runs):
+        return {}
+
+    def link(self, run):
+        return ""
 
     def run_all(self):
         for given in self.started:

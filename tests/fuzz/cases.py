@@ -9,34 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from . import (  # noqa: F401 - they register
-    array_kinds,
     camera_kinds,
     click_kinds,
     file_kinds,
-    form_kinds,
     people_kinds,
     service_kinds,
 )
-from .judging import (
-    DEFECTS,
-    REFUSED,
-    RIGHT,
-    UNJUDGED,
-    failure_class,
-    judge,
-    leftovers,
-    run_match,
-)
+from .judging import DEFECTS, REFUSED, RIGHT, UNJUDGED, failure_class, judge, leftovers, run_match
 from .kinds import DATA, FILES, FILM, KINDS
 from .scene import film, new_draft, write
 from .service_kinds import ROUTES, Project, ask_all, routes, use_store
 
 WEIGHTS = {
-    **{"camera": 3, "clicks": 4, "people": 4, "clips": 3, "toml": 3, "pitch": 2, "settings": 2},
-    **{"ids": 1, "bytes": 3, "video": 1, "store": 2, "request": 2, "forms": 3},
+    **{"camera": 3, "clicks": 4, "people": 4, "clips": 3, "toml": 3, "pitch": 2},
+    **{"ids": 1, "bytes": 3, "video": 1, "store": 2, "request": 2},
 }
 """How often a case begins with a kind of each group: what reaches the stages comes more often."""
-FURTHER = ("camera", "clicks", "people", "clips", "toml", "pitch", "forms")
+FURTHER = ("camera", "clicks", "people", "clips", "toml", "pitch")
 """Groups from which most further kinds of a combination come: others end most matches at once."""
 
 
@@ -152,9 +141,7 @@ def _match_case(names, seed, work):
         return {"class": "not built", "message": f"{type(error).__name__}: {error}"}
     until = "ingest" if base == "filmed" else None
     try:
-        store, match, record, failures = run_match(
-            work / "match", work / "project", draft.overrides, until
-        )
+        store, match, record, failures = run_match(work / "match", work / "project", until)
     except Exception as error:
         kind, message = failure_class(error)
         answer = {"class": kind, "message": message}

@@ -1,7 +1,5 @@
 """Clicks that are not as they should be."""
 
-import math
-
 import numpy as np
 
 from .kinds import drop, exchange, kind, kinds, one
@@ -125,27 +123,6 @@ kinds(
         ].append({"name": "sideline", "xy": [[1.0, 2.0]]}),
     },
     lambda draft, rng, act: act(draft, rng),
-    base="clicked",
-)
-
-
-def _click_entry(draft, rng, how):
-    key, value = how
-    points_of(draft, rng)[0][key] = value
-
-
-kinds(
-    "clicks",
-    {
-        "click_of_unknown_name": ("name", "corner_left_nera"),
-        "click_outside": ("xy", [5000.0, 20.0]),
-        "click_of_text": ("xy", ["10", "20"]),
-        "click_of_one_number": ("xy", [4.0]),
-        "click_of_nan": ("xy", [math.nan, 4.0]),
-        "click_beyond_numbers": ("xy", [10**400, 4.0]),
-        "click_with_a_note": ("note", "unsure"),
-    },
-    _click_entry,
     base="clicked",
 )
 

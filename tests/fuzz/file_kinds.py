@@ -1,4 +1,4 @@
-"""Files that are not what their names say: raw bytes, arrays, videos; and settings of any type."""
+"""Files that are not what their names say: raw bytes, links and videos."""
 
 import gzip
 import os
@@ -176,38 +176,6 @@ for role in ("yaml", "toml", "clicks", "npz"):
     )
 
 
-def _text(draft, rng, how):
-    role, before, after = how
-    path = FILES_OF[role](draft, rng)
-
-    def strike(folder):
-        file = folder / path
-        if file.is_file():
-            file.write_text(file.read_text().replace(before, after, 1))
-
-    draft.after.append(strike)
-    draft.truth = None
-
-
-kinds(
-    "bytes",
-    {
-        "yaml_with_a_key_twice": ("yaml", "fps:", "fps: 50\nfps:"),
-        "yaml_with_an_alias": ("yaml", "contract: 1", "contract: &a 1\nanother: *a"),
-        "yaml_with_a_python_tag": ("yaml", "fps:", "x: !!python/object/apply:os.system [id]\nfps:"),
-        "yaml_with_a_merge": ("yaml", "fps:", "<<: {a: 1}\nfps:"),
-        "yaml_with_a_timestamp": ("yaml", "match_id: fuzz", "match_id: !!timestamp 2024-99-99"),
-        "yaml_with_an_int_tag": ("yaml", "contract: 1", "contract: !!int ''"),
-        "toml_with_a_key_twice": ("toml", "size =", "size = [1, 1]\nsize ="),
-        "toml_with_dotted_keys": ("toml", "size =", ".".join("a" * 900) + " = 1\nsize ="),
-        "clicks_with_a_key_twice": ("clicks", '"drawn"', '"points": [], "drawn"'),
-        "clicks_with_a_surrogate": ("clicks", '"corner', '"\\ud800corner'),
-    },
-    _text,
-    phase=FILES,
-)
-
-
 @kind("bytes", phase=FILES, harmless=True)
 def foreign_files_beside(draft, rng):
     def strike(folder):
@@ -218,55 +186,6 @@ def foreign_files_beside(draft, rng):
         (folder / "detections" / ".cam0.npz").write_bytes(b"hidden")
 
     draft.after.append(strike)
-
-
-# -------------------------------------------------------------------------------------- stills
-
-
-def _still(draft, rng, make):
-    name = some(draft, rng)
-    size = draft.cameras[name].width, draft.cameras[name].height
-
-    def strike(folder):
-        (folder / "stills").mkdir(exist_ok=True)
-        (folder / "stills" / f"{name}.png").write_bytes(make(size))
-
-    draft.after.append(strike)
-
-
-def _png(picture):
-    import cv2
-
-    return cv2.imencode(".png", picture)[1].tobytes()
-
-
-def _declared(width, height):
-    import struct
-    import zlib
-
-    def chunk(kind_of, content):
-        check = zlib.crc32(kind_of + content)
-        return struct.pack(">I", len(content)) + kind_of + content + struct.pack(">I", check)
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    body = zlib.compress(b"\0" * 100)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
-
-
-kinds(
-    "video",
-    {
-        "still_of_grass": lambda s: _png(np.full((s[1], s[0], 3), (40, 120, 60), np.uint8)),
-        "still_of_another_size": lambda s: _png(np.zeros((90, 160, 3), np.uint8)),
-        "still_cut_off": lambda s: _png(np.zeros((s[1], s[0], 3), np.uint8))[:-200],
-        "still_of_text": lambda s: b"not a picture",
-        "still_empty": lambda s: b"",
-        "still_of_60000_by_60000": lambda s: _declared(60000, 60000),
-    },
-    _still,
-    phase=FILES,
-    base="clicked",
-)
 
 
 # -------------------------------------------------------------------------------------- videos
@@ -341,89 +260,4 @@ kinds(
     phase=FILES,
     base="filmed",
     harmless=True,
-)
-
-
-def _pictures(draft, rng, names):
-    camera = some(draft, rng)
-
-    def strike(folder):
-        file = folder / "videos" / f"{camera}.mp4"
-        if file.is_file():
-            file.unlink()
-        place = folder / "videos" / camera
-        place.mkdir()
-        for name in names:
-            (place / name).write_bytes(_png(np.full((48, 64, 3), 50, np.uint8)))
-
-    draft.after.append(strike)
-    draft.camera_spec(camera)["video"] = f"videos/{camera}"
-
-
-kinds(
-    "video",
-    {
-        "pictures_without_numbers": ["a.png", "b.png"],
-        "pictures_with_gaps": ["0.png", "3.png", "9.png"],
-        "pictures_of_huge_numbers": ["0.png", "99999999999999999999.png"],
-        "no_pictures": [],
-        "pictures_that_are_hidden": [".0.png"],
-    },
-    _pictures,
-    phase=FILES,
-    base="filmed",
-)
-
-
-# ------------------------------------------------------------------------------------ settings
-
-VALUES = (
-    "null",
-    "true",
-    '"x"',
-    "[]",
-    "{}",
-    "0",
-    "-1",
-    "1e308",
-    "1e-308",
-    "nan",
-    "Infinity",
-    "1.5",
-    "9" * 400,
-)
-
-
-def _setting(draft, rng, value):
-    from flows.method import METHOD
-
-    stages = [
-        stage
-        for stage in METHOD
-        if stage.settings.model_fields
-        and not {"detection", "redetection", "broadcast", "refitting"} & set(stage.name.split("_"))
-    ]
-    stage = one(rng, stages)
-    name = one(rng, sorted(stage.settings.model_fields))
-    draft.overrides.append(f"{stage.name}.{name}={value}")
-    draft.truth = None
-
-
-kinds("settings", {f"setting_of_{value[:12]}": value for value in VALUES}, _setting)
-
-
-def _assignment(draft, rng, text):
-    draft.overrides.append(text)
-
-
-kinds(
-    "settings",
-    {
-        "setting_without_value": "triangulation.min_views",
-        "setting_of_unknown_stage": "triangulating.min_views=3",
-        "setting_of_unknown_name": "triangulation.min_view=3",
-        "setting_of_surrogate": 'triangulation.min_views="\\ud800"',
-        "setting_of_deep_json": "triangulation.min_views=" + "[" * 3000,
-    },
-    _assignment,
 )

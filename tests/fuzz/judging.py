@@ -156,7 +156,7 @@ def failure_class(error):
     return "refused", message
 
 
-def run_match(folder, project, overrides=(), until=None):
+def run_match(folder, project, until=None):
     """Run a match's stages without Prefect; return store, match, record and failed units.
 
     Raises:
@@ -170,7 +170,7 @@ def run_match(folder, project, overrides=(), until=None):
 
     _open_results_once(Store)
     stages = selected_stages(None, until)
-    settings = parse_overrides(list(overrides), stages)
+    settings = parse_overrides([], stages)
     store = Store.open_or_new(str(project))
     match, _ = register(store, Path(folder))
     log = RunLog.begin(store, match, stages, settings, "never")

@@ -15,8 +15,7 @@ class Kind:
 
     Attributes:
         name: of the kind, unique.
-        group: camera, clicks, people, clips, ids, pitch, toml, bytes, video, settings, store,
-            request, forms.
+        group: camera, clicks, people, clips, ids, pitch, toml, bytes, video, store, request.
         apply: of the draft, or of the project or browser for the last two, and a random generator.
         phase: when it strikes.
         base: the match that it needs: any, clicked, given, filmed, stored.

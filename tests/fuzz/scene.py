@@ -7,7 +7,6 @@ down from the Laws of the Game, and OpenCV projects. A case mutates a `Draft` an
 import io
 import json
 import math
-import zipfile
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -153,7 +152,6 @@ class Draft:
         seen: arrays of each camera's detections.
         pitch: content of pitch.json, if any.
         coco: write detections as COCO results.
-        overrides: settings as `--set` takes them.
         truth: the people again where a kind moves the world; None where no truth is known.
         after: functions of the written folder that spoil its files.
     """
@@ -166,7 +164,6 @@ class Draft:
     seen: dict = field(default_factory=dict)
     pitch: dict | None = None
     coco: bool = False
-    overrides: list = field(default_factory=list)
     truth: np.ndarray | None = None
     after: list = field(default_factory=list)
     click_noise: float = 0.6
@@ -316,22 +313,11 @@ def write(draft, folder):
         spoil(folder)
 
 
-def npz_bytes(arrays, compression=zipfile.ZIP_STORED):
-    """The arrays as an npz file; values that are not arrays are stored as bytes."""
+def npz_bytes(arrays):
+    """The arrays as an npz file, in the types that readers expect."""
     packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", compression) as file:
-        for name, values in arrays.items():
-            content = values
-            if not isinstance(values, bytes):
-                kept = values.dtype if values.dtype.kind not in "fi" else None
-                if kept is None and values.dtype in (np.float64, np.int64):
-                    kept = "<i8" if name == "frame" else "<f4"
-                form = io.BytesIO()
-                np.lib.format.write_array(
-                    form, np.asarray(values, dtype=kept or values.dtype), version=(1, 0)
-                )
-                content = form.getvalue()
-            file.writestr(f"{name}.npy", content)
+    types = {name: "<i8" if name == "frame" else "<f4" for name in arrays}
+    np.savez(packed, **{name: np.asarray(values, types[name]) for name, values in arrays.items()})
     return packed.getvalue()
 
 

@@ -92,36 +92,6 @@ kinds(
     base="stored",
 )
 
-FOREIGN = (
-    ".x.json",
-    ".DS_Store",
-    "._0001.json",
-    "backup.json",
-    "0001 (copy).json",
-    "Thumbs.db",
-    "ä.json",
-)
-
-
-def _foreign(project, rng, place):
-    folder = project.root / place
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / one(rng, FOREIGN)).write_bytes(one(rng, [b"", b"{}", b"\0\1"]))
-
-
-kinds(
-    "store",
-    {
-        f"foreign_file_in_{place.replace('/', '_') or 'the_project'}": place
-        for place in (
-            *("", "matches", "runs", f"runs/{MATCH}", "results", f"results/{MATCH}"),
-            *("reviews", f"reviews/{MATCH}", "pins", f"pins/{MATCH}", "staging"),
-        )
-    },
-    _foreign,
-    base="stored",
-)
-
 
 def _store_act(project, rng, act):
     act(project)
@@ -219,20 +189,7 @@ def use_store(project):
 
 # ------------------------------------------------------------------------------------ requests
 
-NAMES = {
-    "unknown": "nobody",
-    "empty": "%20",
-    "climbing": "..%2f..%2fetc%2fpasswd",
-    "of_bad_utf8": "%ff%fe",
-    "of_nul": "a%00b",
-    "of_markup": "%3Cscript%3E",
-}
-NUMBERS = {
-    "negative": "-1",
-    "huge": "9" * 30,
-    "textual": "abc",
-    "empty": "",
-}
+NUMBERS = {"negative": "-1", "huge": "9" * 30, "textual": "abc", "empty": ""}
 
 
 def edit_body(kind, **fields):
@@ -271,18 +228,6 @@ BODIES = {
     "accept_of_huge_frames": json.dumps({"people": [[10**30, 10**30]]}),
     "verdict_of_nothing": '{"verdict": ""}',
 }
-TYPES = {
-    "text": "text/plain",
-    "form": "application/x-www-form-urlencoded",
-    "none": None,
-}
-HEADERS = {
-    "cookie_of_noise": {"cookie": "\x01=\xff; a=b; ;;=".encode("latin-1")},
-    "origin_of_evil": {"origin": "http://evil.example"},
-    "host_of_evil": {"host": "evil.example"},
-    "length_of_text": {"content-length": "abc"},
-    "range_of_noise": {"range": "bytes=9-1,abc"},
-}
 GOOD = {"match_id": MATCH, "owner": "cam0", "camera": "cam0", "clip": "clip", "number": "0"}
 ROUTES = []
 
@@ -314,49 +259,20 @@ def _ask(project, rng, how):
         choices = [each for each in ROUTES if each[0] in ("POST", "PUT", "DELETE")]
     for _ in range(6):
         method, path = one(rng, choices)
-        keywords = {}
-        url = _path(rng, path, value if kind == "name" else None)
+        keywords, url = {}, _path(rng, path)
         if kind == "number":
             key = one(rng, ["frame", "number", "person", "first", "limit"])
             url = f"{_path(rng, path, value if rng.random() < 0.3 else None)}?{key}={value}"
         if method in ("POST", "PUT", "DELETE", "PATCH"):
             keywords["content"] = value if kind == "body" else '{"edits": []}'
             keywords["headers"] = {"content-type": "application/json"}
-        if kind == "type" and "headers" in keywords:
-            keywords["headers"] = {"content-type": value} if value else {}
-        if kind == "header":
-            keywords["headers"] = {**keywords.get("headers", {}), **value}
-        if kind == "method":
-            method = value
         project.asked.append((method, url, keywords))
 
 
-for label, value in NAMES.items():
-    kinds("request", {f"request_name_{label}": ("name", value)}, _ask, base="stored")
 for label, value in NUMBERS.items():
     kinds("request", {f"request_number_{label}": ("number", value)}, _ask, base="stored")
 for label, value in BODIES.items():
     kinds("request", {f"request_body_{label}": ("body", value)}, _ask, base="stored")
-for label, value in TYPES.items():
-    kinds("request", {f"request_type_{label}": ("type", value)}, _ask, base="stored")
-for label, value in HEADERS.items():
-    kinds("request", {f"request_{label}": ("header", value)}, _ask, base="stored")
-for value in ("PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "HEAD", "PROPFIND"):
-    kinds("request", {f"request_by_{value.lower()}": ("method", value)}, _ask, base="stored")
-
-
-def _login_body(project, rng, body):
-    project.asked.append(
-        ("POST", "/api/login", {"content": body, "headers": {"content-type": "application/json"}})
-    )
-
-
-kinds(
-    "request",
-    {f"login_{label}": body for label, body in BODIES.items() if len(body) < 10_000},
-    _login_body,
-    base="stored",
-)
 
 
 def ask_all(project):

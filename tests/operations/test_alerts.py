@@ -5,14 +5,22 @@ import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
 from threading import Thread
+from types import SimpleNamespace
 
 import apprise
 import pytest
 from command_line import worldpose
 
-from data_contracts.operations import Arrival
-from flows.service import watching
-from flows.service.alerts import LONGEST_PAUSE, Alert, AlertDispatcher, FailedRun, alerts_now
+from data_contracts.operations import Arrival, QueuedRun
+from data_contracts.usability import Usability
+from flows.service.alerts import (
+    LONGEST_PAUSE,
+    MAX_SINGLE,
+    Alert,
+    AlertDispatcher,
+    alerts_now,
+    kept_alerts,
+)
 from flows.service.channels import Channel, apprise_mail, channels_of
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, UnitSummary
@@ -266,36 +274,112 @@ def test_a_question_is_no_alert_before_its_time(plan):
 
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
-    def body(**unit):
-        return MatchStatus("m", stages={"body_fitting": (UnitSummary("clip", "done", **unit),)})
+    def judged(state, *reservations):
+        verdict = "usable with reservations" if reservations else "usable"
+        usability = Usability(verdict=verdict, reservations=reservations)
+        latest = SimpleNamespace(run_id="0001", state=state, usability=usability)
+        return MatchStatus("m", latest)
 
-    assert alerts_now(plan, [body(figures={"offset_rms_m": 0.01})], [], []) == []
-    (poor,) = alerts_now(
-        plan, [body(objections=("offset_rms_m is 0.05, at most 0.03 passes",))], [], []
-    )
-    assert (poor.alert, poor.text) == (
-        "quality",
-        "m/body_fitting/clip: distance of bodies from the seen joints: 5 cm, limit 3 cm",
-    )
+    assert alerts_now(plan, [judged("complete")], [], []) == []
+    assert alerts_now(plan, [judged("waiting", "cam1 is bad.")], [], []) == []  # it asks already
+    (poor,) = alerts_now(plan, [judged("complete", "cam1 is bad.", "cam2 is.")], [], [])
+    text = "m is usable with reservations: cam1 is bad. cam2 is."
+    assert (poor.alert, poor.text) == ("quality", text)
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
         for state in ("arriving", "incomplete", "refused", "taken")
     ]
     (refused,) = alerts_now(plan, [], arrivals, [])
     assert "refused in the inbox is refused: it is a link" in refused.text
-    (failed,) = alerts_now(plan, [], [], [FailedRun("1f2e", "m", "crashed", "killed")])
+    (failed,) = alerts_now(plan, [], [], [ended("m", "failed", "killed")])
     assert failed.link == "http://127.0.0.1:4200/runs/flow-run/1f2e"
     (full,) = alerts_now(plan.model_copy(update={"disk_gb": 1e9}), [], [], [])
     assert full.alert == "disk_low"
 
 
-def test_an_alert_of_a_partial_run_says_so_and_why(plan, monkeypatch):
+def ended(match, state, message="", number=1, **more):
+    return QueuedRun(
+        id=f"run-{number}",
+        flow="match",
+        name=f"{match}, {number}",
+        match_id=match,
+        flow_run="1f2e",
+        state=state,
+        message=message,
+        asked_at=NOW + timedelta(minutes=number),
+        changed_at=NOW,
+        **more,
+    )
+
+
+def test_an_alert_of_a_partial_run_says_so_and_why(plan):
     text = "run 0003 of m: partial, 1 unit failed, 7 are blocked. tracking/clip: no light"
-    raised = f"Flow run encountered an exception: IncompleteRunError: {text}"
-    run = {"id": "1f2e", "name": "m, 1", "state_name": "Failed", "state": {"message": raised}}
-    run["parameters"] = {"match_id": "m"}
-    monkeypatch.setattr(watching.MatchRuns, "runs", lambda *asked, **wanted: [run])
-    monkeypatch.setattr(watching, "may_restart", lambda run: False)
-    (alert,) = alerts_now(plan, [], [], watching.failed_runs(plan, NOW))
+    (alert,) = alerts_now(plan, [], [], [ended("m", "failed", text)])
     assert alert.text == f"run m, 1 is partial: {text}"
     assert alert.match_id == "m"
+
+
+def test_a_later_run_that_ended_well_ends_the_alert_and_old_failures_raise_none(plan):
+    first = ended("m", "failed", "dark")
+    assert len(alerts_now(plan, [], [], [first])) == 1
+    assert len(alerts_now(plan, [], [], [first, ended("m", "begun", number=2)])) == 1
+    assert alerts_now(plan, [], [], [first, ended("m", "complete", number=2)]) == []
+    old = first.model_copy(update={"changed_at": NOW - timedelta(days=8)})
+    assert alerts_now(plan, [], [], [old]) == []
+
+
+def test_a_run_that_was_ended_for_lack_of_progress_is_an_alert_until_it_ends(plan):
+    run = ended("m", "asked", stalled="no progress for 10 min", kills=1)
+    (alert,) = alerts_now(plan, [], [], [run])
+    assert (alert.alert, "no progress for 10 min" in alert.text) == ("run_stalled", True)
+    done = run.model_copy(update={"state": "complete"})
+    assert alerts_now(plan, [], [], [done]) == []
+
+
+def test_a_match_is_one_alert_however_many_of_its_results_are_poor_or_wait(plan):
+    since = datetime.now(UTC) - timedelta(hours=2)
+    usability = Usability(verdict="usable with reservations", reservations=("cam1 is bad.",))
+    latest = SimpleNamespace(run_id="0001", state="partial", usability=usability)
+    waits = [UnitSummary(f"d{it}", "waiting", waiting_since=since, why="b") for it in range(6)]
+    match = MatchStatus("m", latest, stages={"static_calibration": tuple(waits)})
+    runs = [ended("m", "failed", "dark")]
+    (alert,) = alerts_now(plan, [match], [], runs)
+    assert (alert.alert, alert.match_id) == ("run_failed", "m")
+    assert "and 5 more results" in alert.text and alert.text.endswith("cam1 is bad.")
+
+
+def test_a_flood_of_alerts_is_one_message(webhook, tmp_path):
+    dispatcher = AlertDispatcher(StateFolder(tmp_path), [hook(webhook)])
+    dispatcher.hold(many(2000))
+    dispatcher.deliver(dispatcher.channels[0])
+    ((_, posted),) = webhook.posted
+    assert posted["alert"] == "digest" and posted["text"].startswith("2000 alerts are new:")
+    assert "1990 more" in posted["text"]
+    dispatcher.hold(many(2000))
+    dispatcher.deliver(dispatcher.channels[0])
+    assert len(webhook.posted) == 1
+
+
+def test_alerts_that_last_are_told_once_a_day(webhook, tmp_path):
+    dispatcher = AlertDispatcher(StateFolder(tmp_path), [hook(webhook)])
+    dispatcher.hold(many(2))
+    dispatcher.deliver(dispatcher.channels[0])
+    assert len(webhook.posted) == 2  # of their first day there is no digest
+    text = StateFolder(tmp_path).alerts.read_text()
+    StateFolder(tmp_path).alerts.write_text(text.replace(f"{NOW:%Y-%m-%d}", "2026-01-01"))
+    for _ in range(2):  # also after a restart
+        dispatcher = AlertDispatcher(StateFolder(tmp_path), [hook(webhook)])
+        dispatcher.hold(many(3))
+        dispatcher.deliver(dispatcher.channels[0])
+    assert [each["alert"] for _, each in webhook.posted] == [*["quality"] * 3, "digest"]
+    assert webhook.posted[-1][1]["text"].splitlines() == ["2 alerts last:", "alert 0", "alert 1"]
+
+
+def test_alerts_of_two_sources_do_not_end_each_other(tmp_path):
+    dispatcher = AlertDispatcher(StateFolder(tmp_path), [])
+    dispatcher.hold(many(1))
+    dispatcher.hold([Alert("steps", "watch_stalled", "a disk")], source="steps")
+    assert set(kept_alerts(StateFolder(tmp_path))) == {"0", "steps"}
+    dispatcher.hold([], source="steps")
+    assert set(kept_alerts(StateFolder(tmp_path))) == {"0"}
+    assert MAX_SINGLE > 5

@@ -2,8 +2,8 @@
 
 import importlib
 import os
+import platform
 import re
-from collections import Counter
 from contextvars import copy_context
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,15 +19,16 @@ from service import wait_until
 
 from flows.orchestration import prefect_api, suspension
 from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError
-from flows.service import recovery, watching
+from flows.service import recovery
+from flows.service.alerts import alerts_now
 from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, install
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import FLOWS, ServePlan, deployment_name
-from flows.service.recovery import restart_lost_runs
+from flows.service.recovery import adopt_due, recover
+from flows.service.run_queue import beating, queued_run
 from flows.service.schedules import parse_schedules
-from flows.service.watching import failed_runs
 from flows.service.worker import RefusedRunError, ServedWorker, require_installed
 from flows.web import app_context
 from flows.web.app_context import Continuing
@@ -182,22 +183,23 @@ def test_what_schedules_missed_runs_once_after_a_start(plan, prefect, is_updated
             at = (due + timedelta(days=day)).isoformat()
             state = {"type": "SCHEDULED", "state_details": {"scheduled_time": at}}
             given = {"parameters": {"retry": retry}, "tags": tags, "state": state}
-            prefect.create_run("reprocess", name=f"missed {day} {retry}", **given)
+            given["name"] = f"missed {day} {retry}"
+            prefect.ask(f"/deployments/{found['id']}/create_flow_run", given)
     if is_updated:  # as by another version, whose update removes planned runs
         changed = {"description": "older"}
         prefect.ask(f"/deployments/{found['id']}", changed, method="PATCH")
     install(plan)
+    recover(plan)
+    recover(plan)
     named = {"name": {"like_": "missed "}}
     runs = prefect.runs(["ops-reprocess"], **named)
     left = [run for run in runs if run["state_type"] == "SCHEDULED"]
     assert sorted(run["parameters"]["retry"] for run in left) == [False, True]
     assert {run["parameters"]["project"] for run in left} == {plan.project}
-    restart_lost_runs(plan)
-    assert (
-        len(prefect.runs(["ops-reprocess"], state={"type": {"any_": ["SCHEDULED"]}}, **named)) == 2
-    )
+    for run in prefect.queue.open_runs():
+        if run.name.startswith("missed "):
+            prefect.cancel(run, "")
     for run in left:
-        prefect.set_state(run["id"], "CANCELLED", "")
         prefect.ask(f"/flow_runs/{run['id']}", method="DELETE")
 
 
@@ -222,33 +224,43 @@ def planned_runs(prefect, deployment):
     return prefect.list_all("flow_runs", flow_runs=wanted)
 
 
+def open_of(prefect, match):
+    return [run for run in prefect.queue.open_runs() if run.match_id == match]
+
+
 def test_runs_have_readable_names_of_their_own(plan, prefect):
     run = prefect.start("lab", priority="urgent", key="twice", gates="never")
-    assert prefect.start("lab", key="twice").id == run.id
-    assert [each.id for each in prefect.active() if each.match_id == "lab"] == [run.id]
-    name = prefect.ask(f"/flow_runs/{run.id}")["name"]
-    assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", name)
+    assert prefect.start("lab", key="twice") == run
+    assert open_of(prefect, "lab") == [run]
+    assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", run.name)
+    assert prefect.at_prefect([run])[run.flow_run]["name"] == run.name
+    prefect.cancel(run, "")
 
 
 def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
     plan, prefect, monkeypatch
 ):
     monkeypatch.setattr(app_context, "match_runs_of", lambda url: prefect)
+    monkeypatch.setattr(app_context, "FRESH_SECONDS", 0.0)
     continuing = Continuing(Store.create(plan.project))
     first = continuing.go_on("clicked", gates="never")
     assert (first["state"], first["how"]) == ("running", "the deployment")
     assert "waits for its turn" in continuing.go_on("clicked")["how"]
     state = continuing.state("clicked")
     assert (state["state"], state["prefect"]) == ("running", first["prefect"])
-    continuing.go_on("clicked too")
-    assert "before it" in continuing.state("clicked too")["lines"][0]
-    (run,) = (run for run in prefect.active() if run.match_id == "clicked")
-    prefect.set_state(run.id, "RUNNING", "")
+    continuing.go_on("clicked-too")
+    assert "before it" in continuing.state("clicked-too")["lines"][0]
+    (run,) = open_of(prefect, "clicked")
+    prefect.queue.begin(run, run.flow_run)
+    with beating(prefect.queue, run):
+        wait_until(lambda: prefect.queue.beat(run))
+    assert continuing.state("clicked")["percent"] == 0.0
     assert "once more" in continuing.go_on("clicked")["how"]
-    runs = [run for run in prefect.active() if run.match_id.startswith("clicked")]
-    assert [run.match_id for run in runs].count("clicked") == 2
-    for each in runs:  # no other test finds them
-        prefect.set_state(each.id, "CANCELLED", "")
+    assert len(open_of(prefect, "clicked")) == 2
+    assert continuing.cancel("clicked") and continuing.cancel("clicked-too")
+    (run,) = open_of(prefect, "clicked")  # the one at work: its worker ends it
+    prefect.queue.change(run, "failed", "too dark")
+    assert continuing.state("clicked")["lines"] == ["too dark"]
 
 
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
@@ -314,55 +326,96 @@ def test_another_project_of_the_same_name_is_refused(plan):
             install(plan.model_copy(update=changes))
 
 
-def give_run(prefect, name, state, pid=None):
-    run = prefect.create_run("match", name=name)["id"]
-    prefect.set_state(run, state, "", "Suspended" if state == "PAUSED" else None)
-    if pid is not None:
-        prefect.ask(f"/flow_runs/{run}", {"infrastructure_pid": str(pid)}, method="PATCH")
-    return run
+@pytest.fixture
+def lonely(plan, tmp_path):
+    """The plan with a queue of its own, and its runs."""
+    own = plan.model_copy(update={"project": str(tmp_path), "state": tmp_path / "operations"})
+    return own, MatchRuns.of_plan(own)
 
 
-def test_killed_runs_begin_again_and_no_others(plan, prefect, monkeypatch):
-    dead, alive = 2**22 + 1, 1  # beyond the largest process number; the first process
-    given = {
-        "crashed": ("CRASHED", None),
-        "dead": ("RUNNING", dead),
-        "starting": ("PENDING", dead),
-        "alive": ("RUNNING", alive),
-        "waits": ("PAUSED", dead),
-        "done": ("COMPLETED", dead),
+DEAD = {"host": platform.node(), "pid": 2**22 + 1, "worker_pid": 1}
+"""Process and worker that have ended, beyond the largest process number; on this machine."""
+
+
+def test_killed_runs_begin_again_and_no_others(lonely, monkeypatch):
+    plan, prefect = lonely
+    queue, names = prefect.queue, ("lost", "begun", "waits", "done", "off", "crashed", "starting")
+    runs = {name: prefect.start(name) for name in names}
+
+    def kinds():
+        return {
+            name: prefect.ask(f"/flow_runs/{it.flow_run}")["state_name"]
+            for name, it in runs.items()
+        }
+
+    for name in ("begun", "waits", "done"):
+        runs[name] = queue.change(runs[name], "begun", **DEAD)
+        prefect.set_state(runs[name].flow_run, "RUNNING", "")
+    queue.change(runs["waits"], "waiting")
+    prefect.set_state(runs["waits"].flow_run, "PAUSED", "", "Suspended")
+    queue.change(runs["done"], "complete")
+    prefect.set_state(runs["done"].flow_run, "COMPLETED", "")
+    prefect.set_state(runs["off"].flow_run, "CANCELLED", "")
+    prefect.set_state(runs["crashed"].flow_run, "CRASHED", "no memory")
+    prefect.set_state(runs["starting"].flow_run, "PENDING", "")
+    prefect.ask(f"/flow_runs/{runs['lost'].flow_run}", method="DELETE")
+    assert sorted(name.partition(",")[0] for name in recover(plan)) == ["begun", "crashed", "lost"]
+    again = {queue.latest(run).match_id: queue.latest(run) for run in runs.values()}
+    runs["lost"] = again["lost"]
+    assert kinds() == {
+        **{"lost": "Scheduled", "begun": "AwaitingRetry", "crashed": "AwaitingRetry"},
+        **{"waits": "Suspended", "done": "Completed", "off": "Cancelled", "starting": "Pending"},
     }
-    ids = {name: give_run(prefect, name, *each) for name, each in given.items()}
-
-    def states():
-        return {name: prefect.ask(f"/flow_runs/{run}")["state_name"] for name, run in ids.items()}
-
-    assert restart_lost_runs(plan) == ["crashed"]
-    # A run that has given a sign of life a moment ago is not looked after yet; later it is.
-    monkeypatch.setattr(recovery, "SILENT", recovery.SILENT * 0)
-    assert restart_lost_runs(plan) == ["dead"]
+    states = {name: run.state for name, run in again.items()}
+    asked = dict.fromkeys(("lost", "begun", "crashed", "starting"), "asked")
+    assert states == {**asked, "waits": "waiting", "done": "complete", "off": "cancelled"}
+    # The end of the worker is not the run's fault; a crash is.
+    assert (again["begun"].service_deaths, again["begun"].kills) == (1, 0)
+    assert again["crashed"].kills == 1
+    assert recover(plan) == []
     monkeypatch.setattr(recovery, "STARTING", recovery.STARTING * 0)
-    assert restart_lost_runs(plan) == ["starting"]
-    again = dict.fromkeys(("crashed", "dead", "starting"), "AwaitingRetry")
-    assert states() == {**again, "alive": "Running", "waits": "Suspended", "done": "Completed"}
-    # When the service starts, none of its runs is at work; on a server of others they may be.
-    others = plan.model_copy(update={"owns_prefect": False})
-    assert restart_lost_runs(others, at_start=True) == ["alive"]  # silent there
-    prefect.set_state(ids["alive"], "RUNNING", "")
-    assert restart_lost_runs(plan, at_start=True) == ["alive"]
-    prefect.set_state(ids["alive"], "CANCELLING", "")
-    assert restart_lost_runs(plan, at_start=True) == []
-    assert states()["alive"] == "Cancelled"
+    assert [name.partition(",")[0] for name in recover(plan)] == ["starting"]
 
 
-def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, prefect):
-    run = prefect.create_run("match", name="poison")["id"]
+def test_every_run_is_recovered_whatever_becomes_of_prefects_history(lonely):
+    plan, prefect = lonely
+    asked, begun, waits = (prefect.start(name, gates="never") for name in ("a", "b", "c"))
+    prefect.queue.change(begun, "begun", **DEAD)
+    prefect.queue.change(waits, "waiting")
+    for run in prefect.list_all("flow_runs"):
+        prefect.ask(f"/flow_runs/{run['id']}", method="DELETE")
+    assert len(recover(plan)) == 3
+    there = prefect.at_prefect(prefect.queue.open_runs())
+    assert {run["parameters"]["match_id"] for run in there.values()} == {"a", "b", "c"}
+    assert {run["parameters"]["gates"] for run in there.values()} == {"never"}
+    assert {run.id for run in prefect.queue.open_runs()} == {asked.id, begun.id, waits.id}
+    # A worker that takes such a run finds its former states.
+    taken = [queued_run("match", run) for run in there.values()]
+    assert {prefect.queue.take(run).id for run in taken} == {asked.id, begun.id, waits.id}
+
+
+def test_a_run_that_keeps_being_killed_is_left_for_a_person(lonely):
+    plan, prefect = lonely
+    run = prefect.start("poison")
     for _ in range(3):
-        prefect.set_state(run, "RUNNING", "")
-        prefect.set_state(run, "CRASHED", "killed")
-    assert "poison" not in restart_lost_runs(plan)
-    failed = {each.name: each for each in failed_runs(plan, datetime.now(UTC))}
-    assert (failed["poison"].state, failed["poison"].message) == ("crashed", "killed")
+        prefect.queue.change(prefect.queue.latest(run), "begun", **{**DEAD, "worker_pid": None})
+        killed = prefect.queue.kill(prefect.queue.latest(run), "killed")
+        recover(plan)
+    assert (killed.state, killed.message) == ("failed", "killed; it was begun 3 times")
+    (alert,) = alerts_now(plan.model_copy(update={"disk_gb": 0.0}), [], [], prefect.queue.runs())
+    assert (alert.alert, alert.match_id) == ("run_failed", "poison")
+
+
+def test_a_run_that_a_person_retries_at_prefect_is_asked_for_again(lonely):
+    _, prefect = lonely
+    run = prefect.start("again")
+    prefect.queue.change(run, "failed", "too dark")
+    prefect.set_state(run.flow_run, "FAILED", "")
+    adopt_due(prefect)
+    assert open_of(prefect, "again") == []
+    prefect.set_state(run.flow_run, "SCHEDULED", "", "AwaitingRetry")
+    adopt_due(prefect)
+    assert [each.id for each in open_of(prefect, "again")] == [run.id]
 
 
 @pytest.mark.slow  # a worker, and the processes of two runs
@@ -376,7 +429,7 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
     absent, held = prefect.start("absent"), prefect.start("held")
 
     def state(run):
-        return prefect.ask(f"/flow_runs/{run.id}")["state_name"]
+        return prefect.ask(f"/flow_runs/{run.flow_run}")["state_name"]
 
     worker = ServedWorker("worked", installed)
     at_work = Thread(target=copy_context().run, args=(anyio.run, worker.start, True, False, str))
@@ -384,51 +437,30 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
     with plan.state_folder.only_one("match-held", wait=True):
         at_work.start()
         wait_until(lambda: state(held) == "Running" and state(absent) == "Failed")
-        pid = int(prefect.ask(f"/flow_runs/{held.id}")["infrastructure_pid"])
-        assert is_alive(pid)
-        prefect.set_state(held.id, "CANCELLING", "")
+        pid = int(prefect.ask(f"/flow_runs/{held.flow_run}")["infrastructure_pid"])
+        assert is_alive(pid) and prefect.queue.latest(held).pid == pid
+        prefect.cancel(prefect.queue.latest(held), "")
         wait_until(lambda: state(held) == "Cancelled")
     at_work.join(60)
     assert not at_work.is_alive() and not is_alive(pid)
-    assert "absent" in prefect.ask(f"/flow_runs/{absent.id}")["state"]["message"]
+    assert "absent" in prefect.ask(f"/flow_runs/{absent.flow_run}")["state"]["message"]
+    ended = {run.match_id: run for run in prefect.queue.runs()}
+    assert {name: run.state for name, run in ended.items()} == {
+        "absent": "failed",
+        "held": "cancelled",
+    }
+    assert "absent" in ended["absent"].message
 
 
-PAGES = {
-    "old-match": (1, "FAILED"),
-    "crashed-match": (6, "CRASHED"),
-    "failed-match": (11, "FAILED"),
-    "paused-match": (11, "PAUSED"),
-}
-"""Number and state of the runs that are made of a match."""
-
-
-@pytest.fixture
-def pages_of_runs(plan, prefect, monkeypatch):
-    """Give the server more runs than an answer of Prefect holds, which lists them by random ids."""
+def test_runs_are_found_on_all_pages(plan, prefect, monkeypatch):
     monkeypatch.setattr(prefect_api, "PAGE", 5)
-    for match, (count, state) in PAGES.items():
-        run = {
-            "state": {"type": state, "message": "made"},
-            "parameters": {"project": plan.project, "match_id": match},
-        }
-        for name in (f"{match}, {number}" for number in range(count)):
-            prefect.create_run("match", name=name, idempotency_key=name, **run)
-
-
-def test_runs_are_found_on_all_pages(plan, prefect, pages_of_runs, monkeypatch):
-    def failed_by_match():
-        failed = failed_runs(plan, datetime.now(UTC))
-        return Counter(each.match_id for each in failed), failed
-
-    counts, _ = failed_by_match()
-    assert (counts["failed-match"], counts["crashed-match"]) == (11, 0)
-    monkeypatch.setattr(watching, "RESTART_PATIENCE", timedelta(0))
-    counts, failed = failed_by_match()
-    assert (counts["failed-match"], counts["crashed-match"]) == (11, 6)
-    (message,) = {each.message for each in failed if each.match_id == "crashed-match"}
-    assert message == "made; it was not restarted"
-    again = restart_lost_runs(plan)
-    assert sorted(again) == sorted(f"crashed-match, {number}" for number in range(6))
+    run = {
+        "state": {"type": "PAUSED"},
+        "parameters": {"project": plan.project, "match_id": "paused-match"},
+    }
+    place = f"/deployments/{deployments(prefect)['match']['id']}/create_flow_run"
+    for name in (f"paused-match, {number}" for number in range(11)):
+        prefect.ask(place, {**run, "name": name, "idempotency_key": name})
     ask, resumed = PrefectApi.ask, set()
 
     def note_resumed(api, path, *body, **method):
@@ -437,22 +469,14 @@ def test_runs_are_found_on_all_pages(plan, prefect, pages_of_runs, monkeypatch):
         resumed.add(path)
         return {"status": "ACCEPT"}
 
-    with monkeypatch.context() as patch:
-        patch.setattr(PrefectApi, "ask", note_resumed)
-        suspension.resume_suspended(plan.project, "paused-match")
+    monkeypatch.setattr(PrefectApi, "ask", note_resumed)
+    suspension.resume_suspended(plan.project, "paused-match")
     assert len(resumed) == 11
-    # The pages show the last run of every match; their second look asks for later runs alone.
-    monkeypatch.setattr(app_context, "match_runs_of", lambda url: prefect)
-    monkeypatch.setattr(app_context, "FRESH_SECONDS", 0.0)
-    continuing = Continuing(Store.create(plan.project))
-    for _ in range(2):
-        assert continuing.state("old-match")["lines"] == ["made"]
-        assert continuing.links().keys() >= PAGES.keys()
 
 
 def test_a_server_that_refuses_or_is_gone_is_named(plan):
-    absent = MatchRuns("http://127.0.0.1:9/api", tries=1, name="ops")
+    absent = MatchRuns("http://127.0.0.1:9/api", tries=1, name="ops", project=plan.project)
     with pytest.raises(UnreachablePrefectError, match=r"127\.0\.0\.1:9.*nothing was started"):
         absent.start("m")
     with pytest.raises(UnreachablePrefectError, match="answers 401"):
-        MatchRuns(plan.prefect, "worldpose:wrong", name="ops").start("m")
+        MatchRuns(plan.prefect, "worldpose:wrong", name="ops", project=plan.project).start("m")

@@ -4,9 +4,10 @@ from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
 import pytest
+from run_records import run_record
 
 from data_contracts.review import ReviewDecision, ReviewRequest
-from data_contracts.run import RunRecord, WaitingUnit
+from data_contracts.run import WaitingUnit
 from flows.service import overview
 from flows.service.overview import Overview
 
@@ -27,20 +28,13 @@ FIGURES = {
 
 def record():
     """A run of one camera whose clicks need a review."""
-    return RunRecord.model_validate(
-        {
-            "run_id": "0002",
-            "match_id": "m",
-            "parent": None,
-            "state": "waiting",
-            **{name: {} for name in ("settings", "overrides", "versions", "figures")},
-            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
-            "results": {UNIT: "0" * 32},
-            "waiting": (WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,)),),
-            "started_at": ASKED,
-            "finished_at": ENDED,
-            "seconds": 300.0,
-        }
+    return run_record(
+        run_id="0002",
+        state="waiting",
+        results={UNIT: "0" * 32},
+        waiting=(WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,)),),
+        started_at=ASKED,
+        finished_at=ENDED,
     )
 
 

@@ -1,31 +1,293 @@
-"""Runs that restart automatically."""
+"""The queue of a project, its heartbeats, and the end of runs that make no progress."""
 
+import os
+import platform
+import signal
+import subprocess
+import sys
+import threading
+import time
+from datetime import UTC, datetime, timedelta
+
+import psutil
 import pytest
+from service import wait_until
 
-from flows.service.recovery import DEATHS, MOST_BEGINNINGS, MOST_SERVICE_DEATHS, may_restart
+from data_contracts.operations import Heartbeat, QueuedRun
+from flows.orchestration import suspension
+from flows.progress import Reporter, reporting_to
+from flows.service import run_queue, watching
+from flows.service.alerts import AlertDispatcher, kept_alerts
+from flows.service.health import _check_progress
+from flows.service.plan import ServePlan
+from flows.service.recovery import Liveness
+from flows.service.run_queue import beating, find_process
+from worldpose.store.blobs import LocalBlobs
+from worldpose.store.documents import seal
+from worldpose.store.integrity import repair, verify
+from worldpose.store.paths import queue_path
+from worldpose.store.run_queue import MAX_KILLS, MAX_SERVICE_DEATHS, RunQueue, queue_of
+from worldpose.store.store import Store
 
-LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler was lost"
-KILLED = "its process was killed"
+NOW = datetime.now(UTC)
 
 
-def ended(kind, message=KILLED, count=1, labels=None):
-    state = {"type": kind, "message": message}
-    return {"state": state, "state_type": kind, "run_count": count, "labels": labels}
+def a_run(name="m", flow="match", **more):
+    given = {"id": f"id-{name}", "flow": flow, "name": f"{name}, 1", "flow_run": f"flow-run-{name}"}
+    match = {"match_id": name} if flow == "match" else {}
+    return QueuedRun(**{**given, **match, "asked_at": NOW, "changed_at": NOW, **more})
+
+
+@pytest.fixture
+def queue(tmp_path):
+    Store.create(str(tmp_path))
+    return queue_of(str(tmp_path))
+
+
+def test_of_two_writers_of_a_state_one_wins_and_all_states_stay(queue, tmp_path):
+    run = queue.take(a_run())
+    other = RunQueue(LocalBlobs(tmp_path))  # of another process
+    assert other.change(run, "cancelled", "by Ada").number == 2
+    assert queue.change(run, "begun") is None
+    assert queue.latest(run).state == "cancelled"
+    assert queue.open_runs() == []
+    assert queue.take(a_run()) == queue.latest(run)  # asked for once more after a lost answer
+    files = sorted(path.name for path in (tmp_path / "queue" / "match" / "m").iterdir())
+    assert files == ["id-m.0001.json", "id-m.0002.json"]
+    assert verify(Store.open(str(tmp_path))) == ()
+
+
+def test_a_damaged_state_is_found_and_hides_no_other_run(queue, tmp_path, caplog):
+    queue.take(a_run("a")), queue.take(a_run("b"))
+    file = tmp_path / "queue" / "match" / "a" / "id-a.0001.json"
+    file.write_bytes(file.read_bytes()[:-9])
+    again = RunQueue(LocalBlobs(tmp_path))
+    assert [run.match_id for run in again.runs()] == ["b"]
+    assert "verify" in caplog.text
+    store = Store.open(str(tmp_path))
+    (finding,) = verify(store)
+    assert repair(store, [finding]) == ((), ("queue/match/a/id-a.0001.json",))
+    assert verify(store) == ()
 
 
 @pytest.mark.parametrize(
-    ("run", "again"),
+    ("kills", "deaths", "ends"),
     [
-        (ended("CRASHED"), True),
-        (ended("FAILED", LOST), True),
-        (ended("FAILED", "Flow run encountered an exception: IncompleteRunError"), False),
-        (ended("COMPLETED"), False),
-        (ended("CRASHED", count=MOST_BEGINNINGS), False),
-        # A start that ended with the whole service does not count.
-        (ended("CRASHED", count=MOST_BEGINNINGS, labels={DEATHS: 1}), True),
-        (ended("CRASHED", count=MOST_BEGINNINGS + 1, labels={DEATHS: 1}), False),
-        (ended("CRASHED", count=MOST_BEGINNINGS + MOST_SERVICE_DEATHS, labels={DEATHS: 99}), False),
+        (MAX_KILLS - 1, 0, False),
+        (MAX_KILLS, 0, True),
+        (MAX_KILLS - 1, MAX_SERVICE_DEATHS, False),
+        (0, MAX_SERVICE_DEATHS + MAX_KILLS - 1, False),
+        (0, MAX_SERVICE_DEATHS + MAX_KILLS, True),
     ],
 )
-def test_runs_begin_again_that_ended_by_no_fault_of_their_own(run, again):
-    assert may_restart(run) is again
+def test_a_run_has_failed_after_too_many_ends_of_its_own(queue, kills, deaths, ends):
+    run = queue.take(a_run())
+    for number in range(kills + deaths):
+        run = queue.kill(run, "killed", by_service=number >= kills)
+    assert (run.state == "failed") is ends
+
+
+def test_old_ends_are_forgotten_but_the_last_of_each_match(queue, tmp_path):
+    for number in range(3):
+        run = a_run(id=f"{number}", asked_at=NOW - timedelta(days=90 - number))
+        queue.change(queue.take(run), "failed", "dark")
+    old = queue.take(a_run("open", asked_at=NOW - timedelta(days=90)))
+    queue.forget_ended(timedelta(days=1))
+    assert len(queue.runs()) == 4
+    queue.forget_ended(timedelta(0))
+    assert [run.id for run in queue.runs()] == [old.id, "2"]
+
+
+def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
+    for number in range(3000):
+        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
+        file = tmp_path / queue_path(run)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(seal(run))
+    queue.runs()
+    lost = queue.change(queue.take(a_run("lost")), "begun")
+    began = time.process_time()
+    assert queue.open_runs() == [lost]
+    assert time.process_time() - began < 1.0
+
+
+def beats(queue, run, seconds):
+    """How often a run showed progress in this time."""
+    before = queue.beat(run)
+    time.sleep(seconds)
+    return queue.beat(run).number - (before.number if before else 0)
+
+
+def test_heartbeats_tell_progress_and_stop_without_it(queue, monkeypatch):
+    monkeypatch.setattr(run_queue, "BEAT_SECONDS", 0.05)
+    run, reporter = queue.begin(queue.take(a_run()), "flow-run-m"), Reporter()
+    ended, waits, works = (threading.Event() for _ in range(3))
+
+    def compute():
+        with beating(queue, run), reporting_to(reporter):
+            while not waits.is_set():  # as between stages
+                sum(range(1000))
+                time.sleep(0.01)
+            works.wait()  # blocked, and no unit is at work
+            reporter.stage_started("tracking", "who is who", units=3, missing=3)
+            reporter.unit_done("tracking/a", 1.0, {})
+            ended.wait()
+
+    thread = threading.Thread(target=compute)
+    thread.start()
+    wait_until(lambda: queue.beat(run))
+    assert beats(queue, run, 1.0) > 1
+    waits.set()
+    time.sleep(0.3)
+    assert beats(queue, run, 1.0) == 0
+    works.set()
+    wait_until(lambda: "2 units left" in queue.beat(run).doing)
+    assert beats(queue, run, 1.0) > 1
+    assert queue.beat(run).share == pytest.approx(1 / 3)
+    ended.set()
+    thread.join()
+    queue.change(run, "complete")
+    assert queue.beat(run) is None
+
+
+COMPUTE = """
+import sys, time
+from flows.service import run_queue, watching
+from flows.service.alerts import AlertDispatcher, kept_alerts
+from worldpose.store.run_queue import queue_of
+run_queue.BEAT_SECONDS = 0.1
+queue = queue_of(sys.argv[1])
+run = queue.begin(queue.runs()[0], sys.argv[2])
+with run_queue.beating(queue, run):
+    while True:
+        time.sleep(0.01)
+"""
+
+
+@pytest.fixture
+def plan(tmp_path):
+    more = {"prefect": "http://127.0.0.1:9/api", "stall_minutes": 10, "disk_gb": 0.0}
+    return ServePlan(project=str(tmp_path), inbox=tmp_path, state=tmp_path / "operations", **more)
+
+
+def look(liveness, first, last):
+    """Look every half minute."""
+    for half in range(round(2 * first), round(2 * last) + 1):
+        liveness.look(30.0 * half, 30.0 * half)
+
+
+def test_a_frozen_run_is_ended_with_its_reason_and_restarts(queue, plan):
+    run, liveness = queue.take(a_run()), Liveness(plan)
+    process = subprocess.Popen([sys.executable, "-c", COMPUTE, plan.project, run.flow_run])
+    try:
+        wait_until(lambda: queue.beat(run))
+        for minute in (0, 8, 16):  # it makes progress
+            time.sleep(0.3)
+            look(liveness, minute, minute + 8)
+        assert find_process(queue.latest(run).pid, run.flow_run).pid == process.pid
+        time.sleep(0.3)
+        os.kill(process.pid, signal.SIGSTOP)
+        look(liveness, 25, 33)
+        liveness.look(60.0 * 60.0, 60.0 * 60.0)  # the machine slept
+        look(liveness, 60, 70)
+        assert queue.latest(run).state == "begun"
+        look(liveness, 70, 70.5)
+        process.wait(10)
+    finally:
+        process.kill()
+    run = queue.latest(run)
+    assert (run.state, run.kills) == ("killed", 1)
+    assert "no progress for 10 min" in run.stalled
+    assert liveness.alerts == []  # the queue has it
+
+
+def test_a_process_with_the_number_of_a_run_is_not_taken_for_it(queue):
+    begun = queue.change(queue.take(a_run()), "begun", pid=os.getpid(), host=platform.node())
+    assert find_process(begun.pid, begun.flow_run) is None
+    assert find_process(2**22 + 1, begun.flow_run) is None
+    assert psutil.pid_exists(os.getpid())
+
+
+def test_runs_that_nothing_begins_are_an_alert_while_a_place_is_free(queue, plan, monkeypatch):
+    monkeypatch.setattr(Liveness, "_end_silent_worker", lambda self: None)
+    liveness = Liveness(plan)
+    queue.take(a_run("due"))
+    other = queue.change(queue.take(a_run("other")), "begun", host="elsewhere", pid=1)
+    for minute in range(0, 40):  # the other one has the only place
+        queue.blobs.put("queue/match/other/id-other.beat.json", seal_beat(minute))
+        liveness.look(60.0 * minute, 60.0 * minute)
+    assert liveness.alerts == []
+    queue.change(queue.latest(other), "complete")
+    look(liveness, 40, 51)
+    (alert,) = liveness.alerts
+    assert (alert.alert, "due, 1" in alert.text) == ("run_late", True)
+
+
+def seal_beat(number):
+    return seal(Heartbeat(number=number, share=0.0, doing="", at=NOW))
+
+
+@pytest.mark.parametrize(("hours", "how"), [(-2, "back by 2.0 h"), (2, "forward by 2.0 h")])
+def test_a_step_of_the_clock_is_an_alert_for_a_day(queue, plan, hours, how):
+    liveness = Liveness(plan)
+    for second in range(0, 3600, 60):  # a clock that is slewed by 500 ppm is well
+        liveness.look(second, 1e9 + second * 1.0005)
+    assert liveness.alerts == []
+    wall = 1e9 + 3600.0 * hours
+    liveness.look(3600.0, wall + 3600.0)
+    (alert,) = liveness.alerts
+    assert alert.alert == "clock_stepped" and how in alert.text
+    liveness.look(3600.0 + 86399.0, wall + 3600.0 + 86399.0)
+    assert liveness.alerts == [alert]
+    liveness.look(3600.0 + 86401.0, wall + 3600.0 + 86401.0)
+    assert liveness.alerts == []
+
+
+def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
+    """As a scan of an inbox on a network disk that is gone; copies from a bucket take long."""
+    plan.state.mkdir()
+    dispatcher, now = AlertDispatcher(plan.state_folder, []), time.monotonic()
+    steps = {"looking at the inbox": now - 590.0, watching.BUCKET: now - 9000.0}
+    monkeypatch.setattr(watching, "STEPS", steps)
+    watching._watch_steps(plan, dispatcher)
+    assert kept_alerts(plan.state_folder) == {}
+    steps["looking at the inbox"] -= 20.0
+    watching._watch_steps(plan, dispatcher)
+    (alert,) = kept_alerts(plan.state_folder).values()
+    assert "looking at the inbox: no end in 10 min" in alert["text"]
+    del steps["looking at the inbox"]
+    watching._watch_steps(plan, dispatcher)
+    assert kept_alerts(plan.state_folder) == {}
+
+
+def test_what_stands_still_is_unhealthy(plan):
+    state = plan.state_folder
+    state.folder.mkdir()
+    kept = '{"told_by": [], "since": "2026-01-01", "match": "", "link": "http://h/status", '
+    entries = (
+        f'"{kind}": {kept}"alert": "{kind}", "text": "why"}}' for kind in ("quality", "run_late")
+    )
+    state.alerts.write_text(f"{{{', '.join(entries)}}}")
+    (finding,) = _check_progress(state)
+    assert (finding.is_well, finding.state) == (False, "why")
+
+
+def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp_path):
+    monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
+    monkeypatch.setattr(suspension, "SUSPENDING", 5.0)
+    run = {"id": "1", "name": "m, 1", "deployment_id": "d"}
+    run["parameters"] = {"match_id": "m", "project": str(tmp_path)}
+    states = iter(["RUNNING", "PAUSED", "PAUSED", "SCHEDULED"])
+    answers = iter(
+        [
+            {"status": "REJECT", "details": {"reason": "Run input schema not found."}},
+            {"status": "ACCEPT"},
+        ]
+    )
+    listed = lambda *args, **more: [{**run, "state_type": next(states)}]  # noqa: E731
+    monkeypatch.setattr(suspension.PrefectApi, "list_all", listed)
+    monkeypatch.setattr(suspension.PrefectApi, "ask", lambda *args: next(answers))
+    assert suspension.resume_suspended(str(tmp_path), "m") == ["m, 1"]
+    assert next(states) == "SCHEDULED"
+    monkeypatch.setattr(suspension.PrefectApi, "list_all", lambda *args, **more: [])
+    assert suspension.resume_suspended(str(tmp_path), "m") == []

@@ -9,16 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from line_sets import (
-    BROADCAST,
-    SETS,
-    fit,
-    left_out,
-    load_lines,
-    load_scorer,
-    overlap,
-    score_images,
-)
+from line_sets import BROADCAST, SETS, fit, left_out, load_lines, load_scorer, overlap, score_images
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 

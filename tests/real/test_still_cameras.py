@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 
@@ -27,12 +27,11 @@ def bench():
 
 def overhead():
     """A camera 60 m above the centre spot, 10 px per metre; x to the right, y up."""
-    return Camera(
-        focal=np.array([600.0, 600.0]),
-        principal_point=np.array([599.5, 399.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 60.0])),
-        image_size=np.array([1200, 800]),
+    return plain_camera(
+        600.0,
+        (599.5, 399.5),
+        Rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 60.0])),
+        (1200, 800),
     )
 
 

@@ -108,7 +108,8 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     )
     figures = store.manifest("filmed", "detection", "right.late", results["detection/right.late"])
     assert figures.figures["unreadable_share"] == pytest.approx(0.2)
-    assert any("no image, or none that can be decoded, for 20.0%" in w for w in figures.warnings)
+    gap = [figures.figures[f"unreadable_{end}_frame"] for end in ("from", "to")]
+    assert gap == [28.0, 29.0]
 
 
 def test_a_camera_may_film_one_clip_alone(tmp_path, reading):

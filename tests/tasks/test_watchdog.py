@@ -7,12 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from data_contracts.work import Recipe, Work
-from tasks.watchdog import (
-    TaskTimeoutError,
-    WorkerCrashError,
-    kill_on_timeout,
-    was_interrupted,
-)
+from tasks.watchdog import TaskTimeoutError, WorkerCrashError, kill_on_timeout, was_interrupted
 from worldpose.store.recipes import recipe_key
 
 

@@ -13,6 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -48,6 +49,7 @@ BODY_FOLDER_VARIABLE: Final = "WORLDPOSE_BODY_FOLDER"
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
 
+@lru_cache(maxsize=2)
 def load_open_body(name: str = OPEN_BODY) -> BodyModel:
     """Return the open body: 6890 vertices, 24 joints, 10 betas, free for any use (CC0).
 

@@ -39,8 +39,10 @@ class ClipProblem:
         flow: followed points.
         prior: prior of center and lenses.
         weights: weights of the terms.
-        smoothness: (7,) standard deviation of second differences of a frame's parameters; infinite
-            = free.
+        smoothness: (4,) standard deviation of second differences of rotation and log focal length;
+            infinite = free.
+        lens_walk: (frames - 1,) standard deviation of changes of the distortion [deviations of its
+            prior]; None = free.
         flow_loss: scale of the loss of followed points [standard deviations].
         free_frame: (7,) mask of a frame's free parameters.
         free_clip: (5,) mask of the clip's free parameters.
@@ -52,7 +54,8 @@ class ClipProblem:
     flow: FlowEvidence
     prior: Prior
     weights: TermWeights = field(default_factory=TermWeights)
-    smoothness: Floats = field(default_factory=lambda: np.full(FRAME_SIZE, np.inf))
+    smoothness: Floats = field(default_factory=lambda: np.full(4, np.inf))
+    lens_walk: Floats | None = None
     flow_loss: float = np.inf
     free_frame: Flags = field(default_factory=lambda: np.ones(FRAME_SIZE, np.bool_))
     free_clip: Flags = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))

@@ -33,7 +33,7 @@ from worldpose.broadcast_calibration.players import (
     match,
     player_evidence,
 )
-from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.priors import build_prior, lens_walk
 from worldpose.broadcast_calibration.report import (
     BroadcastCalibration,
     BroadcastReport,
@@ -71,7 +71,7 @@ class BroadcastClip:
             numbers of the video.
         proposed: the key frames are proposals: they start the fit and are no evidence in it, since
             they come from the paint that the fit measures in every frame, or from `given`.
-        smooth_weight: factor on the smoothness of focal length and distortion.
+        smooth_weight: factor on the smoothness of the focal length.
         given: camera data of a tracking system in all frames; None without.
     """
 
@@ -171,10 +171,10 @@ def refine(
     first_errors = learned.errors
     camera = tracked.chain.camera
     spread = estimate_smoothness(camera, fps)
-    spread[3:] /= np.sqrt(clip.smooth_weight)
+    spread[3] /= np.sqrt(clip.smooth_weight)
     if not settings.smooth:
         # Smoothness of the rotation still bridges frames without evidence.
-        spread[3:] = np.inf
+        spread[3] = np.inf
     clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
     if clip.proposed:
         clicks = PointEvidence.none()
@@ -217,6 +217,7 @@ def refine(
                 flow=settings.flow_weight * share,
             ),
             smoothness=spread,
+            lens_walk=lens_walk(corrected.focal) if settings.smooth else None,
             flow_loss=settings.loss_scale,
         )
         problem, solution, learned = _fit_and_learn(
@@ -235,8 +236,6 @@ def refine(
         flow_deviation_px=deviation,
         flow_share=share,
         smooth_log_focal=_finite_or_zero(spread[3]),
-        smooth_k1=_finite_or_zero(spread[4]),
-        smooth_k2=_finite_or_zero(spread[5]),
         smooth_frames=lasting,
         player_share=noise.share,
         player_frames=noise.frames,

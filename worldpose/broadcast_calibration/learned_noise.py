@@ -11,11 +11,11 @@ from data_contracts.arrays import Floats, Integers
 from data_contracts.records import Record
 from worldpose.broadcast_calibration.clip_problem import ClipProblem
 from worldpose.broadcast_calibration.evidence import CLICK, MARKING, PointEvidence, spread_noise
-from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES, PitchErrors, PitchFit
 from worldpose.broadcast_calibration.residuals import pixel_residuals
 from worldpose.broadcast_calibration.solver import ClipSolution, displace
-from worldpose.broadcast_calibration.tracking import LENS_POWERS, Chain
+from worldpose.broadcast_calibration.tracking import Chain
 from worldpose.broadcast_calibration.uncertainty import lasting_samples, paint_variance
 from worldpose.pitch.template import PitchTemplate
 
@@ -35,11 +35,6 @@ class Weights(Record):
     smooth_log_focal: float
     """Deviation of second differences: their root mean square in the logarithm of the tracked focal
     lengths, smoothed over 0.2 s."""
-    smooth_k1: float
-    """The same deviation for k1: that of the focal length times 1.6 and k1, because a zoom lens's
-    distortion changes with its zoom."""
-    smooth_k2: float
-    """The same deviation for k2: that of the focal length times k2."""
     smooth_frames: float
     """Correlation time of these second differences: the sum of their autocorrelation [frame]."""
     player_share: float
@@ -50,21 +45,13 @@ class Weights(Record):
 
 
 def estimate_smoothness(camera: MovingCamera, fps: float) -> Floats:
-    """Return the deviation (7,) of second differences in a tracked clip."""
-    min_change = np.array([1e-5, 1e-5, 1e-4, 1e-4])  # log focal, k1, k2, k3
-    spread = np.full(FRAME_SIZE, np.inf)
+    """Return the deviation (4,) of second differences in a tracked clip."""
     # At 50 frames per second: it bridges frames without evidence and does not affect others.
-    spread[:3] = 2e-3 * (50.0 / fps) ** 2
-    width = max(1, round(_WINDOW_S * fps))
-    if len(camera) < 3 * width:
-        spread[3:] = 1.0
-        return spread
-    change = float(np.sqrt(np.mean(_zoom_changes(camera, width) ** 2)))
-    lens = np.median(np.abs(camera.distortion), axis=0)
-    # The deviation of k3 uses at least the size of k2.
-    lens[2] = max(lens[2], lens[1])
-    spread[3:] = np.maximum(np.concatenate([[change], change * LENS_POWERS * lens]), min_change)
-    return spread
+    turn = 2e-3 * (50.0 / fps) ** 2
+    width, zoom = max(1, round(_WINDOW_S * fps)), 1.0
+    if len(camera) >= 3 * width:
+        zoom = max(float(np.sqrt(np.mean(_zoom_changes(camera, width) ** 2))), 1e-5)
+    return np.array([turn, turn, turn, zoom])
 
 
 def correlation_time(camera: MovingCamera, fps: float) -> float:
@@ -168,7 +155,7 @@ class LearnedNoise:
             points={names[point]: place for point, place in zip(points, places, strict=True)},
             size=np.array([getattr(pitch, name) for name in SIZES]) + self.errors.size_m * offset,
             size_std=self.errors.size_m * std,
-            paint_m=0.0 if self.errors.surveyed.all() else self.errors.paint_m,
+            paint_m=0.0 if self.errors.surveyed.all() else self.errors.shown_m,
             line_noise=self.lines,
             click_noise=self.clicks,
         )

@@ -30,7 +30,8 @@ class PitchErrors:
     Attributes:
         surveyed: (points,) mask of the template's points whose place is surveyed.
         survey_m: standard deviation of a surveyed point, each axis [m].
-        paint_m: standard deviation of any other point, each axis [m].
+        most_paint_m: largest standard deviation of any other point in the fit, each axis [m].
+        shown_m: the one that the clip's residuals show [m].
         size_m: (4,) standard deviations of length, width, crown, end fall [m]; 0 = known.
         by_size: (points, 2) change of x by the length, and of y by the width [1].
         size: length, width of the pitch [m].
@@ -38,7 +39,8 @@ class PitchErrors:
 
     surveyed: Flags
     survey_m: float
-    paint_m: float
+    most_paint_m: float
+    shown_m: float
     size_m: Floats
     by_size: Floats
     size: tuple[float, float]
@@ -47,6 +49,7 @@ class PitchErrors:
     def of(cls, pitch: PitchTemplate, settings: BroadcastCalibrationSettings) -> PitchErrors:
         """Return the prior errors of a template."""
         size = (pitch.length, pitch.width)
+        paint_m = max(settings.paint_error_m, settings.survey_error_m)
         _, change = places_by_size(pitch.spec, size, list(pitch.points))
         spread = {
             "length": settings.pitch_size_std_m,
@@ -57,13 +60,19 @@ class PitchErrors:
         return cls(
             surveyed=np.array([name in pitch.surveyed for name in pitch.points]),
             survey_m=settings.survey_error_m,
-            paint_m=max(settings.paint_error_m, settings.survey_error_m),
+            most_paint_m=paint_m,
+            shown_m=paint_m,
             size_m=np.array(
                 [each if name in pitch.assumed else 0.0 for name, each in spread.items()]
             ),
             by_size=change,
             size=size,
         )
+
+    @property
+    def paint_m(self) -> float:
+        """Standard deviation of a point without survey in the fit, each axis [m]."""
+        return min(self.shown_m, self.most_paint_m)
 
     @property
     def point_m(self) -> Floats:
@@ -104,7 +113,8 @@ class PitchErrors:
 
         MacKay's fixed point: the sum of squared offsets over the number of coordinates that the
         evidence determines. The offsets (n, 3) of the points (n,) are in standard deviations, as is
-        their posterior variance (n, 3).
+        their posterior variance (n, 3). One view cannot tell markings off their places from a
+        misfit of its lens or surface: in the fit, the spread stays below `most_paint_m`.
         """
         prior = 6.0  # coordinates that the prior spread of the paint is worth
         chosen = ~self.surveyed[points]
@@ -113,7 +123,7 @@ class PitchErrors:
         squares = float((offsets[chosen] ** 2).sum())
         determined = float((1.0 - variance[chosen]).sum())
         factor = (prior + squares) / (prior + determined)
-        return replace(self, paint_m=max(self.paint_m * float(np.sqrt(factor)), self.survey_m))
+        return replace(self, shown_m=max(self.paint_m * float(np.sqrt(factor)), self.survey_m))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.settings import BroadcastPrior
+
+LENS_POWERS: Final = np.array([1.6, 1.0, 1.0])
+"""Powers of the focal length that k1, k2 and k3 of a zoom lens grow with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +54,7 @@ def build_prior(settings: BroadcastPrior, focal: Floats, image_size: Integers) -
     width = float(image_size[0])
     middle = 0.5 * (image_size - 1.0)
     zoom = focal / (reference * width)
-    growth = np.stack([zoom**1.6, zoom, zoom], axis=-1)
+    growth = zoom[:, None] ** LENS_POWERS
     spread = np.array([settings.k1_std, settings.k2_std, settings.k3_std])
     return Prior(
         center=np.array(settings.center_m),
@@ -62,3 +66,13 @@ def build_prior(settings: BroadcastPrior, focal: Floats, image_size: Integers) -
         distortion=growth * np.array([settings.k1, settings.k2, 0.0]),
         distortion_std=growth * spread * np.sqrt(len(focal)),
     )
+
+
+def lens_walk(focal: Floats) -> Floats:
+    """Return the deviation (frames - 1,) of changes of the distortion [deviations of its prior].
+
+    Over a factor e of the focal lengths (frames,) [px], the distortion departs from its growth with
+    the zoom by one deviation of the prior of one lens; a lens at rest does not change.
+    """
+    zoomed = np.abs(np.diff(np.log(focal)))
+    return np.asarray(np.sqrt((zoomed + 1e-6) / len(focal)))

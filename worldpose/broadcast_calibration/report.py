@@ -204,8 +204,8 @@ def _review_reasons(
     bridged = int((status == FRAME_STATUS.index("bridged")).sum())
     if bridged:
         reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
-    # No painter errs by 0.3 m.
-    if pitch.paint_m > 0.3:
+    # No painter errs by 0.1 m.
+    if pitch.paint_m > 0.1:
         reasons.append(
             f"markings differ from the rules by {pitch.paint_m:.2f} m per axis: the pitch has "
             "another size, or clicks have wrong names"

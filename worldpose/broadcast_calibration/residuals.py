@@ -2,19 +2,21 @@
 
 For the camera L_t of every frame t of a clip, all with one center and principal point:
 
-    E(L) = lambda_4 E_field + lambda_5 E_player + lambda_flow E_flow + E_smooth + E_prior
+    E(L) = lambda_4 E_field + lambda_5 E_player + lambda_flow E_flow + E_smooth + E_lens + E_prior
 
     E_field  = 1/2 sum_i rho(|W_i (Pi(X_i + d_i; L_t) - x_i)|^2)   clicks and painted lines
     E_player = 1/2 sum_i sum_j I_ij rho(|Pi(P_i; L_t) - p_j|^2 / s_j^2)   matched keypoints
     E_flow   = 1/2 sum_k rho(|Pi(Pi^-1(y_k; L_t); L_t+1) - y'_k|^2 / s_k^2)   followed points
-    E_smooth = 1/2 sum_t |(l_t-1 - 2 l_t + l_t+1) / s|^2   rotation, log focal length, distortion
+    E_smooth = 1/2 sum_t |(l_t-1 - 2 l_t + l_t+1) / s|^2   rotation, log focal length
+    E_lens   = 1/2 sum_t |(k_t+1 / s_t+1 - k_t / s_t) / w_t|^2   distortion, w_t^2 = |log f_t+1/f_t|
     E_prior  = 1/2 (center, principal point, lenses and errors d of the pitch, and the rotation
                     if camera data give it)^2 / variance
 
 Pi is the projection and rho the Geman-McClure function; lambda_4 and lambda_5 are those of the
 paper, whose supplement adds the flow and the smoothness. The paper measures residuals in pixels;
 here they are in standard deviations (W_i whitens across a line, s in pixels). The errors d_i of the
-pitch and the priors are not in the paper.
+pitch, the priors and E_lens are not in the paper. The distortion k of a zoom lens grows with a
+power s(f) of the focal length, and departs from it by a random walk over the zoom, not over time.
 """
 
 from __future__ import annotations
@@ -76,6 +78,7 @@ def linearize(camera: MovingCamera, paint_offsets: Floats, problem: ClipProblem)
         + player_residuals(camera, problem.player_points, weights.player, system)
         + flow_residuals(camera, problem.flow, problem.flow_loss, weights.flow, system)
         + smoothness_residuals(camera, problem.smoothness, system)
+        + lens_residuals(camera, problem.prior, problem.lens_walk, system)
         + prior_residuals(camera, paint_offsets, problem.prior, system)
     )
     _remove_fixed(problem, system)
@@ -119,7 +122,7 @@ def smoothness_residuals(camera: MovingCamera, spread: Floats, system: ArrowSyst
     """Add E_smooth of squared second differences to a system, and return it.
 
     The derivatives assume a small rotation between neighbouring frames: a fast pan has a hundredth
-    of a radian per frame. The spread (7,) of a second difference is infinite where free.
+    of a radian per frame. The spread (4,) of a second difference is infinite where free.
     """
     used = np.flatnonzero(np.isfinite(spread))
     if len(camera) < 3 or not len(used):
@@ -140,12 +143,36 @@ def smoothness_residuals(camera: MovingCamera, spread: Floats, system: ArrowSyst
 
 
 def second_differences(camera: MovingCamera) -> Floats:
-    """Return second differences over frames (frames - 2, 7), in the units of a frame's step."""
+    """Return second differences (frames - 2, 4) of rotation [rad] and log focal length."""
     turn = Rigid(
         camera.rotation[1:] @ np.swapaxes(camera.rotation[:-1], -1, -2), np.zeros(3)
     ).rotvec
-    lens = np.concatenate([np.log(camera.focal)[:, None], camera.distortion], axis=1)
-    return np.concatenate([np.diff(turn, axis=0), np.diff(lens, n=2, axis=0)], axis=1)
+    zoom = np.diff(np.log(camera.focal), n=2)[:, None]
+    return np.concatenate([np.diff(turn, axis=0), zoom], axis=1)
+
+
+def lens_residuals(
+    camera: MovingCamera, prior: Prior, walk: Floats | None, system: ArrowSystem
+) -> float:
+    """Add E_lens of changes of the lens to a system, and return it.
+
+    The distortion in deviations of its prior, which grow with the zoom, changes from a frame to the
+    next with the standard deviation `walk` (frames - 1,); None = free.
+    """
+    if walk is None:
+        return 0.0
+    lens = slice(FRAME_SIZE - 3, FRAME_SIZE)
+    gone = np.diff(camera.distortion / prior.distortion_std, axis=0)
+    gone /= walk[:, None]
+    one = 1.0 / (prior.distortion_std[:-1] * walk[:, None])
+    other = 1.0 / (prior.distortion_std[1:] * walk[:, None])
+    numbers = np.arange(FRAME_SIZE)[lens]
+    system.right[:-1, lens] -= one * gone
+    system.right[1:, lens] += other * gone
+    system.blocks[0][:-1, numbers, numbers] += one**2
+    system.blocks[0][1:, numbers, numbers] += other**2
+    system.blocks[1][:-1, numbers, numbers] -= one * other
+    return 0.5 * float((gone**2).sum())
 
 
 def prior_residuals(

@@ -69,7 +69,7 @@ class BroadcastCalibrationSettings(Record):
     [m]."""
     paint_error_m: float = Field(default=0.03, ge=1e-6, le=1)
     """Standard deviation of a point that has its place from the rules of the game [m], in plan and
-    height. It is a prior, which the clip's own markings correct."""
+    height. The clip's own markings may lower it, not raise it."""
     crown_std_m: float = Field(default=0.1, ge=0, le=1)
     """Standard deviation of an unmeasured crown from the standard 0.2 m [m]: prior. The pitches of
     two real cameras have about 0.1 m; 0 = as given."""

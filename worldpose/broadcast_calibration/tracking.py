@@ -18,6 +18,7 @@ from worldpose.broadcast_calibration.moving_camera import (
     MovingCamera,
     join_cameras,
 )
+from worldpose.broadcast_calibration.priors import LENS_POWERS
 from worldpose.broadcast_calibration.residuals import flow_residuals, flow_row
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.lens_models import load_camera
@@ -114,10 +115,6 @@ def _direction_error(one: MovingCamera, other: MovingCamera) -> float:
     rays = one.camera[0].unproject(pixels)
     off = other.camera[0].project(rays.origins + 100.0 * rays.directions) - pixels
     return float(np.sqrt(np.nanmean((off**2).sum(axis=-1)))) if np.isfinite(off).any() else np.inf
-
-
-LENS_POWERS: Final = np.array([1.6, 1.0, 1.0])
-"""Powers of the focal length that k1, k2 and k3 of a zoom lens grow with."""
 
 
 class Turned(NamedTuple):

@@ -123,7 +123,7 @@ def compute_uncertainty(
     whole = np.empty((frames, FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
     whole[:, :FRAME_SIZE, :FRAME_SIZE] = factor.frame_covariance(shared)
     gradients, rest = _lasting_gradients(solution, problem, count, line_shift, player_shift)
-    bent = _lens_gradients(problem, frames, smooth_frames)
+    bent = _zoom_gradients(problem, frames, smooth_frames)
     own, rest = factor.solve(
         np.concatenate([gradients, bent], axis=2),
         np.concatenate([rest, np.zeros((count, bent.shape[2]))], axis=1),
@@ -218,29 +218,28 @@ def _lasting_gradients(
     return by_frame, by_shared
 
 
-def _lens_gradients(problem: ClipProblem, frames: int, lasting: float) -> Floats:
-    """Return the gradients (frames, 7, n) of common errors of second differences.
+def _zoom_gradients(problem: ClipProblem, frames: int, lasting: float) -> Floats:
+    """Return gradients (frames, 7, n) of common errors of the zoom's second differences.
 
-    One column per lens parameter and interval of about `lasting` frames, for an error of one
-    standard deviation; none without correlation.
+    One column per interval of about `lasting` frames, for an error of one standard deviation; none
+    without correlation.
     """
+    zoom = 3  # of a frame's parameters
     length = max(round(lasting), -(-frames // 64))
-    numbers = np.flatnonzero(np.isfinite(problem.smoothness) & problem.free_frame)
-    numbers = numbers[numbers >= 3]
-    starts = range(0, frames - 2, length) if lasting > 1.0 else range(0)
+    used = lasting > 1.0 and np.isfinite(problem.smoothness[zoom]) and problem.free_frame[zoom]
+    starts = range(0, frames - 2, length) if used else range(0)
     # Intervals longer than the correlation time have a smaller common error.
     common = np.sqrt(min(1.0, lasting / length))
-    bends = np.zeros((frames, FRAME_SIZE, len(numbers), len(starts)))
+    bends = np.zeros((frames, FRAME_SIZE, len(starts)))
     for place, begin in enumerate(starts):
         end = min(begin + length, frames - 2)
-        for kind, number in enumerate(numbers):
-            # The sum of (1, -2, 1) over an interval is its last difference less its first one.
-            column = bends[:, number, kind, place]
-            np.add.at(column, [begin, begin + 1, end, end + 1], [1.0, -1.0, -1.0, 1.0])
-            column *= common / problem.smoothness[number]
+        # The sum of (1, -2, 1) over an interval is its last difference less its first one.
+        column = bends[:, zoom, place]
+        np.add.at(column, [begin, begin + 1, end, end + 1], [1.0, -1.0, -1.0, 1.0])
+        column *= common / problem.smoothness[zoom]
     if problem.known is not None:
         bends[problem.known] = 0.0
-    return bends.reshape(frames, FRAME_SIZE, -1)
+    return bends
 
 
 class _Clusters(NamedTuple):

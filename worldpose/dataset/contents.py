@@ -47,6 +47,8 @@ class PointSource:
     pelvis."""
     in_degrees: Floats | None = None
     """The points if the file's angles were degrees; None if they cannot be."""
+    frames: NDArray[np.int64] | None = None
+    """(frames,) match frames, ascending; None if the file numbers none."""
 
     def with_points(self, points: Floats) -> PointSource:
         """Return the same source with other points."""
@@ -213,7 +215,7 @@ def read_clip(
         pixels = read_coco(file, ids, frames) if file.is_file() else None
         views.append(View(name, camera, pixels, COCO17))
     given = None
-    if (folder / "boxes.npz").is_file() or (folder / "boxes").is_dir():
+    if (folder / "boxes.npz").is_file() or any((folder / "boxes").glob("*.npy")):
         given = read_challenge(folder, clip).get(clip)
         if given is not None:
             arrays = {"boxes": given.boxes, "skel_2d": given.skel_2d, "skel_3d": given.skel_3d}
@@ -284,7 +286,7 @@ def _sources(
             findings += [each for each in more if each.fault == "zeros_for_missing"]
             zeros = (tracks.joints == 0.0).all((-1, -2))
             joints = np.where(zeros[..., None, None], np.nan, tracks.joints)
-            sources.append(PointSource(name, COCO17, joints))
+            sources.append(PointSource(name, COCO17, joints, frames=tracks.frames))
             ids = tuple(tracks.person_ids.tolist())
     for name in SUBMISSIONS:
         if (folder / name).is_file() and clip in (found := read_submission(folder / name, (clip,))):
@@ -301,6 +303,10 @@ def _read_poses(
     """Return the points of a pose file's bodies, and their values under other conventions."""
     poses, model_name = read_poses(path)
     model = body(model_name)
+    if poses.betas.shape[-1] != model.shapes:
+        todo = "Name the body model that the betas belong to."
+        expected, found = f"{model.shapes} betas of {model.name}", f"{poses.betas.shape[-1]}"
+        raise wrong(f"{path}: betas", expected, found, todo)
     gone, findings = absent_rows(
         name,
         {

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
 from data_contracts.records import CONTRACT_VERSION
-from data_contracts.release import ReleaseManifest
+from data_contracts.release import DataSetManifest, ReleaseManifest
 from data_contracts.run import StoredFile
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
@@ -21,6 +21,8 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 
 MANIFEST: Final = "manifest.json"
+DATA_SET: Final = "release.json"
+"""Manifest of a data set of several matches."""
 T = TypeVar("T")
 
 
@@ -52,11 +54,26 @@ def released_files(folder: Path, paths: Iterable[Path]) -> tuple[StoredFile, ...
     return tuple(files)
 
 
-def write_manifest(folder: Path, manifest: ReleaseManifest) -> Path:
-    """Write manifest.json, whole or not at all; return its path."""
-    with whole_file(folder / MANIFEST) as draft:
+def write_manifest(folder: Path, manifest: ReleaseManifest | DataSetManifest) -> Path:
+    """Write manifest.json or release.json, whole or not at all; return its path."""
+    path = folder / (MANIFEST if isinstance(manifest, ReleaseManifest) else DATA_SET)
+    with whole_file(path) as draft:
         draft.write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    return folder / MANIFEST
+    return path
+
+
+def read_data_set(folder: Path) -> DataSetManifest:
+    """Read release.json.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    path, todo = folder / DATA_SET, "Give the folder that worldpose release wrote."
+    expected = f"the manifest of a data set, contract {CONTRACT_VERSION}"
+    found = _read(path, TypeAdapter(DataSetManifest), expected, todo)
+    if found is None:
+        raise InputError(str(path), expected=expected, found="no such file", todo=todo)
+    return found
 
 
 def read_manifest(folder: Path) -> ReleaseManifest | None:
@@ -73,10 +90,10 @@ def read_manifest(folder: Path) -> ReleaseManifest | None:
     )
 
 
-def changed_files(folder: Path, manifest: ReleaseManifest) -> list[str]:
+def changed_files(folder: Path, files: Iterable[StoredFile]) -> list[str]:
     """Return the names of released files that are missing or changed."""
     changed = []
-    for file in manifest.files:
+    for file in files:
         path = folder / file.path
         if not path.is_file() or released_files(folder, [path])[0] != file:
             changed.append(file.path)

@@ -73,8 +73,10 @@ def clip_statistics(places: Floats, fps: float, camera: CameraKind | None = None
     )
 
 
-def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistics:
-    """Return the statistics of all clips together."""
+def data_set_statistics(
+    clips: Mapping[str, ClipStatistics], subjects: int | None = None
+) -> DataSetStatistics:
+    """Return the statistics of all clips together; `subjects` is the number of different people."""
     frames = sum(clip.frames for clip in clips.values())
     poses = sum(clip.poses for clip in clips.values())
     ways = [way for clip in clips.values() for way in clip.trajectories_m]
@@ -85,6 +87,7 @@ def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistic
         frames=frames,
         minutes=sum(clip.seconds for clip in clips.values()) / 60.0,
         poses=poses,
+        subjects=subjects,
         distance_km=sum(ways) / 1000.0,
         subjects_per_frame=poses / frames if frames else None,
         speed_m_s=sum(ways) / seconds if seconds else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Final
 
@@ -238,6 +238,44 @@ class PersonScore(Record):
     """Mean joint distance after alignment in each frame [mm]."""
     path_m: float | None = None
     """Length of the true path over the compared frames [m]."""
+    track_frames: int = 0
+    """Frames with joints in the scores of whole tracks."""
+    track_joints: int = 0
+    """Joints behind `g_mpjpe_mm` and `per_person_g_mpjpe_mm`."""
+    aligned_joints: int = 0
+    """Joints behind `pa_mpjpe_mm`."""
+
+
+def pool_people(
+    people: Iterable[PersonScore], settings: EvaluationSettings | None = None
+) -> Evaluation:
+    """Return the scores of whole tracks over the people of several clips.
+
+    Every joint counts once in the errors, every trajectory in the drift. Each clip has its own
+    shared alignment (E1). A score is None if nobody has it.
+    """
+    least = (settings or EvaluationSettings()).min_trajectory_m
+    rows = [one.model_dump() for one in people]
+    known = [row for row in rows if row["track_joints"]]
+    far = [row for row in known if row["path_m"] >= least]
+
+    def mean(name: str, weight: str) -> float | None:
+        return _ratio(
+            sum((r[name] or 0.0) * r[weight] for r in known), sum(r[weight] for r in known)
+        )
+
+    def drift(name: str) -> float | None:
+        return _ratio(sum(0.1 * row[name] / row["path_m"] for row in far), len(far))
+
+    return Evaluation(
+        g_mpjpe_mm=mean("g_mpjpe_mm", "track_joints"),
+        per_person_g_mpjpe_mm=mean("per_person_g_mpjpe_mm", "track_joints"),
+        pa_mpjpe_mm=mean("pa_mpjpe_mm", "aligned_joints"),
+        per_meter_drift_cm_per_m=drift("g_mpjpe_mm"),
+        per_person_drift_cm_per_m=drift("per_person_g_mpjpe_mm"),
+        track_coverage=_ratio(sum(r["track_frames"] for r in rows), sum(r["frames"] for r in rows)),
+        persons=sum(row["frames"] > 0 for row in rows),
+    )
 
 
 def evaluate_joints(
@@ -408,6 +446,9 @@ def _track_figures(
             "per_person_g_mpjpe_mm": _mean(free.per_person[:, index], 1000.0),
             "pa_mpjpe_mm": _mean(free.per_frame[:, index], 1000.0),
             "path_m": float(lengths[index]) if compared[:, index].any() else None,
+            "track_frames": int(compared[:, index].sum()),
+            "track_joints": int(np.isfinite(free.shared[:, index]).sum()),
+            "aligned_joints": int(np.isfinite(free.per_frame[:, index]).sum()),
         }
         for index in range(true.shape[1])
     ]

@@ -1,4 +1,4 @@
-"""HTML page about a data set: statistics, overall and per clip, and findings of its check."""
+"""Page about a data set: statistics and findings of its check; plot of methods' people in it."""
 
 from __future__ import annotations
 
@@ -10,25 +10,69 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from data_contracts.release import CheckReport, DataSetStatistics
-from worldpose.reports.drawing import INK, PALE, png, style
+from data_contracts.release import CheckReport, DataSetManifest, DataSetStatistics
+from worldpose.dataset.benchmark import Sample
+from worldpose.reports.drawing import GRASS, INK, PALE, draw_skeleton, person_color, png, style
 from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table, whole_page
 
 
-def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, CheckReport]) -> str:
-    """Return a self-contained HTML page of statistics, and of findings of the check per folder."""
+def data_set_page(
+    title: str,
+    found: DataSetStatistics,
+    checks: Mapping[str, CheckReport],
+    manifest: DataSetManifest | None = None,
+) -> str:
+    """Return a self-contained HTML page of statistics, and of findings of the check per folder.
+
+    A manifest adds composition, subjects and licences: the page is then the data set's datasheet.
+    """
     people = "-" if found.subjects_per_frame is None else f"{found.subjects_per_frame:.1f}"
     wrong = sum(len(report.findings) for report in checks.values())
-    tiles = (
+    tiles = [
         (f"{found.minutes:.1f} min", f"{found.frames:,} frames"),
         (f"{len(found.clips)}", "clip" if len(found.clips) == 1 else "clips"),
         (people, "people per frame"),
         (f"{found.poses:,}", "3D poses"),
         (f"{found.distance_km:.1f} km", "run and walked by all"),
         ("passed" if not wrong else f"{wrong} wrong", "check of cameras, poses and 2D"),
+    ]
+    about, sections = f"Data set of {', '.join(checks)}", [counted_section(found)]
+    if manifest is not None:
+        about = f"World: {manifest.conventions.world}"
+        tiles.insert(0, (f"{found.subjects}", "subjects"))
+        terms = Table("", ("files", "licence"), tuple(manifest.licences.items()))
+        sections = [_composition(manifest), *sections, Section("Licences", (terms,))]
+    return whole_page(title, about, (*sections, _check_section(checks)), tiles=tiles)
+
+
+def _composition(manifest: DataSetManifest) -> Section:
+    """Return the splits with their runs, and the subjects of several clips."""
+    found, clips = manifest.statistics.clips, manifest.clips
+    splits, clips_of = [], dict[str, list[str]]()
+    for split in dict.fromkeys(clip.split for clip in clips.values()):
+        own = {name: clip for name, clip in clips.items() if clip.split == split}
+        said = (f"{c.match_id}, run {c.run_id}: {c.usability.verdict}" for c in own.values())
+        runs = dict.fromkeys(said)
+        people = {subject for clip in own.values() for subject in clip.subjects}
+        frames, poses = (sum(getattr(found[n], key) for n in own) for key in ("frames", "poses"))
+        metres = sum(sum(found[name].trajectories_m) for name in own)
+        counts = (len(own), len(people), frames, poses, metres)
+        models = ", ".join({clip.body_model for clip in own.values()})
+        splits.append((split, "; ".join(runs), models, *(f"{each:,.0f}" for each in counts)))
+        for name, clip in own.items():
+            for subject in clip.subjects:
+                clips_of.setdefault(subject, []).append(name)
+    numbers = (">clips", ">subjects", ">frames", ">poses", ">metres")
+    several = tuple((s, ", ".join(names)) for s, names in clips_of.items() if len(names) > 1)
+    blocks = [Table("", ("split", "matches", "body model", *numbers), tuple(splits))]
+    if several:
+        blocks.append(Table("Subjects of several clips", ("subject", "clips"), several))
+    lead = (
+        "A match belongs to one split, and so does every subject. Nameless people without an entry "
+        "in the registry count once per clip. The truth of a test part is hidden: the part has "
+        "boxes, and cameras with the pose of the first frame alone."
     )
-    about = f"Data set of {', '.join(checks)}"
-    return whole_page(title, about, (counted_section(found), _check_section(checks)), tiles=tiles)
+    return Section("Composition", tuple(blocks), lead)
 
 
 def counted_section(found: DataSetStatistics) -> Section:
@@ -158,3 +202,42 @@ def _histogram(axes: Axes, values: Sequence[float], title: str, count: str) -> N
     axes.grid(axis="y", color=PALE, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def plot_methods(sample: Sample) -> bytes:
+    """Return a PNG with a column per method: its people, coloured, over the true ones, grey.
+
+    The first row is the camera's view, or that from above without a camera. The second is the view
+    from the side, along the touch line.
+    """
+    count, camera = len(sample.found), sample.camera
+
+    def views(people: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return people[..., :2] if camera is None else camera.project(people), people[..., 1:]
+
+    corners = []
+    for points in views(sample.true.reshape(-1, 3)):
+        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+        room = 0.08 * float((high - low).max())
+        corners.append((low - room, high + room))
+    heights = [4.2 * min((high - low)[1] / (high - low)[0], 1.0) for low, high in corners]
+    size = (4.6 * max(count, 2), sum(heights) + 1.8)
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    panels = figure.subplots(2, count, squeeze=False, height_ratios=heights)
+    labels = "from above, y [m]" if camera is None else "camera view, y [px]", "side view, z [m]"
+    for column, (name, found) in enumerate(sample.found.items()):
+        for row, (low, high) in enumerate(corners):
+            axes = panels[row, column]
+            for person, (true, mine) in enumerate(zip(sample.true, found, strict=True)):
+                draw_skeleton(axes, views(true)[row], PALE)
+                draw_skeleton(axes, views(mine)[row], person_color(person))
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+            axes.set(facecolor=GRASS, ylabel="" if column else labels[row])
+            style(axes)
+        panels[0, column].set_title(name, color=INK, fontsize=12)
+        panels[1, column].set_xlabel("y, across the pitch [m]", color=INK)
+        if camera is not None:
+            panels[0, column].invert_yaxis()
+    title = f"{sample.clip}, frame {sample.frame}: truth grey, predictions after the alignment"
+    figure.suptitle(title, color=INK, fontsize=12)
+    return png(figure)

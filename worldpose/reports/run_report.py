@@ -191,16 +191,19 @@ def report_page(
     the truth, if there is a reference.
     """
     shown = list(sections)
-    if run.warnings:
-        table = Table("", ("",), tuple((Failure(text),) for text in run.warnings))
-        shown.insert(0, Section("Warnings", (table,)))
+    usability = run.usability
+    if said := dict.fromkeys((*usability.reservations, *run.warnings)):
+        heading = usability.verdict.capitalize() if usability.reservations else "Warnings"
+        table = Table("", ("",), tuple((Failure(text),) for text in said))
+        shown.insert(0, Section(heading, (table,)))
     if scores is not None:
         rows = tuple(row[1:] for row in score_rows(scores))
         table = Table("", ("score", ">value", "what it says"), rows)
         shown.append(Section("Against the truth", (table,)))
     return whole_page(
         title,
-        f"Run {run.run_id} of match {run.match_id}, {run.started_at:%d %B %Y}: {run.state}",
+        f"Run {run.run_id} of match {run.match_id}, {run.started_at:%d %B %Y}: {run.state}, "
+        f"{usability.verdict}",
         shown,
         tiles=tiles,
         last=Folded("Record", _record(run, seconds)),

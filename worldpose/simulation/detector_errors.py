@@ -18,6 +18,7 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from data_contracts.records import Record
 from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body.occlusions import TRUNK, facing_axes, find_hiders
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
@@ -26,7 +27,6 @@ from worldpose.simulation.paths import STEP, GroundPath, bursts, drift, sample_t
 from worldpose.simulation.reference import Report, list_detections
 from worldpose.simulation.settings import ObservationNoise, Scenario
 from worldpose.simulation.skeletons import draw_body
-from worldpose.simulation.visibility import TRUNK, facing_axes, find_hiders
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyParameters
+from worldpose.body.occlusions import facing_axes
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -31,7 +32,6 @@ from worldpose.simulation.detector_errors import (
 from worldpose.simulation.paths import Clip, GroundPath, bursts, drift
 from worldpose.simulation.reference import CLIP_ID, Report
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
-from worldpose.simulation.visibility import facing_axes
 
 GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
 """Steps of this share of a turn spread any number of cameras, and an additional one moves none."""

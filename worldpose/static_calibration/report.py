@@ -69,6 +69,10 @@ class MarkingResidual:
     inlier: bool
 
 
+_GROUND_ERROR: Final = "expected ground error"
+"""Beginning of reasons that state an uncertainty, not a contradiction."""
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
     """Accuracy of a calibrated camera, its residuals and warnings.
@@ -109,6 +113,11 @@ class CalibrationReport:
     reasons: tuple[str, ...]
     add_next: tuple[str, ...]
     lines: LineRefinement | None
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """Reasons other than the expected ground error, whose effect on people is measured."""
+        return tuple(each for each in self.reasons if not each.startswith(_GROUND_ERROR))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,12 +249,12 @@ def _accuracy_reasons(
     reasons = []
     if ground_error.median > settings.weak_median_m:
         reasons.append(
-            f"expected ground error {ground_error.median:.2f} m (median over the seen pitch), "
+            f"{_GROUND_ERROR} {ground_error.median:.2f} m (median over the seen pitch), "
             f"over {settings.weak_median_m:g} m"
         )
     if ground_error.p95 > settings.weak_p95_m:
         reasons.append(
-            f"expected ground error {ground_error.p95:.2f} m on the worst twentieth of the seen "
+            f"{_GROUND_ERROR} {ground_error.p95:.2f} m on the worst twentieth of the seen "
             f"pitch, over {settings.weak_p95_m:g} m"
         )
     if fit.misfit > 4.0 * fit.noise_scale**2:

@@ -6,13 +6,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from data_contracts.match import Registration
+from data_contracts.operations import Heartbeat, QueuedRun
 from data_contracts.pin import Pin
 from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry, verify_published
 from worldpose.store.documents import read_checksum, unseal
-from worldpose.store.paths import DAMAGED, MANIFEST, PROJECT, ResultId, damaged_path, is_name
+from worldpose.store.paths import (
+    DAMAGED,
+    MANIFEST,
+    PROJECT,
+    ResultId,
+    damaged_path,
+    is_name,
+    queue_path,
+)
 from worldpose.store.runs import is_run_file
 from worldpose.store.store import Store
 from worldpose.store.writer import content_digest
@@ -34,7 +43,8 @@ class Finding:
     result: ResultId | None = None
     """The result that it belongs to; None for records and stray files."""
     is_damaged_record: bool = False
-    """It is a run record, reservation, registration or pin that is not readable as such."""
+    """It is a run record, reservation, registration, pin or state of the queue that is not readable
+    as such."""
 
 
 def verify(
@@ -43,13 +53,14 @@ def verify(
     """Return all damage in a project, or in one match of it; empty if nothing has changed.
 
     Reads everything: each result's files against its manifest, each manifest, run record, pin,
-    journal entry, reservation and registration against its own checksum, and each run record's
-    results.
+    journal entry, reservation, registration and state of the queue against its own checksum, and
+    each run record's results.
     """
     below = "" if match_id is None else f"/{match_id}"
     # Results last: an active run publishes them before the record that names them.
     documents = [
         *(store.blobs.entries("matches") if match_id is None else []),
+        *store.blobs.entries("queue" if match_id is None else f"queue/match/{match_id}"),
         *store.blobs.entries(f"runs{below}"),
         *store.blobs.entries(f"reviews{below}"),
         *store.blobs.entries(f"pins{below}"),
@@ -146,10 +157,10 @@ def _check_document(
     where, parts = f"{store.url}/{path}", path.split("/")
     is_record = False
     try:
-        if path.endswith(DAMAGED) and parts[0] in ("matches", "runs", "pins"):
+        if path.endswith(DAMAGED) and parts[0] in ("matches", "runs", "pins", "queue"):
             return  # set aside: it has no reader
         data = store.blobs.read(path)
-        if data is None and parts[0] in ("runs", "pins"):
+        if data is None and parts[0] in ("runs", "pins", "queue"):
             return  # ended, forgotten or unpinned since it was listed
         if data is None:
             raise CorruptionError(f"{where} is missing")
@@ -181,6 +192,14 @@ def _check_document(
                 is_record = True
                 pin = unseal(Pin, data, where)
                 fits = (match_id, name) == (pin.match_id, f"{pin.name}.json")
+            case ["queue", *_, name] if name.endswith(".beat.json"):
+                is_record = True
+                unseal(Heartbeat, data, where)
+                return
+            case ["queue", *_, name] if name.endswith(".json"):
+                is_record = True
+                queued = unseal(QueuedRun, data, where)
+                fits = path == queue_path(queued)
             case _:
                 raise CorruptionError(f"{where} is not a file of a project")
         if not fits:

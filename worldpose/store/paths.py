@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pydantic import TypeAdapter, ValidationError
 
+from data_contracts.operations import QueuedRun
 from data_contracts.records import Key, Name, UnitName
 from data_contracts.work import Work
 from worldpose.errors import InputError
@@ -117,6 +118,17 @@ def is_name(text: str) -> bool:
 def pin_path(match_id: str, name: str) -> str:
     """Return the path of a pin."""
     return f"pins/{checked_name(match_id)}/{checked_name(name)}.json"
+
+
+def queue_folder(run: QueuedRun) -> str:
+    """Return the folder of the states of a run: that of its flow, and in it of its match."""
+    folder = f"queue/{checked_name(run.flow)}"
+    return f"{folder}/{checked_name(run.match_id)}" if run.match_id else folder
+
+
+def queue_path(run: QueuedRun) -> str:
+    """Return the path of one state of a run."""
+    return f"{queue_folder(run)}/{run.id}.{run.number:04d}.json"
 
 
 def checked_name(name: str) -> str:

@@ -14,11 +14,13 @@ MIN_SECONDS = 1.0
 
 def measure_absences(
     present: Flags, frame: Integers, people: Sequence[int], fps: float
-) -> tuple[float, list[str]]:
-    """Return the share of time in which people are missing [1], and phrases that name the longest.
+) -> dict[str, float]:
+    """Return metrics of the time in which people are missing.
 
-    It is the larger one of the frames without a person over all frames, and of the frames of people
-    who are missing between frames that show them, over all of their frames in between.
+    `absent_share` is the larger one of the frames without a person over all frames, and of the
+    frames of people who are missing between frames that show them, over all of their frames in
+    between [1]. The longest absence lasts from `absent_from_frame` to `absent_to_frame`, and is
+    that of `absent_person`, or without this one of all people.
 
     Args:
         present: (frames, persons) whether a camera sees the tracked person.
@@ -27,8 +29,8 @@ def measure_absences(
         fps: frames per second.
     """
     if not present.size:
-        return float(len(frame) > 0), []
-    gaps: list[tuple[int, str]] = []
+        return {"absent_share": float(len(frame) > 0)}
+    gaps: list[tuple[int, dict[str, float]]] = []
     missing = total = 0
     for column, number in enumerate(people):
         rows = np.flatnonzero(present[:, column])
@@ -36,14 +38,19 @@ def measure_absences(
         steps = np.diff(rows)
         for at in np.flatnonzero(steps - 1 >= MIN_SECONDS * fps):
             missing += int(steps[at] - 1)
-            ends = f"{frame[rows[at] + 1]} to {frame[rows[at + 1] - 1]}"
-            gaps.append((int(steps[at] - 1), f"person {number} in frames {ends}"))
+            ends = _frames(frame, rows[at] + 1, rows[at + 1] - 1)
+            gaps.append((int(steps[at] - 1), ends | {"absent_person": number}))
     anyone = np.flatnonzero(present.any(axis=1))
     edges = np.concatenate([[-1], anyone, [len(frame)]])
     empty = np.diff(edges) - 1
     for at in np.flatnonzero(empty >= MIN_SECONDS * fps):
-        ends = f"{frame[edges[at] + 1]} to {frame[edges[at + 1] - 1]}"
-        gaps.append((int(empty[at]) * present.shape[1], f"all people in frames {ends}"))
-    alone = 1.0 - len(anyone) / len(frame)
-    said = [text for _, text in sorted(gaps, key=lambda gap: -gap[0])]
-    return max(alone, missing / max(1, total)), said
+        ends = _frames(frame, edges[at] + 1, edges[at + 1] - 1)
+        gaps.append((int(empty[at]) * present.shape[1], ends))
+    share = max(1.0 - len(anyone) / len(frame), missing / max(1, total))
+    _, longest = max(gaps, key=lambda gap: gap[0], default=(0, {}))
+    return {"absent_share": share, **longest}
+
+
+def _frames(frame: Integers, first: int, last: int) -> dict[str, float]:
+    """Return the frames of an absence from row `first` to `last`."""
+    return {"absent_from_frame": int(frame[first]), "absent_to_frame": int(frame[last])}

@@ -1,16 +1,9 @@
-import zipfile
 from dataclasses import fields
 
 import numpy as np
 import pytest
 
-from worldpose.body.body_file import (
-    KEYS,
-    find_body,
-    load_body,
-    read_npz_arrays,
-    save_body,
-)
+from worldpose.body.body_file import KEYS, find_body, load_body, read_npz_arrays, save_body
 from worldpose.errors import InputError, UsageError
 
 
@@ -38,15 +31,11 @@ def test_a_saved_body_comes_back(tmp_path, corrected_body):
     ("changes", "found"),
     [
         ({"weights": None}, "no array named weights"),
-        ({"name": None}, "no array named name"),
         ({"weights": np.zeros((24, 6890))}, "weights"),
-        ({"weights": np.zeros(6890)}, "weights of shape"),
         ({"v_template": np.array([["text"]])}, "v_template of shape"),
         ({"kintree_table": np.zeros((0, 24), int)}, "parents"),
-        ({"kintree_table": np.full((2, 24), np.nan)}, "kintree_table of shape"),
         ({"kintree_table": np.zeros((2, 24), int)}, "parents"),
         ({"f": np.array([{"a": 1}], dtype=object)}, "cannot be read"),
-        ({"shapedirs": np.zeros((6890, 3))}, "shapedirs of shape"),
     ],
 )
 def test_a_file_that_is_no_body_is_refused(tmp_path, open_body, changes, found):
@@ -68,16 +57,6 @@ def test_damaged_files_are_refused(tmp_path, open_body):
     path.write_bytes(whole[:middle] + bytes(1000) + whole[middle + 1000 :])
     with pytest.raises(InputError, match="cannot be read"):
         load_body(path)
-
-
-def test_an_array_that_claims_a_petabyte_is_refused(tmp_path):
-    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }"
-    header += b" " * (117 - len(header)) + b"\n"
-    with zipfile.ZipFile(tmp_path / "body.npz", "w") as file:
-        npy = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
-        file.writestr("v_template.npy", npy)
-    with pytest.raises(InputError, match="cannot be read"):
-        load_body(tmp_path / "body.npz")
 
 
 def test_the_narrow_open_body_differs_in_the_hip_joints_alone(open_body):

@@ -40,14 +40,6 @@ def test_folded_keypoints_are_those_of_the_surface_with_pose_correctives(correct
     assert moved.max() > 1e-3
 
 
-def test_a_missing_person_is_nan_and_the_others_are_not(open_body, people):
-    transl = people.transl.copy()
-    transl[1] = np.nan
-    keypoints = fold_keypoints(open_body, SKELETONS["coco17"])(replace(people, transl=transl))
-    assert np.isnan(keypoints[1]).all()
-    assert np.isfinite(np.delete(keypoints, 1, axis=0)).all()
-
-
 def test_a_vertex_of_a_model_of_another_size_is_refused(open_body):
     cut = replace(
         open_body,

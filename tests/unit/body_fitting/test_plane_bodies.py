@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from scipy.special import chdtri
 from walking_bodies import KEYPOINTS, MODEL, walker
 
@@ -13,7 +14,6 @@ from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.evidence import ankle_height
 from worldpose.body_fitting.monocular import parse_monocular
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
@@ -35,12 +35,8 @@ def panning_camera(frames):
     ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
     z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
     rotation = np.stack([x, np.cross(z, x), z], axis=1)
-    return Camera(
-        focal=np.full((frames, 2), 3500.0),
-        principal_point=np.tile([959.5, 539.5], (frames, 1)),
-        distortion=np.zeros((frames, 5)),
-        cam_from_world=Rigid(rotation, -rotation @ CENTER),
-        image_size=np.array([1920, 1080]),
+    return plain_camera(
+        np.full(frames, 3500.0), (959.5, 539.5), Rigid(rotation, -rotation @ CENTER)
     )
 
 

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from data_contracts.broadcast_calibration import (
-    FRAME_STATUS,
-    KeyFrame,
-)
+from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.given_camera import GivenCamera
@@ -17,7 +14,6 @@ from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
 from worldpose.geometry.pan_tilt import camera_angles
-from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.settings import RenderingSettings
 
 FRAMES, FPS = 16, 25.0
@@ -36,14 +32,14 @@ def true():
 
 @pytest.fixture(scope="module")
 def pictures(true):
-    return [grey(p) for p in render_broadcast(true.camera, clip.PITCH, None, 5, LOOK)]
+    return [grey(p) for p in clip.film_empty_pitch(true.camera, 5, LOOK)]
 
 
 @pytest.fixture(scope="module")
 def bare(true):
     """The same without any paint."""
     unpainted = LOOK.model_copy(update={"paint": 0.0})
-    return [grey(p) for p in render_broadcast(true.camera, clip.PITCH, None, 5, unpainted)]
+    return [grey(p) for p in clip.film_empty_pitch(true.camera, 5, unpainted)]
 
 
 def clicks(true, frame, noise=1.0, renamed=None):
@@ -150,12 +146,7 @@ def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true,
     said, corrected = (
         calibrate_broadcast(
             clip.PITCH,
-            BroadcastClip(
-                [clicks(true, 8)],
-                lambda: iter(pictures),
-                FPS,
-                people=people,
-            ),
+            BroadcastClip([clicks(true, 8)], lambda: iter(pictures), FPS, people=people),
             SETTINGS.model_copy(update={"feed_offset": what}),
         )
         for what in ("report", "correct")

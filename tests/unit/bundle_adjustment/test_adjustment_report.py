@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment.report import (
-    keypoint_outliers,
-    review_clicks,
-)
+from worldpose.bundle_adjustment.report import keypoint_outliers, review_clicks
 from worldpose.bundle_adjustment.residuals import KeypointNoise
 from worldpose.static_calibration.parameters import PARAMETERS
 

@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
@@ -18,7 +19,6 @@ from worldpose.dataset.manifest import write_frame_rates
 from worldpose.dataset.statistics import clip_statistics
 from worldpose.formats.challenge import write_moving_camera, write_submission
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.reports.data_set import plot_statistics
 
@@ -35,13 +35,7 @@ def made(rng, frames, persons):
 
 def panning(frames, focal, angle):
     turn = Rigid.from_rotvec(np.linspace(0, angle, frames)[:, None] * [0, 0, 1], np.zeros(3))
-    return Camera(
-        focal=np.repeat(np.linspace(3000.0, focal, frames)[:, None], 2, axis=1),
-        principal_point=np.zeros((frames, 2)) + [960.0, 540.0],
-        distortion=np.zeros((frames, 5)),
-        cam_from_world=turn,
-        image_size=np.array([1920, 1080]),
-    )
+    return plain_camera(np.linspace(3000.0, focal, frames), (960.0, 540.0), turn)
 
 
 def test_a_clip_that_two_cameras_film_is_one_clip_with_the_people_of_both(tmp_path):

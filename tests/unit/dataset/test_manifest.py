@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from data_contracts.release import ReleasedClip, ReleaseManifest
+from data_contracts.usability import Usability
 from worldpose.dataset.manifest import (
     ORIGINS,
     changed_files,
@@ -37,6 +38,7 @@ def manifest_of(folder, **changes):
         "pitch": True,
         "body_model": "open-neutral/2",
         "licence": "For tests.",
+        "usability": Usability(verdict="usable"),
         "worldpose": "0.1.0",
         "versions": {"numpy": "2.4"},
         "settings": {"tracking": {"a": 1}},
@@ -60,11 +62,11 @@ def test_a_manifest_comes_back_and_holds_the_conventions(tmp_path):
 
 def test_a_changed_and_a_lost_file_are_noticed(tmp_path):
     manifest = manifest_of(tmp_path)
-    assert changed_files(tmp_path, manifest) == []
+    assert changed_files(tmp_path, manifest.files) == []
     (tmp_path / "poses" / "A_1.npz").write_bytes(b"p0ses")
-    assert changed_files(tmp_path, manifest) == ["poses/A_1.npz"]
+    assert changed_files(tmp_path, manifest.files) == ["poses/A_1.npz"]
     (tmp_path / "joints.npz").unlink()
-    assert changed_files(tmp_path, manifest) == ["joints.npz", "poses/A_1.npz"]
+    assert changed_files(tmp_path, manifest.files) == ["joints.npz", "poses/A_1.npz"]
 
 
 def test_a_release_needs_a_licence(tmp_path):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
@@ -27,13 +28,7 @@ AHEAD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def camera(rotation=DOWN, center=(0.0, 0.0, 50.0), focal=1000.0):
-    return Camera(
-        focal=np.array([focal, focal]),
-        principal_point=np.array([959.5, 539.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(rotation, -rotation @ np.array(center)),
-        image_size=np.array([1920, 1080]),
-    )
+    return plain_camera(focal, (959.5, 539.5), Rigid(rotation, -rotation @ np.array(center)))
 
 
 def tilted(down, center):

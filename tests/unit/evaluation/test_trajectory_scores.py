@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from people_samples import crowd, e4, person, score, tracks
 
 from worldpose.errors import InputError
@@ -187,14 +188,12 @@ def test_switches_per_minute_count_match_time():
     assert scores.g_mpjpe_mm == pytest.approx(0.0, abs=MM)
 
 
-SIDE_VIEW = Camera(
-    focal=np.array([1000.0, 1000.0]),
-    principal_point=np.array([959.5, 539.5]),
-    distortion=np.zeros(5),
-    cam_from_world=Rigid(
+SIDE_VIEW = plain_camera(
+    1000.0,
+    (959.5, 539.5),
+    Rigid(
         np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([0.0, 1.5, 50.0])
     ),
-    image_size=np.array([1920, 1080]),
 )
 
 

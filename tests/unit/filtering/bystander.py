@@ -1,6 +1,7 @@
 """People in front of one camera, by hand: all expected positions are arithmetic."""
 
 import numpy as np
+from camera_builders import plain_camera
 
 from worldpose.filtering.judging import BodyViews, Spread, view_bodies
 from worldpose.filtering.redetection import Expected
@@ -25,13 +26,7 @@ STANDING = np.array(
 def camera():
     """At (0, -20, 1), level, looking along y."""
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return Camera(
-        focal=np.array([FOCAL, FOCAL]),
-        principal_point=np.array([499.5, 299.5]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid(rotation, np.array([0.0, 1.0, AWAY])),
-        image_size=np.array(SIZE),
-    )
+    return plain_camera(FOCAL, (499.5, 299.5), Rigid(rotation, np.array([0.0, 1.0, AWAY])), SIZE)
 
 
 def standing(*places):

@@ -2,8 +2,6 @@
 
 import numpy as np
 from bystander import NOISE, SIZE, as_stated, expected
-from hypothesis import given
-from hypothesis import strategies as st
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.filtering.redetection import (
@@ -71,19 +69,6 @@ def test_a_wrist_that_is_not_the_body_s_is_left_out():
     verdicts = judge(bodies, seen, seek(bodies, 0))
     assert kinds(verdicts) == ["found"]
     assert np.flatnonzero(verdicts.rejected[0]).tolist() == [9]
-
-
-@given(
-    st.lists(st.tuples(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 1)), min_size=2,
-             max_size=2),
-    st.sampled_from([(), (0,), (1,), (0, 1)]),
-)  # fmt: skip
-def test_every_answer_is_of_one_kind(answers, detected):
-    bodies = expected((0.0, 0.0), (0.4, 0.5))
-    seen = [answer(bodies, n, off=off, confidence=c) for n, (*off, c) in enumerate(answers)]
-    together = KeypointDetections.concatenate(seen)
-    verdicts = judge(bodies, together, seek(bodies, 0, 1), detected)
-    assert (np.sum([getattr(verdicts, kind) for kind in KINDS], axis=0) == 1).all()
 
 
 class Seeing:

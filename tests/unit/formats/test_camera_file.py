@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 
@@ -6,7 +5,6 @@ from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.challenge import read_camera, write_static_camera
-from worldpose.geometry.cameras import Camera
 
 CALIBRATION = CameraCalibration(
     id="north",
@@ -17,18 +15,6 @@ CALIBRATION = CameraCalibration(
     rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
     translation=(1.0, 5.0, 60.0),
 )
-
-
-def test_opencv_projects_with_it_as_the_camera_does(tmp_path):
-    write_static_camera(tmp_path / "north.npz", CALIBRATION)
-    points = np.array([[0.0, 0.0, 0.0], [10.0, 5.0, 1.8], [-12.0, -8.0, 1.0]])
-    with np.load(tmp_path / "north.npz", allow_pickle=False) as file:
-        rotation = cv2.Rodrigues(file["R"][0])[0]
-        pixels = cv2.projectPoints(points, rotation, file["t"][0], file["K"][0], file["k"][0])[0]
-    # Two float64 implementations of one formula, with values of a thousand pixels.
-    np.testing.assert_allclose(
-        pixels[:, 0], Camera.from_calibration(CALIBRATION).project(points), atol=1e-9
-    )
 
 
 def test_what_was_written_is_read_again(tmp_path):

@@ -1,22 +1,16 @@
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import coco_dataset
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
 
 @pytest.fixture
 def camera():
     """Looks along world z from the origin: a point (x, y, 10) is at pixel (10x + 50, 10y + 40)."""
-    return Camera(
-        focal=np.array([100.0, 100.0]),
-        principal_point=np.array([50.0, 40.0]),
-        distortion=np.zeros(5),
-        cam_from_world=Rigid.identity(),
-        image_size=np.array([100, 80]),
-    )
+    return plain_camera(100.0, (50.0, 40.0), Rigid.identity(), (100, 80))
 
 
 def missing():

@@ -8,12 +8,7 @@ import pytest
 from data_contracts.conventions import COCO17, FEET
 from worldpose.errors import InputError
 from worldpose.formats.c3d_file import write_c3d
-from worldpose.formats.joints_file import (
-    ExtraTracks,
-    JointTracks,
-    read_joints,
-    write_joints,
-)
+from worldpose.formats.joints_file import ExtraTracks, JointTracks, read_joints, write_joints
 
 FPS = 50.0
 

@@ -1,4 +1,3 @@
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -47,22 +46,8 @@ def test_numpy_alone_reads_it_with_the_documented_types(tmp_path, tracks):
         }
 
 
-def test_every_truncation_is_refused(tmp_path, tracks):
-    path = tmp_path / "joints.npz"
-    write_joints(path, tracks)
-    whole = path.read_bytes()
-    for length in (0, 1, 30, 200, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"joints\.npz.*whole npz file"):
-            read_joints(path)
-
-
 def arrays(**changes):
-    plain = {
-        "frames": np.arange(3),
-        "person_ids": np.arange(2),
-        "joints": np.zeros((3, 2, 17, 3)),
-    }
+    plain = {"frames": np.arange(3), "person_ids": np.arange(2), "joints": np.zeros((3, 2, 17, 3))}
     return {name: value for name, value in {**plain, **changes}.items() if value is not None}
 
 
@@ -84,19 +69,14 @@ HALF_MISSING[0, 1, 0, 2] = np.nan
             {"joints": np.zeros((3, 2, 15, 3))},
             r"joints: expected shape \(3, 2, 17, 3\), found \(3, 2",
         ),
-        ({"joints": np.zeros((3, 2, 17))}, r"found \(3, 2, 17\)"),
-        ({"joints": np.zeros((2, 3, 17, 3))}, r"expected shape \(3, 2, 17, 3\)"),
         ({"joints": np.zeros((3, 2, 17, 3), dtype=int)}, "expected float numbers, found <i8"),
         ({"frames": np.arange(3.0)}, "frames: expected int numbers"),
         ({"frames": np.array([0, 2, 1])}, "frames: expected frame numbers that rise"),
-        ({"frames": np.array([0, 0, 1])}, "frames: expected frame numbers that rise"),
         ({"person_ids": np.array([1, 1])}, "person_ids: expected each id once"),
         ({"joints": INFINITE}, r"joints\[frame 2, person 1, left_wrist\]: expected finite metres"),
         ({"joints": HALF_MISSING}, r"joints\[frame 0, person 1, nose\]: expected all of x, y, z"),
         ({"views": np.full((3, 2, 17), -1)}, "views.*expected counts from 0"),
-        ({"views": np.zeros((3, 2))}, "views: expected int numbers"),
         ({"covariance": np.full((3, 2, 17, 3, 3), np.inf)}, "covariance.*expected finite"),
-        ({"covariance": np.zeros((3, 2, 17, 3))}, "covariance: expected shape"),
         ({"joints": np.array([{}], dtype=object)}, "joints.npy: expected numbers"),
     ],
 )
@@ -105,20 +85,3 @@ def test_what_does_not_fit_is_named(tmp_path, changes, message):
     with pytest.raises(InputError, match=message) as caught:
         read_joints(tmp_path / "bad.npz")
     assert str(tmp_path / "bad.npz") in str(caught.value)
-
-
-def test_a_header_that_claims_more_than_the_file_holds_allocates_nothing(tmp_path):
-    path = tmp_path / "bomb.npz"
-    np.savez(path, **arrays())
-    with zipfile.ZipFile(path) as file:
-        members = {name: file.read(name) for name in file.namelist()}
-    # The same length of header, but 3 billion frames.
-    few, many = b"(3,), }" + 8 * b" ", b"(3000000000,),}"
-    assert few in members["frames.npy"]
-    members["frames.npy"] = members["frames.npy"].replace(few, many)
-    with zipfile.ZipFile(path, "w") as file:
-        for name, content in members.items():
-            file.writestr(name, content)
-    message = r"frames.npy: expected \d+ bytes for its shape \(3000000000,\), found \d+ bytes"
-    with pytest.raises(InputError, match=message):
-        read_joints(path)

@@ -33,13 +33,11 @@ def header(text):
             "npy array",
         ),
         (header("{'descr': '<f4', 'fortran_order': False, 'shape': (10, 100), }\n"), "4073 bytes"),
-        (header("{'descr': '<f4', 'fortran_order': False, 'shape': (-1,), }\n"), "bytes"),
         (header("[" * 3000 + "]" * 3000), "npy array"),
         (header("__import__('os').system('id')\n"), "npy array"),
         (header("{'descr': '<z9', 'fortran_order': False, 'shape': (1,), }\n"), "z9"),
         (header("{'descr': [('x', '<f4')], 'fortran_order': False, 'shape': (1,)}\n"), "plain"),
         (b"", "npy array"),
-        (b"\x93NUMPY\x02\x00", "npy 1.0"),
     ],
 )
 def test_a_member_that_lies_is_named(tmp_path, content, told):
@@ -54,12 +52,6 @@ def test_arrays_beyond_the_limit_are_not_unpacked(tmp_path):
     path = written(tmp_path / "a.npz", score=np.zeros(1000))
     with pytest.raises(InputError, match="at most 7000 bytes of arrays, found 8128 bytes"):
         read_npz(path, 7000)
-
-
-def test_no_archive_is_refused(tmp_path):
-    (tmp_path / "a.npz").write_bytes(b"no archive")
-    with pytest.raises(InputError, match="expected a whole npz file"):
-        read_npz(tmp_path / "a.npz", 1000)
 
 
 def test_a_packed_size_that_is_more_than_the_file_does_not_excuse_a_bomb(tmp_path):

@@ -65,11 +65,7 @@ FACING_X = tuple(Rotation.from_euler("XYZ", [90.0, 90.0, 0.0], degrees=True).as_
 
 def lowered(**more):
     """The arms hang, as in the model's zero."""
-    return {
-        "left_shoulder": (FORWARD, -90.0),
-        "right_shoulder": (FORWARD, 90.0),
-        **more,
-    }
+    return {"left_shoulder": (FORWARD, -90.0), "right_shoulder": (FORWARD, 90.0), **more}
 
 
 @pytest.mark.parametrize(

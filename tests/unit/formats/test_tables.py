@@ -10,11 +10,7 @@ import pytest
 from data_contracts.conventions import COCO17
 from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks, fill_gaps
-from worldpose.formats.tables import (
-    joints_table,
-    write_csv,
-    write_parquet,
-)
+from worldpose.formats.tables import joints_table, write_csv, write_parquet
 
 FPS = 50.0
 NOTES = {"licence": "For tests alone.", "joints": "COCO-17"}

@@ -120,12 +120,3 @@ def made_pose(made, step):
         made.image_size,
         made.lens_model,
     )
-
-
-def test_a_rational_lens_without_denominator_is_browns():
-    brown = np.array([0.2, -0.1, 1e-3, 2e-3, 0.05])
-    points = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 3))
-    one = camera(LensModel.BROWN, brown)
-    other = camera(LensModel.RATIONAL, np.append(brown, np.zeros(3)))
-    np.testing.assert_allclose(one.project(points), other.project(points), atol=1e-12)
-    assert Camera.from_numbers(other.numbers, [1920, 1080]).lens_model == LensModel.RATIONAL

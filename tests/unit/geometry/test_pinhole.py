@@ -1,7 +1,6 @@
 import cv2
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
@@ -41,12 +40,6 @@ def test_point_behind_the_camera_or_in_its_plane_has_no_image():
     for jacobian in (found.d_points, found.d_pose, found.d_intrinsics, found.d_distortion):
         assert np.isnan(jacobian[:3]).all()
         assert np.isfinite(jacobian[3]).all()
-
-
-def test_missing_point_has_no_image():
-    found = simple_camera().project_with_jacobians([[np.nan, 0.0, 1.0], [0.0, np.inf, 1.0]])
-    assert found.status.tolist() == [RayStatus.MISSING, RayStatus.MISSING]
-    assert np.isnan(found.points_image).all()
 
 
 def test_batches_of_cameras_give_what_single_cameras_give():
@@ -95,7 +88,6 @@ def test_no_points_and_no_cameras_are_fine():
     [
         (lambda: simple_camera(focal=1000.0), r"\(\.\.\., 2\)", r"\(\)"),
         (lambda: simple_camera(distortion=np.zeros(4)), r"\(\.\.\., 8\)", r"\(4,\)"),
-        (lambda: simple_camera(principal_point=np.zeros(3)), r"\(\.\.\., 2\)", r"\(3,\)"),
         (
             lambda: simple_camera(focal=np.ones((2, 2)), distortion=np.zeros((3, 5))),
             "broadcast",
@@ -166,14 +158,6 @@ def test_rotation_from_a_text_file_becomes_exact(digits):
 def test_matrix_that_is_no_rotation_is_refused(rotation, found):
     with pytest.raises(InputError, match="camera north: rotation: .*" + found):
         Camera.from_calibration(calibration(rotation=rotation.tolist()))
-
-
-@pytest.mark.parametrize(
-    "change", [{"focal_px": (0.0, 3000.0)}, {"focal_px": (3000.0, -1.0)}, {"image_size": (0, 5)}]
-)
-def test_senseless_calibration_is_refused(change):
-    with pytest.raises(ValidationError, match="greater than 0"):
-        calibration(**change)
 
 
 def test_cameras_from_matrices_project_as_opencv_does():

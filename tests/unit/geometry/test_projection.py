@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -146,13 +147,7 @@ def test_pixel_to_ray_to_pixel_returns(camera, seed):
     ("focal", "k1", "k2"), [(2400.0, 0.08, -1.06), (2400.0, 0.99, 4.29), (7100.0, 0.99, -1.06)]
 )
 def test_strong_broadcast_lenses_are_inverted_over_the_whole_image(focal, k1, k2):
-    camera = Camera(
-        focal=np.full(2, focal),
-        principal_point=np.array([960.0, 540.0]),
-        distortion=np.array([k1, k2, 0.0, 0.0, 0.0]),
-        cam_from_world=Rigid.identity(),
-        image_size=np.array([1920, 1080]),
-    )
+    camera = plain_camera(focal, (960.0, 540.0), Rigid.identity(), lens=(k1, k2, 0.0, 0.0, 0.0))
     u, v = np.meshgrid(np.linspace(-0.5, 1919.5, 97), np.linspace(-0.5, 1079.5, 55))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
     rays = camera.unproject(pixels)

@@ -2,58 +2,15 @@
 
 import numpy as np
 
-from worldpose.geometry.rasters import Samples, Surface, cover_triangles, draw_triangles, resolve
+from worldpose.geometry.rasters import cover_triangles
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
 """Of a rectangle whose corners go down first, as a camera has what faces it."""
-BACKS = np.zeros(2, dtype=bool)
-TEXELS = np.zeros((4, 2), dtype=np.float32)
-CLEAR = np.zeros(4, dtype=np.float32)
 
 
 def rectangle(left, top, right, bottom, depth=10.0):
     corners = [(left, top), (left, bottom), (right, bottom), (right, top)]
     return np.column_stack([corners, np.broadcast_to(depth, 4)]).astype(np.float32)
-
-
-def draw(samples, opened, which, closed=None, faces=FACES, level=200, light=1.0):
-    surface = Surface(
-        faces=faces,
-        backs=BACKS,
-        texels=TEXELS,
-        textures=np.full((2, 1, 1, 3), level, dtype=np.uint8),
-        opened=opened,
-        closed=opened if closed is None else closed,
-        light=np.full(4, light, dtype=np.float32),
-    )
-    return draw_triangles(surface, CLEAR, which, samples)
-
-
-def test_a_rectangle_on_pixel_borders_has_all_samples_of_its_pixels():
-    samples = Samples.empty(10, 20, 16, 25)
-    # Pixels 12 and 13 in rows 21 to 23 reach from 11.5 to 13.5 and from 20.5 to 23.5.
-    assert draw(samples, rectangle(11.5, 20.5, 13.5, 23.5), 0) == 2 * 3 * 4
-    hit = np.zeros((5, 6), dtype=bool)
-    hit[1:4, 2:4] = True
-    np.testing.assert_array_equal((samples.who == 0).all(axis=-1), hit)
-    np.testing.assert_array_equal((samples.who == 0).any(axis=-1), hit)
-    np.testing.assert_array_equal(samples.depth[hit], np.float32(10.0))
-    assert (samples.color[hit] == 200).all()
-
-
-def test_half_a_pixel_has_half_its_samples_and_mixes_with_what_is_behind():
-    samples = Samples.empty(0, 0, 3, 3)
-    # Across, samples lie 0.125 and 0.375 px to both sides of the middle.
-    assert draw(samples, rectangle(1.0, 0.5, 1.5, 1.5), 0) == 2
-    picture = np.full((3, 3, 3), 100, dtype=np.uint8)
-    persons, seen = np.full((3, 3), -1, dtype=np.int16), np.zeros(1, dtype=np.int64)
-    resolve(samples.who, samples.color, picture, persons, seen)
-    expected = np.full((3, 3), 100)
-    expected[1, 1] = 150
-    np.testing.assert_array_equal(picture[..., 0], expected)
-    assert seen.tolist() == [2]
-    assert persons[1, 1] == 0
-    assert (persons == -1).sum() == 8
 
 
 def test_a_mask_has_the_pixels_whose_middles_are_covered_whichever_way_triangles_face():

@@ -20,27 +20,11 @@ def quarter_turn_about_z() -> Rigid:
     return Rigid.from_rotvec([0.0, 0.0, np.pi / 2], [10.0, 0.0, 0.0])
 
 
-def test_quarter_turn_about_z_takes_x_to_y():
-    moved = quarter_turn_about_z().apply([[1.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    np.testing.assert_allclose(moved, [[10.0, 1.0, 0.0], [10.0, 0.0, 2.0]], atol=ROUNDING)
-
-
 def test_composition_applies_the_right_transform_first():
     turn, shift = quarter_turn_about_z(), Rigid(np.eye(3), [1.0, 0.0, 0.0])
     # Shift x = 1 to 2, turn it to y = 2, then add 10 to x.
     np.testing.assert_allclose(
         (turn @ shift).apply([[1.0, 0.0, 0.0]]), [[10.0, 2.0, 0.0]], atol=ROUNDING
-    )
-
-
-@given(rotvecs, vectors, rotvecs, vectors, vectors)
-def test_composition_inverse_and_application_agree(r1, t1, r2, t2, point):
-    c_from_b, b_from_a = Rigid.from_rotvec(r1, t1), Rigid.from_rotvec(r2, t2)
-    through = c_from_b.apply(b_from_a.apply(point[None]))
-    # Coordinates reach 500 m: 500 times the unit rounding of a few products.
-    np.testing.assert_allclose((c_from_b @ b_from_a).apply(point[None]), through, atol=1e-12)
-    np.testing.assert_allclose(
-        (c_from_b @ b_from_a).inverse().apply(through), point[None], atol=1e-12
     )
 
 

@@ -105,14 +105,6 @@ def test_clicks_without_a_pitch_are_refused(folder):
     assert "pitch: none" in refusal(folder).expected
 
 
-def test_a_camera_neither_given_nor_clicked_is_named_with_what_to_do(folder):
-    file_of(folder).unlink()
-    with pytest.raises(InputError, match="missing camera cam2; there: cam1") as caught:
-        require_calibrated(read_match(folder))
-    assert "at least four points" in caught.value.todo
-    assert str(file_of(folder)) in caught.value.todo
-
-
 @pytest.mark.parametrize("form", ["JPEG", "PNG", "TIFF", "BMP", "WEBP"])
 def test_a_still_of_every_kind_is_read_as_it_is_shown(tmp_path, form):
     picture = np.random.default_rng(1).integers(0, 255, (18, 32, 3), dtype=np.uint8)

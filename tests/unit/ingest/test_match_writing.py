@@ -85,11 +85,7 @@ def test_a_failure_on_the_way_leaves_nothing(tmp_path, one, make_people):
 
     with pytest.raises(RuntimeError, match="disk full"):
         write_match(
-            tmp_path / "m",
-            one,
-            calibrations={},
-            observations={"cam1": make_people()},
-            further=fail,
+            tmp_path / "m", one, calibrations={}, observations={"cam1": make_people()}, further=fail
         )
     assert list(tmp_path.iterdir()) == []
 

@@ -12,14 +12,12 @@ from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
-from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.video.files import write_video
 
 CAMERAS = ("cam01", "cam02")
-KINDS = {"COCO-17": 17, "BODY_25": 25, "HALPE-26": 26, "COCO-WholeBody": 133}
 
 
 def camera(name, x=0.0):
@@ -63,20 +61,6 @@ def trial(tmp_path):
             write_frame(folder / "pose" / f"{name}_json", number, people)
     (folder / "Config.toml").write_text("[project]\nframe_rate = 60\nframe_range = 'auto'\n")
     return folder
-
-
-@pytest.mark.parametrize(("kind", "size"), KINDS.items())
-def test_each_set_of_keypoints_keeps_those_of_coco(tmp_path, kind, size):
-    values, expected = person(size, 3)
-    values[1 if size != 25 else 16] = 0.0  # the left eye, missing
-    write_frame(tmp_path / "a_json", 7, [values])
-    found = read_openpose_folder(tmp_path / "a_json")
-    assert (found.kind, found.people.frame.tolist()) == (kind, [7])
-    seen = np.arange(17) != 1
-    np.testing.assert_allclose(found.people.keypoints[0, 0, seen], expected[seen, :2], rtol=1e-6)
-    np.testing.assert_allclose(found.people.confidence[0, 0, seen], expected[seen, 2], rtol=1e-6)
-    assert np.isnan(found.people.keypoints[0, 0, 1]).all()
-    assert found.people.score[0, 0] == pytest.approx(expected[seen, 2].mean(), rel=1e-5)
 
 
 def test_a_trial_becomes_a_match(trial, tmp_path):

@@ -1,5 +1,4 @@
 import math
-import pickle
 
 import pytest
 
@@ -45,23 +44,14 @@ FIRST = "match.yaml: cameras[0]"
         (match(fps=...), "match.yaml: fps", "a value", "nothing", "Add"),
         (match(fps=-1), "match.yaml: fps", "greater than or equal to 1", "-1", "Correct"),
         (match(fps="25"), "match.yaml: fps", "a valid number", "'25'", "Correct"),
-        (match(fps=True), "match.yaml: fps", "a valid number", "True", "Correct"),
         (match(fps=math.nan), "match.yaml: fps", "a finite number", "nan", "Correct"),
         (match(match_id=12), "match.yaml: match_id", "a valid string", "12", "quotes: '12'"),
         (match(match_id=False), "match.yaml: match_id", "a valid string", "no, off", "'no'"),
-        (match(match_id=True), "match.yaml: match_id", "a valid string", "yes, on", "'yes'"),
         (match(match_id="../x"), "match.yaml: match_id", "letters", "'../x'", "Rename"),
         (match(match_id="a" * 65), "match.yaml: match_id", "64", "aaa...", "Rename"),
         (match(contract=2), "match.yaml: contract", "1", "2", "version of worldpose"),
-        (match(cameras=[]), "match.yaml: cameras", "at least 1", "0", "Correct"),
         (match(cameras={"a": 1}), "match.yaml: cameras", "a valid array", "a mapping", "Correct"),
-        (
-            match(cameras=[camera(kind="fixed")]),
-            f"{FIRST}.kind",
-            "'broadcast'",
-            "'fixed'",
-            "",
-        ),
+        (match(cameras=[camera(kind="fixed")]), f"{FIRST}.kind", "'broadcast'", "'fixed'", ""),
         (match(cameras=[camera(id=None)]), f"{FIRST}.id", "a valid string", "None", "Correct"),
         (
             match(cameras=[camera(), camera(widht=1)]),
@@ -79,7 +69,6 @@ FIRST = "match.yaml: cameras[0]"
             "named",
         ),
         ([1], "match.yaml", "a mapping", "a list of 1", "Correct"),
-        (None, "match.yaml", "a mapping", "None", "Correct"),
     ],
 )
 def test_refusal_names_key_expected_found_and_what_to_do(data, where, expected, found, todo):
@@ -88,8 +77,3 @@ def test_refusal_names_key_expected_found_and_what_to_do(data, where, expected, 
     assert expected in error.expected
     assert found in error.found
     assert todo in error.todo
-
-
-def test_refusal_travels_between_processes():
-    error = refusal(match(fps=-1))
-    assert str(pickle.loads(pickle.dumps(error))) == str(error)

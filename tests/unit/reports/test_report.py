@@ -1,15 +1,16 @@
 import base64
 import hashlib
 import re
-from datetime import UTC, datetime
+from datetime import timedelta
 from html import unescape
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
+from run_records import AT, run_record
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
-from data_contracts.run import RunRecord, UnitFailure
+from data_contracts.run import UnitFailure
 from worldpose.reports.html_page import (
     CaptionedImage,
     EmbeddedPage,
@@ -17,12 +18,7 @@ from worldpose.reports.html_page import (
     Section,
     compress_image,
 )
-from worldpose.reports.run_report import (
-    CAMERA_MEANINGS,
-    MEANINGS,
-    report_page,
-    score_rows,
-)
+from worldpose.reports.run_report import CAMERA_MEANINGS, MEANINGS, report_page, score_rows
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
@@ -31,26 +27,19 @@ PNG = base64.b64decode(
 
 def run(**changes):
     plain = {
-        "run_id": "0003",
-        "match_id": "tiny-1",
-        "parent": "0002",
-        "state": "partial",
+        **{"run_id": "0003", "match_id": "tiny-1", "parent": "0002", "state": "partial"},
         "results": {"ingest/cam00": "0" * 32, "tracking/clip": "1" * 32},
-        "settings": {},
-        "overrides": {},
         "executed": ("tracking/clip",),
         "reused": ("ingest/cam00",),
         "failed": (
             UnitFailure(unit="triangulation/clip", error="E", message="<script>no</script>"),
         ),
-        "blocked": (),
         "figures": {"tracking/clip": {"persons": 5.0, "mean_views": 5.8125}},
         "versions": {"numpy": "2.4.0"},
-        "started_at": datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC),
-        "finished_at": datetime(2025, 1, 2, 3, 4, 15, tzinfo=UTC),
+        "finished_at": AT + timedelta(seconds=10.0),
         "seconds": 10.0,
     }
-    return RunRecord(**{**plain, **changes})
+    return run_record(**{**plain, **changes})
 
 
 class Page(HTMLParser):
@@ -101,11 +90,7 @@ def test_every_score_has_a_meaning():
     scores = Evaluation(g_mpjpe_mm=80.04, cameras=CameraEvaluation(broadcast=errors))
     assert [row[:3] for row in score_rows(scores)] == [
         ("g_mpjpe_mm", "G-MPJPE", "80.04 mm"),
-        (
-            "cameras.broadcast.ground_error_p95_m",
-            "Broadcast cameras: ground error, 95 %",
-            "0.25 m",
-        ),
+        ("cameras.broadcast.ground_error_p95_m", "Broadcast cameras: ground error, 95 %", "0.25 m"),
         ("cameras.broadcast.coverage", "Broadcast cameras: frames", "50 %"),
     ]
 

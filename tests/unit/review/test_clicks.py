@@ -134,10 +134,8 @@ def added(box, nose=None):
         (added((9, 9, 0, 0)), "not a box inside the image of a"),
         (added((0, 0, 9, 9), nose=(100.0, 9.0)), "outside of the image"),
         (DeletedDetection(camera="tv", frame=0, detection=0), "no camera tv"),
-        (DeletedDetection(camera="clip", frame=0, detection=0), None),
         (hidden("nose"), None),
         (hidden("tail"), "no joint tail"),
-        (hidden("nose", (100.0, 9.0)), "outside of the image"),
     ],
 )
 def test_what_does_not_apply_says_why_and_changes_nothing(folder, edit, reason):

@@ -11,9 +11,7 @@ from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_joints
 from worldpose.ingest.match_folder import read_match
 from worldpose.simulation.foreign import rigs as foreign_rigs
-from worldpose.simulation.foreign.detectors import (
-    PROFILES,
-)
+from worldpose.simulation.foreign.detectors import PROFILES
 from worldpose.simulation.foreign.matches import simulate_foreign_match
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 

@@ -58,14 +58,6 @@ def click(camera, rng, count, noise):
     return dict(zip(names[chosen].tolist(), pixels, strict=True))
 
 
-def draw(camera, marking, count, noise=0.0, rng=None):
-    """Return pixels (count, 2) along the visible part of a marking."""
-    places = PITCH.marking_points(marking, 0.2)
-    pixels = project(camera, places)[seen(camera, places)]
-    chosen = pixels[np.linspace(0, len(pixels) - 1, count).astype(int)]
-    return chosen if rng is None else chosen + noise * rng.standard_normal(chosen.shape)
-
-
 def markings(points, drawn=None):
     """Return clicks and drawn pixels, by name, as the record that people write."""
     return ClickedMarkings.model_validate(

@@ -102,7 +102,7 @@ def test_boards_of_the_pattern_before_opencv_4_6_and_exchanged_sides_are_found(s
     page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
     image, _ = drawn(page, np.random.default_rng(1))
     tried = [(stated, ""), *([] if stated.find(image) else stated.others(image))]
-    found, told = next((board.find(image), note) for board, note in tried if board.find(image))
+    found, told = next((found, note) for board, note in tried if (found := board.find(image)))
     assert len(found.pixels) == 35
     assert found.bend < 0.02
     assert said in told
@@ -147,24 +147,3 @@ def test_a_fisheye_is_chosen_and_found_within_its_stated_uncertainty(reach):
     assert (lens.lens_model, len(lens.distortion), fit.used.all()) == ("fisheye", 4, True)
     assert fit.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.15)
     assert abs(lens.focal_px - 420.0) < 3.0 * lens.focal_std_px < 5.0
-
-
-def test_a_fisheye_is_that_of_opencv():
-    views = fisheye_views(np.random.default_rng(1), (0.9, 0.5))
-    fit = calibrate_lens("cam", views, SIZE)
-    objects = [np.insert(view.places, 2, 0.0, axis=1)[None] for view in views]
-    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
-    error, matrix, lens, _, _ = cv2.fisheye.calibrate(
-        objects, [view.pixels[None] for view in views], SIZE, np.eye(3), np.zeros(4), flags=flags
-    )
-    # OpenCV's minimum has oblong pixels, one degree of freedom more.
-    assert fit.rms_px < 1.01 * error
-    own = np.diag([fit.lens.focal_px] * 2 + [1.0])
-    own[:2, 2] = fit.lens.principal_point_px
-    rays = np.random.default_rng(0).uniform([-1.2, -0.7, 1.0], [1.2, 0.7, 1.0], (100, 1, 3))
-    none = np.zeros(3)
-    one, other = (
-        cv2.fisheye.projectPoints(rays, none, none, matrix, np.ravel(k))[0]
-        for matrix, k in ((own, fit.lens.distortion), (matrix, lens))
-    )
-    assert np.abs(one - other).max() < 1.0

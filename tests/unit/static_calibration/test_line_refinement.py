@@ -3,18 +3,12 @@
 from functools import cache
 
 import numpy as np
-import pytest
 from camera_builders import look_at_camera
 
 from worldpose.body.model import BodyParameters
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration.line_refinement import refine_on_lines
-from worldpose.static_calibration.line_samples import (
-    PaintNoise,
-    project_lines,
-    sample_markings,
-)
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
     CameraOnPitch,
@@ -136,19 +130,3 @@ def test_covariance_holds_the_truth_and_says_more_than_the_start():
     # Mean of chi-square with 11 degrees of freedom is 11; of six starts with one image, below 17
     # in all but one case of a thousand. The template is exact here, which makes it smaller.
     assert np.mean(distances) < 17.0
-
-
-def test_derivatives_of_samples_are_those_of_projection():
-    view = camera()
-    samples = sample_markings(PITCH, 1.0)
-    seen = project_lines(view, samples, 0.12, PaintNoise(1.0, 0.0, 1.0, 1.0))
-    for parameter in range(12):
-        step = np.zeros(12)
-        step[parameter] = 1e-6 if parameter < 7 else 1e-4
-        ahead, behind = step_camera(view, step), step_camera(view, -step)
-        slope = ahead.project(samples.points_world) - behind.project(samples.points_world)
-        slope = (slope * seen.normals).sum(-1) / (2.0 * step[parameter])
-        here = seen.visible
-        assert here.sum() > 50
-        # Central differences of pixels near 1e3 with steps of 1e-6: seven digits.
-        assert seen.by_camera[here, parameter] == pytest.approx(slope[here], rel=1e-4, abs=1e-3)

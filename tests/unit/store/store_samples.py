@@ -6,10 +6,10 @@ import multiprocessing
 import os
 import tempfile
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from run_records import run_record
 
 import data_contracts.arrays
 from data_contracts.arrays import GroupLayout, array_layout
@@ -113,26 +113,9 @@ def place(recipe: Recipe | None = None) -> tuple[str, str, str, str]:
 
 
 def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
-    now = datetime.now(UTC)
-    fields: dict[str, Any] = {
-        "run_id": run_id,
-        "match_id": "final",
-        "parent": None,
-        "state": "complete",
-        "results": {recipe.name: recipe_key(recipe) for recipe in recipes},
-        "settings": {},
-        "overrides": {},
-        "executed": tuple(recipe.name for recipe in recipes),
-        "reused": (),
-        "failed": (),
-        "blocked": (),
-        "figures": {},
-        "versions": {"worldpose": "0.1.0"},
-        "started_at": now,
-        "finished_at": now,
-        "seconds": 1.0,
-    }
-    return RunRecord(**(fields | changes))
+    results = {recipe.name: recipe_key(recipe) for recipe in recipes}
+    own = {"match_id": "final", "results": results, "executed": tuple(results)}
+    return run_record(**({"run_id": run_id, **own} | changes))
 
 
 def run_once(store: Store, *recipes: Recipe) -> str:

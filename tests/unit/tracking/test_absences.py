@@ -17,23 +17,22 @@ def clip(**absent):
 
 
 @pytest.mark.parametrize(
-    ("absent", "share", "said"),
+    ("absent", "share", "longest"),
     [
-        ({}, 0.0, []),
-        ({"one": (40, 63)}, 0.0, []),  # under a second
-        ({"one": (40, 64)}, 25 / 200, ["person 7 in frames 140 to 164"]),
-        ({"one": (60, 99)}, 0.0, []),  # left for good
-        ({"both": (75, 99)}, 0.25, ["all people in frames 175 to 199"]),
-        (
-            {"both": (0, 49), "two": (60, 89)},
-            0.5,
-            ["all people in frames 100 to 149", "person 9 in frames 160 to 189"],
-        ),
+        ({}, 0.0, ()),
+        ({"one": (40, 63)}, 0.0, ()),  # under a second
+        ({"one": (40, 64)}, 25 / 200, (140, 164, 7)),
+        ({"one": (60, 99)}, 0.0, ()),  # left for good
+        ({"both": (75, 99)}, 0.25, (175, 199)),
+        ({"both": (0, 49), "two": (60, 89)}, 0.5, (100, 149)),
+        ({"both": (0, 24), "two": (40, 95)}, 56 / 150, (140, 195, 9)),
     ],
 )
-def test_absences(absent, share, said):
-    assert measure_absences(clip(**absent), FRAME, [7, 9], 25.0) == (pytest.approx(share), said)
+def test_absences(absent, share, longest):
+    names = ("absent_from_frame", "absent_to_frame", "absent_person")
+    expected = {"absent_share": pytest.approx(share), **dict(zip(names, longest, strict=False))}
+    assert measure_absences(clip(**absent), FRAME, [7, 9], 25.0) == expected
 
 
 def test_a_clip_without_people_misses_them_all():
-    assert measure_absences(np.zeros((100, 0), bool), FRAME, [], 25.0) == (1.0, [])
+    assert measure_absences(np.zeros((100, 0), bool), FRAME, [], 25.0) == {"absent_share": 1.0}

@@ -11,11 +11,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.tracking.plane.clocks import estimate_plane_clocks
-from worldpose.tracking.plane.feet import (
-    ANKLE_HEIGHT,
-    GroundPositions,
-    locate_feet,
-)
+from worldpose.tracking.plane.feet import ANKLE_HEIGHT, GroundPositions, locate_feet
 from worldpose.tracking.plane.tracker import TriangulatedPeople, locate_tracks, track_on_plane
 
 detections = KeypointDetections.from_keypoints

@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.tracking.people_selection import (
-    drop_bystanders,
-    drop_shadows,
-    merge_duplicates,
-)
+from worldpose.tracking.people_selection import drop_bystanders, drop_shadows, merge_duplicates
 from worldpose.tracking.person import Person, Sighting
 
 FRAMES, FULL_PITCH = 20, (105.0, 68.0)

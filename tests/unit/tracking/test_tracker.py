@@ -133,3 +133,41 @@ def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
     result = track_people(ring(4), detections(*seen(ring(4), joints)), FPS, SETTINGS)
     assert owners(result) == [0]
     assert (result.detection_index >= 0).all()
+
+
+def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
+    # Two people face each other, are unseen for 1 s, and stand across: each may be either.
+    places = np.zeros((100, 2, 2))
+    places[:30] = [[-0.8, 0.0], [0.8, 0.0]]
+    places[80:] = [[0.0, -0.8], [0.0, 0.8]]
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[30:80] = np.nan
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
+    assert len(result.tracks) == 4
+    assert result.report.undecided == len(result.joins) == 2
+    assert {(join.before, join.after) for join in result.joins} in (
+        {(0, 2), (1, 3)},
+        {(0, 3), (1, 2)},
+    )
+    for join in result.joins:
+        assert not join.decided
+        assert join.margin < np.log(SETTINGS.join_odds)
+    assert result.joins[0].cost >= result.joins[1].cost
+
+
+def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, people, seen):
+    # Two cameras follow a person; then the second sees only a neighbour 0.45 m away, within
+    # the gate: its ray misses the other camera's by more than two views of one body do.
+    places = np.broadcast_to([[0.0, 0.0], [0.0, 0.45]], (40, 2, 2))
+    camera = ring(2)
+    keypoints, confidence = seen(camera, people(places), noise=0.5)
+    keypoints[:, :, 1] = np.nan
+    alone = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
+    assert owners(alone) == [0]
+    keypoints, confidence = seen(camera, people(places), noise=0.5)
+    keypoints[:, 0, 1] = np.nan
+    keypoints[:20, 1, 1] = np.nan
+    keypoints[20:, 1, 0] = np.nan
+    taken = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
+    together = (taken.detection_index[20:] >= 0).all(axis=1)
+    assert not together.any()

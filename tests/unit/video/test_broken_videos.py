@@ -66,12 +66,6 @@ def test_a_dropped_picture_leaves_its_frame_empty_and_shifts_none(tmp_path):
     assert index.on_clock(25.0, "dropped").tolist() == expected.tolist()
 
 
-def test_a_video_of_another_rate_is_refused(tmp_path):
-    index = index_video(encode(tmp_path / "slow.mp4", 80 * np.arange(20)))
-    with pytest.raises(InputError, match="25 frames per second"):
-        index.on_clock(25.0, "slow")
-
-
 @pytest.mark.parametrize(
     ("matrix", "said"),
     [

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.records import Record
+from worldpose.body.occlusions import facing_axes
 from worldpose.simulation.foreign.rigs import View
 from worldpose.simulation.reference import Report, list_detections
-from worldpose.simulation.visibility import facing_axes
 
 
 class DetectorProfile(Record):

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
+from worldpose.body.occlusions import CAPSULES, TRUNK, facing_axes, find_hiders, is_covered
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import fold_radius
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.visibility import CAPSULES, TRUNK, facing_axes, find_hiders, is_covered
 
 Layout = Literal["bowl", "one-side", "low", "goals", "mixed", "hall"]
 

@@ -5,6 +5,7 @@ import pickle
 from collections import defaultdict
 
 import numpy as np
+from camera_builders import plain_camera
 from scipy.spatial.transform import Rotation
 
 from data_contracts.conventions import COCO17
@@ -13,7 +14,6 @@ from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.evaluation.matching import joint_boxes
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
 FRAMES, PEOPLE, WALK = 16, 2, 8.0
@@ -46,12 +46,8 @@ def scene(seed=0):
     pan = Rotation.from_rotvec(np.linspace(-0.02, 0.02, FRAMES)[:, None] * [0.0, 0.0, 1.0])
     down = Rotation.from_rotvec([np.pi / 2 + np.arctan2(14.0, 70.0), 0.0, 0.0])
     rotation = (down * pan).as_matrix()
-    camera = Camera(
-        focal=np.full((FRAMES, 2), 3000.0),
-        principal_point=np.tile([960.0, 540.0], (FRAMES, 1)),
-        distortion=np.zeros((FRAMES, 5)),
-        cam_from_world=Rigid(rotation, -rotation @ [0.0, -70.0, 14.0]),
-        image_size=np.tile([1920, 1080], (FRAMES, 1)),
+    camera = plain_camera(
+        np.full(FRAMES, 3000.0), (960.0, 540.0), Rigid(rotation, -rotation @ [0.0, -70.0, 14.0])
     )
     return bodies, camera
 

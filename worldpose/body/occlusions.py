@@ -1,4 +1,4 @@
-"""Occlusions of joints by the bodies of nearer people, for both simulated worlds."""
+"""Occlusions of joints by the bodies of nearer people, in images."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
+from worldpose.geometry.cameras import Camera
 
 Capsules = tuple[tuple[int, int, float], ...]
 CAPSULES: Final[Capsules] = (
@@ -69,3 +70,21 @@ def is_covered(points: Floats, body: Floats, size: Floats, parts: Capsules = CAP
         away = np.linalg.norm(points - begin - share[..., None] * line, axis=-1)
         covered |= away < width * size[:, None]
     return covered
+
+
+def visible_shares(joints: Floats, camera: Camera) -> Floats:
+    """Return the share of joints in the image that no other hides (frames, persons) [0..1].
+
+    Joints are (frames, persons, 17, 3) [m], world; NaN where a person, or the camera, is missing.
+    """
+    stature = 1.8  # mean height of a person [m]
+    frames, persons, count, _ = joints.shape
+    pixels = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
+    trunk = joints[:, :, TRUNK].mean(axis=2)
+    depth = np.linalg.norm(trunk - camera.center[..., None, :], axis=-1)
+    size = stature * camera.focal.mean(axis=-1)[..., None] / depth
+    seen = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)
+    seen = seen.all(-1) & (find_hiders(pixels, depth, size) < 0)
+    placed = np.asarray(np.isfinite(camera.center).all(axis=-1))
+    known = np.isfinite(joints).all((-1, -2)) & placed[..., None]
+    return np.where(known, seen.mean(-1), np.nan)

@@ -1,0 +1,340 @@
+"""One data set of the runs of several matches, and the check of all that it states."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from data_contracts import release as contracts
+from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17
+from data_contracts.run import StoredFile
+from flows.results import best_results
+from flows.results.best_results import Origin
+from flows.results.dataset import check, count
+from flows.results.export import keep_run
+from worldpose.body.body_file import find_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.occlusions import visible_shares
+from worldpose.dataset import manifest as manifests
+from worldpose.dataset.statistics import data_set_statistics
+from worldpose.errors import InputError, UsageError
+from worldpose.formats import challenge, joints_file
+from worldpose.formats.archives import ARRAY_BYTES, read_npz, write_archive, wrong
+from worldpose.formats.files import read_yaml
+from worldpose.ingest.footage import unit_frames
+from worldpose.ingest.match_folder import read_match
+from worldpose.ingest.pitch_file import NO_PITCH
+from worldpose.store.store import Store
+
+ASSETS: Final = ("poses", "joints", "cameras", "boxes", "footage")
+"""Kinds of files, each with a licence."""
+FootageForm = Literal["none", "digest", "copy"]
+
+
+def write_data_set(
+    store: Store,
+    origins: Sequence[tuple[Origin, contracts.Split]],
+    out: Path,
+    name: str,
+    licences: Mapping[str, str],
+    *,
+    hidden: Path | None = None,
+    footage: FootageForm = "none",
+    subjects: Path | None = None,
+) -> contracts.DataSetManifest:
+    """Write a new folder with all clips of several runs, and release.json; pin the runs.
+
+    `train` and `val` have poses, joints, cameras and boxes; `test` has boxes, and cameras with the
+    pose of the first frame alone: the rest is in the new folder `hidden`. Licences are texts by
+    kind of file; `subjects` is a YAML file with lists of MATCH/NAME or MATCH/CLIP/ID.
+
+    Raises:
+        UsageError: a folder exists, or the test part has no hidden folder.
+        InputError: a result, video or licence is missing, or a subject is in two splits.
+    """
+    tested = any(split == "test" for _, split in origins)
+    if tested != (hidden is not None) or (hidden and out.resolve() in hidden.resolve().parents):
+        todo = "Name both --test MATCH and --hidden FOLDER, a folder that you do not publish."
+        raise _refuse("--hidden", "a folder for the test part's truth, not in --out", hidden, todo)
+    for place in (out, hidden or out):
+        if place.exists():
+            raise _refuse(f"{place}", "a new folder", "one that exists", "Choose another folder.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as workshop:
+        draft, truth = Path(workshop) / "public", Path(workshop) / "hidden"
+        clips: dict[str, contracts.ReleasedSequence] = {}
+        for origin, split in origins:
+            for clip in origin.clips:
+                label = f"{origin.spec.match_id}_{clip}".replace(".", "_")
+                if label in clips:
+                    todo = "Name each match once, and rename clips whose names differ by dots."
+                    raise _refuse(label, "one clip of this name", "two", todo)
+                clips[label] = _write_clip(origin, clip, label, split, Path(workshop), footage)
+        clips = _name_subjects(clips, subjects)
+        parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
+        counted = {each: found for part in parts for each, found in count([part]).clips.items()}
+        manifest = contracts.DataSetManifest(
+            release=name,
+            worldpose=version("worldpose"),
+            pitch=all(origin.spec.pitch != NO_PITCH for origin, _ in origins),
+            licences=dict(licences),
+            clips=clips,
+            statistics=data_set_statistics(counted, len(_splits_of(clips))),
+            files=(),
+            hidden=_listed(truth),
+        )
+        for found in _statement_findings(manifest):
+            todo = "Add --licence KIND=FILE, or put all matches of a person into one split."
+            raise wrong(f"{out}: {found.where[0]}", "no contradiction", found.says, todo)
+        from worldpose.reports.data_set import data_set_page  # late: it loads matplotlib, 0.5 s
+
+        checks = {part.name: check(part, pitch=manifest.pitch) for part in parts}
+        page = data_set_page(name, manifest.statistics, checks, manifest)
+        (draft / "datasheet.html").write_text(page, encoding="utf-8")
+        manifest = manifest.model_copy(update={"files": _listed(draft)})
+        manifests.write_manifest(draft, manifest)
+        for origin, _ in origins:
+            keep_run(store, origin, name)
+        if hidden is not None:
+            hidden.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(truth, hidden)
+        draft.replace(out)
+    return manifest
+
+
+def _refuse(where: str, expected: str, found: object, todo: str) -> UsageError:
+    return UsageError(where, expected=expected, found=f"{found}", todo=todo)
+
+
+def _listed(folder: Path) -> tuple[StoredFile, ...]:
+    return manifests.released_files(folder, [path for path in folder.rglob("*") if path.is_file()])
+
+
+def _write_clip(
+    origin: Origin, clip: str, name: str, split: contracts.Split, root: Path, footage: FootageForm
+) -> contracts.ReleasedSequence:
+    """Write the files of one clip below `root`, the truth of a test part apart from the rest."""
+    public = root / "public" / split
+    part = root / "hidden" if split == "test" else public
+    model, poses, people = best_results.fitted_bodies(origin.run, clip)
+    tracks, spec = origin.tracks(clip), origin.spec
+    joints_file.write_poses(part / "poses" / f"{name}.npz", poses, model.name)
+    joints_file.write_joints(part / f"{name}.joints.npz", tracks)
+    manifests.write_frame_rates(part, {name: spec.fps})
+    views, videos, images = {}, {}, {}
+    for view, camera in best_results.filmed_cameras(origin.run, clip).items():
+        label = name + view.removeprefix(clip)
+        width, height = camera.image_size.reshape(-1, 2)[0].tolist()
+        views[label] = width, height
+        challenge.write_moving_camera(part / "cameras" / f"{label}.npz", camera)
+        boxes = project_people(part, name, label, views[label])
+        write_archive(part / "boxes" / f"{label}.npz", boxes)
+        if split == "test":
+            challenge.write_challenge_camera(public / f"cameras/{label}.npz", camera, 2026)
+            write_archive(public / "boxes" / f"{label}.npz", boxes)
+        if footage != "none":
+            videos[label] = _write_footage(origin, view, public / "footage" / label, footage)
+            images[label] = unit_frames(spec, view).number(spec.clips_of(view)[0].first_frame)
+    found = best_results.tracked_people(origin.run, clip)[1]
+    named = {person: track.name or f"{clip}/{person}" for person, track in found.items()}
+    return contracts.ReleasedSequence(
+        split=split,
+        match_id=spec.match_id,
+        run_id=origin.run.record.run_id,
+        clip_id=clip,
+        usability=origin.run.record.usability,
+        first_frame=int(tracks.frames[0]),
+        fps=spec.fps,
+        body_model=model.name,
+        subjects=tuple(f"{spec.match_id}/{named[person]}" for person in people.tolist()),
+        views=views,
+        footage=videos,
+        first_images=images,
+    )
+
+
+def _write_footage(origin: Origin, view: str, out: Path, form: FootageForm) -> StoredFile:
+    folder = Path(origin.registration.folder)
+    video = read_match(folder).videos.get(view)
+    source = "" if video is None else video.relative_to(folder).as_posix()
+    digest = origin.registration.digest_of(source)
+    if video is None or digest is None:
+        todo = "Add it to the match folder and run again, or choose --footage none."
+        raise wrong(f"{folder}: {view}", "its video", "none", todo)
+    files = [path for path in (video, *video.rglob("*")) if path.is_file()]
+    if form == "copy":
+        copied = out.with_name(f"{out.name}{video.suffix}")
+        copied.parent.mkdir(parents=True, exist_ok=True)
+        (shutil.copytree if video.is_dir() else shutil.copyfile)(video, copied)
+        source = "/".join(copied.parts[-3:])
+    return StoredFile(path=source, size=sum(f.stat().st_size for f in files), sha256=digest)
+
+
+def project_people(part: Path, clip: str, view: str, size: tuple[int, int]) -> dict[str, Floats]:
+    """Return boxes (frames, persons, 4) [px] and visibility (frames, persons) of a clip's files.
+
+    Boxes are around the surfaces of bodies, within the image; NaN outside. Visibility is the share
+    of joints in the image that no nearer person hides. The image has width and height `size` [px].
+    """
+    poses, model = joints_file.read_poses(part / "poses" / f"{clip}.npz")
+    camera = challenge.read_camera(part / "cameras" / f"{view}.npz", size)
+    joints = joints_file.read_joints(part / f"{clip}.joints.npz").joints
+    truth = challenge.challenge_truth(find_body(model or ""), poses, camera)
+    boxes = np.full((*joints.shape[:2], 4), np.nan)
+    boxes[:, truth.persons] = truth.clip.boxes
+    return {"boxes": boxes, "visibility": visible_shares(joints, camera)}
+
+
+def _name_subjects(
+    clips: Mapping[str, contracts.ReleasedSequence], file: Path | None
+) -> dict[str, contracts.ReleasedSequence]:
+    """Return the clips with the subjects of a registry.
+
+    Raises:
+        InputError: the registry has another form or unknown people.
+    """
+    registry = {} if file is None else read_yaml(file)
+    known = {person for clip in clips.values() for person in clip.subjects}
+    owner: dict[str, str] = {}
+    for subject, people in registry.items() if isinstance(registry, dict) else [("", None)]:
+        for person in people if isinstance(people, list) else [people]:
+            if person not in known or person in owner:
+                expected = "a list of MATCH/NAME or MATCH/CLIP/ID of the data set, each once"
+                todo = f"Known are {', '.join(sorted(known)[:8])}, ..."
+                raise wrong(f"{file}: {subject}", expected, f"{person!r}", todo)
+            owner[person] = str(subject)
+    named = {}
+    for name, clip in clips.items():
+        subjects = tuple(owner.get(person, person) for person in clip.subjects)
+        named[name] = clip.model_copy(update={"subjects": subjects})
+    return named
+
+
+def _splits_of(clips: Mapping[str, contracts.ReleasedSequence]) -> dict[str, set[str]]:
+    return {
+        subject: {clip.split for clip in clips.values() if subject in clip.subjects}
+        for subject in {subject for clip in clips.values() for subject in clip.subjects}
+    }
+
+
+def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckReport:
+    """Verify what release.json states: files, splits, licences, numbers, and 3D against boxes.
+
+    Without `hidden`, the truth of the test part is not verified.
+
+    Raises:
+        InputError: there is no such data set.
+    """
+    manifest = manifests.read_data_set(folder)
+    findings = [*_file_findings(folder, hidden, manifest), *_statement_findings(manifest)]
+    figures: dict[str, contracts.ClipFigures] = {}
+    for split in dict.fromkeys(clip.split for clip in manifest.clips.values()):
+        part = folder / split if split != "test" else hidden
+        if part is None:
+            continue
+        try:
+            report = check(part, pitch=manifest.pitch)
+            figures |= report.clips
+            for found in report.findings:
+                where = tuple(f"{split}/{place}" for place in found.where)
+                findings.append(found.model_copy(update={"where": where}))
+            for name, counted in count([part]).clips.items():
+                stated = manifest.statistics.clips.get(name)
+                if stated is None or not _equal(_numbers(stated), _numbers(counted)):
+                    findings.append(_damage("count", "statistics differ from the poses", name))
+        except InputError as error:
+            findings.append(_damage("unreadable", str(error), split))
+        for name, clip in manifest.clips.items():
+            try:
+                findings += _clip_findings(part, name, clip) if clip.split == split else ()
+            except InputError as error:
+                findings.append(_damage("unreadable", str(error), f"{split}: {name}"))
+    return contracts.CheckReport(clips=figures, findings=tuple(findings))
+
+
+def _damage(fault: str, says: str, *where: str) -> contracts.Finding:
+    return contracts.Finding(fault=fault, kind="damage", where=where, says=says)
+
+
+def _numbers(clip: contracts.ClipStatistics) -> Floats:
+    return np.array([clip.frames, clip.seconds, clip.persons, clip.poses, *clip.trajectories_m])
+
+
+def _equal(one: Floats, two: Floats, off: float = 1e-6) -> bool:
+    return one.shape == two.shape and np.allclose(one, two, rtol=0.0, atol=off, equal_nan=True)
+
+
+def _file_findings(
+    folder: Path, hidden: Path | None, manifest: contracts.DataSetManifest
+) -> Iterator[contracts.Finding]:
+    """Yield files that are gone, changed or not listed, and truth in the public test part."""
+    for place, files in ((folder, manifest.files), (hidden, manifest.hidden)):
+        if place is None:
+            continue
+        listed = {file.path for file in files}
+        there = {path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()}
+        if gone := sorted(listed - there):
+            yield _damage("missing_files", f"files of {place.name} are gone", *gone)
+        if new := sorted(there - listed - {manifests.DATA_SET}):
+            yield _damage("unlisted_files", "release.json lists no such files", *new)
+        if changed := manifests.changed_files(place, [f for f in files if f.path in there]):
+            yield _damage("changed_files", f"files of {place.name} have other bytes", *changed)
+    truth = []
+    for path in sorted((folder / "test").rglob("*.npz")):
+        kind = path.relative_to(folder / "test").parts[0]
+        poses = challenge.read_camera_rows(path).rotation if kind == "cameras" else np.empty(0)
+        if np.isfinite(poses).sum() > 9 or kind not in ("cameras", "boxes", "footage"):
+            truth.append(path.relative_to(folder).as_posix())
+    if truth:
+        yield _damage("test_truth", "the public test part has truth that must be hidden", *truth)
+
+
+def _statement_findings(manifest: contracts.DataSetManifest) -> Iterator[contracts.Finding]:
+    """Yield missing licences, subjects in two splits, and totals that clips contradict."""
+    filmed = any(clip.footage for clip in manifest.clips.values())
+    for asset in ASSETS if filmed else ASSETS[:-1]:
+        if not manifest.licences.get(asset, "").strip():
+            yield _damage("missing_licence", "no licence of these files is stated", asset)
+    for subject, splits in _splits_of(manifest.clips).items():
+        if len(splits) > 1:
+            says = f"the subject is in {' and '.join(sorted(splits))}"
+            yield _damage("subject_in_two_splits", says, subject)
+    stated = manifest.statistics
+    whole = data_set_statistics(stated.clips, len(_splits_of(manifest.clips)))
+    others = [name for name, value in whole if value != getattr(stated, name)]
+    if others or stated.clips.keys() != manifest.clips.keys():
+        says = f"clips give other totals of {', '.join(others) or 'clips'}"
+        yield _damage("count", says, manifests.DATA_SET)
+
+
+def _clip_findings(
+    part: Path, name: str, clip: contracts.ReleasedSequence
+) -> Iterator[contracts.Finding]:
+    """Yield boxes outside the image, and poses, joints and boxes that disagree."""
+    poses, model = joints_file.read_poses(part / "poses" / f"{name}.npz")
+    joints = joints_file.read_joints(part / f"{name}.joints.npz").joints
+    mine = fold_keypoints(find_body(model or ""), COCO17)(poses).swapaxes(0, 1)
+    where = f"{clip.split}/{name}.joints.npz"
+    if mine.shape != joints.shape or len(clip.subjects) != joints.shape[1]:
+        yield _damage("count", "poses, joints and subjects are not of the same people", where)
+        return
+    if not _equal(mine, joints, 0.005):
+        yield _damage("joints_differ", "joints are not those of the poses", where)
+    for view, size in clip.views.items():
+        where = f"{clip.split}/boxes/{view}.npz"
+        stored: dict[str, Any] = read_npz(part / "boxes" / f"{view}.npz", ARRAY_BYTES)
+        low, high = np.split(stored.get("boxes", np.empty(0)), 2, axis=-1)
+        if ((high <= low) | (low < -0.5) | (high > np.array(size) - 0.5)).any():
+            yield _damage("box_outside", "a box has no area or leaves the image", where)
+        for key, right in project_people(part, name, view, size).items():
+            # Single precision of poses is far below a hundredth of a pixel.
+            if key not in stored or not _equal(stored[key], right, 0.01):
+                says = f"{key}: not those of the bodies in the camera, frame by frame"
+                yield _damage("boxes_differ", says, where)

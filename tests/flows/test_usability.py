@@ -1,0 +1,135 @@
+"""The verdict on a run, from metrics and warnings that can be judged by hand."""
+
+import pytest
+
+from data_contracts.run import UnitFailure
+from data_contracts.usability import UsableLimits
+from flows.usability import RunOutcome, judge_run
+
+HEALTHY = {
+    "detection/cam1.clip": {"unreadable_share": 0.01, "empty_share": 0.4},
+    "tracking/clip": {"absent_share": 0.05, "unmatched_share": 0.15, "mean_ray_distance_m": 0.06},
+    "triangulation/clip": {"standard_deviation_m": 0.3, "unhealthy_s.cam2": 9.0},
+    "retriangulation/clip": {"standard_deviation_m": 0.05, "unhealthy_s.cam2": 1.8},
+    "body_fitting/clip": {"offset_rms_m": 0.01, "held_out_certain_excess_m.knee": 0.0},
+}
+
+
+def judge(unit="", limits=None, **outcome):
+    """The verdict on a healthy run in which `unit` has other metrics."""
+    figures = HEALTHY | {unit: HEALTHY.get(unit, {}) | outcome.pop("figures", {})}
+    return judge_run(RunOutcome(figures=figures, **outcome), limits or UsableLimits())
+
+
+def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
+    assert judge("x/y") == judge_run(RunOutcome(), UsableLimits())
+    assert judge("x/y").verdict == "usable"
+
+
+@pytest.mark.parametrize(
+    ("unit", "figures", "said"),
+    [
+        (
+            "detection/cam1.clip",
+            {"unreadable_share": 0.05, "unreadable_from_frame": 7, "unreadable_to_frame": 11},
+            "the video of cam1 in clip has no image, or none that can be decoded, for 5 % (limit "
+            "1 %) of the frames, longest in frames 7 to 11.",
+        ),
+        (
+            "tracking/clip",
+            {"absent_share": 0.2, "absent_from_frame": 40, "absent_to_frame": 64},
+            "people are missing in clip for 20 % (limit 5 %) of the time, longest in frames 40 to",
+        ),
+        (
+            "tracking/clip",
+            {
+                "absent_share": 0.2,
+                "absent_from_frame": 40,
+                "absent_to_frame": 64,
+                "absent_person": 7,
+            },
+            "people are missing in clip for 20 % (limit 5 %) of the time, longest person 7 in ",
+        ),
+        ("tracking/clip", {"unmatched_share": 0.3}, "30 % (limit 15 %) of the detections in clip"),
+        ("tracking/clip", {"mean_ray_distance_m": 0.2}, "cameras disagree about the people in "),
+        ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
+        (
+            "retriangulation/clip",
+            {
+                "unhealthy_s.cam2": 2.2,
+                "unhealthy_from_frame.cam2": 50,
+                "unhealthy_to_frame.cam2": 104,
+                "unhealthy_s.cam3": 3.0,
+                "unhealthy_from_frame.cam3": 0,
+                "unhealthy_to_frame.cam3": 74,
+            },
+            "the keypoints of cam3, cam2 depart from the people in clip, or its images are bad, "
+            "for 3 s (limit 2 s) at a time, longest in frames 0 to 74.",
+        ),
+        (
+            "retriangulation/clip",
+            {"misplacement_m.cam1": 0.05, "misplacement_m.cam4": 0.08},
+            "the calibration of cam4 displaces people in clip by 8 cm (limit 5 cm).",
+        ),
+        (
+            "bundle_adjustment/cameras",
+            {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1},
+            "the people contradict the calibration of cam4: the adjustment moves it by 7.1 (limit "
+            "3) standard deviations.",
+        ),
+        ("body_fitting/clip", {"offset_rms_m": 0.05}, "bodies in clip lie 5 cm (limit 3 cm) off"),
+        (
+            "body_fitting/clip",
+            {"held_out_certain_excess_m.knee": 0.02, "held_out_certain_excess_m.hip": 0.001},
+            "bodies in clip are farther from the images than triangulated joints are (knee), by 2",
+        ),
+        (
+            "broadcast_calibration/clip",
+            {"expected_error_median_px": 4.0},
+            "the broadcast camera of clip is uncertain by 4 px (limit 3 px).",
+        ),
+    ],
+)
+def test_a_metric_beyond_its_limit_is_a_reservation(unit, figures, said):
+    found = judge(unit, figures=figures)
+    assert found.verdict == "usable with reservations"
+    (text,) = found.reservations
+    assert text.startswith(said)
+
+
+def test_a_limit_is_a_setting_and_is_kept_with_the_verdict():
+    limits = UsableLimits(max_unmatched_share=0.1)
+    found = judge("x/y", limits)
+    assert (len(found.reservations), found.limits) == (1, limits)
+
+
+def test_warnings_of_stages_that_doubt_their_results_are_reservations_those_of_inputs_are_not():
+    said = {"ingest/cam1": ["cam1: 25 fps"], "triangulation/clip": ["camera cam2 moves."]}
+    assert judge("x/y", warnings=said).reservations == ("camera cam2 moves.",)
+
+
+def test_failed_units_and_cameras_left_out_are_reservations():
+    failed = UnitFailure(unit="filtering/clip", error="E", message="no\n disk")
+    found = judge("x/y", failed=[failed], left_out=["camera cam1 is left out: blind."])
+    assert found.verdict == "usable with reservations"
+    assert found.reservations == (
+        "filtering/clip failed: no disk",
+        "camera cam1 is left out: blind.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("outcome", "said"),
+    [
+        ({"lacks_results": True}, "the run failed."),
+        ({"lacks_people": True}, "no person is placed."),
+        ({"waiting": 2}, "results that wait for review: 2."),
+        (
+            {"unit": "tracking/clip", "figures": {"absent_share": 0.6}},
+            "people are missing in clip for more than 50 % of the time.",
+        ),
+    ],
+)
+def test_results_that_are_not_there_are_not_usable(outcome, said):
+    found = judge(**{"unit": "x/y", **outcome})
+    assert (found.verdict, found.reservations[0]) == ("not usable", said)

@@ -1,0 +1,365 @@
+"""A data set of three matches is written whole, and every fault planted in it is found."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from faulty_data_sets import FPS, PERSONS, edit, transpose_rotation
+from typer.testing import CliRunner
+
+from data_contracts.conventions import COCO17
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.usability import Usability
+from flows.cli.app import app
+from flows.results.best_results import Origin
+from flows.results.data_set_release import (
+    ASSETS,
+    check_data_set,
+    write_data_set,
+)
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.occlusions import visible_shares
+from worldpose.dataset.benchmark import score_folders
+from worldpose.dataset.manifest import read_data_set, released_files
+from worldpose.errors import InputError, UsageError
+from worldpose.store.store import Store
+
+HALF = 8
+"""Frames of a clip."""
+SPLITS = {"ann-1": "train", "bea-1": "val", "cleo-1": "test"}
+CLIP = "ann-1_A"
+
+
+class StubRun(Mapping):
+    """Results by name, as an opened run has them."""
+
+    def __init__(self, match, store, results):
+        self.results, self.store = results, store
+        self.record = SimpleNamespace(
+            run_id="0001",
+            match_id=match,
+            state="complete",
+            usability=Usability(verdict="usable"),
+            results=results,
+            left_out={},
+            body_folder=None,
+        )
+
+    def __getitem__(self, name):
+        return self.results[name]
+
+    def __iter__(self):
+        return iter(self.results)
+
+    def __len__(self):
+        return len(self.results)
+
+
+def results(model, poses, camera, clip, first):
+    """What a run has of one clip: bodies, their joints, tracks and the broadcast camera."""
+    some = poses[:, first : first + HALF]
+    joints = fold_keypoints(model, COCO17)(some).swapaxes(0, 1)
+    frames = np.arange(first, first + HALF)
+    coordinates = {"frame": frames, "person": np.arange(PERSONS)}
+    placed = {
+        "joints": (("frame", "person", "joint", "axis"), joints),
+        "covariance": (
+            ("frame", "person", "joint", "axis", "axis_"),
+            np.zeros((*joints.shape, 3)),
+        ),
+        "views": (("frame", "person", "joint"), np.full(joints.shape[:3], 3)),
+    }
+    fits = {"betas": (("person", "shape"), some.betas[:, 0])}
+    for name in ("global_orient", "body_pose", "transl"):
+        rows = getattr(some, name).swapaxes(0, 1)
+        fits[name] = (("frame", "person", f"{name}_"), rows)
+    tracks = [
+        {"person": p, "first_frame": 0, "last_frame": HALF - 1, "frames_seen": HALF, "views": 3.0}
+        for p in range(PERSONS)
+    ]
+    rows = camera[first : first + HALF]
+    lens = {"focal": rows.focal, "principal_point": rows.principal_point}
+    lens |= {"distortion": rows.distortion, "translation": rows.cam_from_world.translation}
+    moving = {name: (("frame", f"{name}_"), np.array(values)) for name, values in lens.items()}
+    moving["rotation"] = (("frame", "a", "b"), np.array(rows.cam_from_world.rotation))
+    moving["image_size"] = (("side",), np.array([1920, 1080]))
+    attrs = {"clip_id": clip, "pitch": None}
+    return {
+        f"tracking/{clip}": xr.Dataset(coords=coordinates, attrs={"tracks": tracks}),
+        f"triangulation/{clip}": xr.Dataset(placed, coords=coordinates),
+        f"body_fitting/{clip}": xr.Dataset(
+            fits | placed, coords=coordinates, attrs={"body_model": model.name}
+        ),
+        f"broadcast_calibration/{clip}": xr.Dataset(moving, coords={"frame": frames}, attrs=attrs),
+    }
+
+
+@pytest.fixture(scope="module")
+def origins(model, poses, main_camera, tmp_path_factory):
+    """Runs of three matches of two clips each, and their splits."""
+    store = Store.create(str(tmp_path_factory.mktemp("store") / "project"))
+    found = []
+    for match, split in SPLITS.items():
+        folder = tmp_path_factory.mktemp("matches") / match
+        (folder / "broadcast").mkdir(parents=True)
+        (folder / "detections").mkdir()
+        spec = MatchSpec(
+            match_id=match,
+            fps=FPS,
+            cameras=(
+                CameraSpec(id="north", width=1920, height=1080),
+                CameraSpec(id="main", kind="broadcast", width=1920, height=1080),
+            ),
+            clips=tuple(
+                ClipSpec(id=name, first_frame=first, frame_count=HALF, broadcast="main")
+                for name, first in (("A", 0), ("B", HALF))
+            ),
+        )
+        (folder / "match.yaml").write_text(spec.model_dump_json(exclude_none=True))
+        for name in ("north", "A", "B"):
+            (folder / "detections" / f"{name}.json").write_text("[]")
+        for name in "AB":
+            (folder / "broadcast" / f"{name}.mp4").write_text(f"{match} {name}")
+        parts = [results(model, poses, main_camera, *each) for each in (("A", 0), ("B", HALF))]
+
+        def digest_of(path, folder=folder):
+            return hashlib.sha256((folder / path).read_bytes()).hexdigest()
+
+        registration = SimpleNamespace(spec=spec, folder=str(folder), digest_of=digest_of)
+        run = StubRun(match, store, parts[0] | parts[1])
+        found.append((Origin(run, registration), split))
+    return store, found
+
+
+LICENCES = dict.fromkeys(ASSETS, "For tests alone.")
+
+
+@pytest.fixture(scope="module")
+def written(origins, tmp_path_factory):
+    """A sound data set, and its hidden truth; read only."""
+    folder = tmp_path_factory.mktemp("released")
+    registry = folder / "subjects.yaml"
+    registry.write_text("keeper: [ann-1/A/0, ann-1/B/0]\nstriker: [bea-1/A/2, bea-1/B/1]\n")
+    options = {"hidden": folder / "truth", "footage": "copy", "subjects": registry}
+    write_data_set(*origins, folder / "set", "first", LICENCES, **options)
+    return folder
+
+
+def test_a_sound_data_set_passes_and_hides_the_truth(written):
+    report = check_data_set(written / "set", written / "truth")
+    assert report.findings == ()
+    assert len(report.clips) == 6
+    public = {
+        path.relative_to(written / "set").as_posix() for path in written.rglob("set/test/*/*")
+    }
+    views = [f"cleo-1_{clip}" for clip in "AB"]
+    kinds = {"boxes": "npz", "cameras": "npz", "footage": "mp4"}
+    assert public == {f"test/{kind}/{v}.{end}" for kind, end in kinds.items() for v in views}
+    assert np.load(written / "set" / "test" / "cameras" / "cleo-1_A.npz")["R"].shape == (1, 3, 3)
+    manifest = read_data_set(written / "set")
+    assert {clip.split for clip in manifest.clips.values()} == {"train", "val", "test"}
+    # Two people have two clips each; all others count once per clip.
+    assert manifest.statistics.subjects == 6 * PERSONS - 2
+    assert manifest.statistics.frames == 6 * HALF
+    clip = manifest.clips["ann-1_B"]
+    assert clip.first_images == {"ann-1_B": 0}
+    video = clip.footage["ann-1_B"]
+    copied = written / "set" / video.path
+    assert hashlib.sha256(copied.read_bytes()).hexdigest() == video.sha256
+    page = (written / "set" / "datasheet.html").read_text()
+    assert "keeper" in page and "For tests alone." in page and "data:image" in page
+    assert "ann-1, run 0001: usable" in page
+
+
+def test_boxes_show_whom_the_camera_sees(written):
+    boxes = np.load(written / "set" / "train" / "boxes" / f"{CLIP}.npz")
+    there = np.isfinite(boxes["boxes"]).all(-1)
+    poses = np.load(written / "set" / "train" / "poses" / f"{CLIP}.npz")
+    np.testing.assert_array_equal(there, np.isfinite(poses["transl"][..., 0]).T)
+    np.testing.assert_array_equal(there, np.isfinite(boxes["visibility"]))
+    assert np.nanmax(boxes["visibility"]) == 1.0
+
+
+def test_people_behind_others_and_outside_the_image_are_less_visible(model, poses, main_camera):
+    camera = main_camera[:HALF]
+    one = fold_keypoints(model, COCO17)(poses[:1, :HALF]).swapaxes(0, 1)
+    ray = one - camera.center[:, None, None]
+    behind = one + 3.0 * ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    people = np.concatenate([one, behind, one + [0.0, 0.0, 500.0], np.nan * one], axis=1)
+    shares = visible_shares(people, camera)
+    assert (shares[:, 0] == 1.0).all() and (shares[:, 2] == 0.0).all()
+    assert (shares[:, 1] < 0.3).all() and np.isnan(shares[:, 3]).all()
+
+
+def test_a_released_folder_is_scored(written):
+    for reference, clips in (("set", 4), ("truth", 2)):
+        (score,), _ = score_folders(written / reference, {"same": written / reference})
+        assert len(score.clips) == clips
+        assert score.evaluation.g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
+        assert score.evaluation.track_coverage == 1.0
+
+
+def seal(folder, truth):
+    """Record the files as they are, as an author does who does not see the fault."""
+    path = folder / "release.json"
+    stated = json.loads(path.read_text())
+    for key, place in (("files", folder), ("hidden", truth)):
+        files = [each for each in place.rglob("*") if each.is_file() and each != path]
+        stated[key] = [file.model_dump() for file in released_files(place, files)]
+    path.write_text(json.dumps(stated))
+
+
+def state(change):
+    """A fault in release.json."""
+
+    def plant(folder, truth):
+        path = folder / "release.json"
+        stated = json.loads(path.read_text())
+        change(stated)
+        path.write_text(json.dumps(stated))
+
+    return plant
+
+
+def files(name, change):
+    """A fault in the arrays of a file that the digests include."""
+
+    def plant(folder, truth):
+        edit(truth / name.removeprefix("hidden/") if "hidden/" in name else folder / name, change)
+        seal(folder, truth)
+
+    return plant
+
+
+def put(name, index, value):
+    return lambda arrays: arrays[name].__setitem__(index, value)
+
+
+def swap(name):
+    def change(arrays):
+        arrays[name][:, [3, 4]] = arrays[name][:, [4, 3]]
+
+    return change
+
+
+def later(arrays):
+    for name in "KkRt":
+        arrays[name] = np.roll(arrays[name], 1, axis=0)
+
+
+def leave_truth(folder, truth):
+    shutil.copytree(truth / "poses", folder / "test" / "poses")
+    seal(folder, truth)
+
+
+def leave_camera(folder, truth):
+    shutil.copy(truth / "cameras" / "cleo-1_A.npz", folder / "test" / "cameras")
+    seal(folder, truth)
+
+
+def put_keeper_into_val(stated):
+    stated["clips"]["bea-1_A"]["subjects"][0] = "keeper"
+
+
+def count_one_more(stated):
+    stated["statistics"]["clips"][CLIP]["poses"] += 1
+    stated["statistics"]["poses"] += 1
+
+
+POSES, CAMERA, BOXES = (f"train/{kind}/{CLIP}.npz" for kind in ("poses", "cameras", "boxes"))
+JOINTS = f"train/{CLIP}.joints.npz"
+FAULTS = {
+    "missing file": (lambda f, t: (f / BOXES).unlink(), "missing_files", BOXES),
+    "changed digest": (
+        lambda f, t: edit(f / BOXES, put("visibility", (0, 0), 0.0)),
+        "changed_files",
+        BOXES,
+    ),
+    "unlisted file": (lambda f, t: (f / "val" / "x.txt").touch(), "unlisted_files", "val/x.txt"),
+    "swapped frames": (files(POSES, swap("transl")), "boxes_differ", BOXES),
+    "swapped frames of joints": (
+        files(JOINTS, lambda a: a.update(joints=a["joints"][[1, 0, *range(2, HALF)]])),
+        "joints_differ",
+        JOINTS,
+    ),
+    "transposed rotation": (files(CAMERA, transpose_rotation), "transposed_rotation", CAMERA[:-4]),
+    "late camera": (files(CAMERA, later), "boxes_differ", BOXES),
+    "NaN pose": (files(POSES, put("transl", (0, 3), np.nan)), "missing_values_disagree", POSES),
+    "wrong unit": (
+        files(POSES, lambda a: a.update(transl=1000 * a["transl"])),
+        "millimetres",
+        POSES,
+    ),
+    "truth of the test part": (leave_truth, "test_truth", "test/poses/cleo-1_A.npz"),
+    "camera of the test part": (leave_camera, "test_truth", "test/cameras/cleo-1_A.npz"),
+    "box outside": (files(BOXES, put("boxes", (2, 0, 2), 2500.0)), "box_outside", BOXES),
+    "subject in two splits": (state(put_keeper_into_val), "subject_in_two_splits", "keeper"),
+    "broken camera": (files(CAMERA, put("K", (4, 0, 0), -1.0)), "unreadable", f"train: {CLIP}"),
+    "missing licence": (state(lambda s: s["licences"].pop("boxes")), "missing_licence", "boxes"),
+    "wrong count": (state(count_one_more), "count", CLIP),
+    "wrong total": (state(lambda s: s["statistics"].update(frames=7)), "count", "release.json"),
+    "hidden truth": (
+        files("hidden/poses/cleo-1_B.npz", put("transl", (0, 3), 0.0)),
+        "boxes_differ",
+        "test/boxes/cleo-1_B.npz",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_found(written, tmp_path, name):
+    plant, fault, where = FAULTS[name]
+    folder, truth = (shutil.copytree(written / each, tmp_path / each) for each in ("set", "truth"))
+    plant(folder, truth)
+    found = check_data_set(folder, truth).findings
+    assert (fault, where) in {(each.fault, place) for each in found for place in each.where}, found
+
+
+def test_the_command_checks_a_data_set(written, tmp_path):
+    check = ("release", "--check", str(written / "set"), "--hidden", str(written / "truth"))
+    assert "no findings" in CliRunner().invoke(app, check).stdout
+    folder = shutil.copytree(written / "set", tmp_path / "set")
+    (folder / BOXES).unlink()
+    answer = CliRunner().invoke(app, ("release", "--check", str(folder), "--json"))
+    assert answer.exit_code == 1
+    assert "missing_files" in {each["fault"] for each in json.loads(answer.stdout)["findings"]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"hidden": None}, "--hidden: expected a folder for the test part"),
+        ({"licences": {"poses": "x"}}, "set: joints: expected no contradiction, found no licence"),
+        (
+            {"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")},
+            "footage: expected no contradiction, found no licence",
+        ),
+        (
+            {"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"},
+            "keeper: expected no contradiction, found the subject is in train and val",
+        ),
+        ({"subjects": "keeper: [ann-1/A/77]"}, "keeper: expected a list of MATCH/NAME"),
+        ({"subjects": "[keeper]"}, "expected a list of MATCH/NAME"),
+    ],
+)
+def test_a_data_set_that_would_be_wrong_is_refused(origins, tmp_path, changes, told):
+    if "subjects" in changes:
+        changes = {"subjects": tmp_path / "subjects.yaml"} | {"text": changes["subjects"]}
+        changes["subjects"].write_text(changes.pop("text"))
+    options = {"licences": LICENCES, "hidden": tmp_path / "truth"} | changes
+    with pytest.raises((InputError, UsageError), match=told):
+        write_data_set(*origins, tmp_path / "set", "first", **options)
+    assert not (tmp_path / "set").exists() and not (tmp_path / "truth").exists()
+
+
+def test_a_folder_is_never_overwritten_and_no_truth_is_published(origins, written):
+    new = written / "new"
+    with pytest.raises(UsageError, match="expected a new folder"):
+        write_data_set(*origins, written / "set", "first", LICENCES, hidden=new)
+    with pytest.raises(UsageError, match="not in --out"):
+        write_data_set(*origins, new, "first", LICENCES, hidden=new / "test")
