@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 from command_line import succeed, worldpose
+from simulated_kit import lay_out_kit
 
 from worldpose.formats.challenge import read_submission, write_submission
-from worldpose.simulation.challenge_kit import lay_out_kit
 
 NAME = "TEAM_OTHER_000003"
 
