@@ -125,6 +125,10 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         attributes=broadcast_attributes(_clip_of(inputs), calibration, start, clock.rate),
     )
     result.figures.update(_figures(calibration.report, clock.rate))
+    if reasons := calibration.report.reasons:
+        result.warnings.append(
+            f"the broadcast camera of {inputs.unit} needs a check: {'; '.join(reasons)}."
+        )
 
 
 def image_clock(inputs: UnitInputs, ends: str = "") -> ImageClock:
