@@ -1,6 +1,7 @@
 """The challenge's layouts: what others would read, and what others have written."""
 
 import zipfile
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -165,3 +166,9 @@ def test_what_is_no_challenge_is_refused_by_file(tmp_path, name, content, messag
         np.save(tmp_path / kind / "A_1.npy", array, allow_pickle=True)
     with pytest.raises(InputError, match=message):
         read_challenge(tmp_path)
+
+
+def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path):
+    lost = replace(camera, focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal))
+    with pytest.raises(InputError, match="first frame"):
+        write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)
