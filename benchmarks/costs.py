@@ -11,13 +11,14 @@ import threading
 import time
 from argparse import Namespace
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
 from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, TypeVar
+from unittest.mock import patch
 
 import numpy as np
 import psutil
@@ -29,8 +30,17 @@ from data_contracts.arrays import Image
 from flows.results.dataset import check, count
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.body.model import BodyParameters
-from worldpose.detection.enlargement import SeesParts, expect_parts
-from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
+from worldpose.detection import bundled_detector, bundled_pose, pipeline, sampling, suppression
+from worldpose.detection.box_tracking import BoxCleaner
+from worldpose.detection.enlargement import Part, SeesParts, expect_parts
+from worldpose.detection.models import (
+    BUNDLED_WEIGHTS,
+    load_bundled_detector,
+    load_bundled_pose,
+    load_detectors,
+    load_pose,
+)
+from worldpose.detection.pipeline import PeopleFinder, Place
 from worldpose.detection.settings import DetectionSettings
 from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import write_poses
@@ -70,12 +80,15 @@ GROUPS = Path("/sys/fs/cgroup")
     "cost of person detection and poses, in integers and in floating point",
     integer("people", 25),
     integer("frames", 8),
+    integer("rounds", 5),
 )
 def measure_detection(options: Namespace) -> Tables:
     """A crowd in images of 1920 x 1080 is rendered, decoded, searched and posed, in one thread.
 
-    Times are processor time, so other work on the machine does not count. The last table
-    extrapolates to 90 minutes at 50 frames per second of 16 cameras, without rendering.
+    Times are processor time, so other work on the machine does not count. The second table
+    extrapolates to 90 minutes at 50 frames per second of 16 cameras, without rendering. The last
+    one is of the stage without video: its nets answer with what they returned the first time, so
+    that the time is that of the work between them.
     """
     torch.set_num_threads(1)
     rendering, pictures, camera, pitch = render_crowd(options.people, options.frames)
@@ -108,7 +121,93 @@ def measure_detection(options: Namespace) -> Tables:
             f"{title}{before / whole:.2f}", ["work", "ms/image", "images/s", "people/s"], rows
         ),
         "match": Table("a match", names, match),
+        "between": time_parts(pictures, Place(camera, pitch), options.rounds),
     }
+
+
+class Recorded:
+    """A session of a net that gives its first outputs again, in the order of the calls."""
+
+    def __init__(self, session: Any) -> None:
+        self._session, self._outputs = session, list[Any]()
+        self.call = 0
+
+    def run(self, names: Any, inputs: Any) -> Any:
+        """Return the outputs of the call of this number."""
+        if self.call == len(self._outputs):
+            self._outputs.append(self._session.run(names, inputs))
+        self.call += 1
+        return self._outputs[self.call - 1]
+
+
+class Stopwatch:
+    """Processor time of named functions, without that of others inside."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(PARTS, 0.0)
+        self._inside = [0.0]
+
+    def wrap(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function with its time added to that of a part."""
+
+        def timed(*given: Any, **named: Any) -> Any:
+            begun = time.thread_time()
+            self._inside.append(0.0)
+            try:
+                return function(*given, **named)
+            finally:
+                whole = time.thread_time() - begun
+                self.seconds[part] += whole - self._inside.pop()
+                self._inside[-1] += whole
+
+        return timed
+
+
+PARTS: dict[str, list[tuple[Any, str]]] = {
+    "parts of frames, resized": [(sampling, "resize")],
+    "frames and parts as planes": [(bundled_detector, "pad")],
+    "boxes from maps": [(bundled_detector, "decode_boxes")],
+    "suppression": [(suppression, "nms_indices"), (pipeline, "suppress_poses")],
+    "groups of people": [(bundled_detector, "find_groups"), (Part, "merge")],
+    "crops": [(bundled_pose, "sample_crops")],
+    "joints from maps": [(bundled_pose, "decode_candidates")],
+    "joints shared out": [(bundled_pose, "assign_joints")],
+    "tracks of boxes": [(BoxCleaner, "_add_detections"), (BoxCleaner, "_release_frame")],
+    "pitch": [(pipeline, "on_pitch")],
+}
+"""The functions of each part of the work between the nets, by owner and name."""
+
+
+def time_parts(pictures: list[Image], place: Place, rounds: int) -> Table:
+    """Return the time of the work between the nets, and the memory before and after many rounds."""
+    settings, watch = DetectionSettings(), Stopwatch()
+    nets: list[Any] = [*load_detectors(settings), load_pose(settings)]
+    finder = PeopleFinder(nets[:-1], nets[-1], settings)
+    sessions = [(each._net._net, Recorded(each._net._net._session)) for each in nets]
+    whole, memory, process = 0.0, list[float](), psutil.Process()
+    with ExitStack() as patches:
+        for net, recorded in sessions:
+            patches.enter_context(patch.object(net, "_session", recorded))
+        for name, functions in PARTS.items():
+            for owner, function in functions:
+                timed = watch.wrap(name, getattr(owner, function))
+                patches.enter_context(patch.object(owner, function, timed))
+        for number in range(rounds + 2):
+            for _, recorded in sessions:
+                recorded.call = 0
+            if number == 2:  # recorded and warm
+                whole, watch.seconds = 0.0, dict.fromkeys(PARTS, 0.0)
+            memory.append(process.memory_info().rss / 2**20)
+            seconds, _ = time_work(lambda: list(finder.find(enumerate(pictures), place)))
+            whole += seconds
+    images = rounds * len(pictures)
+    rows = [[name, 1e3 * each / images] for name, each in watch.seconds.items()]
+    rest = whole - sum(watch.seconds.values())
+    rows += [["the rest", 1e3 * rest / images], ["together", 1e3 * whole / images]]
+    title = (
+        f"between the nets; {memory[2]:.0f} MB before {images} images, {memory[-1]:.0f} MB after"
+    )
+    return Table(title, ["part", "ms/image"], rows)
 
 
 def render_crowd(people: int, frames: int) -> tuple[float, list[Image], Camera, PitchTemplate]:

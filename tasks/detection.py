@@ -170,6 +170,7 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             "crowd": report.crowd,
             "bridged_share": report.bridged / max(1, report.detections),
             "flicker_share": report.flickers / max(1, report.detections),
+            **report.speed(),
         },
         told,
     )

@@ -52,17 +52,8 @@ def write_data_set(
     """Write a new folder with all clips of several runs, and release.json; pin the runs.
 
     `train` and `val` have poses, joints, cameras and boxes; `test` has boxes, and cameras with the
-    pose of the first frame alone: the rest is in the hidden folder.
-
-    Args:
-        store: project of the runs.
-        origins: runs, each with its split.
-        out: new folder.
-        name: name of the data set.
-        licences: text by kind of file.
-        hidden: new folder of the test part's truth, if there is a test part.
-        footage: whether broadcast videos are copied, or only their digests stated.
-        subjects: YAML file with a list of MATCH/NAME or MATCH/CLIP/ID for each subject.
+    pose of the first frame alone: the rest is in the new folder `hidden`. Licences are texts by
+    kind of file; `subjects` is a YAML file with lists of MATCH/NAME or MATCH/CLIP/ID.
 
     Raises:
         UsageError: a folder exists, or the test part has no hidden folder.

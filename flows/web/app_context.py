@@ -130,7 +130,10 @@ class Continuing:
                 return resumed or self._local.go_on(match_id, gates)
             own = _open_runs(served, match_id)
             states, self._seen = {run.state for run in own}, None
-            if "waiting" in states and (resumed := self._resume(match_id)):
+            # The process of a run that was suspended a moment ago ends its workers first.
+            kinds = {run["state_type"] for run in served.at_prefect(own).values()}
+            is_suspended = "waiting" in states or "PAUSED" in kinds
+            if is_suspended and (resumed := self._resume(match_id)):
                 for run in own:
                     if run.state == "waiting":
                         served.queue.change(run, "asked", "resumed")

@@ -18,6 +18,7 @@ from flows.run_plan import RunPlan
 from tasks.clip_inputs import open_clip, open_frames
 from tasks.unit import UnitInputs
 from worldpose.detection.interfaces import People
+from worldpose.detection.pipeline import DetectionReport
 from worldpose.errors import InputError
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
@@ -181,7 +182,10 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
         found.append((store.manifest(*unit), store.open_result(*unit)["score"].values))
     (fresh, score), (kept, _) = found
     assert np.isnan(score[:, 0]).tolist() == [n == 4 - 2 for n in range(12)]
-    assert (fresh.content, fresh.figures) == (kept.content, kept.figures)
+    assert fresh.content == kept.content
+    speed = DetectionReport().speed()  # each run has its own
+    metrics = [{k: v for k, v in each.figures.items() if k not in speed} for each in (fresh, kept)]
+    assert metrics[0] == metrics[1]
     assert fresh.figures["corrections_refused"] == 0
 
 

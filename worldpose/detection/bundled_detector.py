@@ -6,33 +6,35 @@ other real footage fine-tuned or larger models may serve better. Needs torch.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Generator, Sequence
+from functools import partial
+from itertools import chain, islice
 from typing import Final
 
 import numpy as np
-import torch
 
 from data_contracts.arrays import Image
-from worldpose.detection.bundled_nets import (
-    COARSEST,
-    PeopleNet,
-    decode_boxes,
-)
+from worldpose.detection.bundled_nets import COARSEST, PeopleNet, decode_boxes
 from worldpose.detection.enlargement import (
     STEPS,
     Part,
     choose_reduction,
     find_groups,
     find_small,
-    resize,
     restore_size,
 )
 from worldpose.detection.interfaces import MIN_SCORE, People
-from worldpose.detection.net_inference import QuantizedNet, placed_net
+from worldpose.detection.net_inference import PlacedNet, QuantizedNet, Tensors, run_together
+from worldpose.detection.sampling import Frame, pad, place_frames, resize
 from worldpose.detection.suppression import suppress
 
 NMS_IOU: Final = 0.7
 """Boxes with a larger intersection over union are of one person [1]."""
+View = Callable[[], Frame]
+"""Returns an image that the net shall see."""
+Steps = Generator[Sequence[View], list[People], People]
+"""Yields what the net shall see, gets the people there, and returns those of the frame."""
 
 
 class BundledDetector:
@@ -46,7 +48,9 @@ class BundledDetector:
     def __init__(
         self, net: PeopleNet | QuantizedNet, device: str = "cpu", half: bool = False
     ) -> None:
-        self._net = placed_net(net, device, half)
+        self._net = PlacedNet(net, device, half)
+        # On a GPU, parts of more different sizes are computed at once [px].
+        self._multiple = COARSEST if self._net.device == "cpu" else 4 * COARSEST
 
     @property
     def view_size(self) -> None:
@@ -54,68 +58,103 @@ class BundledDetector:
         return
 
     def detect(self, images: Sequence[Image]) -> list[People]:
-        """Return the people in each frame, computed one by one."""
-        return [self._people(image, None) for image in images]
+        """Return the people in each frame."""
+        return self._people(images, None)
 
     def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
         """Return the people in each frame; the caller knows where their size is unusual."""
-        return [self._people(image, parts) for image in images]
+        return self._people(images, parts)
 
-    def _people(self, image: Image, parts: Sequence[Part] | None) -> People:
-        if parts is None:
-            size = (image.shape[1], image.shape[0])
-            # Half size shows people of full height in the training and of twice that height.
-            sized = self._detect(resize(image, 0.5))
-            zoom = choose_reduction(restore_size(sized, size, 0.5))
-            close = self._close_up(image, float(sized.scores.max(initial=0.0)))
-            if close < 1.0:
-                people = suppress(self._detect(resize(image, close)), NMS_IOU)
-                return restore_size(people, size, close)
-            if zoom < 1.0:
-                return restore_size(self._find_all(resize(image, zoom), None), size, zoom)
-        return self._find_all(image, parts)
+    def _people(self, images: Sequence[Image], parts: Sequence[Part] | None) -> list[People]:
+        frames = place_frames(images, self._net.device)
+        steps = [_search(frame, parts) for frame in frames]
 
-    def _close_up(self, image: Image, usual: float) -> float:
-        """Return the reduction of a frame that people fill; 1 for other frames [1].
+        def see(_: list[int], asked: list[Sequence[View]]) -> list[list[People]]:
+            views = list(chain.from_iterable(asked))
+            most = 16 * self._net.batch  # bounds the memory of their maps
+            starts = range(0, len(views), most)
+            found = chain.from_iterable(self._detect(views[k : k + most]) for k in starts)
+            return [list(islice(found, len(each))) for each in asked]
 
-        People who fill a frame are as high at these reductions as in the training.
-        """
-        if usual >= 0.6:  # the best score of people of usual size
-            return 1.0
-        best, chosen = usual + 0.05, 1.0
-        for zoom in (0.25, 0.125, 0.0884, 0.0625):
-            score = float(self._detect(resize(image, zoom)).scores.max(initial=0.0))
-            if score > best:
-                best, chosen = score, zoom
-        return chosen
+        return run_together(steps, see)
 
-    def _find_all(self, image: Image, parts: Sequence[Part] | None) -> People:
-        """Return the people in an image, with passes over its parts."""
-        found = self._detect(image)
-        if parts is None:
-            for step in STEPS:
-                found = self._look_at(image, found, find_small(found, image.shape, step))
-        else:
-            found = self._look_at(image, found, parts)
-        found = self._look_at(image, found, find_groups(found, image.shape))
-        return suppress(found, NMS_IOU)
+    def _detect(self, views: Sequence[View]) -> list[People]:
+        """Return the detections in images; the same person may be there twice."""
+        images = [view() for view in views]
+        same = defaultdict[tuple[int, ...], list[int]](list)
+        for number, image in enumerate(images):
+            sides = (-(-side // self._multiple) * self._multiple for side in image.shape[:2])
+            same[tuple(sides)].append(number)
+        order, maps = list[int](), list[Tensors]()
+        for shape, numbers in same.items():
+            for start in range(0, len(numbers), self._net.batch):
+                some = numbers[start : start + self._net.batch]
+                order += some
+                maps.append(self._net(pad([images[number] for number in some], shape)))
+        rows = decode_boxes(maps, MIN_SCORE).cpu().numpy().astype(np.float64)
+        found: dict[int, People] = {}
+        for index, number in enumerate(order):
+            own = rows[rows[:, 0] == index]
+            if len(own) > 300:  # most people
+                own = own[np.argsort(-own[:, 5], kind="stable")[:300]]
+            height, width = images[number].shape[:2]
+            boxes = np.clip(own[:, 1:5], -0.5, np.array([width, height, width, height]) - 0.5)
+            real = np.all(boxes[:, 2:] - boxes[:, :2] > 1.0, axis=1)
+            found[number] = People(boxes[real], own[real, 5])
+        return [found[number] for number in range(len(images))]
 
-    def _look_at(self, image: Image, found: People, parts: Sequence[Part]) -> People:
-        """Return the people of earlier passes and of parts of the frame."""
-        for part in parts:
-            found = part.merge(found, self._detect(part.crop(image)))
-        return found
 
-    def _detect(self, image: Image) -> People:
-        """Return the detections in an image; the same person may be there twice."""
-        height, width = image.shape[:2]
-        tall, wide = (-(-side // COARSEST) * COARSEST for side in (height, width))
-        padded = np.full((1, tall, wide, 3), 115, dtype=np.uint8)
-        padded[0, :height, :width] = image
-        with torch.inference_mode():
-            logits, sides = self._net(padded)
-            boxes, scores = decode_boxes(logits[0], sides[0], MIN_SCORE, 300)  # most people
-        found = boxes.double().numpy()
-        found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)
-        real = np.all(found[:, 2:] - found[:, :2] > 1.0, axis=1)
-        return People(found[real], scores.double().numpy()[real])
+def _search(frame: Frame, parts: Sequence[Part] | None) -> Steps:
+    """Search a frame; without `parts`, at the size that its people need."""
+    if parts is not None:
+        return (yield from _find_all(frame, parts))
+    size = (frame.shape[1], frame.shape[0])
+    # Half size shows people of full height in the training and of twice that height.
+    (sized,) = yield [partial(resize, frame, 0.5)]
+    zoom = choose_reduction(restore_size(sized, size, 0.5))
+    close = yield from _close_up(frame, float(sized.scores.max(initial=0.0)))
+    if close < 1.0:
+        (people,) = yield [partial(resize, frame, close)]
+        return restore_size(suppress(people, NMS_IOU), size, close)
+    if zoom < 1.0:
+        people = yield from _find_all(resize(frame, zoom), None)
+        return restore_size(people, size, zoom)
+    return (yield from _find_all(frame, None))
+
+
+def _close_up(frame: Frame, usual: float) -> Generator[Sequence[View], list[People], float]:
+    """Return the reduction of a frame that people fill; 1 for other frames [1].
+
+    People who fill a frame are as high at these reductions as in the training.
+    """
+    if usual >= 0.6:  # the best score of people of usual size
+        return 1.0
+    best, chosen = usual + 0.05, 1.0
+    zooms = (0.25, 0.125, 0.0884, 0.0625)
+    found = yield [partial(resize, frame, zoom) for zoom in zooms]
+    for zoom, people in zip(zooms, found, strict=True):
+        score = float(people.scores.max(initial=0.0))
+        if score > best:
+            best, chosen = score, zoom
+    return chosen
+
+
+def _find_all(frame: Frame, parts: Sequence[Part] | None) -> Steps:
+    """Return the people in a frame, with passes over its parts."""
+    (found,) = yield [lambda: frame]
+    if parts is None:
+        for step in STEPS:
+            found = yield from _look_at(frame, found, find_small(found, frame.shape, step))
+    else:
+        found = yield from _look_at(frame, found, parts)
+    found = yield from _look_at(frame, found, find_groups(found, frame.shape))
+    return suppress(found, NMS_IOU)
+
+
+def _look_at(frame: Frame, found: People, parts: Sequence[Part]) -> Steps:
+    """Return the people of earlier passes and of parts of the frame."""
+    if parts:
+        seen = yield [partial(part.crop, frame) for part in parts]
+        for part, people in zip(parts, seen, strict=True):
+            found = part.merge(found, people)
+    return found

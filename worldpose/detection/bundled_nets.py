@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from itertools import pairwise
+from functools import reduce
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
@@ -20,6 +21,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from worldpose.detection.crops import MAP_COUNT
 from worldpose.errors import InputError
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -28,13 +30,8 @@ STRIDE: Final = 4
 """Pixels of the frame per cell of the people map [px]."""
 COARSEST: Final = 32
 """Frames are padded to multiples of this [px]."""
-CROP: Final = (96, 128)
-"""Width, height of the crops that the keypoint net takes [px]."""
 CELL: Final = 2
 """Pixels of the crop per cell of the keypoint maps [px]."""
-MAP_COUNT: Final = 3
-"""The target box, boxes of people in front of the target, and of people behind it: maps that the
-keypoint net takes with a crop."""
 JOINTS: Final = 17
 GREY_MEAN: Final = 115.0
 GREY_SPREAD: Final = 58.0
@@ -205,19 +202,12 @@ def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Keypoints (batch, joints, 2) [px of the crop], and mass (batch, joints).
     """
-    rows, columns = maps.shape[-2:]
-    chance = functional.softmax(maps.flatten(2), dim=-1)
-    best = chance.argmax(dim=-1)
-    row, column = best // columns, best % columns
-    around = torch.arange(-2, 3, device=maps.device)
-    y = (row[..., None, None] + around[:, None]).expand(*best.shape, 5, 5)
-    x = (column[..., None, None] + around[None, :]).expand(*best.shape, 5, 5)
-    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
-    cell = (y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)).flatten(2)
-    near = chance.gather(-1, cell) * inside.flatten(2)
-    mass = near.sum(dim=-1)
-    at = torch.stack([(near * x.flatten(2)).sum(-1), (near * y.flatten(2)).sum(-1)], dim=-1)
-    return CELL * (at / mass[..., None]) + 0.5 * (CELL - 1), mass
+    columns = maps.shape[-1]
+    chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, *maps.shape[2:])
+    best = chance.flatten(1).argmax(dim=1)
+    cells = torch.arange(len(best), device=maps.device), best // columns, best % columns
+    places, mass = _means(chance, cells)
+    return places.view(*maps.shape[:2], 2), mass.view(maps.shape[:2])
 
 
 def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
@@ -243,83 +233,127 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
 
 
-def cell_centres(count: int, device: torch.device) -> Tensor:
-    """Return the centres of the cells of a row in the frame (count,) [px]."""
-    return torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
-
-
-def decode_boxes(logits: Tensor, sides: Tensor, least: float, most: int) -> tuple[Tensor, Tensor]:
-    """Return boxes (people, 4) [px] and scores (people,) of one frame, best first.
+def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
+    """Return people as rows of the index of the image, box [px] and score (people, 6).
 
     Args:
-        logits: (rows, columns) that a cell is a person's centre.
-        sides: (4, rows, columns) distances from there to left, top, right and bottom [px].
+        maps: of images of some sizes, logits (batch, rows, columns) that a cell is a person's
+            centre, and distances (batch, 4, rows, columns) from there to left, top, right and
+            bottom [px].
         least: lowest score reported.
-        most: most people reported.
     """
-    score = torch.sigmoid(logits)
-    row, column = torch.nonzero(score >= least, as_tuple=True)
-    # The 3 x 3 cells around each; few cells have such scores.
-    columns = score.shape[1] + 2
-    step = torch.arange(3, device=score.device)
-    around = (row * columns + column)[:, None] + (step[:, None] * columns + step).flatten()
-    highest = functional.pad(score, (1, 1, 1, 1)).flatten()[around].amax(dim=1)
-    peak = score[row, column] == highest
-    row, column = row[peak], column[peak]
-    order = torch.argsort(score[row, column], descending=True, stable=True)[:most]
-    row, column = row[order], column[order]
-    x = cell_centres(score.shape[1], score.device)[column]
-    y = cell_centres(score.shape[0], score.device)[row]
-    left, top, right, bottom = sides[:, row, column]
-    return torch.stack([x - left, y - top, x + right, y + bottom], dim=1), score[row, column]
+    chance = torch.sigmoid(torch.cat([logits.flatten() for logits, _ in maps]))
+    cell = torch.nonzero(chance >= least)[:, 0]
+    sizes = [one.shape for logits, _ in maps for one in logits]
+    rows, columns = torch.tensor(sizes, device=cell.device).unbind(dim=1)
+    first = (rows * columns).cumsum(0) - rows * columns
+    image = torch.searchsorted(first, cell, right=True) - 1
+    rows, columns, first = rows[image, None], columns[image, None], first[image]
+    place = cell - first
+    row, column = place // columns[:, 0], place % columns[:, 0]
+    step = torch.arange(-1, 2, device=cell.device)
+    y = (row[:, None] + step).clamp(min=0).minimum(rows - 1) * columns + first[:, None]
+    x = (column[:, None] + step).clamp(min=0).minimum(columns - 1)
+    near = chance.take(y[:, :, None] + x[:, None, :]).flatten(1)
+    peak = near[:, 4] == near.amax(dim=1)
+    image, row, column, place, score = (
+        each[peak] for each in (image, row, column, place, near[:, 4])
+    )
+    ends = [0, *accumulate(len(logits) for logits, _ in maps)]
+    cuts = torch.searchsorted(image, torch.tensor(ends, device=image.device)).tolist()
+    sides = [
+        each.flatten(2)[image[a:b] - end, :, place[a:b]]
+        for (_, each), end, (a, b) in zip(maps, ends, pairwise(cuts), strict=False)
+    ]
+    left, top, right, bottom = torch.cat(sides).unbind(dim=1)
+    x, y = (STRIDE * at + 0.5 * (STRIDE - 1) for at in (column, row))
+    return torch.stack([image, x - left, y - top, x + right, y + bottom, score], dim=1)
+
+
+def _around(maps: Tensor, cells: Sequence[Tensor], step: Tensor, beyond: float = 1.0) -> Tensor:
+    """Return the values of maps (batch, rows, columns) around cells (cells, steps, steps).
+
+    Args:
+        maps: (batch, rows, columns).
+        cells: index of the map, row and column of each cell.
+        step: distances along both axes (steps,).
+        beyond: factor on the nearest value, where a place is beyond the border.
+    """
+    index, places = cells[0], [at[:, None] + step for at in cells[1:]]
+    y, x = (at.clamp(0, count - 1) for at, count in zip(places, maps.shape[1:], strict=True))
+    row = (index[:, None] * maps.shape[1] + y) * maps.shape[2]
+    values = maps.take(row[:, :, None] + x[:, None, :])
+    if beyond != 1.0:
+        shares = [torch.where(a == b, 1.0, beyond) for a, b in zip((y, x), places, strict=True)]
+        values = values * shares[0][:, :, None] * shares[1][:, None, :]
+    return values
+
+
+def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return mean positions (cells, 2) [px of the crop] and mass of the 5 x 5 cells around cells.
+
+    Args:
+        chance: (maps, rows, columns) probabilities.
+        cells: index of the map, row and column of each cell.
+    """
+    step = torch.arange(-2, 3, device=chance.device)
+    near = _around(chance, cells, step, 0.0)
+    mass = near.sum(dim=(1, 2))
+    x = cells[2] + (near * step).sum(dim=(1, 2)) / mass
+    y = cells[1] + (near * step[:, None]).sum(dim=(1, 2)) / mass
+    return CELL * torch.stack([x, y], dim=1) + 0.5 * (CELL - 1), mass
+
+
+MIN_MASS: Final = 0.01
+"""Candidate positions of less probability are dropped, except the likeliest of a joint [1]."""
 
 
 def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return candidate positions of each joint, finer than cells, the likeliest first.
 
-    Positions are the means over the 5 x 5 cells around the peaks of a map.
+    Positions are the means over the 5 x 5 cells around the peaks of a map, the highest cells within
+    three cells of them.
 
     Args:
-        maps: (batch, joints, rows, columns) logits.
+        maps: (batch, joints, rows, columns) logits; rows and columns are multiples of four.
         count: positions of each joint.
 
     Returns:
         Positions (batch, joints, count, 2) [px of the crop], and the probability around each
-        (batch, joints, count); 0 where a map has fewer peaks.
+        (batch, joints, count); 0 where a map has fewer peaks with a probability of `MIN_MASS`.
     """
-    columns = maps.shape[-1]
-    chance = functional.softmax(maps.flatten(2), dim=-1).view_as(maps)
-    peak = chance == _highest_near(chance)
-    _, cell = torch.where(peak, chance, 0.0).flatten(2).topk(2 * count, dim=-1)
-    around = torch.arange(5, device=maps.device)
-    # In maps padded by two cells, the 5 x 5 cells around a cell begin at its own row and column.
-    padded = functional.pad(chance, (2, 2, 2, 2)).flatten(2)
-    first = cell // columns * (columns + 4) + cell % columns
-    at = first[..., None, None] + around[:, None] * (columns + 4) + around
-    about = padded.gather(-1, at.flatten(2)).view(at.shape)
-    mass = about.sum(dim=(-2, -1))
-    total = mass.clamp(min=1e-12)
-    x = cell % columns + (about * (around - 2.0)).sum(dim=(-2, -1)) / total
-    y = cell // columns + (about * (around[:, None] - 2.0)).sum(dim=(-2, -1)) / total
-    places = CELL * torch.stack([x, y], dim=-1) + 0.5 * (CELL - 1)
-    mass = torch.where(peak.flatten(2).gather(-1, cell), mass, 0.0)
-    mass, order = (each[..., :count] for each in mass.sort(dim=-1, descending=True, stable=True))
-    return places.gather(2, order[..., None].expand(*order.shape, 2)), mass
+    shape, (rows, columns) = maps.shape[:2], maps.shape[2:]
+    chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, rows, columns)
+    # Two peaks never share one of the blocks of 4 x 4 cells, and few of these are likely.
+    blocks = chance.view(-1, rows // 4, 4, columns)
+    high = _largest([blocks[:, :, k] for k in range(4)]).unflatten(2, (-1, 4))
+    high = _largest([high[..., k] for k in range(4)])
+    least = high.amax(dim=(1, 2), keepdim=True).clamp(max=MIN_MASS / 25.0)
+    index, row, column = torch.nonzero(high >= least, as_tuple=True)
+    step = torch.arange(-3, 4, device=maps.device)
+    best = _around(chance, (index, 4 * row, 4 * column), step[3:]).flatten(1).max(dim=1)
+    row, column = 4 * row + best.indices // 4, 4 * column + best.indices % 4
+    high = best.values
+    for reach in (1, 3):  # most of these cells have a higher direct neighbour
+        near = _around(chance, (index, row, column), step[3 - reach : 4 + reach])
+        peak = high == near.flatten(1).amax(dim=1)
+        index, row, column, high = index[peak], row[peak], column[peak], high[peak]
+    at, mass = _means(chance, (index, row, column))
+    order = torch.argsort(mass, descending=True, stable=True)
+    order = order[torch.argsort(index[order], stable=True)]
+    index = index[order]
+    rank = torch.arange(len(order), device=maps.device) - torch.searchsorted(index, index)
+    order, index, rank = order[rank < count], index[rank < count], rank[rank < count]
+    places = maps.new_zeros(len(chance), count, 2)
+    masses = maps.new_zeros(len(chance), count)
+    places[index, rank] = at[order]
+    masses[index, rank] = mass[order]
+    return places.view(*shape, count, 2), masses.view(*shape, count)
 
 
-def _highest_near(maps: Tensor) -> Tensor:
-    """Return the highest value within three cells of each, along rows and columns.
-
-    No other position is chosen there.
-    """
-    for axis in (2, 3):
-        border = (0, 0, 3, 3) if axis == 2 else (3, 3)
-        wide = functional.pad(maps, border)
-        size = maps.shape[axis]
-        two = torch.maximum(wide.narrow(axis, 0, size + 5), wide.narrow(axis, 1, size + 5))
-        four = torch.maximum(two.narrow(axis, 0, size + 3), two.narrow(axis, 2, size + 3))
-        maps = torch.maximum(four.narrow(axis, 0, size), four.narrow(axis, 3, size))
-    return maps
+def _largest(each: Sequence[Tensor]) -> Tensor:
+    """Return the elementwise maximum of tensors of one shape: faster than along an axis."""
+    return reduce(torch.maximum, each)
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:

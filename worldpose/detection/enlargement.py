@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Image
 from worldpose.detection.interfaces import Detector, People
@@ -21,6 +20,9 @@ from worldpose.detection.suppression import suppress
 from worldpose.geometry.boxes import box_iou
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
+
+if TYPE_CHECKING:
+    from worldpose.detection.sampling import Frame
 
 STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
 """Heights below which people are seen enlarged [px], and the enlargement [1]."""
@@ -55,15 +57,18 @@ class Part:
     heights: tuple[float, float]
     replaced: tuple[float, float] = (0.0, 0.0)
 
-    def crop(self, image: Image) -> Image:
+    def crop(self, image: Frame) -> Frame:
         """Return the resized crop of the frame."""
+        from worldpose.detection.sampling import resize  # late: planning does not need torch
+
         (left, top), (right, bottom) = self.corner, self.end
         return resize(image[top:bottom, left:right], self.zoom)
 
     def to_frame(self, people: People) -> People:
         """Return the part's people among those found in `crop`, in the frame's pixels."""
-        sides = np.array(self.end, dtype=np.int64) - np.array(self.corner, dtype=np.int64)
-        boxes = restore_size(people, sides, self.zoom).boxes + np.tile(self.corner, 2)
+        (left, top), (right, bottom) = self.corner, self.end
+        boxes = restore_size(people, (right - left, bottom - top), self.zoom).boxes
+        boxes = boxes + np.array([left, top, left, top])
         tall = boxes[:, 3] - boxes[:, 1]
         mine = self._holds(boxes) & (tall > self.heights[0]) & (tall < self.heights[1])
         return People(boxes, people.scores).select(mine)
@@ -76,8 +81,9 @@ class Part:
 
     def _holds(self, boxes: Floats) -> Flags:
         """Return whether the centres of boxes lie in `inner` (people,)."""
-        middles = 0.5 * (boxes[:, :2] + boxes[:, 2:])
-        return np.asarray(np.all((middles >= self.inner[:2]) & (middles < self.inner[2:]), axis=1))
+        x, y = 0.5 * (boxes[:, 0] + boxes[:, 2]), 0.5 * (boxes[:, 1] + boxes[:, 3])
+        left, top, right, bottom = self.inner.tolist()
+        return np.asarray((x >= left) & (x < right) & (y >= top) & (y < bottom))
 
 
 @runtime_checkable
@@ -88,26 +94,15 @@ class SeesParts(Detector, Protocol):
         """Return the people in each image, as `detect`."""
 
 
-def resize(image: Image, zoom: float) -> Image:
-    """Return an image enlarged or reduced by a factor."""
-    import cv2  # late: it takes 0.2 s, and planning a run does not need it
-
-    height, width = image.shape[:2]
-    size = (max(1, round(zoom * width)), max(1, round(zoom * height)))
-    method = cv2.INTER_LINEAR if zoom >= 1.0 else cv2.INTER_AREA
-    return np.asarray(cv2.resize(image, size, interpolation=method), dtype=np.uint8)
-
-
-def restore_size(people: People, size: Sequence[int] | NDArray[np.integer], zoom: float) -> People:
+def restore_size(people: People, size: tuple[int, int], zoom: float) -> People:
     """Return people of a resized image in the pixels of the original.
 
     Args:
-        people: people in the image that `resize` returned.
+        people: people in the resized image.
         size: width, height of the original [px].
-        zoom: its factor.
+        zoom: factor of `sampling.resize`.
     """
-    sides = np.asarray(size)
-    scale = np.tile(sides / np.maximum(1, np.round(zoom * sides)), 2)
+    scale = [side / max(1, round(zoom * side)) for side in (*size, *size)]
     return People((people.boxes + 0.5) * scale - 0.5, people.scores)
 
 
@@ -222,25 +217,32 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
     sure = suppress(people, SAME_PERSON_IOU)
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
     # Neighbours in a group overlap more [1, intersection over union].
-    count, member = connected_components(box_iou(boxes, boxes) > 0.15, directed=False)
+    _, member = connected_components(box_iou(boxes, boxes) > 0.15, directed=False)
+    counts = np.bincount(member)
+    boxes = boxes[np.lexsort((boxes[:, 3] - boxes[:, 1], member))]
+    grouped = np.repeat(counts > 1, counts)
+    boxes, counts = boxes[grouped], counts[counts > 1]
+    if not len(counts):
+        return []
+    first = np.cumsum(counts) - counts
+    heights = boxes[:, 3] - boxes[:, 1]
+    median = 0.5 * (heights[first + (counts - 1) // 2] + heights[first + counts // 2])
+    tall = median[:, None]
+    low = np.minimum.reduceat(boxes[:, :2], first)
+    high = np.maximum.reduceat(boxes[:, 2:], first)
+    # People within a margin of a quarter of their height still belong to the group.
+    inner = np.concatenate([low - 0.25 * tall, high + 0.25 * tall], axis=1)
     size = np.array([shape[1], shape[0]])
-    found = []
-    for number in range(count):
-        own = boxes[member == number]
-        tall = float(np.median(own[:, 3] - own[:, 1]))
-        low, high = own[:, :2].min(axis=0), own[:, 2:].max(axis=0)
-        # People within a margin of a quarter of their height still belong to the group.
-        inner = np.concatenate([low - 0.25 * tall, high + 0.25 * tall])
-        corner = np.maximum(np.floor(low - 0.5 * tall), 0).astype(int)
-        end = np.minimum(np.ceil(high + 0.5 * tall), size).astype(int)
-        # No second pass costs more than the first.
-        widest = float(np.sqrt(np.prod(size) / np.prod(end - corner)))
-        # One pass per enlarged height [px]: the detector is trained on heights up to 160.
-        zooms = {min(height / tall, 3.0, widest) for height in (100.0, 160.0) if len(own) > 1}
-        heights = (0.5 * tall, 2.0 * tall)  # of boxes in the group
-        found += [
-            Part((corner[0], corner[1]), (end[0], end[1]), zoom, inner, heights)
-            for zoom in sorted(zooms)
-            if zoom >= 1.25  # else the group is large enough
-        ]
-    return found
+    corner = np.maximum(np.floor(low - 0.5 * tall), 0).astype(int)
+    end = np.minimum(np.ceil(high + 0.5 * tall), size).astype(int)
+    # No second pass costs more than the first, or enlarges by more than 3 [1].
+    most = np.minimum(np.sqrt(size.prod() / (end - corner).prod(axis=1)), 3.0)
+    # One pass per enlarged height [px]: the detector is trained on heights up to 160.
+    zooms = np.minimum(np.array([100.0, 160.0]) / tall, most[:, None])
+    return [
+        Part((a, b), (c, d), zoom, inner[k], (0.5 * high_px, 2.0 * high_px))
+        for k, (a, b, c, d) in enumerate(np.concatenate([corner, end], axis=1).tolist())
+        for high_px in (float(median[k]),)
+        for zoom in sorted(set(zooms[k].tolist()))
+        if zoom >= 1.25  # else the group is large enough
+    ]

@@ -102,11 +102,18 @@ class PoseEstimator(Protocol):
 
 
 @runtime_checkable
-class FindsOccludedPeople(PoseEstimator, Protocol):
-    """An estimator that also finds occluded people that a detector misses."""
+class EstimatesFrames(PoseEstimator, Protocol):
+    """An estimator for the frames of a batch together, which also finds occluded people."""
 
-    def find_occluded(self, image: Image, people: People) -> KeypointDetections:
-        """Return occluded people next to the detected ones, with the estimator's boxes."""
+    def estimate_frames(
+        self, images: Sequence[Image], boxes: Sequence[Floats]
+    ) -> list[KeypointDetections]:
+        """Return the poses in frames of one size, as `estimate` does in one."""
+
+    def find_occluded(
+        self, images: Sequence[Image], people: Sequence[People]
+    ) -> list[KeypointDetections]:
+        """Return people occluded by the detected ones, which a detector missed."""
 
 
 class PointEstimator(Protocol):
@@ -116,10 +123,12 @@ class PointEstimator(Protocol):
     def points(self) -> tuple[str, ...]:
         """Names of the points."""
 
-    def add_points(self, image: Image, people: KeypointDetections) -> KeypointDetections:
-        """Return the people of one frame with these points and no others.
+    def add_points(
+        self, images: Sequence[Image], people: Sequence[KeypointDetections]
+    ) -> list[KeypointDetections]:
+        """Return the people of frames of one size with these points and no others.
 
         Args:
-            image: the whole frame.
-            people: (people,) with boxes; none is a valid request.
+            images: the whole frames.
+            people: (people,) with boxes, for each frame; none is a valid request.
         """

@@ -7,7 +7,9 @@ learned from renderings of the body model alone (infra/embedded_detector). Needs
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,13 +24,14 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
 from worldpose.detection.bundled_nets import (
     CELL,
-    MAP_COUNT,
     Block,
     Pyramid,
     peaks,
 )
-from worldpose.detection.bundled_pose import SAME_PERSON_IOU, cut_crops
-from worldpose.detection.net_inference import CROPS, QuantizedNet, placed_net
+from worldpose.detection.bundled_pose import SAME_PERSON_IOU
+from worldpose.detection.crops import MAP_COUNT
+from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet
+from worldpose.detection.sampling import sample_crops
 from worldpose.geometry.boxes import box_iou
 
 POINTS: Final = (*LANDMARKS, *FEET)
@@ -123,53 +126,57 @@ class LandmarkEstimator:
     def __init__(
         self, net: LandmarkNet | QuantizedNet, device: str = "cpu", half: bool = False
     ) -> None:
-        self._net = placed_net(net, device, half, _decode, batch=CROPS)
+        self._net = PlacedNet(net, device, half, _decode, fill=CROPS)
 
-    def add_points(self, image: Image, people: KeypointDetections) -> KeypointDetections:
-        """Return the people of a frame with `POINTS`.
+    def add_points(
+        self, images: Sequence[Image], people: Sequence[KeypointDetections]
+    ) -> list[KeypointDetections]:
+        """Return the people of frames of one size with `POINTS`.
 
         Confidence is the probability that a point is correct, from its standard deviation: within
         a twentieth of the box's longer side, as for joints. Points that are probably not visible
         are missing.
 
         Args:
-            image: the whole frame.
-            people: (people,) with boxes.
+            images: the whole frames.
+            people: (people,) with boxes, for each frame.
         """
-        found = self.estimate(image, np.asarray(people.boxes, dtype=np.float64))
-        sides = people.boxes[:, 2:] - people.boxes[:, :2]
-        # Largest error of a correct point, as a share of the box's longer side [1]; as for joints.
-        tolerance = 0.05 * sides.max(axis=1, initial=0.0)[:, None]
-        confidence = np.clip(-np.expm1(-0.5 * (tolerance / found.std) ** 2), 1e-3, 1.0)
-        # Points that are less probably visible are missing [1].
-        shown = found.visible >= 0.5
-        return people.add_points(
-            POINTS,
-            np.where(shown[..., None], found.places, np.nan),
-            np.where(shown, confidence, np.nan),
-        )
+        boxes = [np.asarray(each.boxes, dtype=np.float64) for each in people]
+        more = []
+        for each, box, found in zip(people, boxes, self.estimate(images, boxes), strict=True):
+            # Largest error of a correct point, as a share of the box's longer side [1]; as for
+            # joints.
+            tolerance = 0.05 * (box[:, 2:] - box[:, :2]).max(axis=1, initial=0.0)[:, None]
+            sure = np.clip(-np.expm1(-0.5 * (tolerance / found.std) ** 2), 1e-3, 1.0)
+            # Points that are less probably visible are missing [1].
+            shown = found.visible >= 0.5
+            more.append(
+                each.add_points(
+                    POINTS,
+                    np.where(shown[..., None], found.places, np.nan),
+                    np.where(shown, sure, np.nan),
+                )
+            )
+        return more
 
-    def estimate(self, image: Image, boxes: Floats) -> Landmarks:
+    def estimate(self, images: Sequence[Image], boxes: Sequence[Floats]) -> list[Landmarks]:
         """Return the points of the person in each box.
 
         Args:
-            image: the whole frame.
-            boxes: (people, 4) x0, y0, x1, y1 [px].
+            images: the whole frames, of one size.
+            boxes: (people, 4) x0, y0, x1, y1 [px], for each frame.
         """
-        shape = (len(boxes), len(POINTS))
-        found = Landmarks(np.empty((*shape, 2)), np.empty(shape), np.empty(shape))
-        shares = box_iou(boxes, boxes)
-        others = [boxes[row <= SAME_PERSON_IOU] for row in shares]
-        for batch in cut_crops(image, boxes, others):
-            places, std, visible = (
-                each[: len(batch.crops)].double().numpy()
-                for each in self._net(batch.crops, batch.surroundings)
-            )
-            scale, corner = batch.mappings[:, :, :2], batch.mappings[:, None, :, 2]
-            found.places[batch.rows] = np.einsum("npx,nyx->npy", places, scale) + corner
-            size = np.sqrt(np.abs(np.linalg.det(scale)))
-            found.std[batch.rows], found.visible[batch.rows] = size[:, None] * std, expit(visible)
-        return found
+        others = [each[row <= SAME_PERSON_IOU] for each in boxes for row in box_iou(each, each)]
+        shape = (len(others), len(POINTS))
+        places, std, visible = np.empty((*shape, 2)), np.empty(shape), np.empty(shape)
+        if others:
+            mappings, *given = sample_crops(images, boxes, others, self._net.device)
+            places, std, visible = (each.double().cpu().numpy() for each in self._net(*given))
+            scale = mappings[:, None, [0, 1], [0, 1]]
+            places = places * scale + mappings[:, None, :, 2]
+            std, visible = std * scale[..., 0], expit(visible)
+        ends = pairwise(np.cumsum([0, *map(len, boxes)]))
+        return [Landmarks(places[a:b], std[a:b], visible[a:b]) for a, b in ends]
 
 
 def _decode(outputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-from functools import cache
+from collections.abc import Callable, Hashable
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from data_contracts.checkpoint import Checkpoint
 from worldpose.cache_folder import user_cache
@@ -20,6 +22,8 @@ from worldpose.ingest.validation import validate_record
 
 if TYPE_CHECKING:
     from worldpose.detection.landmark_net import LandmarkEstimator
+
+Loaded = TypeVar("Loaded")
 
 LIBRARIES: Final = {
     "embedded": ("torch", "onnxruntime"),
@@ -79,6 +83,29 @@ def read_pulled(name: str, folder: Path) -> Checkpoint | None:
     return validate_record(Checkpoint, read_json(file), str(file))
 
 
+_NETS: Final[dict[Hashable, Any]] = {}
+_LOADING: Final = Lock()
+
+
+def _share(load: Callable[[], Loaded], name: str, path: Path | None, *how: Hashable) -> Loaded:
+    """Return what was loaded last by the same name from the same files, else what `load` returns.
+
+    Nets have no state, so all units of a process use the same ones.
+    """
+    files = [] if path is None else sorted(path.rglob("*")) if path.is_dir() else [path]
+    stamps = [
+        (each, each.stat().st_mtime_ns, each.stat().st_size) for each in files if each.exists()
+    ]
+    key = (name, *stamps, *how)
+    with _LOADING:
+        if key not in _NETS:
+            if len(_NETS) == 4:  # nets of two kinds of runs
+                del _NETS[next(iter(_NETS))]
+            _NETS[key] = load()
+        loaded: Loaded = _NETS[key]
+        return loaded
+
+
 def load_detectors(settings: DetectionSettings) -> list[Detector]:
     """Return the detectors that the settings name.
 
@@ -86,12 +113,18 @@ def load_detectors(settings: DetectionSettings) -> list[Detector]:
         InputError: an unknown kind, missing or unexpected weights, or a library that is not
             installed.
     """
-    return [_detector(name, settings) for name in settings.detector]
+    how = settings.device, settings.half, settings.person_classes
+    return [
+        _share(partial(_detector, kind, path, settings), kind, path, *how)
+        for kind, path in map(_split_name, settings.detector)
+    ]
 
 
 def load_pose(settings: DetectionSettings) -> PoseEstimator:
     """Return the pose estimator that the settings name; raises as `load_detectors`."""
-    estimator = _pose(settings)
+    kind, path = _split_name(settings.pose)
+    how = settings.device, settings.half
+    estimator = _share(partial(_pose, kind, path, settings), f"pose {kind}", path, *how)
     return FlipTest(estimator) if settings.flip_test else estimator
 
 
@@ -104,8 +137,7 @@ def load_score_map(settings: DetectionSettings) -> ScoreMap | None:
     return SHIPPED_SCORE_MAP if shipped else None
 
 
-def _pose(settings: DetectionSettings) -> PoseEstimator:
-    kind, path = _split_name(settings.pose)
+def _pose(kind: str, path: Path | None, settings: DetectionSettings) -> PoseEstimator:
     if kind == "embedded":
         return load_bundled_pose(path, settings.device, settings.half)
     assert path is not None  # as parted
@@ -118,8 +150,7 @@ def _pose(settings: DetectionSettings) -> PoseEstimator:
     return TransformersPose(path, settings.device, settings.half)
 
 
-def _detector(name: str, settings: DetectionSettings) -> Detector:
-    kind, path = _split_name(name)
+def _detector(kind: str, path: Path | None, settings: DetectionSettings) -> Detector:
     if kind == "embedded":
         return load_bundled_detector(path, settings.device, settings.half)
     assert path is not None  # as parted

@@ -103,7 +103,7 @@ def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
         InputError: onnxruntime or a GPU for it is missing, or the file is no net.
     """
     where = str(file)
-    runtime = _import_runtime(where)
+    runtime = import_library("onnxruntime", where)
     provider = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
     if provider not in runtime.get_available_providers():
         raise InputError(
@@ -129,92 +129,21 @@ def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _import_runtime(where: str) -> ModuleType:
+def import_library(name: str, where: str) -> ModuleType:
+    """Return a library that computes nets.
+
+    Raises:
+        InputError: it is not installed.
+    """
     try:
-        runtime: ModuleType = import_module("onnxruntime")
+        return import_module(name)
     except ImportError as error:
         raise InputError(
             where,
-            expected="onnxruntime, which runs ONNX files",
+            expected=f"{name}, which computes this net",
             found="it is not installed",
             todo='Install it: pip install "worldpose[detectors]".',
         ) from error
-    return runtime
-
-
-def fit_crops(boxes: Floats, size: tuple[int, int], padding: float) -> Floats:
-    """Return crops with a net's aspect ratio around boxes (boxes, 3): left, top, px per crop px.
-
-    Args:
-        boxes: (boxes, 4) x0, y0, x1, y1 [px].
-        size: width, height of a crop [px].
-        padding: size of the crop over that of the box, at its tighter side [1].
-    """
-    middle = (boxes[:, :2] + boxes[:, 2:]) / 2.0
-    extent = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0) * padding
-    scale = (extent / size).max(axis=1)
-    corner = middle - (np.array(size) - 1.0) / 2.0 * scale[:, None]
-    return np.hstack([corner, scale[:, None]])
-
-
-def cut_crops(image: Image, frames: Floats, size: tuple[int, int]) -> Image:
-    """Return the crops (boxes, height, width, 3), smoothed where they are smaller than the frame.
-
-    They are black beyond the frame's border.
-
-    Args:
-        image: the whole frame.
-        frames: (boxes, 3) crops from `fit_crops`.
-        size: width, height of a crop [px].
-    """
-    import cv2  # late: it takes 0.2 s, and planning a run does not need it
-
-    crops = np.empty((len(frames), size[1], size[0], 3), dtype=np.uint8)
-    for crop, (left, top, scale) in zip(crops, frames, strict=True):
-        source, shift = image, np.zeros(2)
-        halvings = max(0, int(np.floor(np.log2(max(scale, 1.0)))))
-        if halvings:
-            # A sample every few pixels would miss those between: shrink the neighbourhood first.
-            step = 2**halvings
-            first = np.maximum(0, np.floor([left, top]).astype(int) - step)
-            last = np.ceil([left + scale * size[0], top + scale * size[1]]).astype(int) + step
-            part = image[first[1] : max(last[1], first[1]), first[0] : max(last[0], first[0])]
-            if not part.size:
-                crop[:] = 0
-                continue
-            target = (-(-part.shape[1] // step), -(-part.shape[0] // step))
-            padded = cv2.copyMakeBorder(
-                part,
-                0,
-                target[1] * step - part.shape[0],
-                0,
-                target[0] * step - part.shape[1],
-                cv2.BORDER_REPLICATE,
-            )
-            source = np.asarray(cv2.resize(padded, target, None, 0, 0, cv2.INTER_AREA), np.uint8)
-            shift = first.astype(np.float64)
-            left, top = (np.array([left, top]) - shift + 0.5) / step - 0.5
-            scale = scale / step
-        matrix = np.array([[scale, 0.0, left], [0.0, scale, top]])
-        cv2.warpAffine(
-            source,
-            matrix,
-            size,
-            crop,
-            cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            cv2.BORDER_CONSTANT,
-        )
-    return crops
-
-
-def points_in_frame(points: Floats, frames: Floats) -> Floats:
-    """Return points of crops in the frame's pixels.
-
-    Args:
-        points: (boxes, points, 2) [px of the crop].
-        frames: (boxes, 3) crops from `fit_crops`.
-    """
-    return np.asarray(points * frames[:, None, 2:] + frames[:, None, :2])
 
 
 def load_onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
@@ -257,15 +186,19 @@ class _OnnxPose:
         """Return the pose in each box."""
         if not len(boxes):
             return KeypointDetections.empty()
-        # Size of crops over that of boxes, as in the training of these nets [1].
-        frames = fit_crops(boxes, self._net.size, 1.25)
-        crops: Image | Singles = cut_crops(image, frames, self._net.size)
+        # Late: OpenCV takes 0.2 s, and planning a run does not need it.
+        from worldpose.detection.crops import crops_around, cut_crop, frame_from_crop
+
+        size = self._net.size
+        mappings = frame_from_crop(crops_around(boxes, size), size)
+        crops: Image | Singles = np.stack([cut_crop(image, each, size, 0) for each in mappings])
         if self._normal:
             crops = (crops.astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         outputs = [output.astype(np.float64) for output in self._net.run(crops)]
-        points, confidence = _read_keypoints(outputs, self._net.size)
+        points, confidence = _read_keypoints(outputs, size)
         found = confidence > 0.0
-        points = np.where(found[..., None], points_in_frame(points, frames), np.nan)
+        points = points * mappings[:, None, 0, :1] + mappings[:, None, :, 2]
+        points = np.where(found[..., None], points, np.nan)
         return KeypointDetections.from_keypoints(
             points, np.where(found, np.minimum(confidence, 1.0), np.nan)
         )

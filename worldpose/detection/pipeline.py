@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
+from time import perf_counter
 from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Flags, Floats, Image
+from data_contracts.arrays import AnyFloats, Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import read_ahead
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
 from worldpose.detection.enlargement import Part, SeesParts, expect_parts
 from worldpose.detection.interfaces import (
     Detector,
-    FindsOccludedPeople,
+    EstimatesFrames,
     People,
     PointEstimator,
     PoseEstimator,
@@ -101,6 +103,7 @@ class DetectionReport:
         beside: occluded people found next to others; later steps may drop some.
         is_given: whether the boxes were given, not detected.
         quarters: turns of the images by 90 degrees, counterclockwise, for the nets.
+        seconds: of the clock, waiting for images, finding boxes, and finding poses.
     """
 
     frames: int = 0
@@ -115,6 +118,22 @@ class DetectionReport:
     beside: int = 0
     is_given: bool = False
     quarters: int = 0
+    seconds: dict[str, float] = field(
+        default_factory=lambda: dict.fromkeys(("images", "boxes", "poses"), 0.0)
+    )
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the time of a block to that of a part."""
+        begun = perf_counter()
+        yield
+        self.seconds[part] += perf_counter() - begun
+
+    def speed(self) -> dict[str, float]:
+        """Return images per second, and the share of the time of each part [1]."""
+        whole = max(sum(self.seconds.values()), 1e-9)
+        shares = {f"{part}_share": each / whole for part, each in self.seconds.items()}
+        return {"images_per_s": self.frames / whole, **shares}
 
     def why_no_person(self) -> str | None:
         """Return the likely reason why a clip of 20 frames or more shows no person.
@@ -255,7 +274,7 @@ class PeopleFinder:
     ) -> Iterator[KeypointDetections]:
         """Yield the people of upright images as `find` does."""
         # Frames decoded while earlier ones are searched.
-        frames = read_ahead(frames, 8)
+        frames = self._wait_for(read_ahead(frames, 8))
         cleaner = BoxCleaner(self._settings)
         self._parts = None
         if (
@@ -279,31 +298,39 @@ class PeopleFinder:
             self.report.boxes = sum(len(people.scores) for people in given.values())
         rows: list[KeypointDetections] = []
         numbers: list[int] = []
-        for number, image, people in found:
-            numbers.append(number)
-            if image is None:
-                self.report.unreadable.append(number)
-                rows.append(KeypointDetections.empty())
-            else:
-                rows.append(self._find_poses(image, people, place))
-                self.report.empty += not len(rows[-1].score)
+        while batch := list(islice(found, self._settings.batch)):
+            numbers += [number for number, _, _ in batch]
+            with self.report.timed("poses"):
+                rows += self._find_poses([(image, people) for _, image, people in batch], place)
+            self.report.unreadable += [number for number, image, _ in batch if image is None]
             # Frames per chunk.
-            if len(rows) == 64:
+            if len(rows) >= 64:
                 yield self._chunk(numbers, rows)
                 rows, numbers = [], []
         if rows:
             yield self._chunk(numbers, rows)
         self.report.bridged, self.report.flickers = cleaner.bridged, cleaner.flickers
 
+    def _wait_for(
+        self, frames: Iterator[tuple[int, Image | None]]
+    ) -> Iterator[tuple[int, Image | None]]:
+        while True:
+            with self.report.timed("images"):
+                frame = next(frames, None)
+            if frame is None:
+                return
+            yield frame
+
     def _people(self, images: list[Image], place: Place | None) -> list[People]:
         """Return the people on the pitch in each frame."""
         settings = self._settings
-        found = [
-            detector.detect(images)
-            if self._parts is None or not isinstance(detector, SeesParts)
-            else detector.detect_parts(images, self._parts)
-            for detector in self._detectors
-        ]
+        with self.report.timed("boxes"):
+            found = [
+                detector.detect(images)
+                if self._parts is None or not isinstance(detector, SeesParts)
+                else detector.detect_parts(images, self._parts)
+                for detector in self._detectors
+            ]
         people_by_frame = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":
@@ -311,64 +338,71 @@ class PeopleFinder:
             else:
                 people = suppress(People.concatenate(members), settings.nms_iou)
             kept = (people.scores >= settings.low_score_threshold) & (box_areas(people.boxes) > 0.0)
-            people = people.select(kept)
-            self.report.boxes += len(people.scores)
-            if place is not None and place.pitch is not None:
-                inside = self._inside(people, images[0], place)
-                self.report.crowd += int(np.count_nonzero(~inside))
-                people = people.select(inside)
-            people_by_frame.append(people)
-        return people_by_frame
+            people_by_frame.append(people.select(kept))
+            self.report.boxes += int(np.count_nonzero(kept))
+        inside = self._inside([people.boxes for people in people_by_frame], images, place)
+        self.report.crowd += sum(int(np.count_nonzero(~each)) for each in inside)
+        return [people.select(each) for people, each in zip(people_by_frame, inside, strict=True)]
 
-    def _inside(self, people: People, image: Image, place: Place) -> Flags:
-        """Return whether people's feet are on the pitch or near it (people,)."""
-        assert place.pitch is not None
-        size = (image.shape[1], image.shape[0])
+    def _inside(
+        self, boxes: Sequence[AnyFloats], images: Sequence[Image], place: Place | None
+    ) -> list[Flags]:
+        """Return whether people's feet are on the pitch or near it (people,), for each frame."""
+        if place is None or place.pitch is None or not images:
+            return [np.ones(len(each), dtype=np.bool_) for each in boxes]
+        size = (images[0].shape[1], images[0].shape[0])
         margin = self._settings.pitch_margin_m
-        return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
+        together = np.concatenate(boxes).astype(np.float64)
+        inside = on_pitch(together, place.camera, size, place.pitch, margin)
+        return np.split(inside, np.cumsum([len(each) for each in boxes])[:-1])
 
-    def _find_poses(self, image: Image, people: People, place: Place | None) -> KeypointDetections:
-        """Return keypoints of people; drop those without any or with the pose of a better box."""
+    def _find_poses(
+        self, batch: Sequence[tuple[Image | None, People]], place: Place | None
+    ) -> list[KeypointDetections]:
+        """Return the people of frames with keypoints; none of frames without an image.
+
+        People without keypoints, or with the pose of a better box, are dropped.
+        """
         settings = self._settings
-        detected = len(people.scores)
-        found = find_poses(self._estimator, image, people, settings)
-        self.report.beside += len(found.score) - detected
-        if place is not None and place.pitch is not None:
-            # Detected people are on the pitch; a person they occlude may be a bystander.
-            inside = self._inside(People.from_detections(found), image, place)
-            found = found.select(inside | (np.arange(len(found.score)) < detected))
-        distinct = suppress_poses(found, settings.min_keypoint_confidence, settings.oks_nms)
-        self.report.unsure += len(found.score) - len(distinct.score)
-        best = np.sort(np.argsort(-distinct.score, kind="stable")[: settings.max_people])
-        kept = distinct.select(best)
-        if self._score_map is not None:
-            kept = replace(kept, score=self._score_map.probability(kept.score))
-        return kept if self._landmarks is None else self._landmarks.add_points(image, kept)
+        images = [image for image, _ in batch if image is not None]
+        people = [people for image, people in batch if image is not None]
+        found = find_poses(self._estimator, images, people, settings)
+        # Detected people are on the pitch; a person they occlude may be a bystander.
+        inside = self._inside([each.boxes for each in found], images, place)
+        kept = []
+        for each, one, there in zip(found, people, inside, strict=True):
+            detected = len(one.scores)
+            self.report.beside += len(each.score) - detected
+            near = each.select(there | (np.arange(len(there)) < detected))
+            distinct = suppress_poses(near, settings.min_keypoint_confidence, settings.oks_nms)
+            self.report.unsure += len(near.score) - len(distinct.score)
+            best = np.sort(np.argsort(-distinct.score, kind="stable")[: settings.max_people])
+            chosen = distinct.select(best)
+            if self._score_map is not None:
+                chosen = replace(chosen, score=self._score_map.probability(chosen.score))
+            self.report.empty += not len(best)
+            kept.append(chosen)
+        if self._landmarks is not None:
+            kept = self._landmarks.add_points(images, kept)
+        rows, nobody = iter(kept), KeypointDetections.empty()
+        if self._landmarks is not None:
+            points = self._landmarks.points
+            nobody = nobody.add_points(
+                points, np.empty((0, len(points), 2)), np.empty((0, len(points)))
+            )
+        return [nobody if image is None else next(rows) for image, _ in batch]
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
         """Return the detections of frames in one record, padded to `max_people` with NaN."""
-        shape = (len(rows), self._settings.max_people)
-        chunk = KeypointDetections(
-            keypoints=np.full((*shape, 17, 2), np.nan, dtype=np.float32),
-            confidence=np.full((*shape, 17), np.nan, dtype=np.float32),
-            boxes=np.full((*shape, 4), np.nan, dtype=np.float32),
-            score=np.full(shape, np.nan, dtype=np.float32),
-            frame=np.array(numbers, dtype=np.int64),
-        )
-        if self._landmarks is not None:
-            points = self._landmarks.points
-            chunk = chunk.add_points(
-                points,
-                np.full((*shape, len(points), 2), np.nan, dtype=np.float32),
-                np.full((*shape, len(points)), np.nan, dtype=np.float32),
-            )
-        for row, found in enumerate(rows):
-            count = len(found.score)
-            for name, values in found.arrays().items():
-                chunk.arrays()[name][row, :count] = values
-            self.report.detections += count
+        arrays = {}
+        for name, like in rows[0].arrays().items():
+            shape = (len(rows), self._settings.max_people, *like.shape[1:])
+            arrays[name] = np.full(shape, np.nan, dtype=np.float32)
+            for row, found in zip(arrays[name], rows, strict=True):
+                row[: len(found.score)] = found.arrays()[name]
+        self.report.detections += sum(len(found.score) for found in rows)
         self.report.frames += len(rows)
-        return chunk
+        return rows[0].with_arrays(arrays, np.array(numbers, dtype=np.int64))
 
 
 def detect_people(
@@ -416,11 +450,22 @@ def detect_people(
 
 
 def find_poses(
-    estimator: PoseEstimator, image: Image, people: People, settings: DetectionSettings
-) -> KeypointDetections:
-    """Return poses with the estimator's boxes, then those of occluded people beside them."""
-    poses = combine_boxes(people, estimator.estimate(image, people.boxes))
-    if not (settings.find_occluded and isinstance(estimator, FindsOccludedPeople)):
+    estimator: PoseEstimator,
+    images: Sequence[Image],
+    people: Sequence[People],
+    settings: DetectionSettings,
+) -> list[KeypointDetections]:
+    """Return the poses of frames of one size, those of occluded people last.
+
+    Boxes are those of the estimator, where it gives any.
+    """
+    boxes = [each.boxes for each in people]
+    if isinstance(estimator, EstimatesFrames):
+        seen = estimator.estimate_frames(images, boxes)
+    else:
+        seen = [estimator.estimate(*each) for each in zip(images, boxes, strict=True)]
+    poses = [combine_boxes(*each) for each in zip(people, seen, strict=True)]
+    if not (settings.find_occluded and isinstance(estimator, EstimatesFrames)):
         return poses
-    occluded = estimator.find_occluded(image, People.from_detections(poses))
-    return KeypointDetections.concatenate([poses, occluded])
+    occluded = estimator.find_occluded(images, [People.from_detections(each) for each in poses])
+    return [KeypointDetections.concatenate(each) for each in zip(poses, occluded, strict=True)]

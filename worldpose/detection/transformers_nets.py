@@ -15,6 +15,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import MIN_SCORE, People
+from worldpose.detection.onnx_nets import import_library
 from worldpose.errors import InputError
 
 
@@ -32,14 +33,14 @@ class TransformersDetector:
         Raises:
             InputError: transformers or a GPU is missing, or the folder holds no such net.
         """
-        self._torch, library = _libraries(folder)
+        self._torch, library = (import_library(n, str(folder)) for n in ("torch", "transformers"))
         # Kinds of detectors, by `model_type` of config.json.
         kind = _kind(folder, library, ("rt_detr", "rt_detr_v2", "d_fine", "detr"))
         # The processors without a suffix need torchvision.
         named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
         self._processor = _load_net(folder, named)
         net = _load_net(folder, library.AutoModelForObjectDetection, use_safetensors=True)
-        self._net = _place_net(net, self._torch, folder, device, half)
+        self._net = _place_net(net, device, half)
         self._device, self._half = device, half
         self._person = next(
             (number for number, name in net.config.id2label.items() if name.lower() == "person"),
@@ -77,12 +78,12 @@ class TransformersPose:
 
     def __init__(self, folder: Path, device: str, half: bool) -> None:
         """Load a saved checkpoint; arguments and errors are those of `TransformersDetector`."""
-        self._torch, library = _libraries(folder)
+        self._torch, library = (import_library(n, str(folder)) for n in ("torch", "transformers"))
         # Kinds of pose estimators.
         _kind(folder, library, ("vitpose",))
         self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
         net = _load_net(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
-        self._net = _place_net(net, self._torch, folder, device, half)
+        self._net = _place_net(net, device, half)
         self._device, self._half = device, half
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
@@ -114,20 +115,6 @@ class TransformersPose:
         return points, pose["scores"].numpy().astype(np.float64).reshape(-1)
 
 
-def _libraries(folder: Path) -> tuple[ModuleType, ModuleType]:
-    try:
-        import torch
-        import transformers
-    except ImportError as error:
-        raise InputError(
-            str(folder),
-            expected="torch and transformers, which run this checkpoint",
-            found=f"no {error.name}",
-            todo='Install them: pip install "worldpose[detectors]".',
-        ) from error
-    return torch, transformers
-
-
 def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
     kind = str(_load_net(folder, library.AutoConfig).model_type)
     if kind not in known:
@@ -152,14 +139,10 @@ def _load_net(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _place_net(net: Any, torch: ModuleType, folder: Path, device: str, half: bool) -> Any:  # noqa: ANN401
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            str(folder),
-            expected="a GPU, because detection.device is cuda",
-            found="no GPU",
-            todo="Set detection.device=cpu.",
-        )
+def _place_net(net: Any, device: str, half: bool) -> Any:  # noqa: ANN401
+    from worldpose.detection.net_inference import require_gpu  # late: it needs torch
+
+    require_gpu(device)
     net = net.eval().to(device)
     return net.half() if half and device == "cuda" else net
 

@@ -9,7 +9,7 @@ from data_contracts.arrays import AnyFloats, Floats
 
 def box_areas(boxes: AnyFloats) -> Floats:
     """Return the areas (...) [px^2] of boxes (..., 4) x0, y0, x1, y1 [px], 0 for reversed sides."""
-    x0, y0, x1, y1 = np.moveaxis(boxes, -1, 0)
+    x0, y0, x1, y1 = (boxes[..., side] for side in range(4))
     return np.asarray(np.maximum(x1 - x0, 0.0) * np.maximum(y1 - y0, 0.0))
 
 
@@ -23,8 +23,8 @@ def box_iou(a: AnyFloats, b: AnyFloats) -> Floats:
         b: (..., m, 4) [px].
     """
     # Each side by itself: operations along an axis of four numbers take several times as long.
-    x0, y0, x1, y1 = np.moveaxis(a[..., :, None, :], -1, 0)
-    u0, v0, u1, v1 = np.moveaxis(b[..., None, :, :], -1, 0)
+    x0, y0, x1, y1 = (a[..., :, None, side] for side in range(4))
+    u0, v0, u1, v1 = (b[..., None, :, side] for side in range(4))
     width, height = np.minimum(x1, u1) - np.maximum(x0, u0), np.minimum(y1, v1) - np.maximum(y0, v0)
     shared = np.maximum(width, 0.0) * np.maximum(height, 0.0)
     union = box_areas(a)[..., :, None] + box_areas(b)[..., None, :] - shared

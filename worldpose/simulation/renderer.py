@@ -206,35 +206,6 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
     return Panorama(tuple(levels), scale, left, top, center)
 
 
-def render_broadcast(
-    cameras: Camera,
-    pitch: PitchTemplate,
-    people: BodyParameters | None,
-    seed: int,
-    settings: RenderingSettings | None = None,
-) -> Iterator[Image]:
-    """Yield the images (height, width, 3) in RGB of a clip; the same arguments, the same bytes.
-
-    Args:
-        cameras: a batch (frames,) with one center.
-        pitch: the painted pitch.
-        people: bodies (persons, frames), world; None = no people.
-        seed: seed of the stadium's look, kits and noise.
-        settings: the defaults if None.
-
-    Raises:
-        InputError: the cameras have different centers.
-    """
-    venue = build_venue(pitch, seed, settings or RenderingSettings())
-    cast = _dress(np.empty((0, 10)) if people is None else people.betas[:, 0], seed)
-    posed = (
-        cast.pose(_NO_PEOPLE if people is None else people[:, frame])
-        for frame in range(len(cameras.focal))
-    )
-    moments = (Moment(cast, surfaces, surfaces) for surfaces in posed)
-    return (each.image for each in film_broadcast(cameras, venue, moments))
-
-
 def film_broadcast(
     cameras: Camera, venue: Venue, moments: Iterable[Moment]
 ) -> Iterator[RenderedFrame]:

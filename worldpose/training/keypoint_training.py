@@ -17,16 +17,16 @@ from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
 from worldpose.detection.bundled_nets import (
     CELL,
-    CROP,
-    MAP_COUNT,
     KeypointNet,
     Seen,
     normalize,
     peaks,
 )
-from worldpose.detection.bundled_pose import (
+from worldpose.detection.bundled_pose import SAME_PERSON_IOU
+from worldpose.detection.crops import (
+    CROP,
     MAP_CELL,
-    SAME_PERSON_IOU,
+    MAP_COUNT,
     crops_around,
     cut_crop,
     frame_from_crop,
@@ -166,7 +166,7 @@ def keypoint_batch(
         turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0
         mapping = frame_from_crop(crop, CROP, turn, mirrored)
         others = _neighbour_boxes(labelled, -1 if elsewhere else person, given, settings, rng)
-        around[index] = surroundings(given, others, mapping, CROP)
+        around[index] = surroundings(given[None], [others], mapping[None], CROP)[0]
         tall = float(sides.max())
         farther = 1.0
         if rng.random() < settings.smaller and tall > settings.min_height:

@@ -68,7 +68,7 @@ def stored_people(
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
     people = people.select(kept)
-    found = find_poses(estimator, picture, people, chosen)
+    (found,) = find_poses(estimator, [picture], [people], chosen)
     distinct = suppress_poses(found, chosen.min_keypoint_confidence, chosen.oks_nms)
     return People.from_detections(distinct)
 

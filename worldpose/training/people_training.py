@@ -12,8 +12,8 @@ from torch.nn import functional
 
 from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
-from worldpose.detection.bundled_nets import STRIDE, PeopleNet, cell_centres, normalize
-from worldpose.detection.bundled_pose import cut_crop, frame_from_crop
+from worldpose.detection.bundled_nets import STRIDE, PeopleNet, normalize
+from worldpose.detection.crops import cut_crop, frame_from_crop
 from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.labels import LabelledPicture, PictureCache
 
@@ -163,8 +163,11 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
     focal = -(weight * torch.where(middle, found, empty)).sum() / people
     # Cells with a target from this value on learn the box's sides [1].
     near = torch.where(target >= 0.5, target, 0.0)
-    x = cell_centres(sides.shape[3], sides.device)[None, None, :]
-    y = cell_centres(sides.shape[2], sides.device)[None, :, None]
+    y, x = (
+        torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
+        for count in sides.shape[2:]
+    )
+    y = y[:, None]
     said = torch.stack([x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3]], dim=-1)
     _, overlap = box_overlap(said, boxes.movedim(1, -1))
     # Weight of the box loss, relative to that of the centres [1]: centres are learned sooner.

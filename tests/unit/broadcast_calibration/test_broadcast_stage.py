@@ -20,7 +20,6 @@ from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.writing import MatchAnnotations, write_match
-from worldpose.simulation.renderer import render_broadcast
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
 
@@ -100,11 +99,11 @@ def folder(tmp_path_factory):
     def video(draft):
         (draft / "broadcast").mkdir()
         goal = draft / "broadcast" / "goal.mp4"
-        write_video(goal, render_broadcast(true.camera, clip.PITCH, None, 5), FPS)
+        write_video(goal, clip.film_empty_pitch(true.camera, 5), FPS)
         shutil.copy(goal, goal.with_name("shot.mp4"))
         write_video(
             goal.with_name("both.fast.mp4"),
-            render_broadcast(true.camera, clip.PITCH, None, 5),
+            clip.film_empty_pitch(true.camera, 5),
             1.2 * FPS,
         )
 

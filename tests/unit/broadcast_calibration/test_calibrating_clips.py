@@ -14,7 +14,6 @@ from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
 from worldpose.geometry.pan_tilt import camera_angles
-from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.settings import RenderingSettings
 
 FRAMES, FPS = 16, 25.0
@@ -33,14 +32,14 @@ def true():
 
 @pytest.fixture(scope="module")
 def pictures(true):
-    return [grey(p) for p in render_broadcast(true.camera, clip.PITCH, None, 5, LOOK)]
+    return [grey(p) for p in clip.film_empty_pitch(true.camera, 5, LOOK)]
 
 
 @pytest.fixture(scope="module")
 def bare(true):
     """The same without any paint."""
     unpainted = LOOK.model_copy(update={"paint": 0.0})
-    return [grey(p) for p in render_broadcast(true.camera, clip.PITCH, None, 5, unpainted)]
+    return [grey(p) for p in clip.film_empty_pitch(true.camera, 5, unpainted)]
 
 
 def clicks(true, frame, noise=1.0, renamed=None):

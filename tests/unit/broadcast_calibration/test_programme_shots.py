@@ -4,12 +4,11 @@ import cv2
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
+from turning_clip import film_empty_pitch
 
 from worldpose.broadcast_calibration.shots import find_shots
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.renderer import render_broadcast
 from worldpose.video.files import VideoReader, cut_video, index_frames, write_video
 
 SIZE = np.array([320, 180])
@@ -19,7 +18,7 @@ FPS = 10.0
 def filmed(center, aims, focal):
     """Images of an empty pitch from a tripod."""
     cameras = Camera.stack([look_at_camera(center, (*aim, 0.0), focal, SIZE) for aim in aims])
-    return list(render_broadcast(cameras, PitchTemplate.standard(), None, 3))
+    return list(film_empty_pitch(cameras, 3))
 
 
 def sweep(begin, end, count):

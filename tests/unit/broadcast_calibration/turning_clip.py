@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from worldpose.body.model import BODY_POSE, BodyParameters
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
@@ -10,13 +11,27 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.cast import dress_people
+from worldpose.simulation.image_formation import Moment
+from worldpose.simulation.renderer import film_broadcast
 from worldpose.simulation.scene import look_at
+from worldpose.simulation.settings import RenderingSettings
+from worldpose.simulation.venues import build_venue
 
 PITCH = PitchTemplate.standard()
 SIZE = (960, 540)
 CENTER = np.array([0.5, -74.0, 16.0])
 SHAPE = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], axis=-1)
 """Joints (17, 3) of a person at the origin [m]."""
+
+
+def film_empty_pitch(cameras, seed, settings=None):
+    """Images (height, width, 3) of a clip without people."""
+    venue = build_venue(PITCH, seed, settings or RenderingSettings())
+    cast = dress_people(np.empty((0, 10)), [], seed)
+    nobody = cast.pose(BodyParameters(*(np.empty((0, n)) for n in (10, 3, BODY_POSE, 3))))
+    moments = [Moment(cast, nobody, nobody)] * len(cameras.focal)
+    return (each.image for each in film_broadcast(cameras, venue, moments))
 
 
 def draw(true, frame, noise=0.0, rng=None):

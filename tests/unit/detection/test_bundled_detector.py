@@ -4,6 +4,7 @@ import numpy as np
 from camera_builders import look_at_camera
 
 from worldpose.detection.bundled_detector import BundledDetector
+from worldpose.detection.bundled_nets import PeopleNet
 from worldpose.detection.enlargement import (
     expect_parts,
     find_small,
@@ -65,12 +66,14 @@ class SizesSeen(BundledDetector):
     """Records the sizes of the images that the net sees; finds a person of a given height."""
 
     def __init__(self, height):
+        super().__init__(PeopleNet())
         self.height, self.shapes = height, []
 
-    def _detect(self, image):
-        zoom = image.shape[0] / SHAPE[0]
-        self.shapes.append(image.shape[:2])
-        return people(tuple(zoom * side for side in (500.0, 300.0, 560.0, 300.0 + self.height)))
+    def _detect(self, views):
+        images = [view() for view in views]
+        self.shapes += [image.shape[:2] for image in images]
+        corners = np.array([500.0, 300.0, 560.0, 300.0 + self.height])
+        return [people(corners * (len(image) / SHAPE[0])) for image in images]
 
 
 def test_the_detector_looks_at_the_size_that_suits_the_people():

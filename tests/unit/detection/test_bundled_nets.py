@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from safetensors.torch import save
 
 from worldpose.detection.bundled_detector import BundledDetector
@@ -8,6 +9,7 @@ from worldpose.detection.bundled_nets import (
     FORMAT,
     KeypointNet,
     PeopleNet,
+    decode_candidates,
     load_weights,
     save_weights,
 )
@@ -62,6 +64,33 @@ def test_people_and_poses_do_not_depend_on_the_batch():
     assert len(both[0].boxes) > 0
     inside = (both[0].boxes >= -0.5) & (both[0].boxes <= np.array([130, 90, 130, 90]) - 0.5)
     assert inside.all()
+
+
+def test_joints_are_the_peaks_that_a_search_over_all_cells_finds():
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:32, :24]
+    at = rng.uniform([0, 0], [32, 24], (2, 17, 3, 2))[..., None, None]
+    heights = rng.uniform(4.0, 9.0, (2, 17, 3, 1, 1))
+    waves = heights * np.exp(-((y - at[..., 0, :, :]) ** 2 + (x - at[..., 1, :, :]) ** 2) / 8.0)
+    maps = torch.from_numpy(waves.sum(axis=2) + rng.normal(0.0, 0.1, (2, 17, 32, 24))).float()
+    places, mass = (each.numpy() for each in decode_candidates(maps, 4))
+    chance = torch.softmax(maps.flatten(2), dim=-1).view_as(maps).numpy()
+    wide = np.pad(chance, ((0, 0), (0, 0), (3, 3), (3, 3)))
+    peak = chance == sliding_window_view(wide, (7, 7), axis=(2, 3)).max(axis=(4, 5))
+    about = sliding_window_view(wide[..., 1:-1, 1:-1], (5, 5), axis=(2, 3))
+    total = about.sum(axis=(4, 5))
+    for one in np.ndindex(2, 17):
+        row, column = np.nonzero(peak[one] & (total[one] >= 0.02))
+        order = np.argsort(-total[one][row, column])[:4]
+        row, column, near = row[order], column[order], about[one][row[order], column[order]]
+        share = near / near.sum(axis=(1, 2), keepdims=True)
+        right = column + (share * np.arange(-2, 3)).sum(axis=(1, 2))
+        below = row + (share * np.arange(-2, 3)[:, None]).sum(axis=(1, 2))
+        count = int((mass[one] >= 0.02).sum())
+        assert 1 <= count == len(order)
+        np.testing.assert_allclose(mass[one][:count], total[one][row, column], rtol=1e-5)
+        said = 2.0 * np.stack([right, below], axis=1) + 0.5
+        np.testing.assert_allclose(places[one][:count], said, atol=1e-3)
 
 
 @pytest.mark.parametrize("which", [0, 1])

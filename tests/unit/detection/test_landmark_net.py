@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
-from worldpose.detection.bundled_nets import CELL, CROP, load_weights
+from worldpose.detection.bundled_nets import CELL, load_weights
+from worldpose.detection.crops import CROP
 from worldpose.detection.interfaces import People
 from worldpose.detection.landmark_net import (
     POINTS,
@@ -62,7 +63,7 @@ def people(*boxes):
 
 def test_points_are_in_frame_pixels_with_the_probability_of_being_correct():
     image = np.zeros((240, 320, 3), dtype=np.uint8)
-    found = LandmarkEstimator(PeakedNet()).add_points(image, people(BOX))
+    (found,) = LandmarkEstimator(PeakedNet()).add_points([image], [people(BOX)])
     assert found.points == POINTS == (*LANDMARKS, *FEET)
     scale = 1.25 * 100.0 / 128.0
     crop = np.array([CELL * 10 + 0.5, CELL * 30 + 0.5])
@@ -135,7 +136,7 @@ def test_the_shipped_net_finds_landmarks_of_unknown_people(shot):
     height = truth.boxes[:, 3] - truth.boxes[:, 1]
     kept = ~truth.ignored & (height > 34.0)
     assert kept.sum() >= 4
-    found = device.estimate(rendered.rendered.image, truth.boxes)
+    (found,) = device.estimate([rendered.rendered.image], [truth.boxes])
     off = np.linalg.norm(found.places - truth.keypoints, axis=-1)
     shown = truth.visible[kept] == 2
     share = (off / height[:, None])[kept]

@@ -1,18 +1,24 @@
 """Nets in integers and in floating point, on a CPU and, where there is one, on a GPU."""
 
+import copy
 from pathlib import Path
 from threading import Thread
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.bundled_nets import CROP, Seen
-from worldpose.detection.models import BUNDLED_WEIGHTS
-from worldpose.detection.net_inference import CROPS, QuantizedNet
+from worldpose.detection.bundled_detector import BundledDetector
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, Seen, load_weights
+from worldpose.detection.bundled_pose import BundledPoseEstimator
+from worldpose.detection.crops import CROP
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_detectors, load_pose
+from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet
 from worldpose.detection.pipeline import detect_people
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
+from worldpose.geometry.boxes import box_iou
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.training.labels import read_picture
@@ -23,8 +29,9 @@ on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.fixture(scope="module")
 def crops():
     rng = np.random.default_rng(3)
-    images = rng.integers(0, 256, (3 * CROPS, CROP[1], CROP[0], 3), dtype=np.uint8)
-    return images, rng.random((3 * CROPS, 3, 32, 24)).astype(np.float32)
+    images = rng.integers(0, 256, (3 * CROPS, 3, CROP[1], CROP[0]), dtype=np.uint8)
+    maps = rng.random((3 * CROPS, 3, 32, 24)).astype(np.float32)
+    return torch.from_numpy(images), torch.from_numpy(maps)
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +48,51 @@ def test_integers_give_equal_bytes_in_every_batch(crops, count):
     some, whole = (Seen._make(net(crops[0][:n], crops[1][:n])) for n in (count, CROPS))
     for name in ("maps", "doubt", "boxes", "fit"):
         np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[:count])
+
+
+def test_torch_alone_finds_the_same_people_as_opencv(still):
+    nets = PeopleNet(), KeypointNet()
+    people, joints = (load_weights(*each) for each in zip(BUNDLED_WEIGHTS, nets, strict=True))
+    boxes, poses = np.empty((0, 4)), []
+    # torch samples on every device but "cpu", so on this other name of it.
+    for device in ("cpu", "cpu:0"):
+        (seen,) = BundledDetector(copy.deepcopy(people), device).detect([still])
+        sure = seen.boxes[seen.scores >= 0.4]
+        boxes = boxes if len(boxes) else sure
+        assert len(boxes) == len(sure) >= 4 and box_iou(boxes, sure).max(axis=1).min() > 0.98
+        pose = BundledPoseEstimator(copy.deepcopy(joints), device)
+        for zoom in (1, 3):  # crops smaller than the net's, and much larger ones
+            enlarged = cv2.resize(still, None, fx=zoom, fy=zoom)
+            poses.append(pose.estimate(enlarged, zoom * boxes))
+    for before, after, zoom in zip(poses[:2], poses[2:], (1, 3), strict=True):
+        known = before.confidence > 0.5
+        apart = np.linalg.norm(before.keypoints - after.keypoints, axis=-1)[known]
+        assert known.sum() > 30 and np.quantile(apart, 0.95) < 0.1 * zoom
+
+
+def test_units_of_a_process_share_their_nets():
+    settings = DetectionSettings()
+    assert load_pose(settings) is load_pose(settings)
+    assert load_detectors(settings)[0] is load_detectors(settings)[0]
+    other = DetectionSettings(detector=f"embedded:{BUNDLED_WEIGHTS[0]}")
+    assert load_detectors(settings)[0] is not load_detectors(other)[0]
+
+
+class Small(torch.nn.Module):
+    """Has memory for three images."""
+
+    def forward(self, images):
+        if len(images) > 3:
+            raise torch.OutOfMemoryError
+        return (images.mean(dim=(1, 2, 3)),)
+
+
+def test_a_batch_that_exceeds_the_memory_is_halved_and_said(crops):
+    net = PlacedNet(Small(), "cpu", False, fill=CROPS)
+    with pytest.warns(RuntimeWarning, match="memory is too small"):
+        (found,) = net(crops[0])
+    (each,) = PlacedNet(Small(), "cpu", False)(crops[0])
+    torch.testing.assert_close(found, each)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

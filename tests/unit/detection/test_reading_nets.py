@@ -5,12 +5,8 @@ import pytest
 
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.crops import crops_around, cut_crop, frame_from_crop
 from worldpose.detection.models import load_detectors, weights_of
-from worldpose.detection.onnx_nets import (
-    cut_crops,
-    fit_crops,
-    points_in_frame,
-)
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
@@ -25,19 +21,19 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
         picture[:] = 0
         picture[row - 6 : row + 7, column - 6 : column + 7] = 255  # a square around the point
         box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
-        frames = fit_crops(box, (48, 64), 1.25)
-        crop = cut_crops(picture, frames, (48, 64))[0, ..., 0].astype(float)
+        mapping = frame_from_crop(crops_around(box, (48, 64))[0], (48, 64))
+        crop = cut_crop(picture, mapping, (48, 64), 0)[..., 0].astype(float)
         middle = np.array(
             [
                 np.average(np.arange(48), weights=crop.sum(0)),
                 np.average(np.arange(64), weights=crop.sum(1)),
             ]
         )
-        back = points_in_frame(middle[None, None], frames)[0, 0]
+        back = mapping[:, :2] @ middle + mapping[:, 2]
         if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
             continue  # the square reaches over the crop: its middle is another
         # A fifth of a crop's pixel: the square's hard edges are sampled twice.
-        np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, frames[0, 2]))
+        np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, mapping[0, 0]))
 
 
 class Leaning:

@@ -27,14 +27,11 @@ def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
         if isinstance(node, ast.ImportFrom)
     }
     first = {name for name in imported if name.startswith("worldpose.simulation.")}
-    shared = {
-        f"worldpose.simulation.{name}" for name in ("recorded_files", "reference", "visibility")
-    }
+    shared = {f"worldpose.simulation.{name}" for name in ("recorded_files", "reference")}
     assert first > shared
     assert all(name.startswith("worldpose.simulation.foreign") for name in first - shared)
-    assert not any(
-        name.startswith(("worldpose.body", "worldpose.body_fitting")) for name in imported
-    )
+    bodies = {name for name in imported if name.startswith("worldpose.body")}
+    assert bodies == {"worldpose.body.occlusions"}
 
 
 def content(folder):
