@@ -49,3 +49,19 @@ def test_parameters_of_a_wrong_shape_are_refused(name, array, expected):
     with pytest.raises(InputError, match=f"BodyParameters.{name}") as refused:
         replace(BodyParameters.rest(), **{name: array})
     assert refused.value.expected == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("template", lambda array: array[:100]),
+        ("template", lambda array: array * np.nan),
+        ("joint_regressor", lambda array: 2.0 * array),
+        ("weights", lambda array: 0.0 * array),
+        ("parents", lambda array: array[::-1]),
+        ("faces", lambda array: array + 6000),
+    ],
+)
+def test_arrays_that_are_no_body_are_refused(open_body, name, change):
+    with pytest.raises(InputError, match="body model open-neutral/2"):
+        replace(open_body, **{name: change(getattr(open_body, name))})

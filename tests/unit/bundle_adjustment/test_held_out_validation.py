@@ -9,6 +9,7 @@ import pytest
 from lab import errors
 
 from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.held_out_validation import held_out_errors
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation.estimate import triangulate_joints
@@ -65,3 +66,11 @@ def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(hones
     assert np.delete(left, WRONG).mean() < 1.25 * np.delete(clean, WRONG).mean()
     # A hundredth of what it was, and more than the others': people alone place it.
     assert left[WRONG] < 0.4
+
+
+def test_true_cameras_are_judged_by_the_noise_alone(clip):
+    made, true, _ = clip(cameras=6, noise=1.0)
+    frames = np.arange(24)
+    held = held_out_errors(made, true, frames, np.ones((24, 6), dtype=bool), robust_scale=100.0)
+    # Two axes of unit variance, and what the joint of five other views adds: 2 (1 + 3 / (2 x 5)).
+    assert np.nanmean(held.loss) == pytest.approx(2.6, rel=0.05)

@@ -68,6 +68,8 @@ def test_angles_turn_the_axes_of_the_camera(angles, right, down, ahead):
         ("pan,tilt,focal_px\n1,2,0\n", "entry 1: focal_px: .* at least 1, found 0"),
         ("pan,tilt\n1,2\n1,x\n", r"column tilt: entry 2: expected a number, found 'x'"),
         ("pan,x\n1,2\n", "columns pan, tilt"),
+        ("pan,tilt,pan (deg)\n1,2,3\n", "every column once"),
+        ("frame,pan,tilt\n3.5,1,1\n", "whole numbers"),
         ("frame,pan,tilt\n3,1,1\n3,1,1\n", "entry 2: expected frames that rise"),
         ("timecode,pan,tilt\n10:00:00:25,1,1\n", "HH:MM:SS:FF at 25"),
         ("pan,tilt,focal_mm\n1,2,50\n", "focal_mm with sensor_width_mm"),

@@ -1,6 +1,7 @@
 """The challenge's layouts: what others would read, and what others have written."""
 
 import zipfile
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -202,3 +203,9 @@ def test_a_frame_without_a_body_takes_the_nearest_one_at_the_place_of_the_feet()
     shape = joints[1, 1] - joints[1, 1, 7:9].mean(axis=0)
     np.testing.assert_allclose(filled[1, 2] - filled[1, 2, 7:9].mean(axis=0), shape, atol=1e-9)
     np.testing.assert_array_equal(filled[0], joints[0])
+
+
+def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path):
+    lost = replace(camera, focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal))
+    with pytest.raises(InputError, match="first frame"):
+        write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)

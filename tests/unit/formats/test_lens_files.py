@@ -170,6 +170,7 @@ def test_an_incomplete_lens_is_refused_with_what_it_lacks(case, tmp_path):
             "3 x 3 camera matrix",
         ),
         ("lens.npz", b"PK\x03\x04 torn", "npz"),
+        ("lens.npy", b"\x93NUMPY", "arrays of numbers"),
         ("lens.txt", b"1400", r"found '\.txt'"),
     ],
 )
@@ -185,6 +186,7 @@ def test_a_broken_file_is_one_clear_error(name, content, said, tmp_path):
         ({"dist": np.zeros(12) + 0.1}, "more terms"),
         ({"mtx": np.diag([1400.0, 1600.0, 1.0])}, "square pixels"),
         ({"mtx": np.diag([0.001, 0.001, 1.0])}, "focal length"),
+        ({"mtx": np.full((3, 3), np.nan)}, "finite numbers"),
     ],
 )
 def test_an_impossible_lens_is_refused(changes, said, tmp_path):

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
@@ -185,3 +186,17 @@ def test_cameras_from_matrices_project_as_opencv_does():
 def test_matrices_that_no_camera_has_are_refused(matrix, rotation, where):
     with pytest.raises(InputError, match=f"from_matrices: {where}"):
         Camera.from_matrices(matrix, np.zeros(5), rotation, np.zeros(3), (1920, 1080))
+
+
+def test_missing_point_has_no_image():
+    found = simple_camera().project_with_jacobians([[np.nan, 0.0, 1.0], [0.0, np.inf, 1.0]])
+    assert found.status.tolist() == [RayStatus.MISSING, RayStatus.MISSING]
+    assert np.isnan(found.points_image).all()
+
+
+@pytest.mark.parametrize(
+    "change", [{"focal_px": (0.0, 3000.0)}, {"focal_px": (3000.0, -1.0)}, {"image_size": (0, 5)}]
+)
+def test_senseless_calibration_is_refused(change):
+    with pytest.raises(ValidationError, match="greater than 0"):
+        calibration(**change)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from worldpose.geometry.rasters import cover_triangles
+from worldpose.geometry.rasters import Samples, Surface, cover_triangles, draw_triangles, resolve
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
 """Of a rectangle whose corners go down first, as a camera has what faces it."""
@@ -22,3 +22,26 @@ def test_a_mask_has_the_pixels_whose_middles_are_covered_whichever_way_triangles
         expected[2:4, 1:4] = 2
         expected[2, 2] = 3
         np.testing.assert_array_equal(mask, expected)
+
+
+def test_half_a_pixel_has_half_its_samples_and_mixes_with_what_is_behind():
+    samples, still = Samples.empty(0, 0, 3, 3), rectangle(1.0, 0.5, 1.5, 1.5)
+    surface = Surface(
+        faces=FACES,
+        backs=np.zeros(2, dtype=bool),
+        texels=np.zeros((4, 2), dtype=np.float32),
+        textures=np.full((2, 1, 1, 3), 200, dtype=np.uint8),
+        opened=still,
+        closed=still,
+        light=np.ones(4, dtype=np.float32),
+    )
+    # Across, samples lie 0.125 and 0.375 px to both sides of the middle.
+    assert draw_triangles(surface, np.zeros(4, dtype=np.float32), 0, samples) == 2
+    picture = np.full((3, 3, 3), 100, dtype=np.uint8)
+    persons, seen = np.full((3, 3), -1, dtype=np.int16), np.zeros(1, dtype=np.int64)
+    resolve(samples.who, samples.color, picture, persons, seen)
+    expected = np.full((3, 3), 100)
+    expected[1, 1] = 150
+    np.testing.assert_array_equal(picture[..., 0], expected)
+    assert seen.tolist() == [2]
+    assert np.flatnonzero(persons == 0).tolist() == [4]

@@ -90,3 +90,14 @@ def test_tangent_update_has_the_documented_derivative(rotvec, translation, point
 def test_wrong_shapes_are_refused_with_both_shapes(make, expected, found):
     with pytest.raises(InputError, match=expected + ".*" + found):
         make()
+
+
+@given(rotvecs, vectors, rotvecs, vectors, vectors)
+def test_composition_inverse_and_application_agree(r1, t1, r2, t2, point):
+    c_from_b, b_from_a = Rigid.from_rotvec(r1, t1), Rigid.from_rotvec(r2, t2)
+    through = c_from_b.apply(b_from_a.apply(point[None]))
+    # Coordinates reach 500 m: 500 times the unit rounding of a few products.
+    np.testing.assert_allclose((c_from_b @ b_from_a).apply(point[None]), through, atol=1e-12)
+    np.testing.assert_allclose(
+        (c_from_b @ b_from_a).inverse().apply(through), point[None], atol=1e-12
+    )

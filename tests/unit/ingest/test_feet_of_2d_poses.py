@@ -9,7 +9,9 @@ from data_contracts.conventions import FEET
 from data_contracts.ingest import INGEST
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import StoredFeedback, open_detections
+from worldpose.errors import InputError
 from worldpose.formats.detection_files import read_openpose_folder
+from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.store.groups import checked_arrays, checked_attributes
 
 PLACES = {
@@ -91,3 +93,29 @@ def test_a_clip_aligns_the_points_of_its_cameras():
     np.testing.assert_array_equal(read[:, 1, :, :3], two.extra_keypoints)
     assert np.isnan(read[:, 1, :, 3:]).all() and np.isnan(read[:, 2]).all()
     assert open_detections(clips[2:], plain.frame, StoredFeedback(clips[2:])).points == ()
+
+
+def broken(given, fault):
+    extra, sure = given.extra_keypoints.copy(), given.extra_confidence.copy()
+    if fault == "lone":
+        sure[0, 0, 0] = np.nan
+    if fault == "large":
+        sure[0, 0, 0] = 1.5
+    if fault == "far":
+        extra[0, 0, 0] = 1e7
+    return given.add_points(("nose",) * 6 if fault == "named" else given.points, extra, sure)
+
+
+@pytest.mark.parametrize(
+    ("fault", "word"),
+    [
+        ("lone", "extra_keypoints"),
+        ("large", "extra_confidence"),
+        ("far", "pixels up to"),
+        ("named", "none of COCO-17"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_place(tmp_path, fault, word):
+    write_keypoint_arrays(tmp_path / "a.npz", broken(people(), fault))
+    with pytest.raises(InputError, match=word):
+        read_keypoint_arrays(tmp_path / "a.npz")

@@ -43,3 +43,16 @@ def test_frames_out_of_order_or_twice_are_refused(write, frames):
     picked = KeyFrames(key_frames=tuple(KeyFrame(frame=f, markings=clicks()) for f in frames))
     with pytest.raises(InputError, match=r"goal\.json: key_frames: .*rising order"):
         write(picked)
+
+
+@pytest.mark.parametrize(
+    ("markings", "place"),
+    [
+        (clicks("centre_mark"), r"key_frames\[0\]\.markings\.points\[0\]\.name.*center_mark"),
+        (clicks(xy=(5000.0, 2.0)), r"key_frames\[0\]\.markings\.points\[0\]\.xy.*image of"),
+        (ClickedMarkings(), r"key_frames\[0\]\.markings: .*Click some"),
+    ],
+)
+def test_a_wrong_entry_is_named(write, markings, place):
+    with pytest.raises(InputError, match=place):
+        write(KeyFrames(key_frames=(KeyFrame(frame=3, markings=markings),)))

@@ -25,8 +25,10 @@ def read(folder, content):
     ("content", "message"),
     [
         ({"length": 105000.0, "width": 68000.0}, "length: .*105000, which looks like millimetres"),
+        ({"length": 10500, "width": 6800}, "length: .*10500, which looks like centimetres"),
         ({"length": 345.0, "width": 223.0}, "length: .*345, which looks like feet"),
         ({"width": 20.0}, "width: expected 40 to 100 metres, found 20. Give all lengths"),
+        ({"crown": 50.0}, "crown"),
         ({"points": {"corner_left_near": [-52500.0, -34000.0, 0.0]}}, "looks like millimetres"),
         ({"points": {"corner_left_near": [-57.4, -37.2, 0.0]}}, "which looks like yards"),
         ({"points": {"corner_left_near": [52.5, -34.0, 0.0]}}, "points.corner_left_near: expected"),

@@ -68,6 +68,7 @@ FIRST = "match.yaml: cameras[0]"
             "used twice: ['cam2']",
             "named",
         ),
+        (match(cameras=[]), "match.yaml: cameras", "at least 1", "0", "Correct"),
         ([1], "match.yaml", "a mapping", "a list of 1", "Correct"),
     ],
 )

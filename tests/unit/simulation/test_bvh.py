@@ -61,6 +61,8 @@ def test_positions_are_those_worked_out_by_hand(tmp_path):
     [
         ("HIERARCHY", "SKELETON", "'SKELETON' as word 1"),
         ("Frames: 3", "Frames: 4", "4 frames of 12 channels"),
+        ("0.02", "0", "every 0 s"),
+        ("OFFSET 0 10 0", "OFFSET 0 ten 0", "'ten'"),
         (
             "3 Zrotation Xrotation Yrotation",
             "3 Zrotation Xrotation Wrotation",

@@ -71,6 +71,8 @@ def tracked(path, **changes):
         ({"xy": np.zeros((60, 2))}, "xy of shape"),
         ({"xy": np.full((60, 2, 2), np.nan)}, "0 people"),
         ({"time": None}, "neither time nor fps"),
+        ({"xy": np.zeros((2, 2, 2)), "time": np.arange(2.0)}, "2 samples"),
+        ({"time": np.zeros(60)}, "1 samples"),
         ({"xy": np.array([None])}, "pickled"),
     ],
 )

@@ -32,8 +32,9 @@ from worldpose.errors import (
     NondeterminismError,
     StoreError,
 )
+from worldpose.store.documents import canonical_json, digest
 from worldpose.store.integrity import verify
-from worldpose.store.paths import ResultId
+from worldpose.store.paths import PROJECT, ResultId
 from worldpose.store.store import Store
 from worldpose.store.writer import ResultWriter
 
@@ -307,3 +308,11 @@ def test_flipped_bit_is_named_when_it_is_read(store: Store) -> None:
             store.open_result(*place()).load()
         store.blobs.put(path, data)
     store.open_result(*place()).load()
+
+
+def test_project_of_another_contract_is_refused(store: Store) -> None:
+    fields = {"contract": 2, "store": "1"}
+    sealed = {**fields, "checksum": digest(canonical_json(fields))}
+    store.blobs.put(PROJECT, canonical_json(sealed) + b"\n")
+    with pytest.raises(InputError, match="expected contract 1, found contract 2"):
+        Store.open(store.url)

@@ -71,3 +71,11 @@ def test_yolo_labels_of_boxes_and_polygons(tmp_path):
     assert len(read_yolo_labels(tmp_path / "a.png", person=1).boxes) == 1
     (tmp_path / "a.txt").write_text("")
     assert read_yolo_labels(tmp_path / "a.png").boxes.shape == (0, 4)
+
+
+@pytest.mark.parametrize("line", ["0 0.5 0.5", "0 0.5 0.5 0.1 high", "person 0.5 0.5 0.1 0.1"])
+def test_damaged_yolo_labels_name_file_and_line(tmp_path, line):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((100, 200, 3), dtype=np.uint8))
+    (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.1 0.1\n{line}\n")
+    with pytest.raises(InputError, match=r"a\.txt.*line 2"):
+        read_yolo_labels(tmp_path / "a.png")

@@ -288,3 +288,17 @@ def test_a_changed_view_shows_what_is_taken_back_again():
 )
 def test_a_change_is_told_with_camera_and_frame(change, said):
     assert said in describe_change(KNOCK.model_copy(update=change))
+
+
+def test_cameras_that_all_sway_agree_with_nobody(cameras):
+    def misfit(size):
+        people = view(cameras, lambda pixels, *_: pixels)
+        phase = np.arange(FRAMES)[:, None] / FRAMES * 2.0 * np.pi + np.arange(4)
+        sway = size * np.stack([np.sin(phase), np.cos(1.3 * phase)], axis=-1)
+        people = replace(people, keypoints=people.keypoints + sway[:, :, None, None])
+        health = CameraHealth.empty(FRAMES, 4, people.detection_index.shape[2], FPS)
+        health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
+        return np.median(health.misfit)
+
+    assert misfit(0.0) < 1.0
+    assert misfit(30.0) > 3.0

@@ -174,3 +174,9 @@ def test_a_list_of_other_files_is_no_video(tmp_path):
     (tmp_path / "video.mp4").write_text("ffconcat version 1.0\nfile other.mov\n")
     with pytest.raises(InputError, match="a list of other files"):
         index_video(tmp_path / "video.mp4")
+
+
+def test_a_video_of_another_rate_is_refused(tmp_path):
+    index = index_video(encode(tmp_path / "slow.mp4", 80 * np.arange(20)))
+    with pytest.raises(InputError, match="25 frames per second"):
+        index.on_clock(25.0, "slow")

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from worldpose.triangulation.residuals import (
+    LANES,
+    Buffers,
+    Observations,
+    Rig,
+    add_data,
+    clear,
+    read_tile,
+    write_leverages,
+)
+from worldpose.triangulation.solve import find_consensus
+
+POINT = np.array([0.7, -1.1, 1.3])
+NOISE = (2.0, 0.0)
+
+
+def buffers_of(camera, image):
+    """Buffers in which every lane sees pixels (cameras, 2), and its joint is at `POINT`."""
+    count = len(image)
+    keypoints = np.broadcast_to(image[None, :, None, None], (1, count, 1, LANES, 2)).copy()
+    precision = np.ones((1, count, 1, LANES))
+    rig, buffers = Rig.from_cameras(camera), Buffers.of(count)
+    index = np.zeros((1, count, 1), np.int64)
+    read_tile(Observations.of(rig, keypoints, precision, index), 0, buffers.tiles)
+    buffers.tiles["used"] = 1.0
+    buffers.state["point"] = POINT[:, None]
+    return rig, buffers
+
+
+@pytest.fixture
+def views(ring):
+    """Four views of `POINT`, each some pixels off."""
+    camera = ring(4)
+    off = np.array([[3, 1], [-2, 4], [1, 1], [0, -3]])
+    return camera, camera.project(POINT[None])[:, 0] + off
+
+
+def test_normal_equations_are_the_gradient_of_half_the_weighted_cost(views):
+    camera, image = views
+    rig, buffers = buffers_of(camera, image)
+    state = buffers.state[0]
+
+    def cost_and_right(point):
+        state["point"][:] = point[:, None]
+        clear(state)
+        for tile, depth in zip(buffers.tiles, rig.depths, strict=True):
+            add_data(tile, depth, NOISE, state)
+        return 0.5 * buffers.tiles["squared"][:, 0].sum(), state["right"][:, 0].copy()
+
+    _, right = cost_and_right(POINT)
+    step = 1e-5
+    for axis in range(3):
+        ahead, _ = cost_and_right(POINT + step * np.eye(3)[axis])
+        behind, _ = cost_and_right(POINT - step * np.eye(3)[axis])
+        # Central differences of a cost of about 10 with third derivatives of order 1e3.
+        assert right[axis] == pytest.approx(-(ahead - behind) / (2 * step), rel=1e-5, abs=1e-3)
+
+
+def test_leverages_of_all_views_sum_to_three(views):
+    camera, image = views
+    rig, buffers = buffers_of(camera, image)
+    find_consensus(rig, (10.0, 0.0), 12.0, buffers)
+    for tile, depth in zip(buffers.tiles, rig.depths, strict=True):
+        write_leverages(tile, depth, (10.0, 0.0), buffers.state[0])
+    # Three unknowns; the matrix is that before a last step of under a micrometre.
+    assert buffers.tiles["leverage"][:, 0].sum() == pytest.approx(3.0, rel=1e-6)
+
+
+def test_lane_without_observations_leaves_the_others_alone(ring):
+    camera = ring(4)
+    rig, buffers = buffers_of(camera, camera.project(POINT[None])[:, 0])
+    for name in ("a", "b", "precision"):
+        buffers.tiles[name][..., 5] = 0.0
+    find_consensus(rig, NOISE, 12.0, buffers)
+    points = buffers.state["point"][0]
+    assert np.isnan(points[:, 5]).all()
+    np.testing.assert_allclose(np.delete(points, 5, axis=1).T - POINT, 0.0, atol=1e-9)
