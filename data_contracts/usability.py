@@ -51,10 +51,10 @@ class UsableLimits(Record):
     """Expected error of the pitch in a broadcast camera's image, median over frames [px]: a painted
     line of 0.12 m is 4 px wide at 60 m with a focal length of 2000 px. Beyond 3 px the drawn pitch
     is visibly off."""
-    max_plane_std_m: Amount = 0.5
+    max_plane_std_m: Amount = 1.0
     """Standard deviation of the places of people on the pitch in a match without static cameras,
-    root of the trace, median over people and frames [m]: beyond a shoulder's width of 0.4 m two
-    players in a duel are not told apart."""
+    root of the trace, median over people and frames [m]: twice that of a good camera in simulation,
+    0.47 m."""
     max_unusable_share: Share = 0.5
     """Share of the time without people beyond which results are not usable [1]: most of the clip
     has none."""

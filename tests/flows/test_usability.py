@@ -98,7 +98,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         (
             "broadcast_tracking/clip",
             {"unmatched_share": 0.1, "plane_std_m": 9.0},
-            "places of people in clip are uncertain by 9 m (limit 50 cm).",
+            "places of people in clip are uncertain by 9 m (limit 1 m).",
         ),
         # A metric that is not there, or not a number, is no good one.
         (
