@@ -105,10 +105,12 @@ BROADCAST_TRACKING = TRACKING.model_copy(
             *(TRACKING.layout(name) for name in _GROUND),
         ),
         "labels": {"axis": ("x", "y"), "axis_": ("x", "y")},
-        "optional": (),
+        "optional": ("given_people",),
         "attributes": {
             "clip_id": "clip of the match",
             "tracks": "one `track` record per person",
+            "given_people": "number of people of given boxes with identities; `person` is their "
+            "row",
         },
     }
 )

@@ -30,12 +30,16 @@ class UsableLimits(Record):
     max_standard_deviation_m: Amount = 0.10
     """Median over joints of the root of the trace of their covariance [m]: with equal errors along
     all axes, sqrt(3) times the standard deviation along one."""
+    max_filled_share: Share = 0.05
+    """Share of joints that no camera sees, filled by the motion model alone [1]: accuracy is that
+    of a guess there."""
     max_misplacement_m: Amount = 0.05
     """Displacement of people by the uncertainty of a camera's calibration, root mean square per
     axis at the median person [m]: as large as the error of a joint."""
     max_moved_deviations: Amount = 3.0
     """Motion of a static camera in the adjustment, over the standard deviation that its calibration
-    states, of center or axes [1]: one in a hundred true cameras lies farther off."""
+    states, root mean square over the axes of its center or orientation [1]: of correct cameras at
+    most 0.3 % exceed it in either."""
     max_body_excess_m: Amount = 0.01
     """Root mean square error of fitted joints beyond that of triangulated joints, as held-out
     cameras show it, its lower limit in the worst joint group [m]. A hundredth of a metre beyond a
@@ -47,6 +51,10 @@ class UsableLimits(Record):
     """Expected error of the pitch in a broadcast camera's image, median over frames [px]: a painted
     line of 0.12 m is 4 px wide at 60 m with a focal length of 2000 px. Beyond 3 px the drawn pitch
     is visibly off."""
+    max_plane_std_m: Amount = 0.5
+    """Standard deviation of the places of people on the pitch in a match without static cameras,
+    root of the trace, median over people and frames [m]: beyond a shoulder's width of 0.4 m two
+    players in a duel are not told apart."""
     max_unusable_share: Share = 0.5
     """Share of the time without people beyond which results are not usable [1]: most of the clip
     has none."""

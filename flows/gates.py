@@ -56,7 +56,7 @@ class Gate:
         for name, limit in self.limits:
             if name not in judged:
                 lines.append(f"{name} could not be computed")
-            elif _exceeds(judged[name], limit):
+            elif exceeds(judged[name], limit):
                 lines.append(_beyond(name, judged, limit))
         return tuple(lines)
 
@@ -74,9 +74,9 @@ class Gate:
         return max([0.0, *beyond])
 
 
-def _exceeds(value: float, limit: float) -> bool:
-    """Return whether a metric exceeds a limit with the digits that the reason shows."""
-    return float(f"{value:.4g}") > float(f"{limit:.4g}")
+def exceeds(value: float, limit: float) -> bool:
+    """Return whether a metric exceeds a limit with the digits that the reason shows; NaN does."""
+    return not float(f"{value:.4g}") <= float(f"{limit:.4g}")
 
 
 def _beyond(name: str, judged: Figures, limit: float) -> str:
@@ -84,7 +84,7 @@ def _beyond(name: str, judged: Figures, limit: float) -> str:
     parts = [
         key.removeprefix(f"{name}.")
         for key, value in judged.items()
-        if key.startswith(f"{name}.") and _exceeds(value, limit)
+        if key.startswith(f"{name}.") and exceeds(value, limit)
     ]
     named = f" ({', '.join(parts)})" if parts else ""
     return f"{name} is {judged[name]:.4g}{named}, at most {limit:.4g} passes"
@@ -152,7 +152,7 @@ class JointLimits(Record):
 
     standard_deviation_m: float = Field(default=_USABLE.max_standard_deviation_m, ge=0)
     """Root of the trace of a joint's covariance, median over joints [m]."""
-    filled_share: float = Field(default=0.05, ge=0)
+    filled_share: float = Field(default=_USABLE.max_filled_share, ge=0)
     """Share of joints filled by the motion model alone [1]."""
     unhealthy_share: float = Field(default=0.05, ge=0)
     """Share of the clip in which a camera's keypoints depart from people, its images are missing,
@@ -362,7 +362,7 @@ class Gatekeeper:
             limit > 0.0
             and metric in before
             and metric in now
-            and not _exceeds(now[metric], before[metric])
+            and not exceeds(now[metric], before[metric])
             for metric, limit in gate.limits
             if any(reason.startswith(f"{metric} ") for reason in reasons)
         )

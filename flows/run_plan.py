@@ -18,6 +18,7 @@ from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
+from flows.usability import usable_limits
 from worldpose.errors import StoreError, UsageError
 from worldpose.sources import code_version
 from worldpose.store.recipes import libraries, recipe_key
@@ -225,6 +226,8 @@ class RunPlan:
         if latest is None or latest.failed or latest.state == "failed" or self.missing:
             return False
         if self.overrides != latest.overrides:  # the next run is to know them
+            return False
+        if latest.usability.limits != usable_limits(self.match):  # it judges by them
             return False
         is_asked = {unit.request for unit in self.waiting} == {u.request for u in latest.waiting}
         return is_asked and self.results.items() <= latest.results.items()

@@ -22,9 +22,7 @@ from data_contracts.run import (
     RunState,
     UnitFailure,
 )
-from data_contracts.usability import UsableLimits
 from flows.gates import Gatekeeper
-from flows.layers import merge_general
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD, unit_order
 from flows.progress import reporter
@@ -33,7 +31,7 @@ from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
-from flows.usability import RunOutcome, exceeded_limits, judge_run
+from flows.usability import RunOutcome, exceeded_limits, judge_run, usable_limits
 from tasks.tracing import add_unit_span, stage_span
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
@@ -66,12 +64,6 @@ def describe_end(record: RunRecord) -> str:
         said = ["partial", *said]
     first = f". {record.failed[0].unit}: {record.failed[0].message}" if record.failed else ""
     return f"run {record.run_id} of {record.match_id}: {', '.join(said)}{first}"
-
-
-def usable_limits(match: Match) -> UsableLimits:
-    """Return the limits that the layers of a match state for the verdict on its results."""
-    stated = merge_general(match.layers).model_dump(include=set(UsableLimits.model_fields))
-    return UsableLimits.model_validate(stated)
 
 
 CLOCK_SECONDS: Final = 5.0
@@ -309,7 +301,7 @@ class RunLog:
             left_out=lost,
             failed=self.failed,
             lacks_results=state == "failed",
-            lacks_people=state == "partial" and not self.failed,
+            lacks_people=self.plan.lacks_cameras or self._lacks_people(),
             waiting=len(self.plan.waiting),
         )
         record = RunRecord(

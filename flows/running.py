@@ -29,7 +29,7 @@ from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
-from flows.run_record import RunLog, expected_work, latest_run, usable_limits
+from flows.run_record import RunLog, expected_work, latest_run
 from flows.settings import Overrides, ResolvedSettings, as_text, flatten, resolve, selected_stages
 from flows.stage import Match
 from tasks.tracing import flush_spans, start_tracing
@@ -204,8 +204,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     reporter().run_planned(expected_work(store, match, plan.missing, latest))
     if plan.missing:
         return _with_prefect(store, match, replace(request, gates=policy), plan.missing)
-    is_judged = latest is not None and latest.usability.limits == usable_limits(match)
-    if latest is not None and is_judged and plan.is_recorded_by(latest):
+    if latest is not None and plan.is_recorded_by(latest):
         reused = tuple(sorted(plan.results))
         return latest.model_copy(
             update={

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Final
 
-from data_contracts.run import UnitFailure
+from data_contracts.run import BODY_STAGES, UnitFailure
 from data_contracts.usability import Usability, UsableLimits
-from flows.review.metric_words import quantity
+from flows.gates import exceeds
+from flows.layers import merge_general
+from flows.review.metric_words import metric_words, quantity
+from flows.stage import Match
 
 Figures = Mapping[str, float]
 
@@ -25,6 +29,8 @@ DOUBTING: Final = (
     "bundle_adjustment",
     "retriangulation",
     "body_fitting",
+    "broadcast_calibration",
+    "broadcast_tracking",
     "refitting",
 )
 """Stages whose warnings doubt their results; those of other stages describe the inputs."""
@@ -39,14 +45,16 @@ class _Rule:
     Attributes:
         stage: the stage of the metric.
         metric: its name; parts are `metric.part`.
-        limit: name in `UsableLimits`.
+        limit: name in `UsableLimits`; empty = a limit of zero.
         says: the reservation, with places for the unit, the value, the parts, and when.
+        is_required: whether a result without the metric could not be judged.
     """
 
     stage: str
     metric: str
     limit: str
     says: str
+    is_required: bool = False
 
 
 _RULES: Final = (
@@ -70,6 +78,7 @@ _RULES: Final = (
         "max_unmatched_share",
         "{value} of the detections in {unit} belong to no track. Look for people beside the pitch, "
         "or for a camera with a wrong clock or pose.",
+        is_required=True,
     ),
     _Rule(
         "tracking",
@@ -77,6 +86,7 @@ _RULES: Final = (
         "max_ray_distance_m",
         "cameras disagree about the people in {unit} by {value}. Check the calibration and the "
         "clocks of the cameras.",
+        is_required=True,
     ),
     _Rule(
         "triangulation",
@@ -84,6 +94,14 @@ _RULES: Final = (
         "max_standard_deviation_m",
         "joints in {unit} are uncertain by {value}. More cameras, or better calibrated ones, have "
         "to see the people.",
+        is_required=True,
+    ),
+    _Rule(
+        "triangulation",
+        "filled_share",
+        "max_filled_share",
+        "no camera sees {value} of the joints in {unit}: motion alone places them. Add cameras, or "
+        "check their 2D poses.",
     ),
     _Rule(
         "triangulation",
@@ -119,12 +137,37 @@ _RULES: Final = (
         "max_body_offset_m",
         "bodies in {unit} lie {value} off the joints that cameras show. Compare both with the "
         "images, or export --stage retriangulation.",
+        is_required=True,
     ),
     _Rule(
         "broadcast_calibration",
         "expected_error_median_px",
         "max_broadcast_error_px",
         "the broadcast camera of {unit} is uncertain by {value}. Click more key frames.",
+        is_required=True,
+    ),
+    _Rule(
+        "broadcast_tracking",
+        "unmatched_share",
+        "max_unmatched_share",
+        "{value} of the detections of the broadcast camera in {unit} belong to no track. Look for "
+        "people beside the pitch, or for wrong key frames.",
+    ),
+    _Rule(
+        "broadcast_tracking",
+        "plane_std_m",
+        "max_plane_std_m",
+        "places of people in {unit} are uncertain by {value}. Click more key frames.",
+    ),
+    *(
+        _Rule(
+            stage,
+            "corrections_refused",
+            "",
+            "{value} corrections of {unit} do not fit its results and are not applied. Correct "
+            "them on the page of the match, or withdraw them, and run again.",
+        )
+        for stage in ("ingest", "detection", "tracking")
     ),
 )
 
@@ -152,6 +195,12 @@ class RunOutcome:
     waiting: int = 0
 
 
+def usable_limits(match: Match) -> UsableLimits:
+    """Return the limits that the layers of a match state for the verdict on its results."""
+    stated = merge_general(match.layers).model_dump(include=set(UsableLimits.model_fields))
+    return UsableLimits.model_validate(stated)
+
+
 def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
     """Return the verdict on a run's results."""
     against = list(_reasons_against(outcome, limits))
@@ -159,6 +208,7 @@ def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
         *against,
         *(f"{each.unit} failed: {' '.join(each.message.split())}" for each in outcome.failed),
         *outcome.left_out,
+        *(() if against else _describe_early_end(outcome.figures)),
         *exceeded_limits(outcome.figures, limits),
         *(
             text
@@ -179,24 +229,36 @@ def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> lis
         for name, own in figures.items():
             stage, _, unit = name.partition("/")
             if stage == last or (stage == rule.stage and f"{last}/{unit}" not in figures):
-                found += _exceeding(rule, unit, own, getattr(limits, rule.limit))
+                limit = getattr(limits, rule.limit) if rule.limit else 0.0
+                found += _exceeding(rule, " in ".join(unit.split(".")), own, limit)
     return found
 
 
-def _exceeding(rule: _Rule, unit: str, figures: Figures, limit: float) -> Iterator[str]:
-    """Yield the sentence of a metric of which the whole, or some parts, exceed the limit."""
-    beyond = {
+def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Iterator[str]:
+    """Yield the sentences of a metric of which the whole, or some parts, exceed the limit.
+
+    A result without any metric was judged before the run.
+    """
+    own = {
         name.partition(".")[2]: value
-        for name, value in sorted(figures.items(), key=lambda each: -each[1])
-        if name.partition(".")[0] == rule.metric and value > limit
+        for name, value in figures.items()
+        if name.partition(".")[0] == rule.metric
     }
+    unknown = [part for part, value in own.items() if not isfinite(value)]
+    if unknown or (rule.is_required and figures and not own):
+        parts = f" ({', '.join(unknown)})" if any(unknown) else ""
+        yield (
+            f"{metric_words(rule.metric)[0]} could not be computed in {place}{parts}. Look at it "
+            "in the report."
+        )
+    beyond = sorted(own.keys() - set(unknown), key=lambda part: (-own[part], part))
+    beyond = [part for part in beyond if exceeds(own[part], limit)]
     if beyond:
-        worst, value = next(iter(beyond.items()))
         yield rule.says.format(
-            unit=" in ".join(unit.split(".")),
-            value=f"{quantity(rule.metric, value)} (limit {quantity(rule.metric, limit)})",
+            unit=place,
+            value=f"{quantity(rule.metric, own[beyond[0]])} (limit {quantity(rule.metric, limit)})",
             part=", ".join(beyond),
-            when=_when(rule.metric.rpartition("_")[0], worst, figures),
+            when=_when(rule.metric.rpartition("_")[0], beyond[0], figures),
         )
 
 
@@ -212,17 +274,27 @@ def _when(subject: str, part: str, figures: Figures) -> str:
     return f", longest {whose}in {frames}"
 
 
+def _describe_early_end(figures: Mapping[str, Figures]) -> Iterator[str]:
+    """Yield that the results, in the order of the method, end before people have places."""
+    stages = [name.partition("/")[0] for name in figures]
+    if stages and not {*BODY_STAGES, "broadcast_tracking"} & {*stages}:
+        yield (
+            f"no person has a body: the results end with {stages[-1]}. Run the match without "
+            "--until."
+        )
+
+
 def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]:
     """Yield why results cannot be used at all."""
     if outcome.lacks_results:
-        yield "the run failed."
+        yield "the run failed. Correct what the failed units say, and run again."
     if outcome.lacks_people:
-        yield "no person is placed."
+        yield "no person is placed. Check videos, 2D poses and calibration in the report."
     if outcome.waiting:
-        yield f"results that wait for review: {outcome.waiting}."
+        yield f"results that wait for review: {outcome.waiting}. Decide them, and run again."
     most = limits.max_unusable_share
     for name, own in outcome.figures.items():
         stage, _, unit = name.partition("/")
         if stage == "tracking" and own.get("absent_share", 0.0) > most:
-            share = quantity("absent_share", most)
-            yield f"people are missing in {unit} for more than {share} of the time."
+            share = f"{quantity('absent_share', most)} of the time"
+            yield f"people are missing in {unit} for more than {share}. Check the videos."

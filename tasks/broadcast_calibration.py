@@ -43,12 +43,18 @@ from worldpose.broadcast_calibration.uncertainty import (
     static_covariance,
 )
 from worldpose.formats.camera_data import read_camera_data
+from worldpose.formats.challenge import read_kit_array
 from worldpose.ingest.clock import ImageClock, camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.writer import ResultWriter
 from worldpose.tracking.plane.feet import GroundPositions, locate_feet
 from worldpose.tracking.plane.shirts import measure_shirts
-from worldpose.tracking.plane.tracker import GroundTracks, track_on_plane
+from worldpose.tracking.plane.tracker import (
+    GroundTracks,
+    find_given_people,
+    locate_tracks,
+    track_on_plane,
+)
 from worldpose.video.folder import open_video, pictures_at
 
 SIZE_METRICS: Final = {
@@ -119,6 +125,10 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         attributes=broadcast_attributes(_clip_of(inputs), calibration, start, clock.rate),
     )
     result.figures.update(_figures(calibration.report, clock.rate))
+    if reasons := calibration.report.reasons:
+        result.warnings.append(
+            f"the broadcast camera of {inputs.unit} needs a check: {'; '.join(reasons)}."
+        )
 
 
 def image_clock(inputs: UnitInputs, ends: str = "") -> ImageClock:
@@ -279,8 +289,19 @@ def broadcast_tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     with open_video(inputs.file("video")) as video:
         positions = _locate_people(filmed, pictures_at(video, number))
     inputs.require_registered("video")
-    size = (filmed.pitch.length, filmed.pitch.width)
-    tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
+    size, fps = (filmed.pitch.length, filmed.pitch.width), float(sources["fps"])
+    given_people = {}
+    if "boxes" in sources:
+        given = read_kit_array(inputs.file("boxes"), "boxes")[number]
+        inputs.require_registered("boxes")
+        found = find_given_people(given, filmed.detections.boxes)
+        found[~np.isfinite(np.take_along_axis(positions.xy[:, 0, :, 0], found, axis=1))] = -1
+        given_people["given_people"] = found.shape[1]
+        person = np.flatnonzero((found >= 0).any(axis=0))
+        tracks = locate_tracks(positions, found[:, None, person], fps)
+    else:
+        tracks = track_on_plane(positions, fps, pitch_size=size)
+        person = np.arange(tracks.xy.shape[1])
     index = tracks.detection_index[:, 0]
     result.write(
         BROADCAST_TRACKING,
@@ -293,12 +314,14 @@ def broadcast_tracking(inputs: UnitInputs, result: ResultWriter) -> None:
         },
         coordinates={
             "frame": inputs.frames,
-            "person": np.arange(index.shape[1], dtype=np.int32),
+            "person": person.astype(np.int32),
         },
         attributes={
             "clip_id": inputs.unit,
+            **given_people,
             "tracks": [
-                _track(number, seen, sources["first_frame"]) for number, seen in enumerate(index.T)
+                _track(int(each), seen, sources["first_frame"])
+                for each, seen in zip(person, index.T, strict=True)
             ],
         },
     )

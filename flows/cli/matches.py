@@ -41,6 +41,7 @@ def import_command(
     boxes: Path | None = None,
     join: Annotated[bool, typer.Option("--join")] = False,
     pose2sim: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
+    challenge: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     fps: float | None = None,
     match_id: str | None = None,
     pitch: Path | None = None,
@@ -75,6 +76,8 @@ def import_command(
         join: With --videos: join the chapters of one recording (GX010001, GX020001).
         pose2sim: Trial of Pose2Sim: Config.toml, calibration/, pose/ with OpenPose JSON,
             videos/.
+        challenge: Folder of a pose challenge: cameras/, boxes/, videos/ or images/, skel_2d/,
+            skel_3d/ and pitch_points.txt; writes OUT/<sequence> for each sequence.
         fps: Frames per second.
         match_id: Id of the match; the folder's name by default.
         pitch: Survey of the markings (CSV); writes only pitch.json.
@@ -103,6 +106,7 @@ def import_command(
         "--videos": videos,
         "--boxes": None if videos else boxes,  # with videos, they are a part of the match
         "--pose2sim": pose2sim,
+        "--challenge": challenge,
         "--fps": fps,
         "--match-id": match_id,
         "--pitch": pitch,
@@ -149,6 +153,8 @@ def import_command(
         answer(as_json, about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
         import_pitch(pitch, template, out, left_handed=left_handed, as_json=as_json)
+    elif challenge is not None:
+        _import_challenge(challenge, out, fps, as_json=as_json)
     elif pose2sim is not None:
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
         _print_match(spec, out, notes, as_json=as_json)
@@ -184,6 +190,7 @@ ALONE: Final = {
         "with --out, and --fps, --match-id, --unit or --up",
         ("--fps", "--match-id", "--unit", "--up"),
     ),
+    "--challenge": ("with --out, and --fps for images", ("--fps",)),
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
     "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
     "--camera-data": (
@@ -211,6 +218,17 @@ def _require_alone(kind: str, given: set[str]) -> None:
             found=", ".join(others) or f"{kind} alone",
             todo="Import the match first; the rest can be added to its folder then.",
         )
+
+
+def _import_challenge(kit: Path, out: Path, fps: float | None, *, as_json: bool) -> None:
+    """Write a match for each sequence of a challenge, and print what was read."""
+    from worldpose.body_fitting.skeletons import pose_skeletons  # late: it loads the body
+    from worldpose.ingest.challenge_kit import import_challenge
+
+    made = import_challenge(kit, out, pose_skeletons, fps)
+    lines = [note for _, notes in made.values() for note in notes]
+    folders = {name: str(out / name) for name in made}
+    answer(as_json, {"folders": folders, "notes": lines}, *lines, f"next: worldpose run {out}/*")
 
 
 def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:

@@ -114,8 +114,8 @@ def health_picture(run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     return [
         CaptionedImage(
             f"{clip_title(clip)}: the health of each static camera over time, by the distance of "
-            "its keypoints from the people whom all cameras place, and by its images. Grey: nobody "
-            f"is seen to compare; black: frames without an image; blue: a change.{said}",
+            "its keypoints from the people that all cameras place, and by its images. Grey: no "
+            f"person is seen to compare; black: frames without an image; blue: a change.{said}",
             plot_health(names, frames, badness, missing, marks),
         )
     ]

@@ -57,8 +57,10 @@ from worldpose.formats.baselines.result import (
 )
 from worldpose.formats.challenge import (
     ChallengeClip,
+    ChallengeTruth,
     Edition,
     challenge_truth,
+    fill_submission,
     write_challenge,
     write_challenge_camera,
     write_moving_camera,
@@ -168,10 +170,13 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iter
     filmed = _filmed(origin)
     together: dict[str, ChallengeClip] = {}
     submissions: dict[str, NDArray[np.float64]] = {}
+    filled: dict[str, int] = {}
     for view, (clip, camera) in filmed.items():
         model, poses, _ = fitted_bodies(origin.run, clip)
         truth = challenge_truth(model, poses, camera)
-        submissions[view] = truth.submission
+        submissions[view], added = _by_given_rows(origin, clip, truth)
+        if added:
+            filled[view] = added
         path = out / "cameras" / f"{view}.npz"
         write_challenge_camera(path, camera, edition)
         yield path
@@ -189,6 +194,29 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iter
     path = out / "submission.zip"
     write_submission(path, submissions)
     yield path
+    if filled:
+        path = out / "filled_poses.json"
+        path.write_text(json.dumps(filled, indent=1), encoding="utf-8")
+        yield path
+
+
+def _by_given_rows(
+    origin: Origin, clip: str, truth: ChallengeTruth
+) -> tuple[NDArray[np.float64], int]:
+    """Return a clip's submission, and the poses that fill gaps of given boxes.
+
+    Where boxes with identities were given, the rows are theirs.
+    """
+    name, run = f"broadcast_tracking/{clip}", origin.run
+    rows = run[name].attrs.get("given_people") if name in run else None
+    if rows is None:
+        return truth.submission, 0
+    tracked, persons = run[name], fitted_bodies(run, clip)[2][truth.persons]
+    joints = np.full((rows, *truth.submission.shape[1:]), np.nan)
+    places = np.full((rows, joints.shape[1], 2), np.nan)
+    joints[persons] = truth.submission
+    places[tracked["person"].values] = tracked["ground"].values.swapaxes(0, 1)
+    return fill_submission(joints, places)
 
 
 def _filmed(origin: Origin) -> dict[str, tuple[str, Camera]]:

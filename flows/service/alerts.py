@@ -152,7 +152,8 @@ class AlertDispatcher:
         with self._lock:
             self._held[source] = list(alerts)
             today, before = f"{datetime.now(UTC):%Y-%m-%d}", self._told
-            told: dict[str, dict[str, Any]] = {}
+            # Before the first look after a restart, nothing says that former alerts are over.
+            told: dict[str, dict[str, Any]] = {} if "" in self._held else dict(before)
             for alert in (each for held in self._held.values() for each in held):
                 known = before.get(alert.key)
                 if known is None:

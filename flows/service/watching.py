@@ -50,8 +50,7 @@ def watch(plan: ServePlan) -> None:
     """Watch, and serve metrics, until this process ends."""
     store, state = Store.create(plan.project), plan.state_folder
     dispatcher = AlertDispatcher(state, channels_of(os.environ, state.alert_settings))
-    # Each at its own interval: none blocks another.
-    # A tenth of the time, however long a scan takes.
+    # Each at its own interval; a scan of the inbox takes a tenth of the time, however long it is.
     _start("looking at the inbox", INBOX_SECONDS, lambda: _look_at_inbox(plan), rest=9.0)
     if plan.bucket is not None:
         from flows.service.bucket import BucketInbox  # imported here: object storage is an extra

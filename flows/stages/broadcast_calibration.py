@@ -14,6 +14,7 @@ from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.ingest.annotations import key_frames_file
+from worldpose.ingest.match_folder import IDENTIFIED
 
 
 @once_a_match
@@ -139,8 +140,17 @@ def camera_inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def tracking_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip, its video and clock, the pitch, and whether there are monocular poses."""
-    return {**video_sources(match, unit), "has_estimates": unit in match.folder.estimates}
+    """Return the clip, its video and clock, the pitch, and whether there are monocular poses.
+
+    Boxes that state who is who are a source, too.
+    """
+    boxes = match.folder.boxes.get(unit)
+    named = boxes is not None and boxes.suffix == IDENTIFIED
+    return {
+        **video_sources(match, unit),
+        "has_estimates": unit in match.folder.estimates,
+        **(match.file_sources("boxes", boxes) if named else {}),
+    }
 
 
 TRACKING = Stage(

@@ -380,6 +380,9 @@ def test_alerts_of_two_sources_do_not_end_each_other(tmp_path):
     dispatcher.hold(many(1))
     dispatcher.hold([Alert("steps", "watch_stalled", "a disk")], source="steps")
     assert set(kept_alerts(StateFolder(tmp_path))) == {"0", "steps"}
+    again = AlertDispatcher(StateFolder(tmp_path), [])  # after a restart the other one looks first
+    again.hold([], source="steps")
+    assert "0" in kept_alerts(StateFolder(tmp_path))
     dispatcher.hold([], source="steps")
     assert set(kept_alerts(StateFolder(tmp_path))) == {"0"}
     assert MAX_SINGLE > 5

@@ -75,5 +75,5 @@ def test_a_run_says_what_it_changed_in_the_2d_poses_of_a_camera(tiny, tmp_path):
     task_of(METHOD[0]).fn(unit.work(store.url, match, "0001"))
     assert store.manifest(match.match_id, "ingest", file.stem, unit.key).warnings == (
         f"confidences above 1, which count as 1: 3 ({file.stem})",
-        f"entries without a known joint, which count as nobody: 1 ({file.stem})",
+        f"entries without a known joint, which count as no person: 1 ({file.stem})",
     )

@@ -8,6 +8,7 @@ other evidence: lines of sight, and places on the pitch with their covariance.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -42,7 +43,8 @@ from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.body_fitting.residuals import PersonObjective, Pose
 from worldpose.body_fitting.results import BodyFit, FittedArrays
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shapes import Piece, solve_shapes, spread_intervals
+from worldpose.body_fitting.shapes import Piece, Shapes, solve_shapes, spread_intervals
+from worldpose.body_fitting.standing import find_standing_distance
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.plane.kalman import CORRELATION_S as PLACE_CORRELATION_S
@@ -146,6 +148,7 @@ def fit_bodies_on_plane(
     }
     pieces = [piece for person, own in people.items() for piece in clip.sample_pieces(person, own)]
     shapes = solve_shapes(solver, people, pieces, {})
+    clip, people = clip.stand(people, shapes)
     result = FittedArrays.empty(model, frames, persons)
     turned = np.full(placed.shape, np.nan)
     for person, own in people.items():
@@ -235,6 +238,55 @@ class _Clip:
             self.solver, Pose(np.zeros_like(orient), orient, angles, betas), place
         )
         return _Person(span, ~covered[span], place, start)
+
+    def stand(
+        self, people: Mapping[int, _Person], shapes: Shapes
+    ) -> tuple[_Clip, dict[int, _Person]]:
+        """Return clip and people with places at which the fitted bodies' feet stand.
+
+        The ankles in the image give a place without regard to the pose, and a foot in the air makes
+        it too far. Bodies fitted without ground tell how high the feet are at such a place.
+        """
+        evidence, ground, settings = self.evidence, self.solver.ground, self.solver.settings
+        assert ground is not None
+        place, covariance = evidence.place.copy(), evidence.place_covariance.copy()
+        free, moved = replace(self.solver, ground=None), {}
+        for person, own in people.items():
+            start = replace(own.start, betas=shapes.people[person].betas)
+            start = stand_on_ground(self.solver, start, own.place)
+            rows = np.arange(own.span.start, own.span.stop)
+            track = self.track(person, rows, evidence.fps, for_shape=False)
+            pose, _ = free.search(track, start, shapes.offsets)
+            joints = self.solver.chained.place(pose.parameters())
+            center = evidence.camera.center[own.span]
+            hips = joints[:, HIPS, :2].mean(axis=1)
+            sight = hips - center[:, :2]
+            distance = np.linalg.norm(sight, axis=-1)
+            sight /= distance[:, None]
+            ankles = joints[:, ANKLES]
+            floor = ground(ankles[..., 0], ankles[..., 1])
+            height = ankle_height(self.solver.chained.model, pose.betas)
+            slope = (center[:, 2] - floor.mean(axis=1)) / distance
+            seen = np.asarray(
+                np.isfinite(evidence.keypoints[own.span, person][:, ANKLES]).all(axis=-1)
+            )
+            low = np.where(seen, ankles[..., 2] - floor - height, np.inf).min(axis=1)
+            low[~seen.any(axis=1)] = np.nan
+            found, variance = find_standing_distance(
+                distance + low / slope, slope, evidence.fps, settings.contact_std_m
+            )
+            new = hips + (found - distance)[:, None] * sight
+            moved[person] = replace(own, place=new)
+            known = np.isfinite(place[own.span, person, 0])
+            place[own.span, person][known] = new[known]
+            # Across the line of sight the fitted place is no surer than the tracked one.
+            along = sight[..., :, None] * sight[..., None, :]
+            across = np.eye(2) - along
+            spread = across @ evidence.place_covariance[own.span, person] @ across
+            spread = spread + variance[:, None, None] * along
+            covariance[own.span, person][known] = spread[known]
+        evidence = replace(evidence, place=place, place_covariance=covariance)
+        return replace(self, evidence=evidence, lifted=_lift_keypoints(evidence)), moved
 
     def track(
         self,

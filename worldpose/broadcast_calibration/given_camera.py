@@ -23,7 +23,7 @@ class GivenCamera:
     """Camera data in each frame of a clip.
 
     Attributes:
-        values: (frames, 10) as `worldpose.formats.camera_data.COLUMNS`; NaN where not stated.
+        values: (frames, 12) as `worldpose.formats.camera_data.COLUMNS`; NaN where not stated.
         leads: whether the key frames of the clip come from these data.
     """
 
@@ -38,6 +38,12 @@ class GivenCamera:
         values[inside] = data.values[np.searchsorted(data.frame, images[inside])]
         return cls(values)
 
+    @property
+    def principal_point(self) -> Floats | None:
+        """(2,) [px], the median of the stated ones; None where none is stated."""
+        stated = self.values[np.isfinite(self.values[:, 10:12]).all(axis=1), 10:12]
+        return np.median(stated, axis=0) if len(stated) else None
+
     def camera(self, image_size: ArrayLike, settings: BroadcastPrior) -> MovingCamera:
         """Return the camera, with roll 0, the median center and the usual lens if not stated."""
         size = np.asarray(image_size, dtype=np.int64)
@@ -45,9 +51,12 @@ class GivenCamera:
         lens[:, :2] = np.where(np.isfinite(self.values[:, 7:9]), self.values[:, 7:9], lens[:, :2])
         center = self.values[np.isfinite(self.values[:, 3:6]).all(axis=1), 3:6]
         pan, tilt, roll = self.values[:, :3].T
+        middle = self.principal_point
         return MovingCamera(
             center=np.median(center, axis=0) if len(center) else np.full(3, np.nan),
-            principal_point=np.asarray(0.5 * (size - 1.0), dtype=np.float64),
+            principal_point=np.asarray(
+                0.5 * (size - 1.0) if middle is None else middle, np.float64
+            ),
             rotation=rotation_of_angles(pan, tilt, np.nan_to_num(roll)),
             focal=self.values[:, 6],
             distortion=lens,
@@ -65,6 +74,11 @@ class GivenCamera:
         if np.isfinite(given.center).all():
             information = np.eye(3) / settings.given_center_std_m**2
             prior = replace(prior, center=given.center, center_information=information)
+        if self.principal_point is not None:
+            # Stated principal points are those of a calibrated lens [px].
+            prior = replace(
+                prior, principal_point=self.principal_point, principal_std=np.full(2, 1.0)
+            )
         return replace(
             prior,
             log_focal=np.where(zoomed, np.log(given.focal), prior.log_focal),

@@ -106,7 +106,7 @@ def score_folders(
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
-                todo = "Write its poses, with NaN where the method found nobody."
+                todo = "Write its poses, with NaN where the method found no person."
                 found = ", ".join(parts[name])
                 raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
@@ -171,7 +171,7 @@ def _read_people(
     low, high = int(rows.min(initial=0)), int(rows.max(initial=0))
     if (source.frames is None and len(rows) != count) or low < 0 or high >= count:
         expected = f"frames {first} to {first + count - 1} of the clip"
-        todo = "Write one row for each frame of the clip, with NaN where nobody was found."
+        todo = "Write one row for each frame of the clip, with NaN where no person was found."
         raise wrong(where, expected, f"{first + low} to {first + high}", todo)
     joints = np.full((count, source.points.shape[1], len(COCO17), 3), np.nan)
     for place, name in enumerate(COCO17):

@@ -33,7 +33,11 @@ def _read(path: Path, form: TypeAdapter[T], expected: str, todo: str) -> T | Non
     try:
         return form.validate_json(path.read_bytes())
     except ValidationError as error:
-        found = str(error.errors()[0]["msg"])
+        errors = error.errors()
+        found = f"{'.'.join(map(str, errors[0]['loc']))}: {errors[0]['msg']}".removeprefix(": ")
+        if all(each["type"] in ("missing", "extra_forbidden") for each in errors):
+            found = f"{found}: another version of worldpose wrote it"
+            todo = f"{todo} Or write it again with this version."
         raise InputError(str(path), expected=expected, found=found, todo=todo) from error
 
 

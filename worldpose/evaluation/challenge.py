@@ -10,7 +10,7 @@ import numpy as np
 from data_contracts.arrays import Floats
 from worldpose.body.keypoints import CHALLENGE15
 from worldpose.errors import InputError
-from worldpose.formats.challenge import read_submission
+from worldpose.formats.challenge import PARQUET, read_submission
 
 HIPS: Final = (CHALLENGE15.index("right_hip"), CHALLENGE15.index("left_hip"))
 ALL: Final = "all clips"
@@ -40,7 +40,7 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
     A person is the same row on both sides, as in the challenge, which gives the boxes.
 
     Args:
-        prediction: a submission, zip or npz.
+        prediction: a submission: zip, npz or parquet.
         reference: true poses in the same layout; NaN without a person.
 
     Raises:
@@ -52,6 +52,8 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
     for clip, places in true.items():
         where = f"{prediction}: {clip}"
         mine = found.get(clip)
+        if mine is not None and PARQUET in (prediction.suffix, reference.suffix):
+            mine, places = _pad_alike(mine, places)
         if mine is None or mine.shape != places.shape:
             shape = "no such clip" if mine is None else f"{mine.shape}"
             raise _refuse(where, f"(persons, frames, 15, 3) = {places.shape}", shape)
@@ -75,6 +77,16 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
         count = len(whole) // len(CHALLENGE15)
         scores[name] = ChallengeScore(float(whole.mean()), float(local.mean()), count)
     return scores
+
+
+def _pad_alike(first: Floats, second: Floats) -> tuple[Floats, Floats]:
+    """Return joints with equal numbers of persons and frames: tables lack empty ones at the end."""
+    shape = np.maximum(first.shape, second.shape)
+    grown = []
+    for joints in (first, second):
+        more = [(0, extra) for extra in (shape - joints.shape).tolist()]
+        grown.append(np.pad(joints, more, constant_values=np.nan))
+    return grown[0], grown[1]
 
 
 def _refuse(where: str, expected: str, found: str) -> InputError:

@@ -22,9 +22,12 @@ from worldpose.parsing import read_cells
 
 _BYTES: Final = 1 << 26
 """Maximum size of a file [byte]: twelve hours of packets at 50 Hz."""
-COLUMNS: Final = ("pan", "tilt", "roll", "x_m", "y_m", "z_m", "focal_px", "k1", "k2", "zoom")
+COLUMNS: Final = (
+    *("pan", "tilt", "roll", "x_m", "y_m", "z_m", "focal_px", "k1", "k2", "zoom"),
+    *("cx_px", "cy_px"),
+)
 """Columns of a table of camera data in a match folder, beside `frame`."""
-_LIMITS: Final = (360.0, 90.0, 180.0, 300.0, 300.0, 300.0, 1e6, 1e3, 1e3, 1e9)
+_LIMITS: Final = (360.0, 90.0, 180.0, 300.0, 300.0, 300.0, 1e6, 1e3, 1e3, 1e9, 1e5, 1e5)
 """Largest absolute values of these columns."""
 COUNTS: Final = "zoom counts are no focal length: without --zoom-table, they are compared alone"
 """Note of data whose zoom is in counts."""
@@ -36,9 +39,9 @@ class CameraData:
 
     Attributes:
         frame: (rows,) numbers of the images in the video, rising.
-        values: (rows, 10) as COLUMNS: angles [deg], center [m], focal length [px], OpenCV's k1 and
-            k2 [1], and counts of the zoom, which only rise or only fall with the focal length; NaN
-            where nothing is stated.
+        values: (rows, 12) as COLUMNS: angles [deg], center [m], focal length [px], OpenCV's k1 and
+            k2 [1], counts of the zoom, which only rise or only fall with the focal length, and the
+            principal point [px]; NaN where nothing is stated.
         notes: sentences about what was assumed and left out.
     """
 
@@ -82,7 +85,9 @@ def read_camera_data(
         found = f"{frame[row]}, then {frame[row + 1]}"
         raise _wrong(f"{path}: entry {row + 2}", "frames that rise, each once", found)
     with np.errstate(invalid="ignore"):
-        off = (np.abs(data.values) > _LIMITS) | (data.values[:, [6]] < 1.0) & (np.arange(10) == 6)
+        off = (np.abs(data.values) > _LIMITS) | (data.values[:, [6]] < 1.0) & (
+            np.arange(len(COLUMNS)) == 6
+        )
     for row, column in np.argwhere(off)[:1]:
         where = f"{path}: entry {row + 1}: {COLUMNS[column]}"
         expected = f"at most {_LIMITS[column]:g}" + (", at least 1" if column == 6 else "")

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.cameras import CameraCalibration
+from data_contracts.records import FRAME_LIMIT
 from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import whole_file
+from worldpose.formats.tables import read_parquet
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, nearest_rotation
 from worldpose.parsing import read_npy
@@ -162,6 +164,51 @@ class CameraRows:
         return CameraRows(self.intrinsics, self.distortion, rotation, translation).camera()
 
 
+def read_kit_camera(path: Path, image_size: tuple[int, int]) -> Camera:
+    """Return the camera (frames,) of a challenge's file, whose pose is NaN where it has none.
+
+    Args:
+        path: K and k of every frame, R and t of every frame or of the first alone.
+        image_size: width and height [px].
+
+    Raises:
+        InputError: as `read_camera`; or another number of poses, unequal focal lengths of the two
+            axes, or distortion beyond k1 and k2.
+    """
+    arrays = read_archive(path, _ROW_MEMBERS)
+    intrinsics, distortion, poses = arrays["K"], arrays["k"], len(arrays["R"])
+    if poses not in (1, len(intrinsics)):
+        raise wrong(f"{path}: R", f"1 or {len(intrinsics)} frames, as K has", f"{poses}")
+    if len(distortion) != len(intrinsics):
+        raise wrong(f"{path}: k", f"{len(intrinsics)} frames, as K has", f"{len(distortion)}")
+    (fx, skew, _), (low, fy, _) = np.moveaxis(intrinsics[:, :2], 0, -1)
+    usual = (fx > 0.0) & (np.abs(fy - fx) <= 1e-3 * np.abs(fx)) & (skew == 0.0) & (low == 0.0)
+    usual &= np.isfinite(intrinsics).all((-1, -2))
+    brown = np.isfinite(distortion).all(-1) & (distortion[:, 2:] == 0.0).all(-1)
+    for name, good, expected in (
+        ("K", usual, "finite, without skew, with equal focal lengths above 0"),
+        ("k", brown, "finite k1 and k2, then three zeros"),
+    ):
+        if not good.all():
+            row = int(np.argmin(good))
+            raise wrong(f"{path}: {name}[{row}]", expected, f"{arrays[name][row].tolist()}")
+    rotation, translation = np.full((len(fx), 3, 3), np.nan), np.full((len(fx), 3), np.nan)
+    rotation[:poses], translation[:poses] = arrays["R"], arrays["t"]
+    known = np.isfinite(rotation).all((-1, -2)) & np.isfinite(translation).all(-1)
+    if not known[0]:
+        raise wrong(f"{path}: R[0], t[0]", "the pose of the first frame", "NaN")
+    for row in np.flatnonzero(known).tolist():
+        rotation[row] = nearest_rotation(f"{path}: R[{row}]", rotation[row])
+    rotation[~known], translation[~known] = np.nan, np.nan
+    return Camera(
+        focal=intrinsics[:, (0, 1), (0, 1)],
+        principal_point=intrinsics[:, :2, 2],
+        distortion=distortion,
+        cam_from_world=Rigid(rotation, translation),
+        image_size=np.array(image_size, dtype=np.int64),
+    )
+
+
 def read_camera_rows(path: Path) -> CameraRows:
     """Read the rows of a camera file without validation; `read_camera` refuses invalid cameras.
 
@@ -265,6 +312,12 @@ Edition = Literal[2025, 2026]
 
 SUBMISSION: Final = "submission.npz"
 """Member of a submission's zip."""
+_COLUMNS: Final = ("sequence", "frame", "person", "joint", "x", "y", "z")
+"""Columns of a submission's table, beside `row_id`."""
+PARQUET: Final = ".parquet"
+"""Ending of a submission's table."""
+MAX_PERSONS: Final = 1000
+"""Largest number of persons in a submission's table [1]."""
 KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3)}
 """Arrays per clip, and their dimensions after frames and persons."""
 
@@ -322,13 +375,71 @@ def write_challenge(
 
 
 def write_submission(path: Path, joints: Mapping[str, Floats]) -> None:
-    """Write a submission: (persons, frames, 15, 3) [m, world] by clip, in single precision."""
+    """Write a submission: (persons, frames, 15, 3) [m, world] by clip, in single precision.
+
+    The ending decides the form: zip, npz, or a table as of 2025 (parquet).
+    """
+    if path.suffix == PARQUET:
+        import pandas as pd  # late: it takes 0.3 s
+
+        from worldpose.formats.tables import write_parquet
+
+        parts = []
+        for clip, array in joints.items():
+            at = np.argwhere(np.isfinite(array).all(-1))
+            columns = dict(zip(("person", "frame", "joint"), at.T, strict=True))
+            places = dict(zip("xyz", array[tuple(at.T)].T, strict=True))
+            parts.append(pd.DataFrame({"sequence": clip, **columns, **places}))
+        table = pd.concat(parts)[[*_COLUMNS]]
+        ids = (table[name].astype(str) for name in _COLUMNS[:4])
+        table.insert(0, "row_id", ["_".join(row) for row in zip(*ids, strict=True)])
+        write_parquet(path, table, {})
+        return
+    if path.suffix == ".npz":
+        write_archive(path, {clip: array.astype(np.float32) for clip, array in joints.items()})
+        return
     single = {clip: array.astype(np.float32) for clip, array in joints.items()}
     with tempfile.TemporaryDirectory() as workshop:
         inner = Path(workshop) / SUBMISSION
         write_archive(inner, single)
         with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
             file.writestr(zipfile.ZipInfo(SUBMISSION), inner.read_bytes(), zipfile.ZIP_DEFLATED)
+
+
+def fill_submission(joints: Floats, places: Floats) -> tuple[Floats, int]:
+    """Return joints (persons, frames, 15, 3) [m] without gaps, and the number of poses added.
+
+    A challenge scores every box, also where no body could be fitted. Such a frame takes the
+    person's body of the nearest frame, or else the mean of all bodies, at the person's place.
+
+    Args:
+        joints: (persons, frames, 15, 3) [m], world; NaN without a body.
+        places: (persons, frames, 2) [m], world, below the mid-hip; NaN where unknown.
+    """
+    hips = [CHALLENGE15.index(name) for name in ("right_hip", "left_hip")]
+    root = joints[..., hips, :2].mean(axis=-2)
+    body = joints.copy()
+    body[..., :2] -= root[..., None, :]
+    has = np.asarray(np.isfinite(joints).all((-1, -2)))
+    mean = body[has].mean(axis=0)
+    filled, frames = joints.copy(), np.arange(joints.shape[1])
+    for person in range(len(joints)):
+        at, known = (np.flatnonzero(each) for each in (has[person], _finite(places[person])))
+        lacks = np.flatnonzero(~has[person])
+        if len(known):
+            track = np.stack([np.interp(frames, known, axis[known]) for axis in places[person].T])
+        elif len(at):
+            track = np.stack([np.interp(frames, at, axis[at]) for axis in root[person].T])
+        else:
+            continue
+        own = body[person, at[np.abs(at - lacks[:, None]).argmin(axis=1)]] if len(at) else mean
+        filled[person, lacks] = own
+        filled[person, lacks, :, :2] += track.T[lacks, None]
+    return filled, int((_finite(filled).all(-1) & ~has).sum())
+
+
+def _finite(points: Floats) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(points).all(-1))
 
 
 def write_pitch_points(path: Path, points: Floats) -> None:
@@ -357,7 +468,7 @@ def read_challenge(folder: Path, only: str | None = None) -> dict[str, Challenge
             kinds[kind] = _by_clip(together, dims, None if only is None else (only,))
         elif files:
             kinds[kind] = {
-                file.stem: _read_npy(file, kind) for file in files if only in (None, file.stem)
+                file.stem: read_kit_array(file, kind) for file in files if only in (None, file.stem)
             }
         else:
             raise wrong(
@@ -385,14 +496,18 @@ def submission_clips(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: there is no such file, or no submission in it.
     """
+    if path.suffix == PARQUET:
+        return tuple(_read_table(path, None))
     with _npz_of(path) as file:
         return _clips_of(file)
 
 
 def is_submission(path: Path) -> bool:
-    """Return whether a file has a submission's layout: a zip with one, or an npz of clips."""
-    if not path.is_file() or path.suffix not in (".zip", ".npz"):
+    """Return whether a file has a submission's layout: a zip with one, an npz or a table."""
+    if not path.is_file() or path.suffix not in (".zip", ".npz", PARQUET):
         return False
+    if path.suffix == PARQUET:
+        return True
     try:
         return "joints" not in submission_clips(path)  # a joints file is an npz, too
     except InputError:
@@ -400,7 +515,10 @@ def is_submission(path: Path) -> bool:
 
 
 def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str, Floats]:
-    """Read the joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
+    """Read the joints (persons, frames, 15, 3) [m, world] of a submission by clip.
+
+    It is an npz, zipped or bare, or a table as of 2025, with a row for each joint of sequence,
+    frame, person, joint, x, y, z. A table's last persons and frames are those with a joint.
 
     Args:
         path: the file.
@@ -409,8 +527,34 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
     Raises:
         InputError: there is no such file, no submission in it, or arrays of another type or shape.
     """
+    if path.suffix == PARQUET:
+        return _read_table(path, only)
     with _npz_of(path) as file:
         return _by_clip(file, ("persons", "frames", 15, 3), only)
+
+
+def _read_table(path: Path, only: Collection[str] | None) -> dict[str, Floats]:
+    """Read a submission's table (parquet) by clip."""
+    table = read_parquet(path, _COLUMNS)
+    index = np.stack([table[name] for name in _COLUMNS[1:4]], axis=1).astype(np.float64)
+    limits = np.array([FRAME_LIMIT, MAX_PERSONS, len(CHALLENGE15)])
+    off = (index != np.floor(index)) | (index < 0) | (index >= limits)
+    if off.any():
+        row, column = np.argwhere(off)[0].tolist()
+        where = f"{path}: row {row}: {_COLUMNS[1 + column]}"
+        raise wrong(
+            where, f"a whole number from 0 to {limits[column] - 1}", f"{index[row, column]}"
+        )
+    values = np.stack([table[name] for name in _COLUMNS[4:]], axis=1).astype(np.float64)
+    sequence, found = table["sequence"].astype(np.str_), dict[str, Floats]()
+    for clip in np.unique(sequence).tolist():
+        own = sequence == clip
+        frame, person, joint = index[own].astype(np.int64).T
+        places = np.full((person.max() + 1, frame.max() + 1, len(CHALLENGE15), 3), np.nan)
+        places[person, frame, joint] = values[own]
+        if only is None or clip in only:
+            found[clip] = places
+    return found
 
 
 @contextmanager
@@ -449,8 +593,12 @@ def _by_clip(
     return found
 
 
-def _read_npy(path: Path, kind: str) -> Floats:
-    """Read and validate a clip's array of one kind."""
+def read_kit_array(path: Path, kind: str) -> Floats:
+    """Return a clip's array of one kind (`KINDS`): boxes or skeletons.
+
+    Raises:
+        InputError: no npy file of floats of this kind's shape.
+    """
     try:
         with path.open("rb") as stream:
             array = read_npy(stream)

@@ -162,7 +162,7 @@ class GivenBoxes(NamedTuple):
 
 
 def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
-    """Return the boxes of a MOTChallenge text.
+    """Return the boxes of a MOTChallenge text, or of an npy file (frames, persons, 4).
 
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and, in truth
@@ -179,6 +179,8 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
             video lacks, an id twice in a frame, an empty box, a box outside of the image, or an
             impossible confidence; the error names the line.
     """
+    if file.suffix == ".npy":
+        return _read_identified(file, frames)
     pedestrian = 1  # class of people in MOTChallenge's truth
     lines, rows = _read_rows(file)
     frame, person, box = rows[:, 0], rows[:, 1], rows[:, 2:6]
@@ -228,6 +230,22 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
         boxes[chosen],
         np.where(score[chosen] == -1.0, 1.0, score[chosen]),
     )
+
+
+def _read_identified(file: Path, frames: int) -> GivenBoxes:
+    """Return the boxes of an npy file, whose rows are the people."""
+    from worldpose.formats.challenge import read_kit_array  # late: it loads the body
+
+    boxes = read_kit_array(file, "boxes")
+    if len(boxes) != frames:
+        raise InputError(
+            str(file),
+            expected=f"{frames} frames, as many as the video has",
+            found=f"{len(boxes)}",
+            todo="Give the boxes of this video.",
+        )
+    frame, person = np.nonzero(np.isfinite(boxes).all(-1))
+    return GivenBoxes(frame, person, boxes[frame, person], np.ones(len(frame)))
 
 
 def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, find_runs
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 
@@ -307,18 +307,49 @@ def write_parquet(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> 
     Raises:
         UsageError: pyarrow is not installed.
     """
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ImportError:
-        raise UsageError(
-            "--format parquet",
-            expected="the package pyarrow, which writes it",
-            found="none installed",
-            todo="Install the extra: pip install 'worldpose[tables]', or choose --format csv.",
-        ) from None
+    pa, parquet = _import_pyarrow("--format parquet", "choose --format csv")
     content = pa.Table.from_pandas(table, preserve_index=False)
     content = content.replace_schema_metadata({**content.schema.metadata, **notes})
     with whole_file(path) as draft:
         parquet.write_table(content, draft, compression="zstd")
     return [path]
+
+
+def read_parquet(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return columns of a Parquet file by name.
+
+    Raises:
+        InputError: the file is unreadable or lacks a column.
+        UsageError: pyarrow is not installed.
+    """
+    pa, parquet = _import_pyarrow(str(path), "give an npz file")
+    try:
+        table = parquet.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(
+            str(path), expected="a Parquet table", found=f"{error}", todo="Write it again."
+        ) from error
+    missing = [name for name in columns if name not in table.column_names]
+    if missing or not table.num_rows:
+        raise InputError(
+            str(path),
+            expected=f"rows with the columns {', '.join(columns)}",
+            found=f"{table.num_rows} rows with {', '.join(table.column_names)}",
+            todo="Write the file again.",
+        )
+    return {name: table[name].to_numpy() for name in columns}
+
+
+def _import_pyarrow(where: str, otherwise: str) -> tuple[Any, Any]:
+    """Return the modules pyarrow and pyarrow.parquet; UsageError without them."""
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise UsageError(
+            where,
+            expected="the package pyarrow, which reads and writes it",
+            found="none installed",
+            todo=f"Install the extra: pip install 'worldpose[tables]', or {otherwise}.",
+        ) from None
+    return pa, parquet

@@ -54,7 +54,8 @@ class MatchFolder:
         key_frames: clicked key frames, by name of a broadcast view; may lack some.
         lenses: given lenses without a pose, by id of a static camera; may lack some.
         estimates: monocular body estimates, by name of a broadcast view; may lack some.
-        boxes: given boxes of people, by id or name of a video; may lack some.
+        boxes: given boxes of people, by id or name of a video; may lack some. Those of a
+            broadcast view in an npy file state who is who.
         camera_data: what a tracking system states about the camera, by name of a broadcast view;
             may lack some.
     """
@@ -178,7 +179,7 @@ def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
         key_frames=read_key_frames(folder, spec, pitch),
         lenses=_lenses(folder, spec, calibrations),
         estimates=_estimates(folder, spec, ".npz"),
-        boxes=_boxes(folder, videos, detections),
+        boxes=_boxes(folder, spec, videos, detections),
         camera_data=_estimates(folder, spec, CAMERA_DATA),
     )
 
@@ -316,8 +317,15 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     return files_by_unit(folder, "detections", (".json", ".npz"), known, units)
 
 
+IDENTIFIED: Final = ".npy"
+"""Ending of files of boxes of a broadcast view whose rows are the clip's people."""
 CAMERA_DATA: Final = ".csv"
 """Ending of files of camera data in `estimates/`."""
+
+
+def given_boxes_file(view: str) -> str:
+    """Return the path of boxes with identities, relative to the match folder."""
+    return f"boxes/{view}{IDENTIFIED}"
 
 
 def camera_data_file(view: str) -> str:
@@ -330,11 +338,14 @@ def _estimates(folder: Path, spec: MatchSpec, suffix: str) -> dict[str, Path]:
 
 
 def _boxes(
-    folder: Path, videos: Mapping[str, Path], detections: Mapping[str, Path]
+    folder: Path, spec: MatchSpec, videos: Mapping[str, Path], detections: Mapping[str, Path]
 ) -> dict[str, Path]:
     known = [name for name in videos if name not in detections]
     units = "a camera or clip with a video and without 2D poses"
-    return files_by_unit(folder, "boxes", (".txt",), known, units)
+    boxes = files_by_unit(folder, "boxes", (".txt",), known, units)
+    filmed = [name for name in spec.broadcast_views if name in videos]
+    units = "a broadcast clip with a video"
+    return boxes | files_by_unit(folder, "boxes", (IDENTIFIED,), filmed, units)
 
 
 def _videos(folder: Path, spec: MatchSpec, known: Container[str]) -> dict[str, Path]:

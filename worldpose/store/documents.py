@@ -67,8 +67,8 @@ def digest(data: bytes | memoryview) -> str:
 
 R = TypeVar("R", bound=Record)
 
-_UNKNOWN_FIELD = "extra_forbidden"
-"""pydantic's error type for an unknown field."""
+_OTHER_FIELDS: Final = {"extra_forbidden": "the unknown field", "missing": "no field"}
+"""pydantic's error types of records with other fields, and what they found."""
 _SEAL: Final = re.compile(rb'\{"checksum":"([0-9a-f]{64})",')
 """Start of a document with no key before `checksum`."""
 
@@ -94,8 +94,8 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
 
     Raises:
         CorruptionError: the bytes differ from the sealed ones.
-        InputError: an intact document, but of an unsupported contract version, or with fields of a
-            later version.
+        InputError: an intact document, but of an unsupported contract version, or with the fields
+            of another version.
     """
     content = _content_after_seal(data)
     if content is not None:
@@ -126,13 +126,18 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
     try:
         return kind.model_validate_json(json.dumps(fields))
     except ValidationError as error:
-        unknown = {str(each["loc"][0]) for each in error.errors() if each["type"] == _UNKNOWN_FIELD}
-        if len(unknown) == error.error_count():
+        found = {
+            f"{_OTHER_FIELDS[each['type']]} {'.'.join(map(str, each['loc']))}"
+            for each in error.errors()
+            if each["type"] in _OTHER_FIELDS
+        }
+        if len(found) == error.error_count():
             raise InputError(
                 where,
-                expected=f"only fields of {kind.__name__} that this version of worldpose knows",
-                found=f"the fields {', '.join(sorted(unknown))} of a later version",
-                todo="Use the worldpose version that wrote it, or a later one.",
+                expected=f"the fields of {kind.__name__} in this version of worldpose",
+                found=f"{', '.join(sorted(found))}: another version of worldpose wrote it",
+                todo="Use that version, or run the match again in a new project: worldpose run "
+                "FOLDER --project NEW.",
             ) from error
         raise CorruptionError(f"{where} is not a valid {kind.__name__}: {error}") from error
 

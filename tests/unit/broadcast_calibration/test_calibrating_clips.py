@@ -204,7 +204,7 @@ def test_without_any_paint_players_hold_the_camera(true, bare):
 
 def camera_data(true, pan_off=0.0, focal=1.0, leads=False):
     """Camera data with an offset of the pan [deg], counts of the zoom, and no k1 and k2."""
-    values = np.full((FRAMES, 10), np.nan)
+    values = np.full((FRAMES, 12), np.nan)
     values[:, :3] = np.stack(camera_angles(true.camera), axis=1) + [pan_off, 0.0, 0.0]
     values[:, 3:6] = true.center + [0.2, -0.1, 0.1]
     values[:, 6], values[:, 9] = focal * true.focal, 9e4 - true.focal

@@ -80,6 +80,10 @@ def test_a_folder_without_a_manifest_has_none_and_another_contract_is_refused(tm
     path.write_text(path.read_text().replace('"contract": 1,', '"contract": 2,', 1))
     with pytest.raises(InputError, match="contract 1"):
         read_manifest(tmp_path)
+    fields = json.loads(write_manifest(tmp_path, manifest_of(tmp_path)).read_text())
+    path.write_text(json.dumps({name: fields[name] for name in fields if name != "usability"}))
+    with pytest.raises(InputError, match=r"usability: Field required: another version.*again with"):
+        read_manifest(tmp_path)
 
 
 def test_origins_tell_absent_automatic_filled_and_corrected_joints(tmp_path):

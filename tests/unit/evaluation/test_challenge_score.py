@@ -63,3 +63,15 @@ def test_a_missing_clip_person_or_pose_is_refused(tmp_path, change, told):
     truth = submission(tmp_path / "t.zip", one=poses())
     with pytest.raises(InputError, match=told):
         score_submission(submission(tmp_path / "p.zip", **change(poses())), truth)
+
+
+def test_a_table_without_its_last_empty_rows_is_scored_and_a_lacking_pose_is_refused(tmp_path):
+    pytest.importorskip("pyarrow")
+    true, found = poses(), poses() + [0.1, 0.0, 0.0]
+    true[1], true[:, 2] = np.nan, np.nan
+    truth = submission(tmp_path / "true.parquet", one=true)
+    score = score_submission(submission(tmp_path / "mine.zip", one=found), truth)["one"]
+    assert (score.global_m, score.poses) == (pytest.approx(0.1), 2)
+    short = submission(tmp_path / "short.parquet", one=found[:, :1])
+    with pytest.raises(InputError, match=r"1 without one|15 without one"):
+        score_submission(short, truth)

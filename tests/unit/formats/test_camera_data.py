@@ -34,7 +34,7 @@ def read(tmp_path, content, name="data", **options):
 def test_a_packet_is_read_as_computed_by_hand(tmp_path):
     data = read(tmp_path, PACKET + packet(b2=0xA6, b3=0, b4=0), first=10)
     assert data.frame.tolist() == [10, 11]
-    expected = [90.0, -30.0, 0.0, 1.0, -2.0, 1.5, np.nan, np.nan, np.nan, 4660.0]
+    expected = [90.0, -30.0, 0.0, 1.0, -2.0, 1.5, np.nan, np.nan, np.nan, 4660.0, np.nan, np.nan]
     np.testing.assert_array_equal(data.values[0], expected)
     assert data.values[1, 0] == -180.0
     assert any("no focal length" in note for note in data.notes)
@@ -89,7 +89,9 @@ def test_tables_have_units_time_codes_and_decimal_commas(tmp_path):
     )
     data = read(tmp_path, table.encode("utf-16"), first=7)
     assert data.frame.tolist() == [7, 9]
-    np.testing.assert_allclose(data.values[0], [1.5, -2, 0, 1, 2, 3, 960, 0.1, 0.2, np.nan])
+    np.testing.assert_allclose(
+        data.values[0], [1.5, -2, 0, 1, 2, 3, 960, 0.1, 0.2, np.nan, np.nan, np.nan]
+    )
     assert np.isnan(data.values[1, [2, 3, 4, 5, 7, 8]]).all()
     assert any("left out: Iris" in note for note in data.notes)
     dropped = "timecode,pan,tilt\n00:00:59;29,0,0\n00:01:00;02,0,0\n"

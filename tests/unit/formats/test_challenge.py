@@ -14,9 +14,12 @@ from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.challenge import (
     challenge_truth,
+    fill_submission,
+    is_submission,
     read_camera_rows,
     read_challenge,
     read_submission,
+    submission_clips,
     write_challenge,
     write_challenge_camera,
     write_submission,
@@ -172,3 +175,37 @@ def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path)
     lost = replace(camera, focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal))
     with pytest.raises(InputError, match="first frame"):
         write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)
+
+
+def drawn_joints():
+    joints = np.random.default_rng(3).normal(0.0, 20.0, (3, 4, 15, 3))
+    joints[1, 2] = np.nan
+    return joints
+
+
+@pytest.mark.parametrize("ending", ["zip", "npz", "parquet"])
+def test_a_submission_of_each_form_is_read_as_written(tmp_path, ending):
+    if ending == "parquet":
+        pytest.importorskip("pyarrow")
+    joints = drawn_joints()
+    file = tmp_path / f"submission.{ending}"
+    write_submission(file, {"A": joints, "B": joints[:2]})
+    assert is_submission(file)
+    assert submission_clips(file) == ("A", "B")
+    read = read_submission(file)
+    np.testing.assert_allclose(read["A"], joints, atol=1e-5)
+    np.testing.assert_allclose(read["B"], joints[:2], atol=1e-5)
+
+
+def test_a_frame_without_a_body_takes_the_nearest_one_at_the_place_of_the_feet():
+    joints = drawn_joints()
+    joints[2] = np.nan
+    places = np.full((3, 4, 2), np.nan)
+    places[1:] = [5.0, -7.0]
+    filled, added = fill_submission(joints, places)
+    assert added == 5
+    hips = filled[1:, 2, 7:9, :2].mean(axis=1)
+    np.testing.assert_allclose(hips, [[5.0, -7.0]] * 2, atol=1e-9)
+    shape = joints[1, 1] - joints[1, 1, 7:9].mean(axis=0)
+    np.testing.assert_allclose(filled[1, 2] - filled[1, 2, 7:9].mean(axis=0), shape, atol=1e-9)
+    np.testing.assert_array_equal(filled[0], joints[0])

@@ -68,3 +68,15 @@ def test_a_bad_line_is_refused_with_its_number(read, text, message):
     with pytest.raises(InputError, match=message) as refused:
         read(text)
     assert "left.txt" in str(refused.value)
+
+
+def test_boxes_of_an_array_have_its_rows_as_people(tmp_path):
+    boxes = np.full((3, 2, 4), np.nan)
+    boxes[0, 1], boxes[2, 0] = [10.0, 20.0, 30.0, 60.0], [1.5, 2.0, 8.0, 9.0]
+    np.save(tmp_path / "clip.npy", boxes)
+    given = read_boxes(tmp_path / "clip.npy", (1920, 1080), 3)
+    assert given.frame.tolist() == [0, 2]
+    assert given.person.tolist() == [1, 0]
+    np.testing.assert_array_equal(given.box, [boxes[0, 1], boxes[2, 0]])
+    with pytest.raises(InputError, match=r"expected 4 frames"):
+        read_boxes(tmp_path / "clip.npy", (1920, 1080), 4)

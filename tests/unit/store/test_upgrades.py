@@ -34,11 +34,21 @@ def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_sto
         Store.create(folder_store.url)
 
 
-def test_a_run_that_a_later_version_recorded_is_refused_as_such(folder_store: Store) -> None:
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda fields: fields.update(mood="good"), "the unknown field mood"),
+        (lambda fields: fields.pop("usability"), "no field usability"),
+    ],
+)
+def test_a_run_that_another_version_recorded_is_refused_as_such(
+    folder_store: Store, change: Callable[[dict[str, Any]], None], found: str
+) -> None:
     run_once(folder_store)
-    rewrite(folder_store, "runs/final/0001.json", lambda fields: fields.update(mood="good"))
-    with pytest.raises(InputError, match="found the fields mood of a later version"):
+    rewrite(folder_store, "runs/final/0001.json", change)
+    with pytest.raises(InputError, match=f"found {found}: another version") as refused:
         folder_store.run("final")
+    assert "worldpose run FOLDER --project NEW" in str(refused.value)
     # It is not damaged, but it is said.
     (finding,) = verify(folder_store)
-    assert "later version" in finding.problem
+    assert "another version" in finding.problem

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from data_contracts.arrays import Floats, Singles
+from data_contracts.arrays import AnyFloats, Floats, Singles
+from worldpose.geometry.boxes import box_iou
 from worldpose.tracking.plane.feet import FrameBlocks, GroundPositions
 from worldpose.tracking.plane.kalman import Motion, PlaneTrack, compare
 from worldpose.tracking.plane.paths import (
@@ -226,6 +227,22 @@ def locate_tracks(
                     track.note(*where, is_whole=True)
         paths.append(None if track is None else track.smooth(motion))
     return _collect(paths, positions, detection_index)
+
+
+def find_given_people(given: Floats, boxes: AnyFloats) -> NDArray[np.int64]:
+    """Return the detection of each given person (frames, persons); -1 = none at the person's box.
+
+    Args:
+        given: (frames, persons, 4) [px], boxes of known people; NaN when absent.
+        boxes: (frames, detections, 4) [px].
+    """
+    index = np.full(given.shape[:2], -1, dtype=np.int64)
+    least = 0.3  # Least intersection over union of a person's given box and the detection's [1].
+    for frame, overlap in enumerate(box_iou(given, np.asarray(boxes, dtype=np.float64))):
+        person, detection = linear_sum_assignment(-overlap)
+        near = overlap[person, detection] >= least
+        index[frame, person[near]] = detection[near]
+    return index
 
 
 def _sight(
