@@ -99,6 +99,7 @@ def test_a_duplicate_under_another_id_is_refused(match, project_copy):
         (["--set", "triangulaton.min_views=3"], "Did you mean 'triangulation'"),
         (["--set", "triangulation.min_views=many"], "integer"),
         (["--set", "triangulation.min_views=" + "[" * 3000], "integer"),
+        (["--set", "triangulation.pixel_noise_px=NaN"], "a finite number"),
         (["--set", "min_views"], "stage.name=value"),
         (["--from", "triangulation", "--until", "tracking"], "Swap the two stages"),
         (["--until", "body"], "one of ingest, proposal, static_calibration, detection"),

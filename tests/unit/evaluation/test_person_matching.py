@@ -1,4 +1,4 @@
-"""Who is whom, worked out by hand."""
+"""Matching of predicted and true people, computed by hand."""
 
 import numpy as np
 from camera_builders import plain_camera

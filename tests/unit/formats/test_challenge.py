@@ -171,6 +171,12 @@ def test_what_is_no_challenge_is_refused_by_file(tmp_path, name, content, messag
         read_challenge(tmp_path)
 
 
+def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path):
+    lost = replace(camera, focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal))
+    with pytest.raises(InputError, match="first frame"):
+        write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)
+
+
 def drawn_joints():
     joints = np.random.default_rng(3).normal(0.0, 20.0, (3, 4, 15, 3))
     joints[1, 2] = np.nan
@@ -203,9 +209,3 @@ def test_a_frame_without_a_body_takes_the_nearest_one_at_the_place_of_the_feet()
     shape = joints[1, 1] - joints[1, 1, 7:9].mean(axis=0)
     np.testing.assert_allclose(filled[1, 2] - filled[1, 2, 7:9].mean(axis=0), shape, atol=1e-9)
     np.testing.assert_array_equal(filled[0], joints[0])
-
-
-def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path):
-    lost = replace(camera, focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal))
-    with pytest.raises(InputError, match="first frame"):
-        write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)

@@ -171,3 +171,18 @@ def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, peo
     taken = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
     together = (taken.detection_index[20:] >= 0).all(axis=1)
     assert not together.any()
+
+
+@pytest.mark.parametrize(("agility", "births"), [(2.5, 2), (70.0, 1)])
+def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
+    ring, people, seen, agility, births
+):
+    # Stands, is unseen for 0.16 s, stands 2.5 m further. Agility times sqrt(0.16^3 / 3): 0.09 m
+    # beside the gate's 0.5, or 2.59 m.
+    places = np.zeros((40, 1, 2))
+    places[28:] = [2.5, 0.0]
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[20:28] = np.nan
+    settings = SETTINGS.model_copy(update={"velocity_change_std_m_s": agility})
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, settings)
+    assert result.report.births == births
