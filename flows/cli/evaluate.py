@@ -86,6 +86,20 @@ def evaluate(
         from worldpose.dataset.benchmark import is_data_set, score_folders
 
         if len(prediction) > 1 or is_data_set(Path(reference)):
+            options = {
+                "--run": run != "latest",
+                "--stage": stage is not None,
+                "--first-frame": first_frame is not None,
+                "--markers": markers is not None,
+                "--method-fps": method_fps is not None,
+            }
+            if given := [name for name, there in options.items() if there]:
+                raise UsageError(
+                    ", ".join(given),
+                    expected="no such option with clips of a data set",
+                    found=f"--reference {reference}",
+                    todo="Leave it out.",
+                )
             folders = named_folders(prediction)
             results, sample = score_folders(
                 Path(reference), folders, body=body, match_in=match_in, fps=fps
@@ -114,7 +128,7 @@ def evaluate(
         )
         print_methods(found, table, as_json=as_json)
         return
-    if not prediction or reference is None or picture is not None:
+    if not prediction or reference is None or picture is not None or method:
         raise UsageError(
             "worldpose evaluate",
             expected="--prediction or --method, and --reference; --picture only with a data set",
