@@ -86,18 +86,11 @@ def evaluate(
         from worldpose.dataset.benchmark import is_data_set, score_folders
 
         if len(prediction) > 1 or is_data_set(Path(reference)):
-            options = {
-                "--run": run != "latest",
-                "--stage": stage is not None,
-                "--first-frame": first_frame is not None,
-                "--markers": markers is not None,
-                "--method-fps": method_fps is not None,
-            }
-            if given := [name for name, there in options.items() if there]:
+            if any((stage, markers, method_fps, first_frame is not None, run != "latest")):
                 raise UsageError(
-                    ", ".join(given),
-                    expected="no such option with clips of a data set",
-                    found=f"--reference {reference}",
+                    "worldpose evaluate",
+                    expected="no --run, --stage, --markers, --first-frame or --method-fps",
+                    found="one of them, with clips of a data set, where it has no effect",
                     todo="Leave it out.",
                 )
             folders = named_folders(prediction)

@@ -93,10 +93,10 @@ def write_data_set(
                 clips[label] = _write_clip(origin, clip, label, split, Path(workshop), footage)
         clips = _name_subjects(clips, subjects)
         parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
-        counted = {part.name: count([part]) for part in parts}
+        counted = {part: count([part]) for part in parts}
         if tested:
-            tests = counted.pop(truth.name).model_dump_json(indent=2)
-            (truth / manifests.STATISTICS).write_text(f"{tests}\n", encoding="utf-8")
+            tests = counted.pop(truth).model_dump_json(indent=2)
+            (truth / "statistics.json").write_text(f"{tests}\n", encoding="utf-8")
         told = {each: n for part in counted.values() for each, n in part.clips.items()}
         manifest = contracts.DataSetManifest(
             release=name,
@@ -246,7 +246,7 @@ def _count_public(
 ) -> contracts.DataSetStatistics:
     """Return the statistics of all clips but those of the test part."""
     public = (clip.subjects for clip in clips.values() if clip.split != "test")
-    return data_set_statistics(counted, len({person for some in public for person in some}))
+    return data_set_statistics(counted, len(set().union(*public)))
 
 
 def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckReport:
@@ -262,17 +262,17 @@ def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckR
     figures: dict[str, contracts.ClipFigures] = {}
     for name, clip in manifest.clips.items():
         part = folder / clip.split if clip.split != "test" else hidden
-        sources = [_view_findings(folder / clip.split, part, name, clip)]
-        if part is not None:
-            sources.append(_convention_findings(part, name, manifest, figures))
-            sources.append(_count_findings(part, name, manifest))
-            sources.append(_clip_findings(part, name, clip))
-        for source in sources:
-            try:
-                findings.extend(source)
-            except InputError as error:
-                found = _damage("unreadable", str(error), f"{clip.split}: {name}")
-                findings += () if found in findings else (found,)
+        try:
+            findings += _view_findings(folder / clip.split, part, name, clip)
+            if part is not None:
+                findings += _clip_findings(part, name, clip, manifest.statistics.clips.get(name))
+                report = check(part, pitch=manifest.pitch, only=name)
+                figures |= report.clips
+                for found in report.findings:
+                    where = tuple(f"{clip.split}/{place}" for place in found.where)
+                    findings.append(found.model_copy(update={"where": where}))
+        except InputError as error:
+            findings.append(_damage("unreadable", str(error), f"{clip.split}: {name}"))
     return contracts.CheckReport(clips=figures, findings=tuple(findings))
 
 
@@ -340,31 +340,6 @@ def _statement_findings(manifest: contracts.DataSetManifest) -> Iterator[contrac
         yield _damage("count", says, manifests.DATA_SET)
 
 
-def _convention_findings(
-    part: Path,
-    name: str,
-    manifest: contracts.DataSetManifest,
-    figures: dict[str, contracts.ClipFigures],
-) -> Iterator[contracts.Finding]:
-    """Yield the faults of one clip's files, and add its figures."""
-    report = check(part, pitch=manifest.pitch, only=name)
-    figures.update(report.clips)
-    for found in report.findings:
-        where = tuple(f"{manifest.clips[name].split}/{place}" for place in found.where)
-        yield found.model_copy(update={"where": where})
-
-
-def _count_findings(
-    part: Path, name: str, manifest: contracts.DataSetManifest
-) -> Iterator[contracts.Finding]:
-    """Yield statistics that the poses contradict."""
-    clip = manifest.clips[name]
-    stated = manifests.read_statistics(part) if clip.split == "test" else manifest.statistics
-    mine, counted = stated.clips.get(name), clip_statistics(read_places(part, name), clip.fps)
-    if mine is None or not _equal(_numbers(mine), _numbers(counted)):
-        yield _damage("count", "statistics differ from the poses", name)
-
-
 def _view_findings(
     public: Path, part: Path | None, name: str, clip: contracts.ReleasedSequence
 ) -> Iterator[contracts.Finding]:
@@ -380,22 +355,23 @@ def _view_findings(
         if own or (video is not None and video.sha256 != digest_of_files(path)):
             yield _damage("footage_differs", "path or digest is not that of the copy", view)
     for view, size in clip.views.items():
-        where, folders = f"{clip.split}/boxes/{view}.npz", (public, part or public)
-        stored, truth = (_read_boxes(folder, view) for folder in folders)
-        low, high = np.split(stored["boxes"], 2, axis=-1)
+        where, folders = f"{clip.split}/{{}}/{view}.npz", (public, part or public)
+        boxes = [_read_boxes(folder, view) for folder in folders]
+        low, high = np.split(boxes[0]["boxes"], 2, axis=-1)
         if ((high <= low) | (low < -0.5) | (high > np.array(size) - 0.5)).any():
-            yield _damage("box_outside", "a box has no area or leaves the image", where)
-        if any(not _equal(stored[key], truth[key]) for key in stored):
-            yield _damage("boxes_differ", "boxes are not those of the hidden truth", where)
-        mine, true = (challenge.read_camera_rows(f / "cameras" / f"{view}.npz") for f in folders)
+            yield _damage(
+                "box_outside", "a box has no area or leaves the image", where.format("boxes")
+            )
+        if not all(map(_equal, *(each.values() for each in boxes))):
+            yield _damage("boxes_differ", "boxes are not the hidden ones", where.format("boxes"))
+        rows = [challenge.read_camera_rows(f / "cameras" / f"{view}.npz") for f in folders]
         # Broadcast images are whole: the principal point is near their middle.
-        if (abs(mine.intrinsics[:, :2, 2] / size - 0.5) > 0.125).any():
+        if (abs(rows[0].intrinsics[:, :2, 2] / size - 0.5) > 0.125).any():
             yield _damage("views_differ", "the image size is not that of the camera", view)
-        lens = _equal(mine.intrinsics, true.intrinsics) and _equal(mine.distortion, true.distortion)
-        pose = _equal(mine.rotation[:1], true.rotation[:1])
-        if not (lens and pose and _equal(mine.translation[:1], true.translation[:1])):
-            where = f"{clip.split}/cameras/{view}.npz"
-            yield _damage("camera_differs", "the camera is not that of the hidden truth", where)
+        known = [(c.intrinsics, c.distortion, c.rotation[0], c.translation[0]) for c in rows]
+        if not all(map(_equal, *known)):
+            says = "the camera is not the hidden one"
+            yield _damage("camera_differs", says, where.format("cameras"))
 
 
 def _read_boxes(part: Path, view: str) -> dict[str, Floats]:
@@ -407,22 +383,22 @@ def _read_boxes(part: Path, view: str) -> dict[str, Floats]:
 
 
 def _clip_findings(
-    part: Path, name: str, clip: contracts.ReleasedSequence
+    part: Path,
+    name: str,
+    clip: contracts.ReleasedSequence,
+    stated: contracts.ClipStatistics | None,
 ) -> Iterator[contracts.Finding]:
-    """Yield facts of release.json, poses, joints and boxes that disagree."""
+    """Yield statements about a clip, its poses, joints and boxes that disagree."""
     poses, model = joints_file.read_poses(part / "poses" / f"{name}.npz")
     tracks = joints_file.read_joints(part / f"{name}.joints.npz")
-    joints, rates = tracks.joints, manifests.read_frame_rates(part)
-    facts = {
-        "fps": manifests.clip_frame_rate(rates, name),
-        "first_frame": next(iter(tracks.frames.tolist()), None),
-        "frames": len(tracks.frames),
-        "body_model": model,
-    }
-    for key, found in facts.items():
-        if found != (stated := getattr(clip, key)):
-            says = f"{key} is {found} in the files, {stated} in {manifests.DATA_SET}"
-            yield _damage("statement_differs", says, name)
+    joints, counted = tracks.joints, clip_statistics(read_places(part, name), clip.fps)
+    if stated is not None and not _equal(_numbers(stated), _numbers(counted)):
+        yield _damage("count", "statistics differ from the poses", name)
+    rate = manifests.clip_frame_rate(manifests.read_frame_rates(part), name)
+    facts = {"fps": rate, "body_model": model, "frames": len(joints)}
+    for key, found in {**facts, "first_frame": int(tracks.frames.min(initial=1 << 40))}.items():
+        if found != getattr(clip, key):
+            yield _damage("statement_differs", f"{key}: {found} in the files", name)
     mine = fold_keypoints(find_body(model or ""), COCO17)(poses).swapaxes(0, 1)
     where = f"{clip.split}/{name}.joints.npz"
     if mine.shape != joints.shape or len(clip.subjects) != joints.shape[1]:

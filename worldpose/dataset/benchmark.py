@@ -179,15 +179,13 @@ def _read_people(
             joints[rows, :, place] = source.point(name)
     wanted = own = camera_files(folder, clip, clips)[0]
     if truth is None and match_in is not None:
-        wanted = [each for each in own if each.stem.endswith(f".{match_in}")]
-        if not wanted:
-            missing = f"{folder}/cameras/{clip}.{match_in}.npz"
+        missing = f"{folder}/cameras/{clip}.{match_in}.npz"
+        if not (wanted := [each for each in own if each.stem.endswith(f".{match_in}")]):
             raise wrong(missing, "a camera", "nothing", "Name it.")
     elif truth is not None and truth.camera is not None:
-        wanted = [each for each in own if each.stem == truth.camera.stem]
         views = camera_files(truth.folder, clip, list_clips(truth.folder))[0]
-        if not wanted and len(own) == len(views) == 1:
-            wanted = own
+        if len(own) > 1 or len(views) > 1:
+            wanted = [each for each in own if each.stem == truth.camera.stem]
         if own and not wanted:
             found = ", ".join(each.name for each in own)
             todo = "Write this camera, or name another one of the reference with --match-in."

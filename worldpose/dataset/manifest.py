@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
 from data_contracts.records import CONTRACT_VERSION
-from data_contracts.release import DataSetManifest, DataSetStatistics, ReleaseManifest
+from data_contracts.release import DataSetManifest, ReleaseManifest
 from data_contracts.run import StoredFile
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
@@ -23,8 +23,6 @@ from worldpose.formats.joints_file import JointTracks
 MANIFEST: Final = "manifest.json"
 DATA_SET: Final = "release.json"
 """Manifest of a data set of several matches."""
-STATISTICS: Final = "statistics.json"
-"""Statistics of a test part, in the folder of its truth."""
 T = TypeVar("T")
 
 
@@ -70,23 +68,9 @@ def read_data_set(folder: Path) -> DataSetManifest:
     Raises:
         InputError: there is none, or it is damaged.
     """
-    form = TypeAdapter(DataSetManifest)
-    return _read_whole(folder / DATA_SET, form, f"a data set of contract {CONTRACT_VERSION}")
-
-
-def read_statistics(folder: Path) -> DataSetStatistics:
-    """Read the statistics of a test part, which are in the folder of its truth.
-
-    Raises:
-        InputError: there are none, or they are damaged.
-    """
-    form = TypeAdapter(DataSetStatistics)
-    return _read_whole(folder / STATISTICS, form, "statistics of the test part")
-
-
-def _read_whole(path: Path, form: TypeAdapter[T], expected: str) -> T:
-    todo = "Give the folder that worldpose release wrote."
-    found = _read(path, form, expected, todo)
+    path, todo = folder / DATA_SET, "Give the folder that worldpose release wrote."
+    expected = f"the manifest of a data set, contract {CONTRACT_VERSION}"
+    found = _read(path, TypeAdapter(DataSetManifest), expected, todo)
     if found is None:
         raise InputError(str(path), expected=expected, found="no such file", todo=todo)
     return found
