@@ -355,23 +355,21 @@ def _view_findings(
         if own or (video is not None and video.sha256 != digest_of_files(path)):
             yield _damage("footage_differs", "path or digest is not that of the copy", view)
     for view, size in clip.views.items():
-        where, folders = f"{clip.split}/{{}}/{view}.npz", (public, part or public)
+        where = tuple(f"{clip.split}/{kind}/{view}.npz" for kind in ("boxes", "cameras"))
+        folders = public, part or public
         boxes = [_read_boxes(folder, view) for folder in folders]
         low, high = np.split(boxes[0]["boxes"], 2, axis=-1)
         if ((high <= low) | (low < -0.5) | (high > np.array(size) - 0.5)).any():
-            yield _damage(
-                "box_outside", "a box has no area or leaves the image", where.format("boxes")
-            )
+            yield _damage("box_outside", "a box has no area or leaves the image", where[0])
         if not all(map(_equal, *(each.values() for each in boxes))):
-            yield _damage("boxes_differ", "boxes are not the hidden ones", where.format("boxes"))
+            yield _damage("boxes_differ", "boxes are not the hidden ones", where[0])
         rows = [challenge.read_camera_rows(f / "cameras" / f"{view}.npz") for f in folders]
         # Broadcast images are whole: the principal point is near their middle.
         if (abs(rows[0].intrinsics[:, :2, 2] / size - 0.5) > 0.125).any():
             yield _damage("views_differ", "the image size is not that of the camera", view)
         known = [(c.intrinsics, c.distortion, c.rotation[0], c.translation[0]) for c in rows]
         if not all(map(_equal, *known)):
-            says = "the camera is not the hidden one"
-            yield _damage("camera_differs", says, where.format("cameras"))
+            yield _damage("camera_differs", "the camera is not the hidden one", where[1])
 
 
 def _read_boxes(part: Path, view: str) -> dict[str, Floats]:
