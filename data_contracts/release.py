@@ -217,6 +217,8 @@ class ReleasedSequence(Record):
     """Verdict on the run's results."""
     first_frame: Frame
     """Match frame of the first row of every array."""
+    frames: Count
+    """Rows of every array; they last frames / fps seconds."""
     fps: FramesPerSecond
     """[1/s]"""
     body_model: str
@@ -245,6 +247,7 @@ class DataSetManifest(Record):
     """Licence text by kind of file: poses, joints, cameras, boxes, footage."""
     clips: dict[str, ReleasedSequence]
     statistics: DataSetStatistics
+    """Without the test part, whose statistics are with its truth."""
     files: tuple[StoredFile, ...]
     """Relative to this file."""
     hidden: tuple[StoredFile, ...]

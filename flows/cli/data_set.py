@@ -233,7 +233,11 @@ def release(
         opened = open_results(store, registration.spec.match_id, run)
         if run == "latest" and (later := describe_later_run(store, opened.record)):
             line(later, to=errors)
-        origins.append((Origin(opened, registration), splits.get(match, "train")))
+        origin = Origin(opened, registration)
+        if absent := sorted({clip.id for clip in registration.spec.clips} - {*origin.clips}):
+            at = f"run {opened.record.run_id} of {opened.record.match_id}"
+            line(f"{at} has no people in {', '.join(absent)}: not in the data set", to=errors)
+        origins.append((origin, splits.get(match, "train")))
     manifest = write_data_set(
         *(store, origins, out, name, licences), hidden=hidden, footage=footage, subjects=subjects
     )
@@ -242,6 +246,7 @@ def release(
         print_json({"out": str(out), "statistics": found.model_dump(mode="json")})
         return
     line(
-        f"wrote {out}: {len(found.clips)} clips, {found.subjects} subjects, {found.frames} frames, "
-        f"{found.poses} poses, {found.distance_km:.3f} km. Verify it: worldpose release --check"
+        f"wrote {out}: {len(manifest.clips)} clips; without those of the test part "
+        f"{found.subjects} subjects, {found.frames} frames, {found.poses} poses, "
+        f"{found.distance_km:.3f} km. Verify it: worldpose release --check"
     )

@@ -86,6 +86,13 @@ def evaluate(
         from worldpose.dataset.benchmark import is_data_set, score_folders
 
         if len(prediction) > 1 or is_data_set(Path(reference)):
+            if any((stage, markers, method_fps, first_frame is not None, run != "latest")):
+                raise UsageError(
+                    "worldpose evaluate",
+                    expected="no --run, --stage, --markers, --first-frame or --method-fps",
+                    found="one of them, with clips of a data set, where it has no effect",
+                    todo="Leave it out.",
+                )
             folders = named_folders(prediction)
             results, sample = score_folders(
                 Path(reference), folders, body=body, match_in=match_in, fps=fps
@@ -114,7 +121,7 @@ def evaluate(
         )
         print_methods(found, table, as_json=as_json)
         return
-    if not prediction or reference is None or picture is not None:
+    if not prediction or reference is None or picture is not None or method:
         raise UsageError(
             "worldpose evaluate",
             expected="--prediction or --method, and --reference; --picture only with a data set",

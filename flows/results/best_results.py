@@ -373,8 +373,8 @@ def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
     Raises:
         InputError: the run has no such camera.
     """
-    todo = "This format is about the broadcast camera's picture: calibrate that camera first, or "
-    todo += "choose another format."
+    todo = "Calibrate the clip's broadcast camera and run the match again. A match with static "
+    todo += "cameras alone has other formats: worldpose export --format joints."
     views = broadcast_views(run, clip) or [require_result(run, f"{BROADCAST}{clip}", todo)]
     bodies = bodies_unit(run, clip)
     frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values

@@ -5,9 +5,10 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -23,14 +24,17 @@ from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.occlusions import visible_shares
 from worldpose.dataset import manifest as manifests
-from worldpose.dataset.statistics import data_set_statistics
+from worldpose.dataset.contents import camera_files
+from worldpose.dataset.statistics import clip_statistics, data_set_statistics, read_places
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import challenge, joints_file
-from worldpose.formats.archives import ARRAY_BYTES, read_npz, write_archive, wrong
+from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import read_yaml
 from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
+from worldpose.ingest.registration import digest_of_files
+from worldpose.store.runs import unpin_run
 from worldpose.store.store import Store
 
 ASSETS: Final = ("poses", "joints", "cameras", "boxes", "footage")
@@ -60,14 +64,24 @@ def write_data_set(
         InputError: a result, video or licence is missing, or a subject is in two splits.
     """
     tested = any(split == "test" for _, split in origins)
-    if tested != (hidden is not None) or (hidden and out.resolve() in hidden.resolve().parents):
+    public, secret = out.resolve(), (hidden or out).resolve()
+    nested = public.is_relative_to(secret) or secret.is_relative_to(public)
+    if tested != (hidden is not None) or (hidden and nested):
         todo = "Name both --test MATCH and --hidden FOLDER, a folder that you do not publish."
-        raise _refuse("--hidden", "a folder for the test part's truth, not in --out", hidden, todo)
+        expected = "a folder for the test part's truth, not in --out nor around it"
+        raise _refuse("--hidden", expected, hidden, todo)
     for place in (out, hidden or out):
         if place.exists():
             raise _refuse(f"{place}", "a new folder", "one that exists", "Choose another folder.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as workshop:
+    with (
+        ExitStack() as undo,
+        tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as workshop,
+    ):
+        # First, so that no run can be collected while its files are written.
+        for origin, _ in origins:
+            if keep_run(store, origin, name):
+                undo.callback(unpin_run, store.blobs, origin.spec.match_id, f"release-{name}")
         draft, truth = Path(workshop) / "public", Path(workshop) / "hidden"
         clips: dict[str, contracts.ReleasedSequence] = {}
         for origin, split in origins:
@@ -79,14 +93,18 @@ def write_data_set(
                 clips[label] = _write_clip(origin, clip, label, split, Path(workshop), footage)
         clips = _name_subjects(clips, subjects)
         parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
-        counted = {each: found for part in parts for each, found in count([part]).clips.items()}
+        counted = {part: count([part]) for part in parts}
+        if tested:
+            tests = counted.pop(truth).model_dump_json(indent=2)
+            (truth / "statistics.json").write_text(f"{tests}\n", encoding="utf-8")
+        told = {each: n for part in counted.values() for each, n in part.clips.items()}
         manifest = contracts.DataSetManifest(
             release=name,
             worldpose=version("worldpose"),
             pitch=all(origin.spec.pitch != NO_PITCH for origin, _ in origins),
             licences=dict(licences),
             clips=clips,
-            statistics=data_set_statistics(counted, len(_splits_of(clips))),
+            statistics=_count_public(told, clips),
             files=(),
             hidden=_listed(truth),
         )
@@ -96,16 +114,17 @@ def write_data_set(
         from worldpose.reports.data_set import data_set_page  # late: it loads matplotlib, 0.5 s
 
         checks = {part.name: check(part, pitch=manifest.pitch) for part in parts}
+        if tested:
+            checks[truth.name] = checks[truth.name].model_copy(update={"clips": {}})
         page = data_set_page(name, manifest.statistics, checks, manifest)
         (draft / "datasheet.html").write_text(page, encoding="utf-8")
         manifest = manifest.model_copy(update={"files": _listed(draft)})
         manifests.write_manifest(draft, manifest)
-        for origin, _ in origins:
-            keep_run(store, origin, name)
         if hidden is not None:
             hidden.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(truth, hidden)
         draft.replace(out)
+        undo.pop_all()
     return manifest
 
 
@@ -151,6 +170,7 @@ def _write_clip(
         clip_id=clip,
         usability=origin.run.record.usability,
         first_frame=int(tracks.frames[0]),
+        frames=len(tracks.frames),
         fps=spec.fps,
         body_model=model.name,
         subjects=tuple(f"{spec.match_id}/{named[person]}" for person in people.tolist()),
@@ -173,6 +193,9 @@ def _write_footage(origin: Origin, view: str, out: Path, form: FootageForm) -> S
         copied = out.with_name(f"{out.name}{video.suffix}")
         copied.parent.mkdir(parents=True, exist_ok=True)
         (shutil.copytree if video.is_dir() else shutil.copyfile)(video, copied)
+        if (found := digest_of_files(copied)) != digest:
+            todo = f"Register it again and run: worldpose ingest {folder}."
+            raise wrong(f"{video}", f"the registered video, {digest}", found, todo)
         source = "/".join(copied.parts[-3:])
     return StoredFile(path=source, size=sum(f.stat().st_size for f in files), sha256=digest)
 
@@ -217,11 +240,13 @@ def _name_subjects(
     return named
 
 
-def _splits_of(clips: Mapping[str, contracts.ReleasedSequence]) -> dict[str, set[str]]:
-    return {
-        subject: {clip.split for clip in clips.values() if subject in clip.subjects}
-        for subject in {subject for clip in clips.values() for subject in clip.subjects}
-    }
+def _count_public(
+    counted: Mapping[str, contracts.ClipStatistics],
+    clips: Mapping[str, contracts.ReleasedSequence],
+) -> contracts.DataSetStatistics:
+    """Return the statistics of all clips but those of the test part."""
+    public = (clip.subjects for clip in clips.values() if clip.split != "test")
+    return data_set_statistics(counted, len(set().union(*public)))
 
 
 def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckReport:
@@ -235,27 +260,19 @@ def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckR
     manifest = manifests.read_data_set(folder)
     findings = [*_file_findings(folder, hidden, manifest), *_statement_findings(manifest)]
     figures: dict[str, contracts.ClipFigures] = {}
-    for split in dict.fromkeys(clip.split for clip in manifest.clips.values()):
-        part = folder / split if split != "test" else hidden
-        if part is None:
-            continue
+    for name, clip in manifest.clips.items():
+        part = folder / clip.split if clip.split != "test" else hidden
         try:
-            report = check(part, pitch=manifest.pitch)
-            figures |= report.clips
-            for found in report.findings:
-                where = tuple(f"{split}/{place}" for place in found.where)
-                findings.append(found.model_copy(update={"where": where}))
-            for name, counted in count([part]).clips.items():
-                stated = manifest.statistics.clips.get(name)
-                if stated is None or not _equal(_numbers(stated), _numbers(counted)):
-                    findings.append(_damage("count", "statistics differ from the poses", name))
+            findings += _view_findings(folder / clip.split, part, name, clip)
+            if part is not None:
+                findings += _clip_findings(part, name, clip, manifest.statistics.clips.get(name))
+                report = check(part, pitch=manifest.pitch, only=name)
+                figures |= report.clips
+                for found in report.findings:
+                    where = tuple(f"{clip.split}/{place}" for place in found.where)
+                    findings.append(found.model_copy(update={"where": where}))
         except InputError as error:
-            findings.append(_damage("unreadable", str(error), split))
-        for name, clip in manifest.clips.items():
-            try:
-                findings += _clip_findings(part, name, clip) if clip.split == split else ()
-            except InputError as error:
-                findings.append(_damage("unreadable", str(error), f"{split}: {name}"))
+            findings.append(_damage("unreadable", str(error), f"{clip.split}: {name}"))
     return contracts.CheckReport(clips=figures, findings=tuple(findings))
 
 
@@ -288,10 +305,14 @@ def _file_findings(
             yield _damage("changed_files", f"files of {place.name} have other bytes", *changed)
     truth = []
     for path in sorted((folder / "test").rglob("*.npz")):
-        kind = path.relative_to(folder / "test").parts[0]
-        poses = challenge.read_camera_rows(path).rotation if kind == "cameras" else np.empty(0)
+        name = path.relative_to(folder).as_posix()
+        kind, poses = name.split("/")[1], np.empty(0)
+        try:
+            poses = challenge.read_camera_rows(path).rotation if kind == "cameras" else poses
+        except InputError as error:
+            yield _damage("unreadable", str(error), name)
         if np.isfinite(poses).sum() > 9 or kind not in ("cameras", "boxes", "footage"):
-            truth.append(path.relative_to(folder).as_posix())
+            truth.append(name)
     if truth:
         yield _damage("test_truth", "the public test part has truth that must be hidden", *truth)
 
@@ -302,24 +323,80 @@ def _statement_findings(manifest: contracts.DataSetManifest) -> Iterator[contrac
     for asset in ASSETS if filmed else ASSETS[:-1]:
         if not manifest.licences.get(asset, "").strip():
             yield _damage("missing_licence", "no licence of these files is stated", asset)
-    for subject, splits in _splits_of(manifest.clips).items():
-        if len(splits) > 1:
-            says = f"the subject is in {' and '.join(sorted(splits))}"
-            yield _damage("subject_in_two_splits", says, subject)
+    splits: dict[tuple[str, str], set[str]] = {}
+    for clip in manifest.clips.values():
+        for member in (("match", clip.match_id), *(("subject", each) for each in clip.subjects)):
+            splits.setdefault(member, set()).add(clip.split)
+    for (kind, one), of in splits.items():
+        if len(of) > 1:
+            says = f"the {kind} is in {' and '.join(sorted(of))}"
+            yield _damage(f"{kind}_in_two_splits", says, one)
     stated = manifest.statistics
-    whole = data_set_statistics(stated.clips, len(_splits_of(manifest.clips)))
+    whole = _count_public(stated.clips, manifest.clips)
     others = [name for name, value in whole if value != getattr(stated, name)]
-    if others or stated.clips.keys() != manifest.clips.keys():
+    public = {name for name, clip in manifest.clips.items() if clip.split != "test"}
+    if others or stated.clips.keys() != public:
         says = f"clips give other totals of {', '.join(others) or 'clips'}"
         yield _damage("count", says, manifests.DATA_SET)
 
 
-def _clip_findings(
-    part: Path, name: str, clip: contracts.ReleasedSequence
+def _view_findings(
+    public: Path, part: Path | None, name: str, clip: contracts.ReleasedSequence
 ) -> Iterator[contracts.Finding]:
-    """Yield boxes outside the image, and poses, joints and boxes that disagree."""
+    """Yield what is wrong in published views, footage, cameras and boxes.
+
+    `part` has the truth of a test part; None if it is not there.
+    """
+    if {path.stem for path in camera_files(public, name, (name,))[0]} != clip.views.keys():
+        yield _damage("views_differ", "views are not those of the cameras' files", name)
+    for path in (public / "footage").glob("*"):
+        video = clip.footage.get(view := path.name if path.is_dir() else path.stem)
+        own = view in clip.views and (video is None or video.path != "/".join(path.parts[-3:]))
+        if own or (video is not None and video.sha256 != digest_of_files(path)):
+            yield _damage("footage_differs", "path or digest is not that of the copy", view)
+    for view, size in clip.views.items():
+        where = tuple(f"{clip.split}/{kind}/{view}.npz" for kind in ("boxes", "cameras"))
+        folders = public, part or public
+        boxes = [_read_boxes(folder, view) for folder in folders]
+        low, high = np.split(boxes[0]["boxes"], 2, axis=-1)
+        if ((high <= low) | (low < -0.5) | (high > np.array(size) - 0.5)).any():
+            yield _damage("box_outside", "a box has no area or leaves the image", where[0])
+        if not all(map(_equal, *(each.values() for each in boxes))):
+            yield _damage("boxes_differ", "boxes are not the hidden ones", where[0])
+        rows = [challenge.read_camera_rows(f / "cameras" / f"{view}.npz") for f in folders]
+        # Broadcast images are whole: the principal point is near their middle.
+        if (abs(rows[0].intrinsics[:, :2, 2] / size - 0.5) > 0.125).any():
+            yield _damage("views_differ", "the image size is not that of the camera", view)
+        known = [(c.intrinsics, c.distortion, c.rotation[0], c.translation[0]) for c in rows]
+        if not all(map(_equal, *known)):
+            yield _damage("camera_differs", "the camera is not the hidden one", where[1])
+
+
+def _read_boxes(part: Path, view: str) -> dict[str, Floats]:
+    members = {
+        "boxes": Member(("frames", "persons", 4), "float"),
+        "visibility": Member(("frames", "persons"), "float"),
+    }
+    return read_archive(part / "boxes" / f"{view}.npz", members)
+
+
+def _clip_findings(
+    part: Path,
+    name: str,
+    clip: contracts.ReleasedSequence,
+    stated: contracts.ClipStatistics | None,
+) -> Iterator[contracts.Finding]:
+    """Yield statements about a clip, its poses, joints and boxes that disagree."""
     poses, model = joints_file.read_poses(part / "poses" / f"{name}.npz")
-    joints = joints_file.read_joints(part / f"{name}.joints.npz").joints
+    tracks = joints_file.read_joints(part / f"{name}.joints.npz")
+    joints, counted = tracks.joints, clip_statistics(read_places(part, name), clip.fps)
+    if stated is not None and not _equal(_numbers(stated), _numbers(counted)):
+        yield _damage("count", "statistics differ from the poses", name)
+    rate = manifests.clip_frame_rate(manifests.read_frame_rates(part), name)
+    facts = {"fps": rate, "body_model": model, "frames": len(joints)}
+    for key, found in {**facts, "first_frame": int(tracks.frames.min(initial=1 << 40))}.items():
+        if found != getattr(clip, key):
+            yield _damage("statement_differs", f"{key}: {found} in the files", name)
     mine = fold_keypoints(find_body(model or ""), COCO17)(poses).swapaxes(0, 1)
     where = f"{clip.split}/{name}.joints.npz"
     if mine.shape != joints.shape or len(clip.subjects) != joints.shape[1]:
@@ -329,12 +406,9 @@ def _clip_findings(
         yield _damage("joints_differ", "joints are not those of the poses", where)
     for view, size in clip.views.items():
         where = f"{clip.split}/boxes/{view}.npz"
-        stored: dict[str, Any] = read_npz(part / "boxes" / f"{view}.npz", ARRAY_BYTES)
-        low, high = np.split(stored.get("boxes", np.empty(0)), 2, axis=-1)
-        if ((high <= low) | (low < -0.5) | (high > np.array(size) - 0.5)).any():
-            yield _damage("box_outside", "a box has no area or leaves the image", where)
+        stored = _read_boxes(part, view)
         for key, right in project_people(part, name, view, size).items():
             # Single precision of poses is far below a hundredth of a pixel.
-            if key not in stored or not _equal(stored[key], right, 0.01):
+            if not _equal(stored[key], right, 0.01):
                 says = f"{key}: not those of the bodies in the camera, frame by frame"
                 yield _damage("boxes_differ", says, where)

@@ -50,12 +50,14 @@ def check(
     fps: float | None = None,
     body: str | None = None,
     pitch: bool = True,
+    only: str | None = None,
 ) -> CheckReport:
     """Check a data set and return faults and measurements; one clip is in memory at a time.
 
     The folder is one of `worldpose export`, or of the same layout. Without `fps` the rate is the
     one that the data set states, or 50 per second; `body` is the model of pose files that name
-    none. `pitch` says whether the ground is z = 0; a manifest can state otherwise.
+    none. `pitch` says whether the ground is z = 0; a manifest can state otherwise. `only` is the
+    clip to check; None = all.
 
     Raises:
         InputError: a file cannot be read.
@@ -75,6 +77,8 @@ def check(
     clips = tuple(rates)
     figures = {}
     for name, rate in rates.items():
+        if only not in (None, name):
+            continue
         shipped = read_clip(
             folder,
             name,

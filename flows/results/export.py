@@ -77,7 +77,7 @@ from worldpose.geometry.lens_models import LensModel
 from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
-from worldpose.store.runs import pin_run
+from worldpose.store.runs import pin_run, read_pin
 from worldpose.store.store import Store
 from worldpose.triangulation.camera_changes import move_on
 from worldpose.video.files import write_video
@@ -418,9 +418,14 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
     return written
 
 
-def keep_run(store: Store, origin: Origin, name: str) -> None:
-    """Pin the run of a release, so that its results are never garbage collected."""
+def keep_run(store: Store, origin: Origin, name: str) -> bool:
+    """Pin the run of a release, never to be garbage collected; return whether the pin is new.
+
+    Raises:
+        InputError: a pin cannot have this name, or another run of the match has it.
+    """
     record = origin.run.record
+    new = read_pin(store.blobs, record.match_id, f"release-{name}") is None
     pin = Pin(
         match_id=record.match_id,
         name=f"release-{name}",
@@ -430,6 +435,7 @@ def keep_run(store: Store, origin: Origin, name: str) -> None:
         pinned_at=datetime.now(UTC),
     )
     pin_run(store.blobs, pin)
+    return new
 
 
 def release(

@@ -177,10 +177,20 @@ def _read_people(
     for place, name in enumerate(COCO17):
         if name in source.skeleton:
             joints[rows, :, place] = source.point(name)
-    own = camera_files(folder, clip, clips)[0]
-    wanted = [each for each in own if match_in is None or each.stem.endswith(f".{match_in}")]
-    if match_in is not None and truth is None and not wanted:
-        raise wrong(f"{folder}/cameras/{clip}.{match_in}.npz", "a camera", "nothing", "Name it.")
+    wanted = own = camera_files(folder, clip, clips)[0]
+    if truth is None and match_in is not None:
+        missing = f"{folder}/cameras/{clip}.{match_in}.npz"
+        if not (wanted := [each for each in own if each.stem.endswith(f".{match_in}")]):
+            raise wrong(missing, "a camera", "nothing", "Name it.")
+    elif truth is not None and truth.camera is not None:
+        views = camera_files(truth.folder, clip, list_clips(truth.folder))[0]
+        if len(own) > 1 or len(views) > 1:
+            wanted = [each for each in own if each.stem == truth.camera.stem]
+        if own and not wanted:
+            found = ", ".join(each.name for each in own)
+            todo = "Write this camera, or name another one of the reference with --match-in."
+            missing = f"{folder}/cameras/{truth.camera.name}"
+            raise wrong(missing, "the camera of the reference's boxes", found, todo)
     plural = {}
     if poses.is_file():
         with zipfile.ZipFile(poses) as file:

@@ -54,15 +54,18 @@ def _composition(manifest: DataSetManifest) -> Section:
         said = (f"{c.match_id}, run {c.run_id}: {c.usability.verdict}" for c in own.values())
         runs = dict.fromkeys(said)
         people = {subject for clip in own.values() for subject in clip.subjects}
-        frames, poses = (sum(getattr(found[n], key) for n in own) for key in ("frames", "poses"))
-        metres = sum(sum(found[name].trajectories_m) for name in own)
-        counts = (len(own), len(people), frames, poses, metres)
+        counts = [len(own), sum(clip.frames for clip in own.values())]
+        if split != "test":
+            poses = sum(found[name].poses for name in own)
+            metres = sum(sum(found[name].trajectories_m) for name in own)
+            counts += [len(people), poses, round(metres)]
+        told = *(f"{each:,}" for each in counts), *("hidden",) * (5 - len(counts))
         models = ", ".join({clip.body_model for clip in own.values()})
-        splits.append((split, "; ".join(runs), models, *(f"{each:,.0f}" for each in counts)))
+        splits.append((split, "; ".join(runs), models, *told))
         for name, clip in own.items():
             for subject in clip.subjects:
                 clips_of.setdefault(subject, []).append(name)
-    numbers = (">clips", ">subjects", ">frames", ">poses", ">metres")
+    numbers = (">clips", ">frames", ">subjects", ">poses", ">metres")
     several = tuple((s, ", ".join(names)) for s, names in clips_of.items() if len(names) > 1)
     blocks = [Table("", ("split", "matches", "body model", *numbers), tuple(splits))]
     if several:
@@ -70,7 +73,7 @@ def _composition(manifest: DataSetManifest) -> Section:
     lead = (
         "A match belongs to one split, and so does every subject. Nameless people without an entry "
         "in the registry count once per clip. The truth of a test part is hidden: the part has "
-        "boxes, and cameras with the pose of the first frame alone."
+        "boxes, and cameras with the pose of the first frame alone. Statistics are without it."
     )
     return Section("Composition", tuple(blocks), lead)
 

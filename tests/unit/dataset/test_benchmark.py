@@ -15,7 +15,7 @@ from flows.cli.app import app
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import score_folders
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
@@ -307,3 +307,32 @@ def test_a_clip_that_a_method_lacks_is_refused(reference, tmp_path):
     (tmp_path / "mine" / "poses" / "B_2.npz").unlink()
     with pytest.raises(InputError, match=r"mine: clip B_2: expected poses/B_2\.npz"):
         score_folders(reference, {"mine": tmp_path / "mine"})
+
+
+def test_boxes_are_compared_in_the_same_view(reference, tmp_path):
+    """Each side has the cameras main and side; then the method has one of them alone."""
+    for name in ("mine", "true"):
+        cameras = shutil.copytree(reference, tmp_path / name) / "cameras"
+        shutil.copy(cameras / "A_1.npz", cameras / "A_1.side.npz")
+        (cameras / "A_1.npz").rename(cameras / "A_1.main.npz")
+        edit(cameras / "A_1.side.npz", lambda a: a.update(K=a["K"] * [[[0.7], [0.7], [1.0]]]))
+    asked = tmp_path / "true", {"mine": tmp_path / "mine"}
+    (score,), _ = score_folders(*asked)
+    assert score.clips["A_1"].g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
+    (tmp_path / "mine" / "cameras" / "A_1.main.npz").unlink()
+    with pytest.raises(InputError, match=r"mine/cameras/A_1\.main\.npz: expected the camera"):
+        score_folders(*asked)
+    (tmp_path / "true" / "cameras" / "A_1.side.npz").unlink()
+    (tmp_path / "mine" / "cameras" / "A_1.side.npz").unlink()
+    shutil.copy(tmp_path / "true/cameras/A_1.main.npz", tmp_path / "mine/cameras/A_1.npz")
+    (score,), _ = score_folders(*asked)
+    assert score.clips["A_1"].g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "option", ["--run=3", "--stage=body_fitting", "--first-frame=3", "--markers=x", "--method=a=x"]
+)
+def test_an_option_without_effect_is_refused(reference, option):
+    answer = run("--reference", reference, "--prediction", f"a={reference}", option)
+    assert isinstance(answer.exception, UsageError)
+    assert option.split("=")[0] in str(answer.exception)

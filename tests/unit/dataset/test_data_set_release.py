@@ -27,6 +27,7 @@ from worldpose.body.occlusions import visible_shares
 from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.manifest import read_data_set, released_files
 from worldpose.errors import InputError, UsageError
+from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
 
 HALF = 8
@@ -163,9 +164,14 @@ def test_a_sound_data_set_passes_and_hides_the_truth(written):
     assert np.load(written / "set" / "test" / "cameras" / "cleo-1_A.npz")["R"].shape == (1, 3, 3)
     manifest = read_data_set(written / "set")
     assert {clip.split for clip in manifest.clips.values()} == {"train", "val", "test"}
-    # Two people have two clips each; all others count once per clip.
-    assert manifest.statistics.subjects == 6 * PERSONS - 2
-    assert manifest.statistics.frames == 6 * HALF
+    # Two people have two clips each; all others count once per clip, and the test part not at all.
+    assert manifest.statistics.subjects == 4 * PERSONS - 2
+    assert manifest.statistics.frames == 4 * HALF
+    assert manifest.clips["cleo-1_A"].frames == HALF
+    stated = json.loads((written / "set" / "release.json").read_text())["statistics"]["clips"]
+    assert set(stated) == {f"{match}_{clip}" for match in ("ann-1", "bea-1") for clip in "AB"}
+    hidden = json.loads((written / "truth" / "statistics.json").read_text())
+    assert set(hidden["clips"]) == {"cleo-1_A", "cleo-1_B"}
     clip = manifest.clips["ann-1_B"]
     assert clip.first_images == {"ann-1_B": 0}
     video = clip.footage["ann-1_B"]
@@ -174,6 +180,7 @@ def test_a_sound_data_set_passes_and_hides_the_truth(written):
     page = (written / "set" / "datasheet.html").read_text()
     assert "keeper" in page and "For tests alone." in page and "data:image" in page
     assert "ann-1, run 0001: usable" in page
+    assert page.count("cleo-1_A") == 0
 
 
 def test_boxes_show_whom_the_camera_sees(written):
@@ -271,6 +278,21 @@ def count_one_more(stated):
     stated["statistics"]["poses"] += 1
 
 
+def clip(name, **changes):
+    """A fault in what release.json says of a clip."""
+    return state(lambda stated: stated["clips"][name].update(changes))
+
+
+def footage(**changes):
+    return state(lambda stated: stated["clips"][CLIP]["footage"][CLIP].update(changes))
+
+
+def unreadable_camera(folder, truth):
+    edit(folder / "test" / "cameras" / "cleo-1_A.npz", lambda arrays: arrays.pop("K"))
+    edit(folder / BOXES, put("boxes", (2, 0, 2), 2500.0))
+    seal(folder, truth)
+
+
 POSES, CAMERA, BOXES = (f"train/{kind}/{CLIP}.npz" for kind in ("poses", "cameras", "boxes"))
 JOINTS = f"train/{CLIP}.joints.npz"
 FAULTS = {
@@ -300,6 +322,34 @@ FAULTS = {
     "box outside": (files(BOXES, put("boxes", (2, 0, 2), 2500.0)), "box_outside", BOXES),
     "subject in two splits": (state(put_keeper_into_val), "subject_in_two_splits", "keeper"),
     "broken camera": (files(CAMERA, put("K", (4, 0, 0), -1.0)), "unreadable", f"train: {CLIP}"),
+    "no visibility": (files(BOXES, lambda a: a.pop("visibility")), "unreadable", f"train: {CLIP}"),
+    "no boxes": (files(BOXES, lambda a: a.pop("boxes")), "unreadable", f"train: {CLIP}"),
+    "a broken camera hides no fault": (unreadable_camera, "box_outside", BOXES),
+    "broken test camera": (unreadable_camera, "unreadable", "test/cameras/cleo-1_A.npz"),
+    "test box outside": (
+        files("test/boxes/cleo-1_A.npz", put("boxes", (2, 0, 2), 2500.0)),
+        "box_outside",
+        "test/boxes/cleo-1_A.npz",
+    ),
+    "other test box": (
+        files("test/boxes/cleo-1_A.npz", lambda a: a.update(boxes=a["boxes"] * 0.9)),
+        "boxes_differ",
+        "test/boxes/cleo-1_A.npz",
+    ),
+    "transposed test camera": (
+        files("test/cameras/cleo-1_A.npz", transpose_rotation),
+        "camera_differs",
+        "test/cameras/cleo-1_A.npz",
+    ),
+    "zeroed footage digest": (footage(sha256="0" * 64), "footage_differs", CLIP),
+    "footage nowhere": (footage(path="train/footage/none.mp4"), "footage_differs", CLIP),
+    "no views": (clip(CLIP, views={}), "views_differ", CLIP),
+    "wrong image size": (clip(CLIP, views={CLIP: [3840, 2160]}), "views_differ", CLIP),
+    "wrong frame rate": (clip(CLIP, fps=25.0), "statement_differs", CLIP),
+    "wrong first frame": (clip(CLIP, first_frame=3), "statement_differs", CLIP),
+    "wrong frames": (clip("cleo-1_A", frames=3), "statement_differs", "cleo-1_A"),
+    "wrong body model": (clip(CLIP, body_model="smpl-male"), "statement_differs", CLIP),
+    "match in two splits": (clip("bea-1_A", match_id="ann-1"), "match_in_two_splits", "ann-1"),
     "missing licence": (state(lambda s: s["licences"].pop("boxes")), "missing_licence", "boxes"),
     "wrong count": (state(count_one_more), "count", CLIP),
     "wrong total": (state(lambda s: s["statistics"].update(frames=7)), "count", "release.json"),
@@ -345,15 +395,17 @@ def test_the_command_checks_a_data_set(written, tmp_path):
         ),
         ({"subjects": "keeper: [ann-1/A/77]"}, "keeper: expected a list of MATCH/NAME"),
         ({"subjects": "[keeper]"}, "expected a list of MATCH/NAME"),
+        ({"name": "my set"}, "expected 1 to 64 letters, .* found 'release-my set'"),
     ],
 )
 def test_a_data_set_that_would_be_wrong_is_refused(origins, tmp_path, changes, told):
     if "subjects" in changes:
         changes = {"subjects": tmp_path / "subjects.yaml"} | {"text": changes["subjects"]}
         changes["subjects"].write_text(changes.pop("text"))
-    options = {"licences": LICENCES, "hidden": tmp_path / "truth"} | changes
+    options = {"licences": LICENCES, "hidden": tmp_path / "truth", "name": "second"} | changes
     with pytest.raises((InputError, UsageError), match=told):
-        write_data_set(*origins, tmp_path / "set", "first", **options)
+        write_data_set(*origins, tmp_path / "set", **options)
+    assert "release-second" not in [pin.name for pin in list_pins(origins[0].blobs, "ann-1")]
     assert not (tmp_path / "set").exists() and not (tmp_path / "truth").exists()
 
 
@@ -361,5 +413,29 @@ def test_a_folder_is_never_overwritten_and_no_truth_is_published(origins, writte
     new = written / "new"
     with pytest.raises(UsageError, match="expected a new folder"):
         write_data_set(*origins, written / "set", "first", LICENCES, hidden=new)
-    with pytest.raises(UsageError, match="not in --out"):
-        write_data_set(*origins, new, "first", LICENCES, hidden=new / "test")
+    for out, hidden in ((new, new / "test"), (new, new), (new / "set", new)):
+        with pytest.raises(UsageError, match="not in --out nor around it"):
+            write_data_set(*origins, out, "first", LICENCES, hidden=hidden)
+    assert not new.exists()
+
+
+def test_a_video_that_changed_since_its_registration_is_not_copied(origins, tmp_path):
+    store, ((origin, _), *_) = origins
+    registration = SimpleNamespace(**vars(origin.registration) | {"digest_of": lambda _: "0" * 64})
+    changed = [(Origin(origin.run, registration), "train")]
+    with pytest.raises(InputError, match="Register it again and run: worldpose ingest"):
+        write_data_set(store, changed, tmp_path / "set", "third", LICENCES, footage="copy")
+
+
+def test_the_command_names_clips_without_people(origins, tmp_path, monkeypatch):
+    store, ((origin, _), *_) = origins
+    some = {unit: found for unit, found in origin.run.items() if unit.endswith("/A")}
+    run = StubRun("ann-1", store, some)
+    monkeypatch.setattr("flows.registering.find_registration", lambda *_: origin.registration)
+    monkeypatch.setattr("flows.results.best_results.open_results", lambda *_: run)
+    (tmp_path / "TERMS.txt").write_text("For tests alone.")
+    asked = ["release", "ann-1/1", "--name=fourth", f"--project={store.url}"]
+    places = [f"--out={tmp_path}/set", f"--licence={tmp_path}/TERMS.txt"]
+    answer = CliRunner().invoke(app, [*asked, *places])
+    assert answer.exit_code == 0, answer.exception
+    assert "run 0001 of ann-1 has no people in B: not in the data set" in answer.stderr
