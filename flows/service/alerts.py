@@ -144,6 +144,7 @@ class AlertDispatcher:
     def __init__(self, state: StateFolder, channels: Sequence[Channel]) -> None:
         self.state, self.channels = state, tuple(channels)
         self._told = kept_alerts(state)
+        self._former = frozenset(self._told)
         self._held: dict[str, list[Alert]] = {}
         self._lock, self._writing = Lock(), Lock()
 
@@ -153,7 +154,8 @@ class AlertDispatcher:
             self._held[source] = list(alerts)
             today, before = f"{datetime.now(UTC):%Y-%m-%d}", self._told
             # Before the first look after a restart, nothing says that former alerts are over.
-            told: dict[str, dict[str, Any]] = {} if "" in self._held else dict(before)
+            former = frozenset[str]() if "" in self._held else self._former & before.keys()
+            told = {key: before[key] for key in former}
             for alert in (each for held in self._held.values() for each in held):
                 known = before.get(alert.key)
                 if known is None:

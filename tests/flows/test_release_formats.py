@@ -178,7 +178,9 @@ def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_
 
 def test_a_format_that_needs_the_broadcast_camera_says_so(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies())
-    with pytest.raises(WorldposeError, match=r"broadcast_calibration/A_1.*calibrate that camera"):
+    with pytest.raises(
+        WorldposeError, match=r"broadcast_calibration/A_1.*Calibrate the clip's broadcast camera"
+    ):
         write("challenge", run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
