@@ -43,7 +43,7 @@ RESULT_PAGES = {
     ),
     "people": (
         "People, joints and bodies",
-        "tracking triangulation body_fitting body_accuracy second_world",
+        "tracking triangulation body_fitting body_accuracy challenge second_world",
     ),
     "moving_cameras": (
         "Moving cameras",
