@@ -115,6 +115,9 @@ def _recover(
         is_elsewhere = not plan.owns_prefect and run.host != platform.node()
         if is_elsewhere or find_process(run.pid, run.flow_run) is not None:
             return False
+        if kind == "PAUSED":  # suspended, and killed before the queue was told
+            runs.queue.change(run, "waiting", "for review")
+            return False
         if kind == "CANCELLING":
             runs.set_state(run.flow_run, kind := "CANCELLED", KILLED)
         else:

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -16,7 +17,7 @@ from service import wait_until
 from data_contracts.operations import Heartbeat, QueuedRun
 from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
-from flows.service import run_queue, watching
+from flows.service import recovery, run_queue, watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
@@ -199,6 +200,15 @@ def test_a_frozen_run_is_ended_with_its_reason_and_restarts(queue, plan):
     assert (run.state, run.kills) == ("killed", 1)
     assert "no progress for 10 min" in run.stalled
     assert liveness.alerts == []  # the queue has it
+
+
+def test_a_run_that_was_killed_while_it_was_suspended_waits_for_its_review(
+    queue, plan, monkeypatch
+):
+    run = queue.change(queue.take(a_run()), "begun", pid=None)
+    runs = SimpleNamespace(queue=queue)
+    assert not recovery._recover(plan, runs, run, {"state_type": "PAUSED"}, timedelta(0))
+    assert queue.latest(run).state == "waiting"
 
 
 def test_a_process_with_the_number_of_a_run_is_not_taken_for_it(queue):
