@@ -27,8 +27,8 @@ from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.errors import InputError
 from worldpose.evaluation.cameras import surface_points
-from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_joints
+from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.footage import read_unit

@@ -42,8 +42,8 @@ from worldpose.detection.models import (
 )
 from worldpose.detection.pipeline import PeopleFinder, Place
 from worldpose.detection.settings import DetectionSettings
-from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import write_poses
+from worldpose.formats.release_cameras import write_moving_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.match_folder import read_match

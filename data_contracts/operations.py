@@ -76,7 +76,7 @@ class Serving(Record):
 
 
 class QueuedRun(Record):
-    """One state of a run that a served project was asked for; the one of the last number holds."""
+    """One state of a run that a served project queued; the state with the highest number holds."""
 
     contract: Literal[1] = CONTRACT_VERSION
     id: Name
@@ -85,11 +85,11 @@ class QueuedRun(Record):
     flow: str
     """Name of its deployment's flow."""
     name: str
-    """What people read."""
+    """Name that pages and Prefect show."""
     match_id: str = ""
-    """Empty for a run that is not of a match."""
+    """Empty for a run without a match."""
     parameters: dict[str, JsonValue] = {}
-    """Those that the run was asked for with, without those of its deployment."""
+    """Parameters of this run, without those of its deployment."""
     priority: Priority | None = None
     """None: that of its deployment."""
     key: str = ""

@@ -1,6 +1,8 @@
 """Records of runs of which a test states what it is about."""
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 from data_contracts.run import RunRecord
 from data_contracts.usability import Usability
@@ -18,3 +20,22 @@ def run_record(**stated):
         "usability": Usability(verdict="usable"),
     }
     return RunRecord(**(plain | stated))
+
+
+class StubRun(Mapping):
+    """Results by name, as an opened run has them."""
+
+    def __init__(self, results, store, **stated):
+        self.results, self.store = results, store
+        about = {"run_id": "0001", "match_id": "m", "state": "complete", "results": results}
+        about |= {"left_out": {}, "body_folder": None, "usability": Usability(verdict="usable")}
+        self.record = SimpleNamespace(**(about | stated))
+
+    def __getitem__(self, name):
+        return self.results[name]
+
+    def __iter__(self):
+        return iter(self.results)
+
+    def __len__(self):
+        return len(self.results)

@@ -18,15 +18,14 @@ from worldpose.formats.archives import read_npz
 from worldpose.formats.challenge import (
     ChallengeClip,
     challenge_truth,
-    read_camera,
     write_challenge,
     write_challenge_camera,
-    write_moving_camera,
     write_pitch_points,
     write_submission,
 )
 from worldpose.formats.joints_file import read_joints, read_poses
 from worldpose.formats.keypoint_files import read_keypoint_arrays
+from worldpose.formats.release_cameras import read_camera, write_moving_camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import read_pitch

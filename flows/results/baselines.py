@@ -20,8 +20,8 @@ from worldpose.evaluation.matching import EvaluationSettings
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.baselines import Method, find_method
 from worldpose.formats.baselines.result import MethodResult, resample_result
-from worldpose.formats.challenge import RELEASE_SIZE
 from worldpose.formats.joints_file import JointTracks
+from worldpose.formats.release_cameras import RELEASE_SIZE
 from worldpose.geometry.cameras import Camera
 
 

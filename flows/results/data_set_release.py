@@ -27,7 +27,7 @@ from worldpose.dataset import manifest as manifests
 from worldpose.dataset.contents import camera_files
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, read_places
 from worldpose.errors import InputError, UsageError
-from worldpose.formats import challenge, joints_file
+from worldpose.formats import challenge, joints_file, release_cameras
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import read_yaml
 from worldpose.ingest.footage import unit_frames
@@ -152,7 +152,7 @@ def _write_clip(
         label = name + view.removeprefix(clip)
         width, height = camera.image_size.reshape(-1, 2)[0].tolist()
         views[label] = width, height
-        challenge.write_moving_camera(part / "cameras" / f"{label}.npz", camera)
+        release_cameras.write_moving_camera(part / "cameras" / f"{label}.npz", camera)
         boxes = project_people(part, name, label, views[label])
         write_archive(part / "boxes" / f"{label}.npz", boxes)
         if split == "test":
@@ -207,7 +207,7 @@ def project_people(part: Path, clip: str, view: str, size: tuple[int, int]) -> d
     of joints in the image that no nearer person hides. The image has width and height `size` [px].
     """
     poses, model = joints_file.read_poses(part / "poses" / f"{clip}.npz")
-    camera = challenge.read_camera(part / "cameras" / f"{view}.npz", size)
+    camera = release_cameras.read_camera(part / "cameras" / f"{view}.npz", size)
     joints = joints_file.read_joints(part / f"{clip}.joints.npz").joints
     truth = challenge.challenge_truth(find_body(model or ""), poses, camera)
     boxes = np.full((*joints.shape[:2], 4), np.nan)
@@ -308,7 +308,7 @@ def _file_findings(
         name = path.relative_to(folder).as_posix()
         kind, poses = name.split("/")[1], np.empty(0)
         try:
-            poses = challenge.read_camera_rows(path).rotation if kind == "cameras" else poses
+            poses = release_cameras.read_camera_rows(path).rotation if kind == "cameras" else poses
         except InputError as error:
             yield _damage("unreadable", str(error), name)
         if np.isfinite(poses).sum() > 9 or kind not in ("cameras", "boxes", "footage"):
@@ -363,7 +363,7 @@ def _view_findings(
             yield _damage("box_outside", "a box has no area or leaves the image", where[0])
         if not all(map(_equal, *(each.values() for each in boxes))):
             yield _damage("boxes_differ", "boxes are not the hidden ones", where[0])
-        rows = [challenge.read_camera_rows(f / "cameras" / f"{view}.npz") for f in folders]
+        rows = [release_cameras.read_camera_rows(f / "cameras" / f"{view}.npz") for f in folders]
         # Broadcast images are whole: the principal point is near their middle.
         if (abs(rows[0].intrinsics[:, :2, 2] / size - 0.5) > 0.125).any():
             yield _damage("views_differ", "the image size is not that of the camera", view)
@@ -386,7 +386,7 @@ def _clip_findings(
     clip: contracts.ReleasedSequence,
     stated: contracts.ClipStatistics | None,
 ) -> Iterator[contracts.Finding]:
-    """Yield statements about a clip, its poses, joints and boxes that disagree."""
+    """Yield statements that disagree with the poses, joints and boxes of the clip."""
     poses, model = joints_file.read_poses(part / "poses" / f"{name}.npz")
     tracks = joints_file.read_joints(part / f"{name}.joints.npz")
     joints, counted = tracks.joints, clip_statistics(read_places(part, name), clip.fps)

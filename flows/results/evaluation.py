@@ -31,8 +31,8 @@ from worldpose.evaluation.marker_reference import (
 )
 from worldpose.evaluation.metrics import PersonScore, evaluate_joints
 from worldpose.evaluation.position_reference import align_positions
-from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import JointTracks, read_joints
+from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.pitch.template import PitchTemplate

@@ -63,13 +63,12 @@ from worldpose.formats.challenge import (
     fill_submission,
     write_challenge,
     write_challenge_camera,
-    write_moving_camera,
     write_pitch_points,
-    write_static_camera,
     write_submission,
 )
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
+from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens

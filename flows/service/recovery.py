@@ -159,7 +159,7 @@ def _start_again(runs: MatchRuns, run: QueuedRun, there: PrefectRun | None) -> N
 
 
 def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> bool:
-    """Return whether a run that is asked for cannot begin.
+    """Return whether a queued run cannot begin.
 
     A run stays in a starting state if its process was killed while the server was not reachable or
     its disk was full: it would occupy a slot of the pool forever. After the clock was set back, a
@@ -198,7 +198,7 @@ class Liveness:
         """End runs that make no progress, and the worker if it takes none.
 
         Args:
-            now: of a clock that nobody sets [s].
+            now: of the monotonic clock [s].
             wall: of the machine's clock [s].
         """
         self._held = {key: each for key, each in self._held.items() if each[1] > now}

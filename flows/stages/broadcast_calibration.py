@@ -142,7 +142,7 @@ def camera_inputs(match: Match, unit: str) -> tuple[str, ...]:
 def tracking_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the clip, its video and clock, the pitch, and whether there are monocular poses.
 
-    Boxes that state who is who are a source, too.
+    Boxes with identities are a source, too.
     """
     boxes = match.folder.boxes.get(unit)
     named = boxes is not None and boxes.suffix == IDENTIFIED

@@ -16,7 +16,7 @@ from command_line import TINY, succeed
 import worldpose
 from flows.results.export import EXPORTS
 from worldpose.formats.calibration_writer import write_calibration_toml
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

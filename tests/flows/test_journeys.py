@@ -19,7 +19,7 @@ from test_broadcast_run import remove_static_cameras
 
 import worldpose as library
 from worldpose.body.body_file import load_open_body, save_body
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 
 NEW_PROCESS = {"COLUMNS": "200"}
 """An environment of its own makes a command a new process."""

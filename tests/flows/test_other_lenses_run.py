@@ -10,8 +10,8 @@ from camera_builders import look_at_camera
 from command_line import succeed
 
 from worldpose.formats.calibration_writer import write_calibration_toml
-from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_joints
+from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.lens_models import LensModel
 
 NOISE_PX = 1.0

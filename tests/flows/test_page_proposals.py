@@ -13,7 +13,7 @@ from command_line import TINY, succeed, worldpose
 from page_client import MATCH
 
 from flows.registering import open_match
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from command_line import succeed
 
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 from worldpose.store.store import Store, open_run
 
 PEOPLE = 5

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from run_records import StubRun
 from stand_ins import empty_store
 from typer.testing import CliRunner
 
@@ -25,35 +25,11 @@ from worldpose.body.keypoints import CHALLENGE15, fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import ORIGINS
 from worldpose.errors import InputError, UsageError, WorldposeError
-from worldpose.formats.challenge import read_camera, read_challenge, read_submission
+from worldpose.formats.challenge import read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
+from worldpose.formats.release_cameras import read_camera
 
 FRAMES = np.arange(100, 104)
-
-
-class StubRun(Mapping):
-    """Results by name, as an opened run has them."""
-
-    def __init__(self, **results):
-        self.results = {name.replace("__", "/"): data for name, data in results.items()}
-        self.store = empty_store()
-        self.record = SimpleNamespace(
-            run_id="0001",
-            match_id="m",
-            state="complete",
-            results=self.results,
-            left_out={},
-            body_folder=None,
-        )
-
-    def __getitem__(self, name):
-        return self.results[name]
-
-    def __iter__(self):
-        return iter(self.results)
-
-    def __len__(self):
-        return len(self.results)
 
 
 def bodies():
@@ -118,7 +94,8 @@ def origin(folder, **results):
         ),
         clips=(ClipSpec(id="A_1", first_frame=100, frame_count=4, broadcast="main"),),
     )
-    return Origin(StubRun(**results), SimpleNamespace(spec=spec, folder=str(folder)))
+    named = {name.replace("__", "/"): data for name, data in results.items()}
+    return Origin(StubRun(named, empty_store()), SimpleNamespace(spec=spec, folder=str(folder)))
 
 
 def write(form, run, out):

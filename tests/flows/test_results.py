@@ -19,8 +19,8 @@ from flows.reports.people import body_tables
 from worldpose import open_run
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
-from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_joints, read_poses
+from worldpose.formats.release_cameras import read_camera
 from worldpose.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("server")

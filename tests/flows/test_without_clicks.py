@@ -5,7 +5,7 @@ import shutil
 import yaml
 from command_line import succeed
 
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch

@@ -16,9 +16,9 @@ from flows.run_plan import plan_run
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
-from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_poses
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.formats.release_cameras import read_camera
 from worldpose.store.store import Store
 
 STAGES = (

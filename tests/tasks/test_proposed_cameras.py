@@ -11,7 +11,7 @@ from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
 from worldpose.errors import InputError
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate

@@ -16,7 +16,7 @@ from tasks.ingest import ingest
 from tasks.static_calibration import static_calibration
 from tasks.unit import unit_task
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
-from worldpose.formats.challenge import read_camera
+from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.importing import import_lenses
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.recipes import recipe_differences

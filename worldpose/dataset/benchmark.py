@@ -21,8 +21,8 @@ from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
 from worldpose.errors import InputError
 from worldpose.evaluation import matching, metrics
 from worldpose.formats.archives import ARRAY_BYTES, read_npz, wrong
-from worldpose.formats.challenge import CameraRows, read_camera
 from worldpose.formats.joints_file import PLURALS, JointTracks
+from worldpose.formats.release_cameras import CameraRows, read_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
 

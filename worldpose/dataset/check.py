@@ -35,7 +35,7 @@ from worldpose.dataset.plausibility import (
     visibility_findings,
     world_fault,
 )
-from worldpose.formats.challenge import CameraRows
+from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.boxes import box_iou
 
 _BODIES: Final = 400

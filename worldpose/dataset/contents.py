@@ -19,14 +19,13 @@ from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError, say_failure
 from worldpose.formats.archives import wrong
 from worldpose.formats.challenge import (
-    CameraRows,
     ChallengeClip,
-    read_camera_rows,
     read_challenge,
     read_submission,
     submission_clips,
 )
 from worldpose.formats.joints_file import read_joints, read_poses
+from worldpose.formats.release_cameras import CameraRows, read_camera_rows
 from worldpose.geometry.rigid import Rigid
 
 

@@ -15,7 +15,7 @@ from data_contracts.arrays import Floats
 from data_contracts.records import Positive, Record, Share
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View, sample_evenly
-from worldpose.formats.challenge import CameraRows
+from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.cameras import Camera
 
 LATEST: Final = 3

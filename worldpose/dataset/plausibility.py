@@ -25,7 +25,7 @@ from worldpose.dataset.faults import (
     frame_faults,
     point_faults,
 )
-from worldpose.formats.challenge import CameraRows
+from worldpose.formats.release_cameras import CameraRows
 
 FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
 ANKLE = 0.09

@@ -12,8 +12,9 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import ClipStatistics, DataSetStatistics
 from worldpose.errors import InputError
-from worldpose.formats.challenge import read_camera_rows, read_submission
+from worldpose.formats.challenge import read_submission
 from worldpose.formats.joints_file import read_joints, read_poses
+from worldpose.formats.release_cameras import read_camera_rows
 
 CameraKind = Literal["S", "M", "M+Z"]
 KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")

@@ -20,8 +20,9 @@ from worldpose.body.keypoints import BODY25, CHALLENGE15
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.camera_data import COLUMNS, CameraData, write_camera_data
-from worldpose.formats.challenge import read_kit_array, read_kit_camera
+from worldpose.formats.challenge import read_kit_array
 from worldpose.formats.files import require_file
+from worldpose.formats.release_cameras import read_kit_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.pan_tilt import camera_angles
 from worldpose.ingest.match_folder import camera_data_file, given_boxes_file

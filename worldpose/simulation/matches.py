@@ -20,8 +20,8 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.body.body_file import OPEN_BODY, load_open_body
 from worldpose.body.model import BodyParameters
 from worldpose.formats.archives import write_archive
-from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import write_poses
+from worldpose.formats.release_cameras import write_moving_camera
 from worldpose.ingest.footage import write_still
 from worldpose.ingest.writing import MatchAnnotations, write_match
 from worldpose.pitch.template import PitchTemplate

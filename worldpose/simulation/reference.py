@@ -16,8 +16,8 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.archives import write_archive
 from worldpose.formats.calibration_writer import write_calibration_toml
-from worldpose.formats.challenge import write_static_camera
 from worldpose.formats.joints_file import JointTracks, write_joints
+from worldpose.formats.release_cameras import write_static_camera
 from worldpose.geometry.cameras import Camera
 
 CLIP_ID: Final = "clip"

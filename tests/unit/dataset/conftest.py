@@ -10,15 +10,10 @@ from data_contracts.conventions import COCO17
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
-from worldpose.formats.challenge import (
-    challenge_truth,
-    write_challenge,
-    write_moving_camera,
-    write_static_camera,
-    write_submission,
-)
+from worldpose.formats.challenge import challenge_truth, write_challenge, write_submission
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
+from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 

@@ -17,8 +17,8 @@ from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import score_folders
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.archives import write_archive
-from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
+from worldpose.formats.release_cameras import write_moving_camera
 
 CLIPS = ("A_1", "B_2", "C_3")
 OWN = 0.4 * np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])

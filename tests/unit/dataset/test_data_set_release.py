@@ -3,18 +3,17 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 from faulty_data_sets import FPS, PERSONS, edit, transpose_rotation
+from run_records import StubRun
 from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.usability import Usability
 from flows.cli.app import app
 from flows.results.best_results import Origin
 from flows.results.data_set_release import (
@@ -34,31 +33,6 @@ HALF = 8
 """Frames of a clip."""
 SPLITS = {"ann-1": "train", "bea-1": "val", "cleo-1": "test"}
 CLIP = "ann-1_A"
-
-
-class StubRun(Mapping):
-    """Results by name, as an opened run has them."""
-
-    def __init__(self, match, store, results):
-        self.results, self.store = results, store
-        self.record = SimpleNamespace(
-            run_id="0001",
-            match_id=match,
-            state="complete",
-            usability=Usability(verdict="usable"),
-            results=results,
-            left_out={},
-            body_folder=None,
-        )
-
-    def __getitem__(self, name):
-        return self.results[name]
-
-    def __iter__(self):
-        return iter(self.results)
-
-    def __len__(self):
-        return len(self.results)
 
 
 def results(model, poses, camera, clip, first):
@@ -132,7 +106,7 @@ def origins(model, poses, main_camera, tmp_path_factory):
             return hashlib.sha256((folder / path).read_bytes()).hexdigest()
 
         registration = SimpleNamespace(spec=spec, folder=str(folder), digest_of=digest_of)
-        run = StubRun(match, store, parts[0] | parts[1])
+        run = StubRun(parts[0] | parts[1], store, match_id=match)
         found.append((Origin(run, registration), split))
     return store, found
 
@@ -430,7 +404,7 @@ def test_a_video_that_changed_since_its_registration_is_not_copied(origins, tmp_
 def test_the_command_names_clips_without_people(origins, tmp_path, monkeypatch):
     store, ((origin, _), *_) = origins
     some = {unit: found for unit, found in origin.run.items() if unit.endswith("/A")}
-    run = StubRun("ann-1", store, some)
+    run = StubRun(some, store, match_id="ann-1")
     monkeypatch.setattr("flows.registering.find_registration", lambda *_: origin.registration)
     monkeypatch.setattr("flows.results.best_results.open_results", lambda *_: run)
     (tmp_path / "TERMS.txt").write_text("For tests alone.")

@@ -17,8 +17,9 @@ from flows.results.dataset import check, count
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import write_frame_rates
 from worldpose.dataset.statistics import clip_statistics
-from worldpose.formats.challenge import write_moving_camera, write_submission
+from worldpose.formats.challenge import write_submission
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
+from worldpose.formats.release_cameras import write_moving_camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.reports.data_set import plot_statistics
 

@@ -4,7 +4,7 @@ import pytest
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
-from worldpose.formats.challenge import read_camera, write_static_camera
+from worldpose.formats.release_cameras import read_camera, write_static_camera
 
 CALIBRATION = CameraCalibration(
     id="north",

@@ -16,7 +16,6 @@ from worldpose.formats.challenge import (
     challenge_truth,
     fill_submission,
     is_submission,
-    read_camera_rows,
     read_challenge,
     read_submission,
     submission_clips,
@@ -24,6 +23,7 @@ from worldpose.formats.challenge import (
     write_challenge_camera,
     write_submission,
 )
+from worldpose.formats.release_cameras import read_camera_rows
 from worldpose.geometry.rigid import Rigid
 
 FRAMES = 3

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_joints
+from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.match_folder import read_match
 from worldpose.simulation.foreign import rigs as foreign_rigs
 from worldpose.simulation.foreign.detectors import PROFILES

@@ -12,8 +12,8 @@ from flows.cli.app import app
 from flows.results.baselines import score_methods, table_csv, table_latex, table_rows
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.baselines import METHODS
-from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import write_joints
+from worldpose.formats.release_cameras import write_moving_camera
 
 LOCAL, ALONE = ("hybrik", "4dhumans"), ("wham", "gvhmr")
 NOT_SEEN = "smpl"

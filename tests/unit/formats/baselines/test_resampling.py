@@ -8,8 +8,8 @@ from flows.cli.evaluate import named_rates
 from flows.results.baselines import score_methods
 from worldpose.body.model import BodyParameters
 from worldpose.errors import UsageError
-from worldpose.formats.challenge import write_moving_camera
 from worldpose.formats.joints_file import write_joints
+from worldpose.formats.release_cameras import write_moving_camera
 
 
 def test_a_file_of_every_second_picture_scores_as_one_of_all(tmp_path):
