@@ -147,8 +147,8 @@ def joint_tracks(
     """
     stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
     on_plane = f"{PLANE}/{clip}" in run
-    if stage is None and not stages and not on_plane and (views := broadcast_views(run, clip)):
-        frames = run[broadcast_unit(run, views[0])]["frame"].values
+    if stage is None and not stages and not on_plane and (moving := broadcast_views(run, clip)):
+        frames = run[broadcast_unit(run, moving[0])]["frame"].values
         return JointTracks(frames, np.zeros(0, np.int64), np.zeros((len(frames), 0, 17, 3)))
     if stage is None and on_plane and not (stages and run[f"{stages[0]}/{clip}"].sizes["person"]):
         tracked = run[f"{PLANE}/{clip}"]
