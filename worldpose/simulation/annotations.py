@@ -172,7 +172,7 @@ def _make_mistake(
     taken = list(clicked)
     victim = taken[rng.integers(len(taken))]
     others = [name for name in _confusable_names(victim) if name in names and name not in clicked]
-    angle, far = 2.0 * np.pi * rng.random(), rng.uniform(*settings.wrong_distance_px)
+    angle, far = 2.0 * np.pi * rng.random(), rng.uniform(20.0, 60.0)
     if rng.random() < 0.5 and others:
         named = others[rng.integers(len(others))]
         return {named if name == victim else name: xy for name, xy in clicked.items()}, {
@@ -209,7 +209,7 @@ def _draw_markings(
         if len(seen) < 2 or np.ptp(seen, axis=0).max() < SHORT:
             continue
         # Clicks are at about even steps, wherever a sample is near.
-        steps = np.linspace(0.0, len(seen) - 1.0, settings.drawn_points).round().astype(int)
+        steps = np.linspace(0.0, len(seen) - 1.0, 8).round().astype(int)
         points = seen[np.unique(steps)]
         points = points + settings.noise_px * rng.standard_normal(points.shape)
         drawn.append(DrawnMarking(name=name, xy=tuple(_place_click(camera, xy) for xy in points)))
