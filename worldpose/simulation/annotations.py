@@ -62,14 +62,8 @@ def click(
 ) -> Clicks:
     """Return a person's clicks on named points, and lines if points are few.
 
-    Args:
-        camera: the true one.
-        pitch: the painted pitch.
-        people: joints (persons, 17, 3) [m], world, of possible occluders.
-        settings: number and accuracy of clicks.
-        clustered: all points come from one part of the image.
-        mistaken: one point has a wrong name or a gross error, each in every second such camera.
-        rng: this camera's own.
+    `people` are joints (persons, 17, 3) [m], world, of possible occluders. All points come from one
+    part of the image if `clustered`; one has a wrong name or a gross error if `mistaken`.
     """
     names = list(pitch.points)
     places = pitch.positions(names)
@@ -236,13 +230,8 @@ def click_key_frames(
 ) -> KeyFrames:
     """Return clicks in frames spread over the clip, each at a local maximum of clickable markings.
 
-    Args:
-        cameras: the true ones, a batch (frames,).
-        pitch: the painted pitch.
-        people: joints (frames, persons, 17, 3) [m], world, of possible occluders.
-        settings: accuracy; lines and arcs are always drawn.
-        count: number of key frames.
-        rng: random generator of the clicks.
+    `cameras` is a batch (frames,), `people` are joints (frames, persons, 17, 3) [m], world, of
+    possible occluders. Lines and arcs are always drawn.
     """
     # Search range for a key frame around its even place, as a share of the clip's length [1].
     search_range = 0.1
@@ -281,10 +270,7 @@ def _information(clicks: Clicks) -> int:
 def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchSpec:
     """Return the pitch with all its points as measured, to a millimetre.
 
-    Args:
-        painted: the true pitch.
-        error: error of a point, standard deviation along each axis [m].
-        rng: the surveyor's own.
+    `error` is the standard deviation of a point along each axis [m].
     """
     points = {}
     for name, place in PitchTemplate.from_spec(painted).points.items():
@@ -296,13 +282,7 @@ def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchS
 def add_calibration_errors(
     cameras: dict[str, Camera], errors: CalibrationErrors, rng: np.random.Generator
 ) -> dict[str, Camera]:
-    """Return the true cameras with the errors of the settings.
-
-    Args:
-        cameras: the true ones by id.
-        errors: spreads; all zero returns the true cameras.
-        rng: draws the errors, and which cameras are bad.
-    """
+    """Return the true cameras with the errors of the settings."""
     if errors == CalibrationErrors():
         return cameras
     bad = rng.permutation(len(cameras))[: errors.bad_cameras]

@@ -42,12 +42,8 @@ def walk(
     Feet point (frames, 2) [rad], left and right, from the x axis towards y, along the path at the
     time of their placement.
 
-    Args:
-        body: measures.
-        path: covers `times` and a stride before and after.
-        times: (frames,) [s].
-        ground: height of the ground under the feet.
-        rng: draws the stride phase at the start of the path and the turns of the head.
+    The path covers `times` (frames,) [s] and a stride before and after. `rng` draws the stride
+    phase at the start of the path and the turns of the head.
     """
     cycle = stride_cycle(path, rng.random())
     swing = 2.0 * np.pi * np.interp(times, path.time, cycle)
@@ -99,9 +95,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
     Sources are in docs/explanation/simulation.md.
     A standing person rests a quarter of the way between the two, with both feet on the ground.
 
-    Args:
-        path: one person's path.
-        phase: stride at the start of the path [1], for a person who never stands.
+    `phase` is the stride at the start of the path [1], for a person who never stands.
     """
     # Turning by 1 rad/s needs as many steps as walking at this many metres per second [m]; a
     # turn of less than half of that uses the hips alone.
@@ -242,13 +236,9 @@ def gather(
 ) -> Crowd:
     """Return the people of a scenario.
 
-    Args:
-        scenario: people, place and duration.
-        pitch: the ground under them.
-        seed: every person draws from a separate stream; the paths of those who wander, too.
-        driven: paths from tracking data, one per person.
-        clip: motion capture that the third person plays, the first who is no goalkeeper, or the
-            last of fewer.
+    Every person draws from a separate stream; the paths of those who wander, too. `driven` are
+    paths from tracking data, one per person. The third person plays `clip`, the first who is no
+    goalkeeper, or the last of fewer.
     """
     settings, duration = scenario.crowd, scenario.duration
     person_seeds = seed.spawn(settings.people if driven is None else len(driven))

@@ -59,12 +59,9 @@ def project_bodies(
 ) -> Projections:
     """Return the exact pixels of bodies, and the occlusions of joints by nearer bodies.
 
-    Args:
-        camera: a single camera, or one for every frame.
-        joints: (frames, persons, 17, 3) [m], world; NaN where absent.
-        heights: (persons,) [m].
-        bias: (frames, persons, 17, 3) [m], world, from a joint to the detector's joint; None =
-            zero.
+    `joints` (frames, persons, 17, 3) [m], world, are NaN where absent; `heights` (persons,) [m];
+    `bias` [m], world, leads from each joint to the detector's; None = zero. The camera is single,
+    or a batch (frames,).
     """
     frames, persons = joints.shape[:2]
 
@@ -340,13 +337,8 @@ def estimate_bodies(
     [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. The order of a frame's rows does not
     identify persons.
 
-    Args:
-        model: the bodies' model.
-        bodies: (frames, persons), world; NaN where missing.
-        camera: batch (frames,).
-        fps: [1/s].
-        errors: errors of the method.
-        rng: draws the same numbers for any people in the image.
+    `bodies` (frames, persons) are in the world, NaN where missing; `camera` is a batch (frames,).
+    `rng` draws the same numbers for any people in the image.
     """
     frames, persons = bodies.batch_shape
     given = np.concatenate([bodies.global_orient, bodies.body_pose], axis=-1)

@@ -106,10 +106,8 @@ def shape_people(mannequin: Mannequin, betas: Floats) -> Singles:
 def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) -> Surfaces:
     """Return posed surfaces.
 
-    Args:
-        mannequin: common model of the people.
-        shaped: (persons, vertices, 3) vertices of `shape_people`.
-        poses: poses of the same people, a batch (persons,); NaN = missing.
+    `shaped` (persons, vertices, 3) are of `shape_people`; `poses` are a batch (persons,), NaN =
+    missing.
     """
     posed = mannequin.body.articulate(poses)
     motions = np.concatenate(
@@ -273,10 +271,7 @@ def _jitter_color(color: Floats, rng: np.random.Generator) -> Floats:
 def paint_person(kit: Kit, number: int | None, rng: np.random.Generator) -> Image:
     """Return the textures (2, SIZE, SIZE, 3) of one person's front and back, in the T-pose.
 
-    Args:
-        kit: the person's clothes.
-        number: on shirt and shorts.
-        rng: draws skin, hair, boots and the folds of the cloth.
+    `rng` draws skin, hair, boots and the folds of the cloth.
     """
     x = LEFT + TEXEL * (np.arange(SIZE) + 0.5)
     y = TOP - TEXEL * (np.arange(SIZE) + 0.5)
@@ -413,11 +408,7 @@ def dress_people(
 ) -> Cast:
     """Return a cast; a person's looks depend on the seed and the person's number alone.
 
-    Args:
-        betas: (persons, 10) betas of the open body.
-        roles: role of each person.
-        seed: draws kits and looks.
-        patterns: shirt patterns to draw from.
+    `betas` (persons, 10) are of the open body.
     """
     mannequin = open_mannequin()
     kits = draw_kits(np.random.default_rng([seed, 5]), patterns)

@@ -191,12 +191,8 @@ def simulate_match(
 
     docs/explanation/simulation.md describes the files.
 
-    Args:
-        scenario: the scenario to simulate.
-        seed: seed from 0.
-        out: absent or an empty folder; the write is atomic.
-        options: changes of the scenario, and which files to write; the defaults if None.
-        advance: receives the filming's progress.
+    `out` is absent or an empty folder; the write is atomic. `advance` receives the filming's
+    progress.
 
     Returns:
         The match's match.yaml. Its id names scenario, seed and overrides of the scenario.

@@ -49,14 +49,10 @@ def list_detections(
 ) -> Report:
     """Return the detections of bodies, in shuffled order.
 
-    Args:
-        keypoints: (frames, bodies, 17, 2) [px].
-        confidence: (frames, bodies, 17); NaN where not found.
-        displaced: (frames, bodies, 17), joints with gross errors.
-        whose: (bodies,) the person of each body, -1 for none.
-        box: returns boxes (frames, detections, 4) [px] for the order (frames, detections) of the
-            bodies, their keypoints, and which are found.
-        rng: shuffles every frame independently.
+    Of the bodies: `keypoints` (frames, bodies, 17, 2) [px], `confidence` (frames, bodies, 17), NaN
+    where not found, `displaced` alike, gross errors, and `whose` (bodies,), their persons, -1 for
+    none. `box` returns boxes (frames, detections, 4) [px] for the order (frames, detections) of the
+    bodies, their keypoints, and which are found.
     """
     found: Flags = np.asarray(np.isfinite(confidence).any(axis=-1))
     order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
@@ -91,14 +87,8 @@ def write_reference(
 ) -> None:
     """Write the ground truth of a match.
 
-    Args:
-        folder: reference/ of the match.
-        truth: the joints.
-        defined: the same joints where the detector takes them to be; None without detections.
-        cameras: the true static cameras.
-        reports: detections by camera or clip.
-        records: content of JSON files by name.
-        pitch: the painted pitch, if there is one.
+    `defined` are the joints where the detector takes them to be; None without detections. `reports`
+    are by camera or clip, `records` the content of JSON files by name.
     """
     write_joints(folder / "joints.npz", truth)
     if defined is not None:

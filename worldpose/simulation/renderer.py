@@ -54,11 +54,8 @@ def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floa
     A vertex casts no shadow beyond the boards, or where the stand's shadow already covers the
     grass; the stand does not block light that comes straight down.
 
-    Args:
-        venue: the stadium.
-        camera: a single camera.
-        vertices: (persons, vertices, 3) [m], world.
-        light: (4,) direction down from the light, z = -1, and its share of all light.
+    `vertices` (persons, vertices, 3) [m], world; `light` is (4,) direction down from it, z = -1,
+    and its share of all light.
     """
     bend, way = venue.bend.astype(np.float32), light[:2].astype(np.float32)
     height = np.maximum(vertices[..., 2] + vertices[..., :2] ** 2 @ bend, np.float32(0.0))
@@ -83,12 +80,8 @@ def shade_ground(
 ) -> None:
     """Darken the grass in shadows.
 
-    Args:
-        venue: the stadium and its lights.
-        camera: a single camera.
-        image: (height, width, 3), changed in place.
-        things: faces (triangles, 3) and vertices (things, vertices, 3) [m], world, of objects that
-            cast shadows.
+    `things` are faces (triangles, 3) and vertices (things, vertices, 3) [m], world, of what casts
+    shadows; the image (height, width, 3) is changed in place.
     """
     soft = 0.9  # standard deviation of a shadow's rim [px]: some centimetres
     height, width = image.shape[:2]
@@ -157,13 +150,8 @@ def expose(
 ) -> RenderedFrame:
     """Return the image of people before a scene.
 
-    Args:
-        venue: the stadium.
-        camera: a single camera.
-        scene: (height, width, 3) the scene without them, before the lens; changed in place.
-        grain: grain of `sensor_grain`.
-        moment: the people.
-        frame: seeds the noise of this image.
+    `scene` (height, width, 3) is without them, before the lens; it is changed in place. `grain` is
+    of `sensor_grain`; the frame seeds its place.
     """
     height, width = scene.shape[:2]
     cast, goals = moment.cast, venue.goals
@@ -260,8 +248,7 @@ def _haze_before(venue: Venue, outline: Singles) -> Singles:
 def cluster_boxes(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
     """Return image regions that share no pixel, each with the indices of the things in it.
 
-    Args:
-        spans: left, top, right, bottom of each thing; None for a thing outside the image.
+    Spans are left, top, right, bottom of each thing; None for a thing outside the image.
     """
     parts: list[tuple[Box, list[int]]] = []
     for number, span in enumerate(spans):
@@ -315,11 +302,7 @@ def open_view(
 ) -> View:
     """Return a static camera's view of a stadium, about a second for 1920 x 1080.
 
-    Args:
-        camera: a single camera.
-        pitch: the painted pitch; the surface follows its crown.
-        seed: seed of the stadium's look, the same for all its cameras, and of the sensor's noise.
-        settings: the defaults if None.
+    The seed is that of the stadium's look, the same for all its cameras, and of the sensor's noise.
     """
     venue = build_venue(pitch, seed, settings or RenderingSettings())
     return View(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
@@ -335,12 +318,7 @@ def render_frame(
 ) -> RenderedFrame:
     """Return one image of people; the same arguments give the same bytes.
 
-    Args:
-        view: a static camera.
-        cast: the people.
-        opened: their surfaces when the shutter opens.
-        closed: their surfaces when it closes; None = no motion.
-        frame: index of the image, which seeds its noise.
+    `closed` are the surfaces when the shutter closes; None = no motion. The frame seeds the noise.
     """
     moment = Moment(cast, opened, closed or opened)
     return expose(view.venue, view.camera, view.scene.copy(), view.grain, moment, frame)
@@ -357,12 +335,8 @@ def render_pitch(
 
     Painted lines are `LINE_WIDTH` wide with the template's lines in their middle.
 
-    Args:
-        camera: a single camera.
-        pitch: the painted pitch.
-        people: bodies (persons,), world; None = no people.
-        seed: seed of the stadium's look, kits and noise.
-        settings: the defaults if None.
+    `people` are bodies (persons,), world; None = nobody. The seed is that of the stadium's look,
+    kits and noise.
 
     Raises:
         InputError: a batch of cameras.
@@ -417,10 +391,6 @@ class Panorama:
 def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
     """Return a turning camera's panorama of pitch, boards and stands.
 
-    Args:
-        cameras: a batch (frames,) with one center.
-        venue: the stadium.
-
     Raises:
         InputError: the cameras have different centers.
     """
@@ -462,10 +432,7 @@ def film_broadcast(
 ) -> Iterator[RenderedFrame]:
     """Yield a clip's frames, like `render_frame`.
 
-    Args:
-        cameras: a batch (frames,) with one center.
-        venue: the stadium.
-        moments: people in every frame.
+    `cameras` is a batch (frames,) with one center; `moments` are the people in every frame.
 
     Raises:
         InputError: the cameras have different centers.

@@ -43,12 +43,7 @@ def place_camera(
     principal point a few pixels off the centre and the mild barrel distortion (k1, k2) of a stadium
     lens (C5).
 
-    Args:
-        rig: seats, distances, heights and image size.
-        index: number from 0.
-        target: (3,) [m], world; aim of the ring.
-        pitch: off which the ring's cameras stand.
-        rng: this camera's own.
+    `target` (3,) [m], world, is the aim of the ring.
     """
     if index < len(rig.seats):
         seat = rig.seats[index]
@@ -121,13 +116,9 @@ def move_broadcast_camera(
     the zoom varies between wide and close. Radial distortion grows with the focal length, as in the
     released clips: k1 0.1 to 1, k2 0.6 to 4.3.
 
-    Args:
-        settings: place, zoom and operator.
-        times: (frames,) [s], of the camera's own images.
-        action: (samples, 2) [m], world; place of the action.
-        action_times: (samples,) [s], from `WARM_UP` before the first frame to the last.
-        image_size: width, height [px].
-        rng: the camera's and the operator's own.
+    `times` (frames,) [s] are those of the camera's own images. `action` (samples, 2) [m], world, is
+    the place of the action at `action_times` (samples,) [s], from `WARM_UP` before the first frame
+    to the last.
     """
     center = np.array(
         [
@@ -291,11 +282,7 @@ def simulate_scene(
     Every person and every camera draws from a separate stream: an additional camera changes no
     existing number, and an additional person no motion of those who wander.
 
-    Args:
-        scenario: everything but the seed.
-        seed: seed from 0.
-        driven: paths of the people, instead of the scenario's movement.
-        clip: motion capture for one of them.
+    People are `driven` along paths, instead of the scenario's movement; one of them plays `clip`.
     """
     people_seed, rig_seed, systematic_seed, broadcast_seed, error_seed, survey_seed, click_seed = (
         Seed(seed).spawn(7)

@@ -197,10 +197,7 @@ def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detecto
 def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floats:
     """Return the joints as the detector defines them (frames, persons, 17, 3) [m], world.
 
-    Args:
-        joints: anatomical ones (frames, persons, 17, 3) [m], world.
-        detector: definitions.
-        personal: (persons, 17, 3) each person's own offsets, in units of the profile's.
+    `personal` (persons, 17, 3) are each person's own offsets, in units of the profile's.
     """
     _, left = facing_axes(joints)
     along = joints - joints[:, :, _PARENT]
@@ -229,14 +226,8 @@ def detect_people(
 ) -> Report:
     """Return the detections in a camera's images.
 
-    Args:
-        detector: detector of the match.
-        view: people in the camera's images.
-        defined: pixels (frames, persons, 17, 2) of the joints as the detector defines them [px].
-        image_size: width and height [px].
-        fps: [1/s].
-        lost: share of frames that the camera lost [1].
-        rng: this camera's own.
+    `defined` (frames, persons, 17, 2) are pixels of the joints as the detector defines them, `lost`
+    is the share of frames that the camera lost.
     """
     profile = detector.profile
     frames, persons = view.size.shape

@@ -131,14 +131,9 @@ def walk_posture(
 ) -> Posture:
     """Return the posture of a person who walks or runs along a trajectory.
 
-    Args:
-        times: (frames,) [s], evenly spaced.
-        root: (frames, 2) middle of the hips in plan [m], world.
-        heading: (frames,) direction that the body faces [rad].
-        leg: its length [m].
-        manner: the person's style.
-        gestures: the person's gestures.
-        rng: draws the first step and the gaze.
+    `times` (frames,) [s] are evenly spaced, `root` (frames, 2) [m] is the middle of the hips in
+    plan, world, `heading` (frames,) [rad] the direction that the body faces. `rng` draws the first
+    step and the gaze.
     """
     still = 0.05  # A slower person keeps both feet down [m/s]
     # Maximum distance of the hips past a resting ankle; then the heel rises [share of the

@@ -118,14 +118,8 @@ def simulate_foreign_scene(
 ) -> ForeignScene:
     """Return a match of the second simulator; the same arguments give the same numbers.
 
-    Args:
-        scenario: ranges.
-        seed: seed from 0.
-        duration: [s], instead of the scenario's.
-        cameras: number of them, instead of the scenario's.
-        people: number of them, instead of the scenario's.
-        recordings: motion capture and tracking data to replay; None = all motion is computed.
-        calibrated: return the exact cameras.
+    `duration` [s], `cameras` and `people` take the place of the scenario's; `calibrated` returns
+    the exact cameras. Without recordings, all motion is computed.
     """
     streams = np.random.SeedSequence([seed, *scenario.name.encode()]).spawn(6)
     rng = np.random.default_rng(streams[0])
@@ -366,15 +360,8 @@ def simulate_foreign_match(
 
     docs/explanation/simulation.md describes the files.
 
-    Args:
-        scenario: ranges.
-        seed: seed from 0.
-        out: absent or an empty folder; the write is atomic.
-        duration: [s], instead of the scenario's.
-        cameras: number of them, instead of the scenario's.
-        people: number of them, instead of the scenario's.
-        recordings: folder with npz files of motion capture and tracking data (`read_recordings`).
-        calibrated: write the exact cameras.
+    `out` is absent or an empty folder; the write is atomic. `recordings` is as for
+    `read_recordings`, other options as for `simulate_foreign_scene`.
 
     Returns:
         The match's match.yaml.
