@@ -43,13 +43,8 @@ def compare_times(
 ) -> Table:
     """Return the best times of all sides, which run in turns, and their ratios to the first side.
 
-    Args:
-        title: of the table.
-        sides: calls by name; the first one is ours.
-        rounds: number of measured rounds.
-        columns: names of the further columns.
-        more: returns the values of the further columns.
-        scale: what a side's time is multiplied by, if it did a part of the work.
+    `more` returns the values of the further columns by side; a side that did a part of the work has
+    its time multiplied by `scale`.
     """
     best = best_seconds(sides, rounds)
     best = {name: seconds * (scale or {}).get(name, 1.0) for name, seconds in best.items()}
@@ -155,9 +150,7 @@ def best_seconds(sides: Mapping[str, Callable[[], object]], rounds: int) -> dict
 def run_worldpose(*words: object, accepted: Collection[int] = (0,)) -> str:
     """Run the command line quietly and return its output; end the program if it fails.
 
-    Args:
-        words: arguments.
-        accepted: exit codes that are no failure.
+    Exit codes `accepted` are no failure.
     """
     done = subprocess.run(
         [WORLDPOSE, *map(str, words)], capture_output=True, text=True, check=False

@@ -67,12 +67,6 @@ def region_counts(
     `level` for normal errors: d^T C^-1 d is below the quantile of the chi-square distribution with
     three degrees of freedom. People are matched per frame as for the other metrics.
 
-    Args:
-        prediction: estimated joints with covariance.
-        reference: true joints; with `views`, only joints seen by enough cameras count.
-        level: stated probability, above 0 and below 1.
-        settings: gate and views; the defaults if None.
-
     Raises:
         InputError: the prediction has no covariance.
     """

@@ -150,9 +150,7 @@ def soccernet_markings(
 ) -> ClickedMarkings:
     """Return one image's annotation as drawn markings, without unknown names.
 
-    Args:
-        lines: points along each marking as shares of the image's width and height [1].
-        image_size: width, height [px].
+    Points along each marking are shares of the image's width and height.
     """
     width, height = image_size
     drawn = []

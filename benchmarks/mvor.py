@@ -176,10 +176,8 @@ def judge_result(
 ) -> tuple[str, int | None]:
     """Return whether a result is "real", "false" or "unknown", and the identity of its person.
 
-    Args:
-        names: identities of its detections.
-        elsewhere: the identities of all boxes in these detections' views.
-        taken: identities of people that other results show.
+    `names` are identities of its detections, `elsewhere` those of all boxes in their views, `taken`
+    those of people that other results show.
     """
     known = Counter(name for name in names if name >= 0)
     if not known:

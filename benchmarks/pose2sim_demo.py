@@ -163,10 +163,8 @@ def score(
 ) -> tuple[float, ...]:
     """Return metrics of one person.
 
-    Args:
-        joints: (frames, 17, 3) [m].
-        cameras: batch (cameras,).
-        seen: (frames, cameras, people, 17, 3) x, y [px] and confidence of the 2D poses.
+    `joints` (frames, 17, 3) [m]; `seen` (frames, cameras, people, 17, 3) are x, y [px] and
+    confidence of the 2D poses.
 
     Returns:
         Median and 90th percentile of the distance to the person's 2D poses [px], missing joints

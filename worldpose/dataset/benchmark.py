@@ -81,12 +81,8 @@ def score_folders(
     Tracks are matched by boxes in the reference's camera. A prediction's boxes are those of
     `boxes/<clip>.npz`, or of its joints in its own camera, or in that of the reference.
 
-    Args:
-        reference: true clips.
-        predictions: folder of each method, by title; further clips do not count.
-        body: body model of pose files that name none.
-        match_in: broadcast camera of clips with several; None = the first.
-        fps: frames per second [1/s]; None = what the reference states.
+    `body` is the model of pose files that name none, `match_in` the broadcast camera of clips with
+    several, by default the first, `fps` [1/s] by default what the reference states.
 
     Raises:
         InputError: a clip is missing, has other frames, or its camera has another convention; the

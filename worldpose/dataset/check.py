@@ -143,10 +143,8 @@ def _overlap(boxes: Floats, skel_2d: Floats) -> float:
 def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
     """Return the median 2D residual [px] of bodies after optimal translation.
 
-    Args:
-        bodies: (n, points, 3) [m], camera axes.
-        plane: (n, points, 2), the undistorted 2D at depth 1.
-        focal: (n, 2) [px].
+    `bodies` (n, points, 3) [m] are in camera axes, `plane` (n, points, 2) the undistorted 2D at
+    depth 1, `focal` (n, 2) [px].
     """
     # x (Z + tz) = X + tx, and the same for y: linear in the translation.
     ones, zeros = np.ones_like(plane[..., 0]), np.zeros_like(plane[..., 0])

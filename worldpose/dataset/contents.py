@@ -119,9 +119,8 @@ def implausible(fault: str, says: str, *where: str, **figures: float) -> Finding
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:
     """Return a mask of missing persons and frames of a file, and findings on it.
 
-    Args:
-        name: the file.
-        arrays: (rows, columns, ...), which must be missing together.
+    The arrays (rows, columns, ...) of a file must be missing together. A row is missing if it is so
+    in any array, or zero in all.
 
     Returns:
         (rows, columns) bool, missing in any array or zero in all; and findings.

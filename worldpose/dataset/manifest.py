@@ -162,9 +162,7 @@ def origins_of(
 
     A joint without a contributing camera was filled in, from motion or from the rest of the body.
 
-    Args:
-        tracks: joints with their views; unknown views count as seen.
-        corrected: (frames, persons, 17), set or confirmed by a person.
+    A person set or confirmed `corrected` (frames, persons, 17). Unknown views count as seen.
     """
     origin = np.full(tracks.joints.shape[:3], ORIGINS.index("automatic"), dtype=np.uint8)
     if tracks.views is not None:

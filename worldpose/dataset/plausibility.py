@@ -225,10 +225,8 @@ FAR: Final = 500.0
 def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
     """Return the share of people that a camera shows upright and at a person's size.
 
-    Args:
-        source: names of the points.
-        points: (frames, persons, points, 3) [m], world.
-        rows: the camera; with an implausible or varying position its share is zero.
+    `points` (frames, persons, points, 3) [m] are in the world. A camera with an implausible or
+    varying position has the share zero.
     """
     people = 4000  # maximum number of sampled bodies
     # Distance of a camera's centre from its median beyond which its pose is invalid [m].

@@ -61,11 +61,8 @@ def evaluate_cameras(
 ) -> tuple[CameraEvaluation | None, tuple[CameraScore, ...]]:
     """Return errors of all static and all broadcast cameras, and of each camera.
 
-    Args:
-        estimated: single cameras or batches (frames,), by camera or clip id.
-        true: single cameras or batches (frames,); the function skips ids that only one side has.
-        pitch: the surface; without one there are neither ground nor reprojection errors.
-        settings: the defaults if None.
+    Cameras are single or batches (frames,), by id; ids that only one side has are skipped. Without
+    a pitch there are neither ground nor reprojection errors.
 
     Raises:
         InputError: an estimated and a true camera have different numbers of frames.
@@ -145,9 +142,7 @@ def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
 
     NaN if a ray is missing or passes above the horizon.
 
-    Args:
-        rays: (...) rays.
-        pitch: the surface, extended beyond the touch lines.
+    The surface extends beyond the touch lines.
     """
     newton_steps = 8  # each step squares the error; the surface is within 0.2 m of the start plane
     origins, directions = rays.origins, rays.directions

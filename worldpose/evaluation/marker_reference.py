@@ -232,11 +232,8 @@ def align_reference(
     offset, then a refinement with fixed matches. The motion is rigid: a wrong size of the
     prediction remains an error.
 
-    Args:
-        prediction: estimated joints.
-        joints: (samples, persons, 17, 3) [m] in the reference's world; NaN where missing.
-        rate: samples per second [1/s].
-        fps: match frames per second [1/s].
+    `joints` (samples, persons, 17, 3) [m] are in the reference's world, NaN where missing, at
+    `rate` samples per second [1/s].
 
     Raises:
         DegenerateError: prediction and reference match at no offset.

@@ -73,11 +73,8 @@ def identity_scores(
 ) -> IdentityScores:
     """Return the identity scores of predicted tracks against true people.
 
-    Args:
-        distances: (frames, true persons, predicted persons) [m]; infinite where either is absent.
-        true_exists: (frames, true persons).
-        predicted_exists: (frames, predicted persons).
-        gate: maximum distance between matched persons [m].
+    `distances` (frames, true, predicted persons) [m] are infinite where either is absent; `gate`
+    [m] is the maximum of a match.
 
     Note:
         IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations: Bernardin and Stiefelhagen,
@@ -263,9 +260,8 @@ def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray
     identity switch it is wrong, however near another person is. The function merges tracks of one
     true person; if several exist in one frame, it takes the one of least cost.
 
-    Args:
-        pairs: (frames, true persons) matches per frame, -1 for none.
-        cost: (frames, true persons, predicted persons); infinite where either does not exist.
+    `pairs` (frames, true persons) are matches per frame, -1 for none; `cost` (frames, true,
+    predicted persons) is infinite where either does not exist.
 
     Note:
         E3.
@@ -309,10 +305,8 @@ def register_world(
     candidate with the least sum of distances from true to predicted people, each clipped at the
     gate, wins; a fit to all its matches refines it.
 
-    Args:
-        predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
-        true: (frames, true persons, joints, 3) [m]; NaN where missing.
-        gate: maximum distance between matched persons after the motion [m].
+    Both are (frames, persons, joints, 3) [m], NaN where missing; `gate` [m] is the maximum distance
+    of matched people after the motion.
     """
     rounds = 3  # iterations of matching and alignment, enough to converge
     shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
@@ -401,14 +395,10 @@ def match_tracks(
 ) -> NDArray[np.int64]:
     """Return the predicted person of each true one (frames, true), by whole tracks (E3).
 
-    Args:
-        people: (frames, predicted persons, 17, 3) [m]; NaN where missing.
-        true: (frames, true persons, 17, 3) [m]; NaN where missing.
-        distances: (frames, true persons, predicted persons) [m] of all pairs.
-        match: (frames, true persons), matches by these distances.
-        camera: compares boxes in its image; None = match by distance.
-        boxes: (frames, predicted persons, 4) [px] of the prediction there; None = of its joints.
-        settings: minimum overlap, gate, and threshold for registration.
+    `people` and `true` are (frames, persons, 17, 3) [m], NaN where missing, `distances` (frames,
+    true, predicted persons) [m], `match` (frames, true persons) the matches by these. With a
+    camera, boxes in its image are compared: `boxes` (frames, predicted persons, 4) [px], or those
+    of the joints.
 
     Raises:
         InputError: camera and truth have different numbers of frames.

@@ -115,11 +115,8 @@ def aligned_errors(
 ) -> AlignedErrors:
     """Return joint errors after the three alignments of the paper.
 
-    Args:
-        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing or not counted.
-        with_scale: similarities if true, rigid motions if not.
-        min_joints: minimum common joints of a person for the alignment per frame.
+    Both are (frames, persons, 17, 3) [m], in the order of the true people, NaN where missing or not
+    counted. `with_scale` asks for similarities instead of rigid motions.
     """
     source, target = paper_joints(predicted), paper_joints(true)
     frames, persons, joints, _ = target.shape

@@ -60,10 +60,7 @@ def align_positions(
     Axes of providers may point the other way: of the four ways, the one is taken that clearly
     agrees with the prediction.
 
-    Args:
-        path: as for `read_positions`.
-        prediction: the joints of the same people.
-        first: match frame of the file's first row; None = its frames are match frames.
+    `first` is the match frame of the file's first row; None = its frames are match frames.
 
     Raises:
         InputError: the file is invalid, or no way of its axes clearly agrees.

@@ -77,13 +77,9 @@ def paint_bodies(
 ) -> None:
     """Draw bodies over an image with a depth test.
 
-    Args:
-        canvas: (height, width, 3), RGB, modified in place.
-        camera: the image's camera, single.
-        bodies: (persons, vertices, 3) [m], world, finite.
-        faces: (triangles, 3), counter-clockwise seen from outside.
-        colors: (persons, 3) colors in 0..1.
-        opacity: opacity of the bodies; 1 is opaque. Below 1, each body has an opaque rim.
+    `canvas` (height, width, 3) RGB is changed in place. `bodies` (persons, vertices, 3) [m], world,
+    are finite; `faces` (triangles, 3) are counter-clockwise seen from outside; `colors` (persons,
+    3) are in 0..1. Below opacity 1, each body has an opaque rim.
     """
     height, width = canvas.shape[:2]
     surfaces = bodies.astype(np.float32)

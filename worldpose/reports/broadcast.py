@@ -42,13 +42,9 @@ def plot_camera_course(
 
     Bands are two standard deviations to either side; frames without a camera stay empty.
 
-    Args:
-        frame: (frames,) match frames.
-        camera: a batch (frames,).
-        covariance: (frames, 7, 7) covariance of a step, in the order of
-            `data_contracts.broadcast_calibration.FRAME_STEP`.
-        before: the same frames, independent and without smoothing; drawn below.
-        given: what camera data state instead, by the name of a curve.
+    `camera` is a batch (frames,), `covariance` (frames, 7, 7) that of a step, in the order of
+    `data_contracts.broadcast_calibration.FRAME_STEP`. `before` are the same frames, independent and
+    without smoothing, drawn below; `given` is what camera data state, by the name of a curve.
     """
     curves = _curves(camera)
     rough = {} if before is None else _curves(before)

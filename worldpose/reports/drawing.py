@@ -142,13 +142,9 @@ def picture_panels(
 
     Places are computed, not adjusted to the text, which takes 0.1 s.
 
-    Args:
-        titles: one for each panel.
-        corner: (2,) upper left corner of the part [px].
-        side: (2,) width and height of the part [px].
-        still: the camera's image (height, width, 3), RGB; None = plain ground.
-        ground: colour of plain ground.
-        below: free height below the panels [px].
+    The part has its upper left `corner` (2,) and size `side` (2,) [px] in the image `still`
+    (height, width, 3) RGB; without it, the ground has one colour. `below` [px] stays free below the
+    panels.
     """
     dpi = 110  # resolution of a figure [px/in]
     (left, top), (across, down) = np.asarray(corner, float), np.asarray(side, float)

@@ -64,12 +64,10 @@ def plot_health(
 ) -> bytes:
     """Return a PNG of the health of cameras over time, a row each.
 
-    Args:
-        cameras: (rows,) names.
-        frame: (bins + 1,) first match frame of each bin, and the frame after the last.
-        badness: (bins, rows), above 1 somebody should look; NaN where nothing is known.
-        missing: (bins, rows) share of frames without an image; NaN where not known.
-        marks: camera, match frame of a sudden change (None = it lasts), and what is written there.
+    `frame` (bins + 1,) are the first match frames of the bins, and the frame after the last.
+    `badness` (bins, rows), above 1 somebody should look, and `missing` (bins, rows), the share of
+    frames without an image, are NaN where not known. `marks` are camera, match frame of a sudden
+    change (None = it lasts), and what is written there.
     """
     height = 1.6 + 0.32 * len(cameras)
     figure = Figure(figsize=(14.0, height), dpi=110, layout="constrained", facecolor="white")

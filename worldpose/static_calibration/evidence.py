@@ -65,8 +65,7 @@ class ClickEvidence:
     def on_surface(self, surface: Floats) -> ClickEvidence:
         """Return the evidence at its places on another surface.
 
-        Args:
-            surface: (2,) crown and end fall [m].
+        The surface is (2,) crown and end fall [m].
         """
         change = surface - self.surface
         points, samples = self.points_world.copy(), self.samples_world.copy()

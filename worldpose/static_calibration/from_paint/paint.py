@@ -64,11 +64,8 @@ def find_paint(
 ) -> Iterator[PaintMap]:
     """Yield the paint of an image, once for every lens that it may have, the likely one first.
 
-    Args:
-        picture: (height, width, 3) RGB.
-        lens: focal length, principal point and distortion of the image; None = not known. Then the
-            distortion is the one that makes the most paint straight.
-        where: file or camera, for messages.
+    `picture` (height, width, 3) is RGB. Without the lens, the distortion is the one that makes the
+    most paint straight. Messages begin with `where`.
 
     Raises:
         InputError: the image has no color or shows no grass.

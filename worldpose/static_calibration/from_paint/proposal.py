@@ -187,13 +187,7 @@ def propose_camera(
 ) -> Proposal:
     """Return the camera that explains the paint of an image best.
 
-    Args:
-        picture: (height, width, 3) RGB.
-        pitch: the stadium's template.
-        side: where the camera stands.
-        prior: heights, distances, focal lengths; the defaults if None.
-        lens: a lens that was calibrated before.
-        where: file or camera, for messages.
+    `picture` (height, width, 3) is RGB; the camera stands at `side`. Messages begin with `where`.
 
     Raises:
         InputError: there is no grass, or too little paint for a camera.
