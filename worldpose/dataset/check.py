@@ -9,31 +9,13 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.release import ClipFigures, Finding
+from worldpose.dataset import faults as known_faults
+from worldpose.dataset import plausibility
 from worldpose.dataset.contents import (
     PointSource,
     ShippedClip,
     convention,
     sample_evenly,
-)
-from worldpose.dataset.faults import (
-    SOUND,
-    Agreement,
-    CheckSettings,
-    agreement_findings,
-    axis_orders,
-    compare_view,
-)
-from worldpose.dataset.plausibility import (
-    BONES,
-    body_findings,
-    camera_findings,
-    ground_findings,
-    is_blind,
-    pitch_findings,
-    plausible_share,
-    turning_findings,
-    visibility_findings,
-    world_fault,
 )
 from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.boxes import box_iou
@@ -82,7 +64,7 @@ def skeleton_findings(
     skeleton: tuple[str, ...],
     rows: CameraRows,
     clip: str,
-    settings: CheckSettings,
+    settings: known_faults.CheckSettings,
 ) -> Iterator[Finding]:
     """Yield 3D skeletons in camera axes that no translation brings onto their 2D.
 
@@ -99,7 +81,7 @@ def skeleton_findings(
     picked = sample_evenly(len(frame), _BODIES)
     frame, person = frame[picked], person[picked]
     bodies, pixels = skel_3d[frame, person], skel_2d[frame, person]
-    upper, lower = (skeleton.index(f"left_{name}") for name in BONES["thighs"])
+    upper, lower = (skeleton.index(f"left_{name}") for name in plausibility.BONES["thighs"])
     thigh = float(np.median(np.linalg.norm(bodies[:, upper] - bodies[:, lower], axis=-1)))
     for unit, size in (("millimetres", 1000.0), ("centimetres", 100.0)):
         if settings.bones_m[0] <= thigh / size <= settings.bones_m[1]:
@@ -114,7 +96,7 @@ def skeleton_findings(
         return
     row, bodies, plane, focal = row[told], bodies[told], plane[told], focal[told]
     guesses = {_AS_SHIPPED: bodies}
-    for name, axes in axis_orders():
+    for name, axes in known_faults.axis_orders():
         guesses[f"the camera's {name}"] = bodies @ axes
     turned = rows.rotation[row]
     posed = np.isfinite(turned).all((-1, -2))
@@ -162,7 +144,9 @@ def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
     return float(np.median(np.where(seen[..., 2] > 0.0, far, np.inf)))
 
 
-def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures, list[Finding]]:
+def check_clip(
+    clip: ShippedClip, settings: known_faults.CheckSettings
+) -> tuple[ClipFigures, list[Finding]]:
     """Return metrics and findings of one clip.
 
     2D data takes precedence: a fault is named if its repair makes 3D and 2D agree. Remaining
@@ -174,20 +158,20 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         found
         for source in clip.sources
         for view in clip.views
-        if (found := compare_view(source, view, settings)) is not None
+        if (found := known_faults.compare_view(source, view, settings)) is not None
     ]
-    named = {one.source for one in agreements if one.fault is not SOUND}
+    named = {one.source for one in agreements if one.fault is not known_faults.SOUND}
     slips = [
         found
         for source in clip.sources
         for view in clip.views
         if source.name not in named
-        for found in turning_findings(source, view, settings)
+        for found in plausibility.turning_findings(source, view, settings)
     ]
     slipped = {slip.where[0] for slip in slips}
     findings += [
         found
-        for found in agreement_findings(agreements, settings)
+        for found in known_faults.agreement_findings(agreements, settings)
         if found.fault != "reprojection" or found.where[0] not in slipped
     ]
     findings += [*slips, *_challenge_findings(clip, settings)]
@@ -196,16 +180,16 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
     for source in clip.sources:
         repaired = _repair_source(source, agreements)
         if not clip.pitch:
-            findings += body_findings(repaired, clip.fps, settings)
+            findings += plausibility.body_findings(repaired, clip.fps, settings)
             continue
         blind = [
             view
             for view in clip.views
             if view.name not in {one.view for one in agreements}
-            and is_blind(repaired, view.rows, settings)
+            and plausibility.is_blind(repaired, view.rows, settings)
         ]
-        fault, before, after = world_fault(repaired, settings)
-        shares.append(plausible_share(repaired, settings))
+        fault, before, after = plausibility.world_fault(repaired, settings)
+        shares.append(plausibility.plausible_share(repaired, settings))
         if fault is not None and fault.points is not None:
             repair = {"shipped_plausible_share": before, "explained_plausible_share": after}
             says = f"{fault.says}: so people stand on the pitch"
@@ -213,18 +197,18 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
             points = fault.points(repaired)
             repaired = repaired if points is None else repaired.with_points(points)
         if repaired is source and source.name not in {one.source for one in agreements}:
-            findings += ground_findings(source, settings)
-        findings += body_findings(repaired, clip.fps, settings)
-        findings += pitch_findings(repaired, settings)
-        blind = [view for view in blind if is_blind(repaired, view.rows, settings)]
-        for finding, reason in visibility_findings(repaired, blind, settings):
+            findings += plausibility.ground_findings(source, settings)
+        findings += plausibility.body_findings(repaired, clip.fps, settings)
+        findings += plausibility.pitch_findings(repaired, settings)
+        blind = [view for view in blind if plausibility.is_blind(repaired, view.rows, settings)]
+        for finding, reason in plausibility.visibility_findings(repaired, blind, settings):
             findings.append(finding)
             if reason is not None:
                 faults |= {place.removeprefix("cameras/"): reason for place in finding.where}
     for view in clip.views:
-        fault = faults.get(view.name, SOUND)
+        fault = faults.get(view.name, known_faults.SOUND)
         rows = view.rows if fault.camera is None else fault.camera(view.rows)
-        findings += camera_findings(view.name, rows, settings)
+        findings += plausibility.camera_findings(view.name, rows, settings)
     seen = [one.median_px for one in agreements]
     worst = max(seen) if seen and max(seen) < float("inf") else None
     figures = ClipFigures(
@@ -239,7 +223,9 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
     return figures, list(_merge_findings(findings))
 
 
-def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[Finding]:
+def _challenge_findings(
+    clip: ShippedClip, settings: known_faults.CheckSettings
+) -> Iterator[Finding]:
     """Yield findings on boxes and skeletons relative to the mid-hip."""
     if clip.given is None:
         return
@@ -256,7 +242,9 @@ def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[
             )
 
 
-def _repair_source(source: PointSource, agreements: Iterable[Agreement]) -> PointSource:
+def _repair_source(
+    source: PointSource, agreements: Iterable[known_faults.Agreement]
+) -> PointSource:
     """Repair the source for the fault that its 2D data indicates most often."""
     faults = [a.fault for a in agreements if a.source == source.name and a.fault.points is not None]
     if not faults:

@@ -153,20 +153,20 @@ class Detector:
         """
         noise, persons = self.scenario.noise, joints.shape[1]
         people = project_bodies(camera, joints, heights, self.perceive(joints))
-        *real, merged_into = self._detect(people, rng)
+        keypoints, confidence, displaced, merged_into = self._detect(people, rng)
         figures = project_bodies(camera, *self._draw_false_positives(len(joints), rng))
-        *false, _ = self._detect(figures, rng)
-        false[1] = 0.6 * false[1]  # less sure of false positives
+        others = self._detect(figures, rng)
         dropped = bursts(noise.dropped_share, 0.06, (len(joints),), self.scenario.fps, rng)
-        keypoints, confidence, displaced = (
-            np.concatenate(both, axis=1) for both in zip(real, false, strict=True)
-        )
+        keypoints = np.concatenate([keypoints, others[0]], axis=1)
+        # A detector is less sure of false positives.
+        confidence = np.concatenate([confidence, 0.6 * others[1]], axis=1)
+        displaced = np.concatenate([displaced, others[2]], axis=1)
         size = np.concatenate([people.size, figures.size], axis=1)
         boxes = _bounding_boxes(keypoints, merged_into, size)
         found = list_detections(
             keypoints,
             np.where(dropped[:, None, None], np.nan, confidence),
-            displaced.astype(np.bool_),
+            displaced,
             np.concatenate([np.arange(persons), np.full(keypoints.shape[1] - persons, -1)]),
             lambda order, keypoints, found: np.take_along_axis(boxes, order[..., None], axis=1),
             rng,

@@ -24,7 +24,7 @@ from worldpose.simulation.foreign.detectors import (
     detect_people,
     draw_detector,
 )
-from worldpose.simulation.foreign.gait import draw_gestures, draw_manner, walk_posture
+from worldpose.simulation.foreign.gait import walk_posture
 from worldpose.simulation.foreign.recordings import Recordings, play_motion, read_recordings
 from worldpose.simulation.foreign.rigs import (
     Layout,
@@ -284,11 +284,8 @@ def _draw_people(
     for person, (skeleton, rng) in enumerate(zip(skeletons, rngs, strict=True)):
         trajectory, posture = known[person], replayed.get(person)
         if posture is None:
-            manner = draw_manner(rng)
-            gestures = draw_gestures(scenario.gestures, times[0], times[-1], rng)
-            posture = walk_posture(
-                times, trajectory.root, trajectory.heading, skeleton.leg, manner, gestures, rng
-            )
+            course = (trajectory.root, trajectory.heading)
+            posture = walk_posture(times, *course, skeleton.leg, scenario.gestures, rng)
         joints = place_joints(skeleton, posture, trajectory.root, trajectory.heading, fps, ground)
         people.append(Person(skeleton, joints, trajectory.source))
     return people
