@@ -39,7 +39,11 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import Scenario
 from worldpose.static_calibration.estimate import calibrate_camera
-from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
+from worldpose.static_calibration.parameters import (
+    CameraEstimate,
+    project_with_jacobian,
+    step_between,
+)
 from worldpose.static_calibration.report import StaticCalibration, calibration_arrays
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.tracking.settings import TrackingSettings
@@ -144,17 +148,7 @@ def ground_errors(found: Camera, true: Camera, places: Floats, pitch: PitchTempl
 
 def region(estimate: CameraEstimate, true: Camera) -> float:
     """Return the estimate's probability mass that is nearer to it than the true camera."""
-    camera = estimate.camera
-    off = true.cam_from_world @ camera.cam_from_world.inverse()
-    step = np.concatenate(
-        [
-            off.rotvec,
-            off.translation,
-            [np.log(true.focal[0] / camera.focal[0])],
-            true.principal_point - camera.principal_point,
-            (true.distortion - camera.distortion)[[0, 1, 4]],
-        ]
-    )
+    step = step_between(estimate.camera, true)
     free = np.diag(estimate.covariance) > 0.0
     inner = estimate.covariance[np.ix_(free, free)]
     squared = step[free] @ np.linalg.solve(inner, step[free])

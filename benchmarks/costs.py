@@ -72,9 +72,6 @@ SURE = 0.4
 INTERVAL_S = 0.25
 
 
-GROUPS = Path("/sys/fs/cgroup")
-
-
 @benchmark(
     "detection",
     "cost of person detection and poses, in integers and in floating point",

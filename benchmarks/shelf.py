@@ -44,8 +44,6 @@ POINTS, MILLIMETERS = 0.3, 1.0
 
 LETTERS = {"triangulation": "T", "retriangulation": "R", "body_fitting": "B"}
 
-FOUND_M = 0.5
-
 
 @benchmark("shelf", "Shelf through whole runs: all cameras, causally, without each camera", DATA)
 def score_runs(options: Namespace) -> Tables:
