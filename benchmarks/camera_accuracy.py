@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 from common import places_of_feet, quantile, simulate, tell
-from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, duration, integer, option, seeds
 from scipy.stats import chi2
 
 import worldpose
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
@@ -319,7 +318,7 @@ def score_moving_cameras(options: Namespace) -> Tables:
             joints = read_joints(folder / "reference" / "joints.npz").joints
             people = people_of(match, joints, clip)
 
-            def pictures(file: Path = match.videos[clip]) -> Iterator[NDArray[np.uint8]]:
+            def pictures(file: Path = match.videos[clip]) -> Iterator[Image]:
                 with VideoReader(file) as video:
                     yield from (picture for _, picture in video.frames(grey=True))
 
@@ -363,7 +362,7 @@ def people_of(match: MatchFolder, joints: Floats, clip: str) -> People:
     return People(given, seen.keypoints.astype(np.float64), match.spec.fps)
 
 
-def feet_in_picture(true: MovingCamera, joints: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def feet_in_picture(true: MovingCamera, joints: Floats) -> tuple[Floats, Flags]:
     """Return players' places (frames, persons, 3) [m], and a mask of those inside the image."""
     feet = joints[:, :, 15:17].mean(axis=2)
     seen = true.camera.project(feet)
@@ -454,7 +453,7 @@ def score_clocks(options: Namespace) -> Tables:
     return {"clocks": Table(f"{found} of {len(rows)} cases found", columns, rows)}
 
 
-def orders(cameras: int) -> Iterator[NDArray[np.float64]]:
+def orders(cameras: int) -> Iterator[Floats]:
     """Yield the shifts (cameras,) of five orders [frame]."""
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -462,8 +461,8 @@ def orders(cameras: int) -> Iterator[NDArray[np.float64]]:
 
 
 def shift(
-    cameras: Camera, seen: KeypointDetections, fps: float, late: NDArray[np.float64]
-) -> tuple[KeypointDetections, NDArray[np.float64]]:
+    cameras: Camera, seen: KeypointDetections, fps: float, late: Floats
+) -> tuple[KeypointDetections, Floats]:
     """Return detections whose frame t shows the time t + late, and these offsets."""
     people = track_people(cameras, seen, fps).detection_index
     every = np.arange(len(late))
@@ -473,7 +472,7 @@ def shift(
     return shift_in_time(seen.assign_people(people), -late), late
 
 
-def report(name: str, found: Synchronization, true: NDArray[np.float64]) -> list[Any]:
+def report(name: str, found: Synchronization, true: Floats) -> list[Any]:
     """Return a row; the last value is whether all offsets are found within `WANTED`."""
     off = found.late - true
     off = off - np.nanmedian(off) if np.isfinite(off).any() else off

@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from registry import Table
 
 from data_contracts.arrays import Floats, Image
@@ -184,9 +183,7 @@ def run_in_process(
     return match.match_id, found
 
 
-def distances_to_polyline(
-    pixels: NDArray[np.float64], line: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def distances_to_polyline(pixels: Floats, line: Floats) -> Floats:
     """Return the distance of each pixel (n, 2) to a polyline (m, 2), NaN in gaps [px].
 
     Infinite where the polyline has no two finite neighbours.
@@ -199,5 +196,5 @@ def distances_to_polyline(
     offset = pixels[:, None] - start
     share = (offset * step).sum(axis=-1) / np.maximum((step**2).sum(axis=-1), 1e-12)
     nearest = offset - np.clip(share, 0.0, 1.0)[..., None] * step
-    distances: NDArray[np.float64] = np.linalg.norm(nearest, axis=-1).min(axis=1)
+    distances: Floats = np.linalg.norm(nearest, axis=-1).min(axis=1)
     return distances

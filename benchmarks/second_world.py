@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 from common import tell
-from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, duration, integer, option
 from scipy.special import chdtri
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from data_contracts.run import RunRecord
 from flows.match import task_of
@@ -227,7 +226,7 @@ def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
     return log.run_stages(compute)
 
 
-def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
+def views_of_detections(folder: Path, truth: JointTracks) -> Integers:
     """Return the number of static cameras that detect each true person (frames, persons)."""
     count = np.zeros(truth.joints.shape[:2], np.int64)
     spec = read_match(folder).spec
@@ -255,7 +254,7 @@ def score_stage(run: Run, stage: str, reference: Path, fps: float) -> dict[str, 
 
 
 def people_with_bodies(
-    tracks: JointTracks | None, truth: JointTracks, shown: NDArray[np.int64]
+    tracks: JointTracks | None, truth: JointTracks, shown: Integers
 ) -> dict[str, int]:
     """Return the number of people that two cameras see, and the number of those with bodies."""
     seen = shown >= 2

@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import (
-    load_module,
-    read_settings,
-    run_in_process,
-    run_worldpose,
-    tell,
-)
+from common import load_module, read_settings, run_in_process, run_worldpose, tell
 from registry import DATA, SET, Table, Tables, benchmark, integer, option
 
 from flows.results.best_results import JointDefinition, joint_tracks

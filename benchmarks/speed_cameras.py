@@ -11,10 +11,9 @@ import cv2
 import numpy as np
 from common import best_seconds, compare_times, quantile
 from cv2.typing import MatLike
-from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, integer
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Floats, Image, Singles
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
@@ -161,7 +160,7 @@ def _refine(prior: CameraOnPitch, picture: Image) -> Camera:
     return refine_on_lines(prior, PITCH, picture, survey_error=0.0).estimate.camera
 
 
-def _make_map(picture: Image, start: Camera) -> NDArray[np.float32]:
+def _make_map(picture: Image, start: Camera) -> Singles:
     away = distance_map(picture, start, line_points(start, 6000))
     return np.minimum(away, np.float32(FARTHEST))
 
@@ -201,9 +200,7 @@ def looked_up(away: MatLike, pixels: Floats) -> Floats:
     return np.asarray(mapped[0], float)
 
 
-def by_gauss_newton(
-    away: NDArray[np.float32], start: Camera, points: Floats, spread: Floats
-) -> Camera:
+def by_gauss_newton(away: Singles, start: Camera, points: Floats, spread: Floats) -> Camera:
     """Return a damped Gauss-Newton result on the map, with its gradient and our Jacobian."""
     gx = cv2.Sobel(away / 8.0, cv2.CV_32F, 1, 0, ksize=3)
     gy = cv2.Sobel(away / 8.0, cv2.CV_32F, 0, 1, ksize=3)

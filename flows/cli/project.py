@@ -26,8 +26,7 @@ from worldpose.store.store import Store
 
 
 def init(
-    folder: Annotated[str, typer.Argument(metavar="DIR")],
-    as_json: JsonOption = False,
+    folder: Annotated[str, typer.Argument(metavar="DIR")], as_json: JsonOption = False
 ) -> None:
     """Create a project: the folder of registered matches and their results.
 

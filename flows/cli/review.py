@@ -23,12 +23,7 @@ from flows.stage import Match
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store.store import Store
 
-commands = typer.Typer(
-    name="review",
-    help=__doc__,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+commands = typer.Typer(name="review", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
 MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
 Requests = Annotated[

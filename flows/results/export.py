@@ -12,20 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from data_contracts.triangulation import CameraChange
 from flows.results import best_results
 from flows.results.broadcast_views import broadcast_views, moving_cameras
-from flows.results.outputs import (
-    RELEASE,
-    VIEWER_SUFFIX,
-    record_owner,
-    require_own,
-    write_whole,
-)
+from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
 from flows.results.tool_exports import TOOL_EXPORTS
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
@@ -146,7 +140,7 @@ def export_challenge(
     """Write cameras, boxes, skeletons, pitch points and the submission, of each broadcast view."""
     filmed = _filmed(origin)
     together: dict[str, challenge.ChallengeClip] = {}
-    submissions: dict[str, NDArray[np.float64]] = {}
+    submissions: dict[str, Floats] = {}
     filled: dict[str, int] = {}
     for view, (clip, camera) in filmed.items():
         model, poses, _ = best_results.fitted_bodies(origin.run, clip)
@@ -179,7 +173,7 @@ def export_challenge(
 
 def _by_given_rows(
     origin: best_results.Origin, clip: str, truth: challenge.ChallengeTruth
-) -> tuple[NDArray[np.float64], int]:
+) -> tuple[Floats, int]:
     """Return a clip's submission, and the poses that fill gaps of given boxes.
 
     Where boxes with identities were given, the rows are theirs.

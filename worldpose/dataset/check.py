@@ -11,12 +11,7 @@ from data_contracts.arrays import Floats
 from data_contracts.release import ClipFigures, Finding
 from worldpose.dataset import faults as known_faults
 from worldpose.dataset import plausibility
-from worldpose.dataset.contents import (
-    PointSource,
-    ShippedClip,
-    convention,
-    sample_evenly,
-)
+from worldpose.dataset.contents import PointSource, ShippedClip, convention, sample_evenly
 from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.boxes import box_iou
 

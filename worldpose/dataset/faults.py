@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Positive, Record, Share
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View, sample_evenly
@@ -219,8 +218,6 @@ def _turn_vectors(rotation: Floats, vectors: Floats) -> Floats:
     return np.asarray((rotation @ vectors[..., None])[..., 0])
 
 
-Ints = NDArray[np.int64]
-
 SOUND = Fault("none", "as shipped")
 """No repair."""
 
@@ -245,9 +242,9 @@ class Agreement:
 class _Sample:
     """2D points of a view, each with its frame, person and index in the source's skeleton."""
 
-    frame: Ints
-    person: Ints
-    point: Ints
+    frame: Integers
+    person: Integers
+    point: Integers
     pixels: Floats
 
 
@@ -344,8 +341,8 @@ def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
 
 
 def _later(
-    frame: Ints, count: int, rows: CameraRows, fault: Fault
-) -> tuple[NDArray[np.bool_], Ints, Camera]:
+    frame: Integers, count: int, rows: CameraRows, fault: Fault
+) -> tuple[Flags, Integers, Camera]:
     """Return which frames remain when a fault shifts them, their 3D frames, and the camera there.
 
     The camera is a batch if it moves.

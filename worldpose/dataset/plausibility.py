@@ -6,17 +6,10 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.release import Finding
-from worldpose.dataset.contents import (
-    PointSource,
-    View,
-    convention,
-    implausible,
-    sample_evenly,
-)
+from worldpose.dataset.contents import PointSource, View, convention, implausible, sample_evenly
 from worldpose.dataset.faults import (
     LATEST,
     CheckSettings,
@@ -309,7 +302,7 @@ def visibility_findings(
 
 
 def _make_finding(
-    views: Sequence[View], which: NDArray[np.bool_], fault: Fault | None, share: Floats
+    views: Sequence[View], which: Flags, fault: Fault | None, share: Floats
 ) -> Finding:
     where = tuple(f"cameras/{view.name}" for view, ours in zip(views, which, strict=True) if ours)
     figures = {"explained_share_seen": float(share[which].min())}

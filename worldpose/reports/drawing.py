@@ -26,7 +26,7 @@ from matplotlib.quiver import Quiver
 from matplotlib.text import Annotation
 from numpy.typing import ArrayLike, NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
@@ -96,12 +96,12 @@ def draw_people(axes: Axes, camera: Camera, tracks: JointTracks, frame: int) -> 
         draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
 
 
-def pitch_corners(pitch: PitchSpec) -> NDArray[np.float64]:
+def pitch_corners(pitch: PitchSpec) -> Floats:
     """Return two opposite corners of the pitch (2, 2) [m]."""
     return 0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]])
 
 
-def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
+def markings(pitch: PitchSpec) -> list[Floats]:
     """Return the painted lines as polylines (n, 3) [m], world, sampled every half metre."""
     template = PitchTemplate.from_spec(pitch)
     samples = template.sample_lines(0.5)

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
@@ -105,9 +104,7 @@ def _person_boxes(camera: Camera, people: Floats) -> Floats:
     return np.concatenate([low - more, high + more, depth[seen].mean(axis=1)[:, None]], axis=1)
 
 
-def _are_visible(
-    camera: Camera, places: Floats, pixels: Floats, boxes: Floats
-) -> NDArray[np.bool_]:
+def _are_visible(camera: Camera, places: Floats, pixels: Floats, boxes: Floats) -> Flags:
     """Return which points (n,) are in the image and not occluded by people."""
     depth = camera.cam_from_world.apply(places)[:, 2]
     inside = (pixels >= BORDER) & (pixels <= camera.image_size - 1.0 - BORDER)
@@ -118,14 +115,14 @@ def _are_visible(
 
 
 def _choose_points(
-    there: NDArray[np.int64],
+    there: Integers,
     x: Floats,
     places: Floats,
     width: float,
     settings: ClickSettings,
     clustered: bool,
     rng: np.random.Generator,
-) -> NDArray[np.int64]:
+) -> Integers:
     """Return indices of the points to click, in random order."""
     tries = 50  # draws of points before collinear ones are accepted
     low, high = settings.clustered_points if clustered else settings.points
@@ -223,7 +220,7 @@ COMPARED_FRAMES: Final = 5
 def click_key_frames(
     cameras: Camera,
     pitch: PitchTemplate,
-    people: NDArray[np.float64],
+    people: Floats,
     settings: ClickSettings,
     count: int,
     rng: np.random.Generator,
@@ -296,9 +293,7 @@ def add_calibration_errors(
     return given
 
 
-def _move_camera(
-    camera: Camera, turn: NDArray[np.float64], shift: NDArray[np.float64], scale: float
-) -> Camera:
+def _move_camera(camera: Camera, turn: Floats, shift: Floats, scale: float) -> Camera:
     # Distance of the point whose projection an error of the center leaves unchanged [m].
     pivot = 60.0
     pose = camera.cam_from_world

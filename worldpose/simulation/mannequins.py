@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image, Singles
+from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from worldpose.body.body_file import load_open_body
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.simulation.settings import PATTERNS, CrowdSettings, Pattern
@@ -34,7 +34,7 @@ class Mannequin:
 
     body: BodyModel
     """The body from which a part of the vertices is kept."""
-    kept: NDArray[np.int64]
+    kept: Integers
     """(vertices,) indices of the kept vertices of the body."""
     clothed: Floats
     """(vertices, 3) [m], the mean body in T-pose with the thickness of clothes and hair."""
@@ -42,13 +42,13 @@ class Mannequin:
     """(vertices, 3) unit normals of the same."""
     correctives: Singles
     """(207, 3 vertices) [m] for each unit of the pose feature."""
-    bones: NDArray[np.int64]
+    bones: Integers
     """(vertices, 4) joints that move each vertex."""
     shares: Singles
     """(vertices, 4) skinning weights of these joints, with sum 1."""
     faces: NDArray[np.int32]
     """(triangles, 3), counter-clockwise seen from outside."""
-    backs: NDArray[np.bool_]
+    backs: Flags
     """(triangles,) whether a triangle faces backwards in the T-pose."""
     texels: Singles
     """(vertices, 2) column and row in a kit's textures."""
@@ -124,7 +124,7 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
     return Surfaces(vertices, normals / np.maximum(length, np.float32(1e-6)))
 
 
-def _normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
+def _normals(vertices: Floats, faces: Integers) -> Floats:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)
@@ -134,9 +134,7 @@ def _normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
     return unit
 
 
-def _cluster_vertices(
-    vertices: Floats, faces: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cluster_vertices(vertices: Floats, faces: Integers) -> tuple[Integers, Integers]:
     """Return the kept vertices and the faces between them: one per cell, nearest to its mean.
 
     No cell crosses the middle of the body, so legs stay apart.
@@ -401,10 +399,7 @@ class Cast:
 
 
 def dress_people(
-    betas: Floats,
-    roles: Sequence[Role],
-    seed: int,
-    patterns: tuple[Pattern, ...] = PATTERNS,
+    betas: Floats, roles: Sequence[Role], seed: int, patterns: tuple[Pattern, ...] = PATTERNS
 ) -> Cast:
     """Return a cast; a person's looks depend on the seed and the person's number alone.
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.archives import write_archive
@@ -43,8 +43,8 @@ def list_detections(
     keypoints: Floats,
     confidence: Floats,
     displaced: Flags,
-    whose: NDArray[np.int64],
-    box: Callable[[NDArray[np.int64], Floats, Flags], Floats],
+    whose: Integers,
+    box: Callable[[Integers, Floats, Flags], Floats],
     rng: np.random.Generator,
 ) -> Report:
     """Return the detections of bodies, in shuffled order.

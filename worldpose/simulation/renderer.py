@@ -141,12 +141,7 @@ class Moment:
 
 
 def expose(
-    venue: Venue,
-    camera: Camera,
-    scene: Image,
-    grain: NDArray[np.int8],
-    moment: Moment,
-    frame: int,
+    venue: Venue, camera: Camera, scene: Image, grain: NDArray[np.int8], moment: Moment, frame: int
 ) -> RenderedFrame:
     """Return the image of people before a scene.
 
@@ -309,12 +304,7 @@ def open_view(
 
 
 def render_frame(
-    view: View,
-    cast: Cast,
-    opened: Surfaces,
-    closed: Surfaces | None = None,
-    *,
-    frame: int = 0,
+    view: View, cast: Cast, opened: Surfaces, closed: Surfaces | None = None, *, frame: int = 0
 ) -> RenderedFrame:
     """Return one image of people; the same arguments give the same bytes.
 

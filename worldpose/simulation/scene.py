@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyParameters
@@ -30,11 +30,7 @@ GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 def place_camera(
-    rig: RigSettings,
-    index: int,
-    target: NDArray[np.float64],
-    pitch: PitchSpec,
-    rng: np.random.Generator,
+    rig: RigSettings, index: int, target: Floats, pitch: PitchSpec, rng: np.random.Generator
 ) -> Camera:
     """Return the static camera with this number.
 
@@ -65,12 +61,8 @@ def place_camera(
 
 
 def _place_in_ring(
-    rig: RigSettings,
-    index: int,
-    target: NDArray[np.float64],
-    pitch: PitchSpec,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    rig: RigSettings, index: int, target: Floats, pitch: PitchSpec, rng: np.random.Generator
+) -> tuple[Floats, Floats, float]:
     """Return center and aim (3,) [m], world, and focal length [px]."""
     standard_person = 1.8  # body height for `RigSettings.person_height_px` [m]
     azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
@@ -85,7 +77,7 @@ def _place_in_ring(
     return center, aim, rig.person_height_px * far / (standard_person * distance / far)
 
 
-def look_at(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:
+def look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
     """Return the pose of a camera at `center` that looks at `aim`, rolled by an angle [rad]."""
     forward = (aim - center) / np.linalg.norm(aim - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -208,7 +200,7 @@ class StaticViews:
 
     detections: KeypointDetections
     person: NDArray[np.int16]
-    displaced: NDArray[np.bool_]
+    displaced: Flags
 
     def index(self, persons: int) -> NDArray[np.int16]:
         """Return each person's detection index (frames, cameras, persons); -1 = not found."""

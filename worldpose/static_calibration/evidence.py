@@ -71,12 +71,7 @@ class ClickEvidence:
         points, samples = self.points_world.copy(), self.samples_world.copy()
         points[:, 2] += self.points_by_surface @ change
         samples[:, 2] += self.samples_by_surface @ change
-        return replace(
-            self,
-            points_world=points,
-            samples_world=samples,
-            surface=surface,
-        )
+        return replace(self, points_world=points, samples_world=samples, surface=surface)
 
 
 def gather_evidence(

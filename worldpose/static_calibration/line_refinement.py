@@ -37,11 +37,7 @@ from worldpose.static_calibration.curvature_correction import (
 )
 from worldpose.static_calibration.fit import CameraProblem
 from worldpose.static_calibration.line_detection import brightness
-from worldpose.static_calibration.line_samples import (
-    PaintNoise,
-    sample_markings,
-    thin_samples,
-)
+from worldpose.static_calibration.line_samples import PaintNoise, sample_markings, thin_samples
 from worldpose.static_calibration.line_search import Bars, LineFit, LineSearch
 from worldpose.static_calibration.parameters import CameraOnPitch
 from worldpose.static_calibration.settings import (

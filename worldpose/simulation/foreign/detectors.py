@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Record
 from worldpose.body.occlusions import facing_axes
 from worldpose.simulation.foreign.rigs import View
@@ -219,7 +218,7 @@ def detect_people(
     detector: Detector,
     view: View,
     defined: Floats,
-    image_size: NDArray[np.int64],
+    image_size: Integers,
     fps: float,
     lost: float,
     rng: np.random.Generator,
@@ -270,7 +269,7 @@ def detect_people(
     keypoints = np.where(there[..., None], keypoints, np.nan)
     confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
 
-    def box(order: NDArray[np.int64], places: Floats, found: Flags) -> Floats:
+    def box(order: Integers, places: Floats, found: Flags) -> Floats:
         low = np.where(np.isfinite(places), places, np.inf).min(axis=2, initial=np.inf)
         high = np.where(np.isfinite(places), places, -np.inf).max(axis=2, initial=-np.inf)
         tall = np.where(found[..., None], high - low, 0.0)
@@ -406,7 +405,7 @@ def _draw_confidence(
 def _draw_false_positives(
     profile: DetectorProfile,
     size: Floats,
-    image_size: NDArray[np.int64],
+    image_size: Integers,
     frames: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:

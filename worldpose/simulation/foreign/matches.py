@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.static_calibration import ClickedMarkings
@@ -224,7 +223,7 @@ def simulate_foreign_scene(
     )
 
 
-def _motion_times(frames: int, fps: float) -> tuple[Floats, NDArray[np.int64]]:
+def _motion_times(frames: int, fps: float) -> tuple[Floats, Integers]:
     """Return the times of the motion [s], and which of them are frames."""
     # Minimum rate of the motion's computation [1/s], a multiple of the frame rate.
     motion_rate = 100.0

@@ -73,7 +73,7 @@ class RigCamera:
         towards = np.stack([np.cos(order * angle + phase), np.sin(order * angle - phase)], axis=-1)
         return np.asarray(pixels + swirl[..., None] * towards)
 
-    def sees(self, pixels: Floats) -> NDArray[np.bool_]:
+    def sees(self, pixels: Floats) -> Flags:
         """Return which pixels (..., 2) lie in the image."""
         with np.errstate(invalid="ignore"):
             inside = (pixels >= -0.5) & (pixels <= self.camera.image_size - 0.5)
@@ -397,7 +397,7 @@ def click_points(
     return markings, {new: name for name, new in names.items() if new != name}
 
 
-def _is_inside(camera: RigCamera, pixels: Floats) -> NDArray[np.bool_]:
+def _is_inside(camera: RigCamera, pixels: Floats) -> Flags:
     with np.errstate(invalid="ignore"):
         inside = (pixels > _MARGIN) & (pixels < camera.camera.image_size - 1.0 - _MARGIN)
     return np.asarray(inside.all(axis=-1))

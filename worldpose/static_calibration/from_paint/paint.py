@@ -387,12 +387,7 @@ def _fit_line(
 ) -> tuple[Flags, Floats, float]:
     """Return the mask of a line's pixels, its normal (2,) and its offset [px]."""
     near = np.zeros(len(points), np.bool_)
-    for tolerance in (
-        3.0 * _TOLERANCE,
-        2.0 * _TOLERANCE,
-        1.5 * _TOLERANCE,
-        _TOLERANCE,
-    ):
+    for tolerance in (3.0 * _TOLERANCE, 2.0 * _TOLERANCE, 1.5 * _TOLERANCE, _TOLERANCE):
         turned = _angle_between(angles, np.arctan2(across[1], across[0]))
         near = (np.abs(points @ across - offset) < tolerance) & (turned < 0.3)
         if np.count_nonzero(near) < 10:
