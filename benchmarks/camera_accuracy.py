@@ -290,9 +290,6 @@ def errors(
     "broadcast_accuracy",
     "moving cameras of simulated clips: errors after each step, coverage",
     option("matches", nargs="+", type=Path, help="of `worldpose simulate --scenario broadcast-*`"),
-    integer("key-frames", 0, "of each clip's; 0 = all"),
-    option("--without-players", action="store_true"),
-    option("--without-m6", action="store_true", help="no smoothness, no followed points"),
 )
 def score_moving_cameras(options: Namespace) -> Tables:
     """`worldpose simulate --scenario broadcast-pan --duration 30 --cameras 1 --no-stills --out A`.
@@ -303,16 +300,11 @@ def score_moving_cameras(options: Namespace) -> Tables:
     cameras with the centre, and of players' places in the image inside their stated regions.
     """
     settings = BroadcastCalibrationSettings()
-    if options.without_m6:
-        settings = settings.model_copy(update={"smooth": False, "flow_weight": 0.0})
     told: dict[str, list[Floats]] = {}
     rows, stated = [], []
     for folder in options.matches:
         match = read_match(folder)
         for clip in match.key_frames:
-            keys = match.key_frames[clip].key_frames
-            number = options.key_frames or len(keys)
-            chosen = [keys[int((i + 0.5) * len(keys) / number)] for i in range(number)]
             camera = match.spec.broadcast_views[clip].camera
             true = true_camera(folder, (camera.width, camera.height), clip)
             joints = read_joints(folder / "reference" / "joints.npz").joints
@@ -322,9 +314,9 @@ def score_moving_cameras(options: Namespace) -> Tables:
                 with VideoReader(file) as video:
                     yield from (picture for _, picture in video.frames(grey=True))
 
+            keys = list(match.key_frames[clip].key_frames)
             assert match.pitch is not None  # of every scenario with a broadcast camera
-            seen = None if options.without_players else people
-            given = BroadcastClip(chosen, pictures, match.spec.fps, people=seen, boxes=people.boxes)
+            given = BroadcastClip(keys, pictures, match.spec.fps, people=people, boxes=people.boxes)
             found = calibrate_broadcast(PitchTemplate.from_spec(match.pitch), given, settings)
             steps = {"tracked": found.tracked, "lines": found.before, "all": found.camera}
             for label, each in steps.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import subprocess
 import sys
 import time
@@ -74,16 +73,6 @@ def places_of_feet(joints: Floats, pitch: PitchTemplate) -> Floats:
 def quantile(values: Floats, share: float = 0.5) -> float:
     """Return a quantile; NaN without values."""
     return float(np.nanquantile(values, share)) if np.isfinite(values).any() else np.nan
-
-
-def read_settings(words: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return settings by stage from STAGE.SETTING=JSON."""
-    overrides: dict[str, dict[str, Any]] = {}
-    for word in words:
-        name, _, value = word.partition("=")
-        stage, _, setting = name.partition(".")
-        overrides.setdefault(stage, {})[setting] = json.loads(value)
-    return overrides
 
 
 def read_changes(words: Sequence[str]) -> dict[str, Any]:

@@ -265,8 +265,6 @@ def overlap(
     integer("surveys", 4),
     integer("first", 0),
     integer("count", 100, "of line sets"),
-    option("--drop", type=float, default=0.2, help="share of drawn lines"),
-    integer("clutter", 4, "random segments added to the lines"),
     duration(4.0),
 )
 def score_proposals(options: Namespace) -> Tables:
@@ -275,8 +273,8 @@ def score_proposals(options: Namespace) -> Tables:
     Ground: the true pixel of a player's place, back through the camera onto the pitch [m].
 
     lines: lines that people drew into broadcast images (`wc14`, `sn22_lines`), without their names,
-    as paint; some are dropped, and random segments are added. Error: half of the drawn lines are
-    nearer to their marking [px of 960].
+    as paint; a fifth is dropped, and four random segments are added. Error: half of the drawn
+    lines are nearer to their marking [px of 960].
 
     sides: people seen by cameras with errors of calibration, half of them turned by half a turn.
     The side of the first camera is stated; those of the others follow from the people in twelve
@@ -439,8 +437,8 @@ def drawn_lines(data: Path, options: Namespace) -> Iterator[Outcome]:
             for name, line in listed[key].items()
             if (law := SOCCERNET_MARKINGS.get(name)) in named and law is not None
         }
-        shown = [line for line in drawn.values() if rng.random() >= options.drop]
-        for _ in range(options.clutter):
+        shown = [line for line in drawn.values() if rng.random() >= 0.2]
+        for _ in range(4):
             start = rng.uniform([0.0, 0.3 * SIZE[1]], SIZE)
             angle, length = rng.uniform(0.0, np.pi), rng.uniform(50.0, 200.0)
             way = length * np.array([np.cos(angle), 0.4 * np.sin(angle)])

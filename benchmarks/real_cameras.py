@@ -84,7 +84,6 @@ Row = tuple[int, str, float, float, Floats]
     "cameras without a click in real stills, against labelled markings",
     DATA,
     option("--fetch", action="store_true", help="get the stills first, into DATA/still_cameras"),
-    option("--mirror", type=Path, help="folder of clones named owner+name"),
     option("--half", choices=("tuned", "held")),
     option("--only", nargs="*", default=()),
 )
@@ -101,7 +100,7 @@ def score_stills(options: Namespace) -> Tables:
     wrong if half of its labelled markings are not right, at 20 px.
     """
     if options.fetch:
-        fetch_stills(options.data, options.mirror or options.data / "stills_repositories")
+        fetch_stills(options.data)
     stills, scores = read_labels(options.half, options.only), list[tuple[str, Score]]()
     for still in stills:
         picture = cv2.imread(str(options.data / "still_cameras" / f"{still['name']}.png"))
@@ -125,12 +124,15 @@ def score_stills(options: Namespace) -> Tables:
     return {"stills": Table(title, [*columns, "time [s]"], rows)}
 
 
-def fetch_stills(data: Path, clones: Path) -> None:
+def fetch_stills(data: Path) -> None:
     """Write the stills to `data/still_cameras`; some are frames of videos."""
     out = data / "still_cameras"
     out.mkdir(parents=True, exist_ok=True)
     for still in read_labels():
-        content = fetch_file(clones, *(still[name] for name in ("repository", "commit", "path")))
+        content = fetch_file(
+            data / "stills_repositories",
+            *(still[name] for name in ("repository", "commit", "path")),
+        )
         if "frame" in still:
             (out / "video.mp4").write_bytes(content)
             with open_video(out / "video.mp4") as video:

@@ -35,7 +35,6 @@ from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog
 from flows.settings import selected_stages
 from flows.stage import Stage
-from worldpose.errors import InputError
 from worldpose.evaluation.matching import (
     EvaluationSettings,
     joint_distances,
@@ -359,10 +358,9 @@ def group_joints(group: str) -> list[int]:
     return [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]
 
 
-def _match(
-    prediction: JointTracks, reference: JointTracks, settings: EvaluationSettings
-) -> tuple[Floats, Floats | None, Flags]:
+def _match(prediction: JointTracks, reference: JointTracks) -> tuple[Floats, Floats | None, Flags]:
     """Return matched joints, their covariance, and which of them count, as the true people."""
+    settings = EvaluationSettings()
     joints = select_frames(prediction.joints, prediction.frames, reference.frames)
     match = match_people(joint_distances(joints, reference.joints), settings.match_gate_m)
     covariance = None
@@ -377,51 +375,35 @@ def _match(
     return found, covariance, counts
 
 
-def group_errors(
-    prediction: JointTracks, reference: JointTracks, settings: EvaluationSettings | None = None
-) -> dict[str, tuple[float, int]]:
-    """Return the sum of distances [mm] and the number of joints per group."""
-    found, _, counts = _match(prediction, reference, settings or EvaluationSettings())
-    away = np.where(counts, 1e3 * np.linalg.norm(found - reference.joints, axis=-1), 0.0)
+def _by_group(values: Floats | Flags, counts: Flags) -> dict[str, tuple[Any, int]]:
+    """Return the sum of values of joints (frames, persons, 17), and their number, per group."""
     groups = {name: group_joints(name) for name in JOINT_GROUPS}
     return {
-        name: (float(away[..., some].sum()), int(counts[..., some].sum()))
+        name: (values[..., some].sum().item(), int(counts[..., some].sum()))
         for name, some in groups.items()
     }
 
 
+def group_errors(prediction: JointTracks, reference: JointTracks) -> dict[str, tuple[float, int]]:
+    """Return the sum of distances [mm] and the number of joints per group."""
+    found, _, counts = _match(prediction, reference)
+    away = np.linalg.norm(found - reference.joints, axis=-1)
+    return _by_group(np.where(counts, 1e3 * away, 0.0), counts)
+
+
 def region_counts(
-    prediction: JointTracks,
-    reference: JointTracks,
-    level: float = 0.95,
-    settings: EvaluationSettings | None = None,
+    prediction: JointTracks, reference: JointTracks, level: float = 0.95
 ) -> dict[str, tuple[int, int]]:
     """Return the number of joints inside their confidence region and in total, per group.
 
     A region is the ellipsoid of the stated covariance that contains the true joint with probability
     `level` for normal errors: d^T C^-1 d is below the quantile of the chi-square distribution with
     three degrees of freedom. People are matched per frame as for the other metrics.
-
-    Raises:
-        InputError: the prediction has no covariance.
     """
-    settings = settings or EvaluationSettings()
-    if prediction.covariance is None:
-        raise InputError(
-            "prediction",
-            expected="joints with covariance",
-            found="joints without covariance",
-            todo="Export the joints of a run, or evaluate without confidence regions.",
-        )
-    found, covariance, counts = _match(prediction, reference, settings)
-    assert covariance is not None
+    found, covariance, counts = _match(prediction, reference)
+    assert covariance is not None  # joints of a run have one
     counts &= np.isfinite(covariance).all(axis=(-1, -2))
     error = np.where(counts[..., None], found - reference.joints, 0.0)
     covariance = np.where(counts[..., None, None], covariance, np.eye(3))
     squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
-    inside: Flags = np.asarray(counts & (squared <= chdtri(3, 1.0 - level)))
-    groups = {name: group_joints(name) for name in JOINT_GROUPS}
-    return {
-        name: (int(inside[..., some].sum()), int(counts[..., some].sum()))
-        for name, some in groups.items()
-    }
+    return _by_group(np.asarray(counts & (squared <= chdtri(3, 1.0 - level))), counts)
