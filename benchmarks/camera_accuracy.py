@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 from common import places_of_feet, quantile, simulate, tell
-from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, duration, integer, option, seeds
 from scipy.stats import chi2
 
 import worldpose
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
@@ -39,7 +38,11 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import Scenario
 from worldpose.static_calibration.estimate import calibrate_camera
-from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
+from worldpose.static_calibration.parameters import (
+    CameraEstimate,
+    project_with_jacobian,
+    step_between,
+)
 from worldpose.static_calibration.report import StaticCalibration, calibration_arrays
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.tracking.settings import TrackingSettings
@@ -144,17 +147,7 @@ def ground_errors(found: Camera, true: Camera, places: Floats, pitch: PitchTempl
 
 def region(estimate: CameraEstimate, true: Camera) -> float:
     """Return the estimate's probability mass that is nearer to it than the true camera."""
-    camera = estimate.camera
-    off = true.cam_from_world @ camera.cam_from_world.inverse()
-    step = np.concatenate(
-        [
-            off.rotvec,
-            off.translation,
-            [np.log(true.focal[0] / camera.focal[0])],
-            true.principal_point - camera.principal_point,
-            (true.distortion - camera.distortion)[[0, 1, 4]],
-        ]
-    )
+    step = step_between(estimate.camera, true)
     free = np.diag(estimate.covariance) > 0.0
     inner = estimate.covariance[np.ix_(free, free)]
     squared = step[free] @ np.linalg.solve(inner, step[free])
@@ -297,9 +290,6 @@ def errors(
     "broadcast_accuracy",
     "moving cameras of simulated clips: errors after each step, coverage",
     option("matches", nargs="+", type=Path, help="of `worldpose simulate --scenario broadcast-*`"),
-    integer("key-frames", 0, "of each clip's; 0 = all"),
-    option("--without-players", action="store_true"),
-    option("--without-m6", action="store_true", help="no smoothness, no followed points"),
 )
 def score_moving_cameras(options: Namespace) -> Tables:
     """`worldpose simulate --scenario broadcast-pan --duration 30 --cameras 1 --no-stills --out A`.
@@ -310,28 +300,23 @@ def score_moving_cameras(options: Namespace) -> Tables:
     cameras with the centre, and of players' places in the image inside their stated regions.
     """
     settings = BroadcastCalibrationSettings()
-    if options.without_m6:
-        settings = settings.model_copy(update={"smooth": False, "flow_weight": 0.0})
     told: dict[str, list[Floats]] = {}
     rows, stated = [], []
     for folder in options.matches:
         match = read_match(folder)
         for clip in match.key_frames:
-            keys = match.key_frames[clip].key_frames
-            number = options.key_frames or len(keys)
-            chosen = [keys[int((i + 0.5) * len(keys) / number)] for i in range(number)]
             camera = match.spec.broadcast_views[clip].camera
             true = true_camera(folder, (camera.width, camera.height), clip)
             joints = read_joints(folder / "reference" / "joints.npz").joints
             people = people_of(match, joints, clip)
 
-            def pictures(file: Path = match.videos[clip]) -> Iterator[NDArray[np.uint8]]:
+            def pictures(file: Path = match.videos[clip]) -> Iterator[Image]:
                 with VideoReader(file) as video:
                     yield from (picture for _, picture in video.frames(grey=True))
 
+            keys = list(match.key_frames[clip].key_frames)
             assert match.pitch is not None  # of every scenario with a broadcast camera
-            seen = None if options.without_players else people
-            given = BroadcastClip(chosen, pictures, match.spec.fps, people=seen, boxes=people.boxes)
+            given = BroadcastClip(keys, pictures, match.spec.fps, people=people, boxes=people.boxes)
             found = calibrate_broadcast(PitchTemplate.from_spec(match.pitch), given, settings)
             steps = {"tracked": found.tracked, "lines": found.before, "all": found.camera}
             for label, each in steps.items():
@@ -369,7 +354,7 @@ def people_of(match: MatchFolder, joints: Floats, clip: str) -> People:
     return People(given, seen.keypoints.astype(np.float64), match.spec.fps)
 
 
-def feet_in_picture(true: MovingCamera, joints: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def feet_in_picture(true: MovingCamera, joints: Floats) -> tuple[Floats, Flags]:
     """Return players' places (frames, persons, 3) [m], and a mask of those inside the image."""
     feet = joints[:, :, 15:17].mean(axis=2)
     seen = true.camera.project(feet)
@@ -460,7 +445,7 @@ def score_clocks(options: Namespace) -> Tables:
     return {"clocks": Table(f"{found} of {len(rows)} cases found", columns, rows)}
 
 
-def orders(cameras: int) -> Iterator[NDArray[np.float64]]:
+def orders(cameras: int) -> Iterator[Floats]:
     """Yield the shifts (cameras,) of five orders [frame]."""
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -468,8 +453,8 @@ def orders(cameras: int) -> Iterator[NDArray[np.float64]]:
 
 
 def shift(
-    cameras: Camera, seen: KeypointDetections, fps: float, late: NDArray[np.float64]
-) -> tuple[KeypointDetections, NDArray[np.float64]]:
+    cameras: Camera, seen: KeypointDetections, fps: float, late: Floats
+) -> tuple[KeypointDetections, Floats]:
     """Return detections whose frame t shows the time t + late, and these offsets."""
     people = track_people(cameras, seen, fps).detection_index
     every = np.arange(len(late))
@@ -479,7 +464,7 @@ def shift(
     return shift_in_time(seen.assign_people(people), -late), late
 
 
-def report(name: str, found: Synchronization, true: NDArray[np.float64]) -> list[Any]:
+def report(name: str, found: Synchronization, true: Floats) -> list[Any]:
     """Return a row; the last value is whether all offsets are found within `WANTED`."""
     off = found.late - true
     off = off - np.nanmedian(off) if np.isfinite(off).any() else off

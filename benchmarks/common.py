@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import subprocess
 import sys
 import time
@@ -14,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from registry import Table
 
 from data_contracts.arrays import Floats, Image
@@ -43,13 +41,8 @@ def compare_times(
 ) -> Table:
     """Return the best times of all sides, which run in turns, and their ratios to the first side.
 
-    Args:
-        title: of the table.
-        sides: calls by name; the first one is ours.
-        rounds: number of measured rounds.
-        columns: names of the further columns.
-        more: returns the values of the further columns.
-        scale: what a side's time is multiplied by, if it did a part of the work.
+    `more` returns the values of the further columns by side; a side that did a part of the work has
+    its time multiplied by `scale`.
     """
     best = best_seconds(sides, rounds)
     best = {name: seconds * (scale or {}).get(name, 1.0) for name, seconds in best.items()}
@@ -80,16 +73,6 @@ def places_of_feet(joints: Floats, pitch: PitchTemplate) -> Floats:
 def quantile(values: Floats, share: float = 0.5) -> float:
     """Return a quantile; NaN without values."""
     return float(np.nanquantile(values, share)) if np.isfinite(values).any() else np.nan
-
-
-def read_settings(words: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return settings by stage from STAGE.SETTING=JSON."""
-    overrides: dict[str, dict[str, Any]] = {}
-    for word in words:
-        name, _, value = word.partition("=")
-        stage, _, setting = name.partition(".")
-        overrides.setdefault(stage, {})[setting] = json.loads(value)
-    return overrides
 
 
 def read_changes(words: Sequence[str]) -> dict[str, Any]:
@@ -155,9 +138,7 @@ def best_seconds(sides: Mapping[str, Callable[[], object]], rounds: int) -> dict
 def run_worldpose(*words: object, accepted: Collection[int] = (0,)) -> str:
     """Run the command line quietly and return its output; end the program if it fails.
 
-    Args:
-        words: arguments.
-        accepted: exit codes that are no failure.
+    Exit codes `accepted` are no failure.
     """
     done = subprocess.run(
         [WORLDPOSE, *map(str, words)], capture_output=True, text=True, check=False
@@ -191,9 +172,7 @@ def run_in_process(
     return match.match_id, found
 
 
-def distances_to_polyline(
-    pixels: NDArray[np.float64], line: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def distances_to_polyline(pixels: Floats, line: Floats) -> Floats:
     """Return the distance of each pixel (n, 2) to a polyline (m, 2), NaN in gaps [px].
 
     Infinite where the polyline has no two finite neighbours.
@@ -206,5 +185,5 @@ def distances_to_polyline(
     offset = pixels[:, None] - start
     share = (offset * step).sum(axis=-1) / np.maximum((step**2).sum(axis=-1), 1e-12)
     nearest = offset - np.clip(share, 0.0, 1.0)[..., None] * step
-    distances: NDArray[np.float64] = np.linalg.norm(nearest, axis=-1).min(axis=1)
+    distances: Floats = np.linalg.norm(nearest, axis=-1).min(axis=1)
     return distances

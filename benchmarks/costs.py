@@ -48,8 +48,8 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.match_folder import read_match
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import gather
+from worldpose.simulation.mannequins import assign_roles, dress_people
 from worldpose.simulation.renderer import open_view, render_frame
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
@@ -70,9 +70,6 @@ SURE = 0.4
 """Minimum score of boxes that get a pose here: the stage's high score threshold."""
 
 INTERVAL_S = 0.25
-
-
-GROUPS = Path("/sys/fs/cgroup")
 
 
 @benchmark(

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from common import read_changes
-from numpy.typing import NDArray
 from registry import DATA, SET, Table, Tables, benchmark
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -106,13 +106,13 @@ def load_moments(folder: Path) -> tuple[Camera, list[dict[str, Any]]]:
     """
     said = json.loads((folder / "camma_mvor_2018.json").read_text())
     room = np.array(said["cameras_info"]["camParams"]["firstCamToRoomRef"]).reshape(4, 4)
-    detections: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
+    detections: dict[int, list[Floats]] = defaultdict(list)
     for each in json.loads((folder / "openpose_kps.json").read_text()):
         detections[each["image_id"]].append(np.array(each["coco_keypoints"]).reshape(17, 3))
     boxes: dict[int, list[list[float]]] = defaultdict(list)
     for each in said.get("annotations", []):
         boxes[each["image_id"]].append([*each["bbox"], each["person_id"]])
-    truth: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
+    truth: dict[str, list[Floats]] = defaultdict(list)
     for person in said["annotations3D"]:
         points = np.array(person["keypoints3D"]).reshape(-1, 4)[MVOR]
         joints = (points[:, :3] @ room[:3, :3].T + room[:3, 3]) / 1000.0
@@ -130,9 +130,7 @@ def load_moments(folder: Path) -> tuple[Camera, list[dict[str, Any]]]:
     return load_cameras(said["cameras_info"]), moments
 
 
-def count_views(
-    cameras: Camera, truth: NDArray[np.float64], image: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def count_views(cameras: Camera, truth: Floats, image: Floats) -> Integers:
     """Return the number of cameras that see each person (people, 8, 3)."""
     views = np.zeros(len(truth), dtype=np.int64)
     for c in range(image.shape[1]):
@@ -150,7 +148,7 @@ def count_views(
     return views
 
 
-def name_detections(boxes: NDArray[np.float64], image: NDArray[np.float64]) -> list[int]:
+def name_detections(boxes: Floats, image: Floats) -> list[int]:
     """Return the identity of each detection (detections, 17, 3) of a view from boxes (n, 5)."""
     names = []
     for joints in image:
@@ -176,10 +174,8 @@ def judge_result(
 ) -> tuple[str, int | None]:
     """Return whether a result is "real", "false" or "unknown", and the identity of its person.
 
-    Args:
-        names: identities of its detections.
-        elsewhere: the identities of all boxes in these detections' views.
-        taken: identities of people that other results show.
+    `names` are identities of its detections, `elsewhere` those of all boxes in their views, `taken`
+    those of people that other results show.
     """
     known = Counter(name for name in names if name >= 0)
     if not known:
@@ -205,7 +201,7 @@ def measure(
     `extra` those beyond the annotated ones, both by the cameras whose detections place them. Of
     `extra`, `false` are no person and `unknown` cannot be judged.
     """
-    errors: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
+    errors: dict[int, list[Floats]] = defaultdict(list)
     people: dict[int, int] = defaultdict(int)
     results: dict[int, int] = defaultdict(int)
     extra: dict[int, int] = defaultdict(int)
@@ -258,11 +254,9 @@ def measure(
     }
 
 
-def mean_error(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def mean_error(errors: list[Floats]) -> Floats:
     """Return the mean error of each of `GROUPS` (4,) [cm]; NaN without people."""
     if not errors:
         return np.full(len(GROUPS), np.nan)
-    means: NDArray[np.float64] = np.nanmean(
-        np.array(errors).reshape(-1, len(GROUPS), 2), axis=(0, 2)
-    )
+    means: Floats = np.nanmean(np.array(errors).reshape(-1, len(GROUPS), 2), axis=(0, 2))
     return means

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 from common import run_worldpose
-from numpy.typing import NDArray
 from registry import OUT, Table, Tables, benchmark, option
 
 import worldpose
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from flows.results.best_results import joint_tracks, static_cameras
 from worldpose.formats.detection_files import read_openpose_folder
@@ -128,7 +128,7 @@ def write_trial(demo: Path, detected: tuple[Path, str], out: Path, *, several: b
             file.write_text(json.dumps({"version": 1.3, "people": found}))
 
 
-def run_pose2sim(tool: Path, trial: Path, *, convert: bool) -> list[NDArray[np.float64]]:
+def run_pose2sim(tool: Path, trial: Path, *, convert: bool) -> list[Floats]:
     """Return the joints (frames, 17, 3) [m] of Pose2Sim's people, z up; NaN where missing."""
     for folder in ("pose-associated", "pose-3d"):
         shutil.rmtree(trial / folder, ignore_errors=True)
@@ -142,7 +142,7 @@ def run_pose2sim(tool: Path, trial: Path, *, convert: bool) -> list[NDArray[np.f
     return [read_trc(file) for file in sorted((trial / "pose-3d").glob("*.trc"))]
 
 
-def read_trc(file: Path) -> NDArray[np.float64]:
+def read_trc(file: Path) -> Floats:
     """Return joints (frames, 17, 3) [m], z up, by the frame numbers of a TRC file."""
     lines = file.read_text().splitlines()
     names = [name for name in lines[3].split("\t")[2:] if name.strip()]
@@ -158,15 +158,11 @@ def read_trc(file: Path) -> NDArray[np.float64]:
     return joints
 
 
-def score(
-    joints: NDArray[np.float64], cameras: Camera, seen: NDArray[np.float64]
-) -> tuple[float, ...]:
+def score(joints: Floats, cameras: Camera, seen: Floats) -> tuple[float, ...]:
     """Return metrics of one person.
 
-    Args:
-        joints: (frames, 17, 3) [m].
-        cameras: batch (cameras,).
-        seen: (frames, cameras, people, 17, 3) x, y [px] and confidence of the 2D poses.
+    `joints` (frames, 17, 3) [m]; `seen` (frames, cameras, people, 17, 3) are x, y [px] and
+    confidence of the 2D poses.
 
     Returns:
         Median and 90th percentile of the distance to the person's 2D poses [px], missing joints
@@ -198,7 +194,7 @@ def score(
     )
 
 
-def distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def distance(one: Floats, other: Floats) -> float:
     """Return the median distance of two people's joints [m]; infinite if never seen together."""
     frames = min(len(one), len(other))
     off = np.linalg.norm(one[:frames] - other[:frames], axis=-1)
@@ -226,7 +222,7 @@ def compare(tool: Path, nets: Path, name: str, work: Path) -> Tables:
     for c, each in enumerate(poses):
         seen[: len(each), c, : each.shape[1]] = each
     asked = Camera.stack(list(given.values()))
-    methods: dict[str, tuple[list[NDArray[np.float64]], Camera]] = {
+    methods: dict[str, tuple[list[Floats], Camera]] = {
         "Pose2Sim, the demo's calibration": (run_pose2sim(tool, trial, convert=True), asked)
     }
     (trial / "calibration" / "Calib_qualisys.toml").unlink()

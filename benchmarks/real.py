@@ -42,7 +42,6 @@ import numpy as np
 import shelf
 import stills
 from common import distances_to_polyline, run_in_process
-from numpy.typing import NDArray
 from registry import DATA, Table, Tables, as_data, benchmark, format_table, option
 from scipy.spatial import KDTree
 
@@ -72,6 +71,8 @@ from worldpose.video.folder import index_video, open_video
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "real"))
 import static_pair
 
+from data_contracts.arrays import Floats, Image
+
 Metrics = dict[str, Any]
 
 PAIR_M = 2.0
@@ -90,7 +91,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi")
 
 
 def calibrate_pair(
-    places: Mapping[str, NDArray[np.float64]], pixels: Mapping[str, Sequence[float]]
+    places: Mapping[str, Floats], pixels: Mapping[str, Sequence[float]]
 ) -> StaticCalibration:
     """Return one camera of the static pair from its clicks."""
     points = {name: tuple(place) for name, place in places.items()}
@@ -161,9 +162,7 @@ def score_lines(folder: Path, side: str, count: int | None) -> Metrics:
     }
 
 
-def _find_lines(
-    pitch: PitchTemplate, clicks: ClickedMarkings, still: NDArray[np.uint8]
-) -> LineRefinement:
+def _find_lines(pitch: PitchTemplate, clicks: ClickedMarkings, still: Image) -> LineRefinement:
     lines = calibrate_camera(pitch, clicks, static_pair.SIZE, picture=still).report.lines
     if lines is None or not lines.refined:
         raise WorldposeError(f"static pair: the lines were not used: {lines and lines.reason}")
@@ -172,7 +171,7 @@ def _find_lines(
 
 def track_sides(
     folder: Path, frames: int, work: Path, *, clicked: bool = True
-) -> tuple[Metrics, list[NDArray[np.float64]]]:
+) -> tuple[Metrics, list[Floats]]:
     """Return metrics of the calibrations, and where each camera alone places people.
 
     Without clicks both cameras are proposed from their videos. Places are (frames, persons, 2) [m]
@@ -213,9 +212,7 @@ def track_sides(
     return metrics, places
 
 
-def pair_feet(
-    first: NDArray[np.float64], second: NDArray[np.float64], offset: float
-) -> list[NDArray[np.float64]]:
+def pair_feet(first: Floats, second: Floats, offset: float) -> list[Floats]:
     """Return the distances of pairs [m] in each frame, the second camera's taken `offset` later."""
     before = int(np.floor(offset))
     found = []
@@ -260,7 +257,7 @@ def score_static_pair(folder: Path, frames: int | None) -> Metrics:
     return metrics
 
 
-def _score_feet(left: NDArray[np.float64], right: NDArray[np.float64]) -> Metrics:
+def _score_feet(left: Floats, right: Floats) -> Metrics:
     """Return distances of the same feet under the clock offset that fits best."""
     offsets = np.arange(-MAX_OFFSET_FRAMES, MAX_OFFSET_FRAMES + 0.05, 0.1)
     by_offset = [pair_feet(left, right, float(offset)) for offset in offsets]
@@ -274,7 +271,7 @@ def _score_feet(left: NDArray[np.float64], right: NDArray[np.float64]) -> Metric
     }
 
 
-def _quantile(values: NDArray[np.float64], share: float, otherwise: float) -> float:
+def _quantile(values: Floats, share: float, otherwise: float) -> float:
     return float(np.quantile(values, share)) if len(values) else otherwise
 
 
@@ -325,7 +322,7 @@ def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
     index = index_video(videos[0])
     count = len(index) if frames is None else min(frames, len(index))
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
+    def pictures() -> Iterator[Image]:
         with open_video(videos[0], index) as video:
             yield from (picture for _, picture in video.frames(0, count, grey=True))
 

@@ -84,7 +84,6 @@ Row = tuple[int, str, float, float, Floats]
     "cameras without a click in real stills, against labelled markings",
     DATA,
     option("--fetch", action="store_true", help="get the stills first, into DATA/still_cameras"),
-    option("--mirror", type=Path, help="folder of clones named owner+name"),
     option("--half", choices=("tuned", "held")),
     option("--only", nargs="*", default=()),
 )
@@ -101,7 +100,7 @@ def score_stills(options: Namespace) -> Tables:
     wrong if half of its labelled markings are not right, at 20 px.
     """
     if options.fetch:
-        fetch_stills(options.data, options.mirror or options.data / "stills_repositories")
+        fetch_stills(options.data)
     stills, scores = read_labels(options.half, options.only), list[tuple[str, Score]]()
     for still in stills:
         picture = cv2.imread(str(options.data / "still_cameras" / f"{still['name']}.png"))
@@ -125,12 +124,15 @@ def score_stills(options: Namespace) -> Tables:
     return {"stills": Table(title, [*columns, "time [s]"], rows)}
 
 
-def fetch_stills(data: Path, clones: Path) -> None:
+def fetch_stills(data: Path) -> None:
     """Write the stills to `data/still_cameras`; some are frames of videos."""
     out = data / "still_cameras"
     out.mkdir(parents=True, exist_ok=True)
     for still in read_labels():
-        content = fetch_file(clones, *(still[name] for name in ("repository", "commit", "path")))
+        content = fetch_file(
+            data / "stills_repositories",
+            *(still[name] for name in ("repository", "commit", "path")),
+        )
         if "frame" in still:
             (out / "video.mp4").write_bytes(content)
             with open_video(out / "video.mp4") as video:
@@ -343,15 +345,20 @@ def read_drawn(name: str) -> KeyFrames:
 
 def calibrate(data: Path, *, proposed: bool = False) -> BroadcastCalibration:
     """Return the clip's camera, from its key frames, clicked or proposed."""
-    with open_video(data / "frames") as video:
-        pictures = [picture for _, picture in video.frames(grey=True)]
-        numbers = np.linspace(0, FRAMES - 1, PROPOSED_FRAMES).astype(int).tolist()
-        shown = [next(video.frames(number, number + 1)) for number in numbers]
-    keys = [*read_drawn("clicks.json").key_frames]
-    if proposed:
-        keys = propose_key_frames(shown, PitchTemplate.standard(), side="near", where=str(data))
-    clip = BroadcastClip(keys, lambda: iter(pictures), FPS, proposed=proposed)
-    return calibrate_broadcast(PitchTemplate.standard(), clip)
+    return _calibrate(data / "frames", read_drawn("clicks.json"), FPS, proposed=proposed)
+
+
+def _calibrate(video: Path, keys: KeyFrames, fps: float, *, proposed: bool) -> BroadcastCalibration:
+    """Return a video's camera from its key frames, or from as many as the stage proposes."""
+    chosen, pitch = [*keys.key_frames], PitchTemplate.standard()
+    with open_video(video) as opened:
+        pictures = [picture for _, picture in opened.frames(grey=True)]
+        if proposed:
+            numbers = np.linspace(0, len(pictures) - 1, PROPOSED_FRAMES).astype(int).tolist()
+            shown = [next(opened.frames(number, number + 1)) for number in numbers]
+            chosen = propose_key_frames(shown, pitch, side="near", where=str(video))
+    clip = BroadcastClip(chosen, lambda: iter(pictures), fps, proposed=proposed)
+    return calibrate_broadcast(pitch, clip)
 
 
 def estimated_pitch(found: BroadcastCalibration) -> PitchTemplate:
@@ -385,36 +392,24 @@ def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrame
                 along = ends[1] - ends[0]
                 normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
                 normal *= np.sign(normal[1])
-                slopes = normal * squeeze @ _pixel_slopes(found, key.frame, world[nearest])
+                place = world[nearest][None]
+                by_frame = found.camera.project_with_jacobian(key.frame, place)[1][0]
+                slopes = normal * squeeze @ by_frame
                 std = np.sqrt(slopes @ found.uncertainty.frame[key.frame] @ slopes)
                 distance = float(off[nearest] @ normal)
                 rows.append((key.frame, marking.name, distance, float(std), slopes))
     return rows
 
 
-def _pixel_slopes(found: BroadcastCalibration, frame: int, place: Floats) -> Floats:
-    """Return the slopes (2, 12) of a place's pixel by the parameters of its frame."""
-    return np.asarray(found.camera.project_with_jacobian(frame, place[None])[1][0])
-
-
 def calibrate_cut(
     folder: Path, *, proposed: bool = False
 ) -> tuple[BroadcastCalibration, KeyFrames]:
     """Return the camera of a clip that `cut_clip` wrote, and the clip's lines."""
-    video = folder / "clip.mp4"
     keys, lines = (
         validate_record(KeyFrames, json.loads((folder / f"{name}.json").read_text()), name)
         for name in ("key_frames", "lines")
     )
-    chosen, pitch = [*keys.key_frames], PitchTemplate.standard()
-    with open_video(video) as opened:
-        pictures = [picture for _, picture in opened.frames(grey=True)]
-        if proposed:
-            numbers = np.linspace(0, len(pictures) - 1, PROPOSED_FRAMES).astype(int).tolist()
-            shown = [next(opened.frames(number, number + 1)) for number in numbers]
-            chosen = propose_key_frames(shown, pitch, side="near", where=str(video))
-    clip = BroadcastClip(chosen, lambda: iter(pictures), cut_clip.FPS, proposed=proposed)
-    return calibrate_broadcast(pitch, clip), lines
+    return _calibrate(folder / "clip.mp4", keys, cut_clip.FPS, proposed=proposed), lines
 
 
 def errors_of_cut(

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 from common import tell
-from joint_regions import group_errors, region_counts
-from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, duration, integer, option
+from scipy.special import chdtri
 
-from data_contracts.conventions import JOINT_GROUPS
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.conventions import COCO17, JOINT_GROUPS
 from data_contracts.run import RunRecord
 from flows.match import task_of
 from flows.registering import find_match
@@ -35,7 +35,13 @@ from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog
 from flows.settings import selected_stages
 from flows.stage import Stage
-from worldpose.evaluation.matching import joint_distances, match_people
+from worldpose.evaluation.matching import (
+    EvaluationSettings,
+    joint_distances,
+    match_people,
+    select_frames,
+    take_matched,
+)
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.ingest.footage import unit_frames
@@ -219,7 +225,7 @@ def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
     return log.run_stages(compute)
 
 
-def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
+def views_of_detections(folder: Path, truth: JointTracks) -> Integers:
     """Return the number of static cameras that detect each true person (frames, persons)."""
     count = np.zeros(truth.joints.shape[:2], np.int64)
     spec = read_match(folder).spec
@@ -247,7 +253,7 @@ def score_stage(run: Run, stage: str, reference: Path, fps: float) -> dict[str, 
 
 
 def people_with_bodies(
-    tracks: JointTracks | None, truth: JointTracks, shown: NDArray[np.int64]
+    tracks: JointTracks | None, truth: JointTracks, shown: Integers
 ) -> dict[str, int]:
     """Return the number of people that two cameras see, and the number of those with bodies."""
     seen = shown >= 2
@@ -344,3 +350,60 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
         if not answer.exists():
             return plan | {"state": "crash", "failures": [f"exit code {process.exitcode}"]}
         return dict(json.loads(answer.read_text()))
+
+
+def group_joints(group: str) -> list[int]:
+    """Return the indices of a group's joints in COCO-17."""
+    parts = JOINT_GROUPS[group]
+    return [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]
+
+
+def _match(prediction: JointTracks, reference: JointTracks) -> tuple[Floats, Floats | None, Flags]:
+    """Return matched joints, their covariance, and which of them count, as the true people."""
+    settings = EvaluationSettings()
+    joints = select_frames(prediction.joints, prediction.frames, reference.frames)
+    match = match_people(joint_distances(joints, reference.joints), settings.match_gate_m)
+    covariance = None
+    if prediction.covariance is not None:
+        stated = select_frames(prediction.covariance, prediction.frames, reference.frames)
+        flat = take_matched(stated.reshape(*stated.shape[:3], 9), match)
+        covariance = flat.reshape(*flat.shape[:3], 3, 3)
+    found = take_matched(joints, match)
+    counts: Flags = np.asarray(np.isfinite(found - reference.joints).all(axis=-1))
+    if reference.views is not None:
+        counts &= reference.views >= settings.min_views
+    return found, covariance, counts
+
+
+def _by_group(values: Floats | Flags, counts: Flags) -> dict[str, tuple[Any, int]]:
+    """Return the sum of values of joints (frames, persons, 17), and their number, per group."""
+    groups = {name: group_joints(name) for name in JOINT_GROUPS}
+    return {
+        name: (values[..., some].sum().item(), int(counts[..., some].sum()))
+        for name, some in groups.items()
+    }
+
+
+def group_errors(prediction: JointTracks, reference: JointTracks) -> dict[str, tuple[float, int]]:
+    """Return the sum of distances [mm] and the number of joints per group."""
+    found, _, counts = _match(prediction, reference)
+    away = np.linalg.norm(found - reference.joints, axis=-1)
+    return _by_group(np.where(counts, 1e3 * away, 0.0), counts)
+
+
+def region_counts(
+    prediction: JointTracks, reference: JointTracks, level: float = 0.95
+) -> dict[str, tuple[int, int]]:
+    """Return the number of joints inside their confidence region and in total, per group.
+
+    A region is the ellipsoid of the stated covariance that contains the true joint with probability
+    `level` for normal errors: d^T C^-1 d is below the quantile of the chi-square distribution with
+    three degrees of freedom. People are matched per frame as for the other metrics.
+    """
+    found, covariance, counts = _match(prediction, reference)
+    assert covariance is not None  # joints of a run have one
+    counts &= np.isfinite(covariance).all(axis=(-1, -2))
+    error = np.where(counts[..., None], found - reference.joints, 0.0)
+    covariance = np.where(counts[..., None, None], covariance, np.eye(3))
+    squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
+    return _by_group(np.asarray(counts & (squared <= chdtri(3, 1.0 - level))), counts)

@@ -11,14 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import (
-    load_module,
-    read_settings,
-    run_in_process,
-    run_worldpose,
-    tell,
-)
-from registry import DATA, SET, Table, Tables, benchmark, integer, option
+from common import load_module, run_in_process, run_worldpose, tell
+from registry import DATA, Table, Tables, benchmark, option
 
 from flows.results.best_results import JointDefinition, joint_tracks
 from worldpose.body_fitting.evidence import perceived_joints
@@ -43,8 +37,6 @@ POINTS, MILLIMETERS = 0.3, 1.0
 """Loss through a stage that counts as worse."""
 
 LETTERS = {"triangulation": "T", "retriangulation": "R", "body_fitting": "B"}
-
-FOUND_M = 0.5
 
 
 @benchmark("shelf", "Shelf through whole runs: all cameras, causally, without each camera", DATA)
@@ -122,11 +114,6 @@ def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Pat
     option("--windows", type=int, nargs="+", default=[211, 121, 60, 30], help="lengths [frame]"),
     option("--first", type=int, help="first frame; that of the labels if not given"),
     option("--cameras", type=int, nargs="+", default=[5, 4, 3, 2], help="numbers of cameras"),
-    option("--without", nargs="*", default=[], help="the subset without these alone"),
-    integer("iterations", 1),
-    option("--until", default="body_fitting"),
-    option("--keep", type=Path, help="folder whose results are not recomputed"),
-    SET,
 )
 def score_subsets(options: Namespace) -> Tables:
     """Every subset of cameras is a match, and so is every window of frames, in sequence.
@@ -141,37 +128,32 @@ def score_subsets(options: Namespace) -> Tables:
     first = options.first or int(truth["frames"][0])
     rows: list[list[Any]] = []
     worse: dict[str, list[bool]] = {}
-    how = (options.until, options.iterations, read_settings(options.settings))
     with tempfile.TemporaryDirectory() as temporary:
-        folder = options.keep or Path(temporary)
+        folder = Path(temporary)
         store = Store.open_or_new(str(folder / "project"))
         for length, number in itertools.product(options.windows, options.cameras):
             windows = [range(n, n + length) for n in range(first, last + 2 - length, length)]
             for frames, cameras in itertools.product(
                 windows, itertools.combinations(every, number)
             ):
-                rest, shown = set(every) - set(cameras), np.isin(truth["frames"], frames)
-                if options.without and rest != set(options.without):
-                    continue
+                shown = np.isin(truth["frames"], frames)
                 if not np.isfinite(truth["gt"][shown][:, [0, 2], 0, 0]).any():
                     continue
                 label = f"{' '.join(cameras)}, {frames.start} to {frames.stop - 1}"
                 try:
                     folder_of_case = write_case(data / "import", cameras, frames, folder)
-                    match, found = run_in_process(store, folder_of_case, *how)
+                    match, (keys,) = run_in_process(store, folder_of_case, STAGES[-1], 1, {})
                 except WorldposeError as error:
                     rows.append([label, type(error).__name__, None, None])
                     continue
                 marks: dict[str, tuple[float, float]] = {}
-                for turn, keys in enumerate(found, 1):
-                    for stage in (each for each in STAGES if f"{each}/clip" in keys):
-                        both = score(scorer, truth, store, match, keys, stage)
-                        marks |= {f"{letter}{turn}": pair for letter, pair in both.items()}
+                for stage in (each for each in STAGES if f"{each}/clip" in keys):
+                    marks |= score(scorer, truth, store, match, keys, stage)
                 rows += [[label, name, *pair] for name, pair in marks.items()]
-                for before, after in itertools.pairwise(("T1", "R1", "B1")):
+                for before, after in itertools.pairwise(("T", "R", "B")):
                     if after in marks:
                         lost = marks[before][0] - marks[after][0]
-                        risen = marks[after][1] - marks[before][1] if after == "R1" else 0.0
+                        risen = marks[after][1] - marks[before][1] if after == "R" else 0.0
                         is_bad = lost > POINTS or risen > MILLIMETERS
                         worse.setdefault(f"{before} to {after}", []).append(is_bad)
                 tell(f"{label} {marks}")

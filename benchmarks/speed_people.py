@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 import torch
 from common import compare_times, quantile, simulate
-from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, integer
 from scipy.optimize import linear_sum_assignment
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.body_file import load_open_body
@@ -68,7 +67,7 @@ class Workload(NamedTuple):
     cameras: Camera
     joints: Floats
     seen: KeypointDetections
-    owner: NDArray[np.int64]
+    owner: Integers
     bodies: BodyParameters
 
 

@@ -17,10 +17,6 @@ def read_yolo_labels(picture: Path, person: int = 0) -> LabelledPicture:
     A line is `class x_center y_center width height`, or `class x y x y ...` for a polygon, all
     relative to the image's sides. Objects of other classes are left out.
 
-    Args:
-        picture: the image.
-        person: class of people.
-
     Raises:
         InputError: the image or its labels cannot be read.
     """
@@ -59,10 +55,7 @@ def _no_yolo_labels(file: Path, found: str) -> InputError:
 def label_boxes(picture: Path, boxes: Floats, ignored: Flags) -> LabelledPicture:
     """Return labels without keypoints.
 
-    Args:
-        picture: the image.
-        boxes: (people, 4) x0, y0, x1, y1 [px].
-        ignored: (people,) see `LabelledPicture`.
+    Boxes (people, 4) are x0, y0, x1, y1 [px].
     """
     people = len(boxes)
     return LabelledPicture(

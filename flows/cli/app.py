@@ -51,11 +51,7 @@ GROUPS: Final = {
         "check": "data_set:check",
         "statistics": "data_set:statistics",
     },
-    "Find out why": {
-        "why": "lineage:why",
-        "diff": "lineage:diff",
-        "timings": "lineage:timings",
-    },
+    "Find out why": {"why": "lineage:why", "diff": "lineage:diff", "timings": "lineage:timings"},
     "Keep the project in order": {
         "pin": "project:pin",
         "unpin": "project:unpin",

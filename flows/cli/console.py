@@ -26,9 +26,7 @@ errors = Console(stderr=True, soft_wrap=True)
 ProjectOption = Annotated[
     str,
     typer.Option(
-        "--project",
-        envvar="WORLDPOSE_PROJECT",
-        help="Folder or s3:// URL that holds all results.",
+        "--project", envvar="WORLDPOSE_PROJECT", help="Folder or s3:// URL that holds all results."
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -39,8 +37,7 @@ MatchArgument = Annotated[
     str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
 ]
 RunOption = Annotated[
-    str,
-    typer.Option("--run", help="A run's number or name; by default the latest, with results."),
+    str, typer.Option("--run", help="A run's number or name; by default the latest, with results.")
 ]
 StageOption = Annotated[
     str | None, typer.Option("--stage", help="Stage of the joints; the last by default.")

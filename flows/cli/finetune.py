@@ -10,16 +10,8 @@ import typer
 from pydantic import JsonValue, ValidationError
 
 from data_contracts.finetune import NetKind, NetVersion
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    answer,
-    errors,
-    line,
-    print_json,
-    print_table,
-)
+from flows.cli import console
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
 from flows.settings import parse_value
 from worldpose.errors import UsageError, unknown_name
 
@@ -35,7 +27,7 @@ class _Lines(logging.Handler):
     """Log handler that prints training progress."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        line(record.getMessage(), to=errors)
+        console.line(record.getMessage(), to=console.errors)
 
 
 def label(
@@ -63,7 +55,7 @@ def label(
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
     frames = propose_labels(videos, every, out, settings)
     told = f"proposed labels of {frames} frames: correct {out / 'labels.json'}"
-    answer(as_json, {"frames": frames, "labels": str(out / "labels.json")}, told)
+    console.answer(as_json, {"frames": frames, "labels": str(out / "labels.json")}, told)
 
 
 def finetune(
@@ -121,7 +113,7 @@ def finetune(
         logger.removeHandler(shown)
     folder = Path(project) / FOLDER
     if as_json:
-        print_json({"versions": [version.model_dump(mode="json") for version in versions]})
+        console.print_json({"versions": [version.model_dump(mode="json") for version in versions]})
     else:
         _print(versions, folder)
 
@@ -139,10 +131,10 @@ def _print(versions: list[NetVersion], folder: Path) -> None:
         for v in versions
     ]
     columns = ("net", "metric", ">before", ">after", ">held-out images", "")
-    print_table("fine-tuning", columns, rows)
+    console.print_table("fine-tuning", columns, rows)
     chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
     if chosen:
-        line(f"use it with: worldpose run MATCH {' '.join(chosen)}")
+        console.line(f"use it with: worldpose run MATCH {' '.join(chosen)}")
 
 
 def _kind(name: str, where: str) -> NetKind:

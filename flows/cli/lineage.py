@@ -7,17 +7,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    RunOption,
-    answer,
-    line,
-    print_json,
-    print_table,
-)
+from flows.cli import console
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption, RunOption
 from flows.cli.options import MoreSettingsOption
 from flows.registering import find_registration
 from flows.results.comparison import (
@@ -64,7 +55,7 @@ def diff(
             "compared": [asdict(each) for each in compared],
             "moved": [asdict(each) for each in pictures],
         }
-        print_json({"a": run_a, "b": run_b, **found})
+        console.print_json({"a": run_a, "b": run_b, **found})
         return
     rows = [
         (
@@ -75,10 +66,10 @@ def diff(
         )
         for change in changes
     ]
-    print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "metrics"), rows)
+    console.print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "metrics"), rows)
     _print_compared(compared)
     if pictures:
-        print_table(
+        console.print_table(
             "images with the largest changes of people",
             ("clip", "camera", ">frame", ">person", ">px"),
             [
@@ -105,12 +96,12 @@ def _print_compared(compared: list[SubjectChange]) -> None:
         if change.mark != "unchanged"
     ]
     if rows:
-        print_table("better and worse", ("kind", "which", "is", "metrics"), rows)
+        console.print_table("better and worse", ("kind", "which", "is", "metrics"), rows)
     for kind in KINDS:
         marks = count_marks(compared, kind)
         if marks:
             each = ", ".join(f"{count} {mark}" for mark, count in sorted(marks.items()))
-            line(f"{kind}: {each}")
+            console.line(f"{kind}: {each}")
 
 
 def why(
@@ -132,7 +123,7 @@ def why(
     """
     found = explain_unit(Store.open(project), unit, parse_overrides(assignments or []))
     reasons = (f"  {reason}" for reason in found.reasons)
-    answer(as_json, asdict(found), f"{found.unit}: {found.state}", *reasons)
+    console.answer(as_json, asdict(found), f"{found.unit}: {found.state}", *reasons)
 
 
 def timings(
@@ -148,7 +139,7 @@ def timings(
     store = Store.open(project)
     found = run_time(store, find_registration(store, match).spec.match_id, run)
     if as_json:
-        print_json(asdict(found))
+        console.print_json(asdict(found))
         return
     columns = ("stage", ">units", ">elapsed s", ">of the run %", ">work s", ">longest unit s")
     whole = max(found.seconds, 1e-9)
@@ -165,7 +156,7 @@ def timings(
     ]
     for name, seconds in (("start", found.start), ("between units", found.between)):
         rows.append((name, "", f"{seconds:.2f}", f"{100.0 * seconds / whole:.1f}", "", ""))
-    print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
-    line(f"all its results, also those of earlier runs: {found.cost}")
+    console.print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
+    console.line(f"all its results, also those of earlier runs: {found.cost}")
     if not found.stages:
-        line("nothing was computed by this run; --run names another")
+        console.line("nothing was computed by this run; --run names another")

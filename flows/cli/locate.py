@@ -10,16 +10,8 @@ import numpy as np
 import typer
 
 from data_contracts.cameras import CameraCalibration, LensCalibration
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    line,
-    print_json,
-    print_table,
-    progress,
-)
+from flows.cli import console
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
 from flows.cli.options import WorkersOption
 from flows.cli.synchronize import choose_clip, load_detections
 from flows.registering import find_match
@@ -85,7 +77,7 @@ def locate_cameras(
         )
     require_new(out)
     store = Store.open_or_new(project)
-    with progress(verbose=False):
+    with console.progress(verbose=False):
         opened = find_match(store, match, unfinished=True)
         folder = opened.folder
         if folder.pitch is not None:
@@ -120,7 +112,7 @@ def locate_cameras(
     calibrations = {name: found.cameras[c].to_calibration(name) for c, name in enumerate(names)}
     written = _write(calibrations, folder.folder if apply else None, out)
     if as_json:
-        print_json({"clip": chosen, "written": written, **_as_json(found, names)})
+        console.print_json({"clip": chosen, "written": written, **_as_json(found, names)})
         return
     _print(found, names, written, known)
 
@@ -245,15 +237,15 @@ def _print(
         *("camera", ">position m", ">rotation +- deg", ">focal length px", ">keypoints"),
         *(">residual px", ">held out px", ">coverage %"),
     )
-    print_table("cameras by the people", head, rows)
+    console.print_table("cameras by the people", head, rows)
     by = "standing feet" if found.on_feet else "upright bodies"
-    line(
+    console.line(
         f"{found.people} people, stature {found.stature_m:.2f} m by their limbs; all lengths "
         f"+- {100 * found.scale_std:.1f} %; vertical by {by}, +- {np.degrees(found.up_std):.1f} deg"
     )
     if known.cameras is None and found.people > 1:
-        line("The stature given is that of the median person.")
+        console.line("The stature given is that of the median person.")
     for place in written:
-        line(f"wrote {place}")
+        console.line(f"wrote {place}")
     if not written:
-        line("Add --apply to write calibration.toml into the match folder, or --out FILE.")
+        console.line("Add --apply to write calibration.toml into the match folder, or --out FILE.")

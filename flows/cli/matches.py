@@ -142,12 +142,7 @@ def import_command(
         _import_clicks(clicks, out, camera, as_json=as_json)
     elif kind == "--camera-data" and camera_data is not None:
         target, data = import_camera_data(
-            camera_data,
-            out,
-            camera,
-            first=first_frame,
-            number=freed_camera,
-            zoom_table=zoom_table,
+            camera_data, out, camera, first=first_frame, number=freed_camera, zoom_table=zoom_table
         )
         about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
         answer(as_json, about, f"wrote {target}: {len(data.frame)} rows", *data.notes)

@@ -38,7 +38,7 @@ BodyFolderOption = Annotated[
     Path | None,
     typer.Option(
         help="Folder of installed bodies (worldpose body install); by default that of "
-        "WORLDPOSE_BODY_FOLDER, or else ~/.local/share/worldpose/bodies.",
+        "WORLDPOSE_BODY_FOLDER, or else ~/.local/share/worldpose/bodies."
     ),
 ]
 

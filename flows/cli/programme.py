@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.progress import Progress
 
+from data_contracts.arrays import Image
 from flows.cli.console import JsonOption, answer, errors, line, print_json, print_table
 from worldpose.errors import InputError, UsageError
 
@@ -112,7 +111,7 @@ def clips(
         line(f"{sum(reason in shot.unfit for shot in shots)} shots not proposed: {reason}")
 
 
-def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, Image | None]]:
     """Yield all images, downscaled, with progress on a terminal; add undecodable ones to `lost`."""
     from worldpose.video.files import VideoReader
 

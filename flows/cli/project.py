@@ -8,17 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from data_contracts.pin import Pin
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    answer,
-    errors,
-    line,
-    print_json,
-    print_table,
-    progress,
-)
+from flows.cli import console
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
 from flows.match_state import match_state
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
@@ -35,8 +26,7 @@ from worldpose.store.store import Store
 
 
 def init(
-    folder: Annotated[str, typer.Argument(metavar="DIR")],
-    as_json: JsonOption = False,
+    folder: Annotated[str, typer.Argument(metavar="DIR")], as_json: JsonOption = False
 ) -> None:
     """Create a project: the folder of registered matches and their results.
 
@@ -46,7 +36,7 @@ def init(
         folder: Folder or s3:// URL to create.
     """
     store = Store.create(folder)
-    answer(as_json, {"project": store.url}, f"created project {store.url}")
+    console.answer(as_json, {"project": store.url}, f"created project {store.url}")
 
 
 def status(
@@ -65,10 +55,10 @@ def status(
     wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
     rows = [_match_status(store, match_id) for match_id in wanted]
     if as_json:
-        print_json({"matches": rows})
+        console.print_json({"matches": rows})
         return
     if not rows:
-        line("No match is registered. Register one: worldpose ingest FOLDER.")
+        console.line("No match is registered. Register one: worldpose ingest FOLDER.")
         return
     columns = (
         "match",
@@ -94,25 +84,29 @@ def status(
                 ", ".join(unsettled[:3]) + (" ..." * (len(unsettled) > 3)),
             )
         )
-    print_table("matches", columns, shown)
+    console.print_table("matches", columns, shown)
     for row in rows:
         if row["problem"]:
-            line(f"{row['match']}: {row['problem']}")
+            console.line(f"{row['match']}: {row['problem']}")
         judged = row["usability"] or {"verdict": "", "reservations": ()}
         if judged["reservations"]:
-            line(f"{row['match']}: the results of run {row['run']} are {judged['verdict']}:")
+            console.line(
+                f"{row['match']}: the results of run {row['run']} are {judged['verdict']}:"
+            )
         for text in judged["reservations"]:
-            line(f"  {text}")
+            console.line(f"  {text}")
         for text in (each for each in row["warnings"] if each not in judged["reservations"]):
-            line(f"{row['match']}: {text}")
+            console.line(f"{row['match']}: {text}")
         if row["why"] and row["now"] != judged["verdict"]:
-            line(f"{row['match']}: {row['now']}. {row['why']} {row['todo']}")
+            console.line(f"{row['match']}: {row['now']}. {row['why']} {row['todo']}")
         if row["waiting"]:
-            line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
+            console.line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
         for name, run_id in row["pins"].items():
-            line(f"{row['match']}: run {run_id} is pinned as {name}")
+            console.line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
-            line(f"{row['match']}: judged with the settings of its next run: {row['settings']}")
+            console.line(
+                f"{row['match']}: judged with the settings of its next run: {row['settings']}"
+            )
 
 
 STATES = tuple(state.value for state in UnitState)
@@ -186,11 +180,11 @@ def verify(
             as *.damaged.
     """
     store = Store.open(project)
-    with progress() as reporter:
+    with console.progress() as reporter:
         findings = verify_store(store, progress=reporter.bytes_read)
     withdrawn, set_aside = repair(store, findings) if mend else ((), ())
     if as_json:
-        print_json(
+        console.print_json(
             {
                 "findings": [{"path": each.path, "problem": each.problem} for each in findings],
                 "withdrawn": [each.path for each in withdrawn],
@@ -198,20 +192,20 @@ def verify(
             }
         )
     for finding in findings:
-        line(f"damaged: {finding.path}: {finding.problem}", to=errors)
+        console.line(f"damaged: {finding.path}: {finding.problem}", to=console.errors)
     for result in withdrawn:
-        line(f"withdrawn: {result.path}", to=errors)
+        console.line(f"withdrawn: {result.path}", to=console.errors)
     for path in set_aside:
-        line(f"set aside: {damaged_path(path)}", to=errors)
+        console.line(f"set aside: {damaged_path(path)}", to=console.errors)
     if findings and not mend:
-        errors.print(
+        console.errors.print(
             "worldpose verify --repair withdraws damaged results and sets damaged records aside; "
             "then run the match again"
         )
     if findings:
         raise typer.Exit(1)
     if not as_json:
-        line("Every stored byte is as it was published.")
+        console.line("Every stored byte is as it was published.")
 
 
 def gc(
@@ -239,7 +233,7 @@ def gc(
     freed = collect(store, plan) if delete else 0
     rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
     verb = "removed" if delete else "no run reaches"
-    answer(
+    console.answer(
         as_json,
         {"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed},
         *(f"{garbage.path}  {garbage.reason}" for garbage in plan.garbage),
@@ -307,4 +301,4 @@ def unpin(
 
 def _say_pin(kept: Pin, verb: str, as_json: bool) -> None:
     told = f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}"
-    answer(as_json, kept.model_dump(mode="json"), told)
+    console.answer(as_json, kept.model_dump(mode="json"), told)

@@ -8,17 +8,8 @@ from typing import Annotated, Final
 import typer
 from pydantic import JsonValue
 
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    VerboseOption,
-    errors,
-    line,
-    print_json,
-    print_table,
-    progress,
-)
+from flows.cli import console
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, VerboseOption
 from flows.cli.options import DaskOption, MoreSettingsOption, TimeLimitOption, WorkersOption
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
@@ -63,10 +54,10 @@ def reprocess(
     wanted = [find_registration(store, name).spec.match_id for name in matches or ()]
     limits = parse_time_limits(time_limits or ())
     request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
-    with progress(verbose=verbose):
+    with console.progress(verbose=verbose):
         found = reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run)
     if as_json:
-        print_json({"matches": [_as_json(each) for each in found]})
+        console.print_json({"matches": [_as_json(each) for each in found]})
     else:
         _print(found)
     raise typer.Exit(exit_code(found))
@@ -82,18 +73,18 @@ def exit_code(found: Sequence[Reprocessed]) -> int:
 
 def _print(found: Sequence[Reprocessed]) -> None:
     if not found:
-        line("No match is registered. Register one: worldpose ingest FOLDER.")
+        console.line("No match is registered. Register one: worldpose ingest FOLDER.")
     for each in found:
         if each.state in ("never run", "current"):
-            line(f"{each.match_id}: {_nothing_to_do(each)}")
+            console.line(f"{each.match_id}: {_nothing_to_do(each)}")
             continue
         count = 0 if each.status is None else len(each.status.to_compute)
         run = "" if each.record is None else f", run {each.record.run_id}"
-        line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
+        console.line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
         if each.status is not None:
             _print_units(each.status)
         if each.problem is not None:
-            line(f"error: {each.problem}", to=errors)
+            console.line(f"error: {each.problem}", to=console.errors)
 
 
 def _nothing_to_do(each: Reprocessed) -> str:
@@ -116,7 +107,7 @@ def _print_units(status: RunStatus) -> None:
         more = [f"and {len(own) - MAX_REASONS} more"] * (len(own) > MAX_REASONS)
         inputs = [f"changed inputs: {', '.join(unit.changed_inputs)}"] * bool(unit.changed_inputs)
         rows.append((name, unit.state.value, "\n".join([*own[:MAX_REASONS], *more, *inputs])))
-    print_table(f"since run {status.latest.run_id}", ("unit", "state", "why"), rows)
+    console.print_table(f"since run {status.latest.run_id}", ("unit", "state", "why"), rows)
 
 
 def _as_json(each: Reprocessed) -> dict[str, JsonValue]:

@@ -10,28 +10,8 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.review import Edit
-from flows.cli import review_exchange
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    answer,
-    errors,
-    line,
-    print_json,
-    print_table,
-)
-from flows.cli.options import (
-    PAGES_PORT,
-    CertificateOption,
-    HostOption,
-    KeyOption,
-    NamesOption,
-    PortOption,
-    TokenOption,
-    UsersOption,
-    certificate_and_key,
-)
+from flows.cli import console, options, review_exchange
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
@@ -43,12 +23,7 @@ from flows.stage import Match
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store.store import Store
 
-commands = typer.Typer(
-    name="review",
-    help=__doc__,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+commands = typer.Typer(name="review", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
 MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
 Requests = Annotated[
@@ -86,12 +61,12 @@ def list_reviews(
             found += reviews_of(store, opened, latest_run(store, name))
         except (OSError, WorldposeError) as failure:
             problems[name] = str(failure)
-            line(f"{name}: {failure}", to=errors)
+            console.line(f"{name}: {failure}", to=console.errors)
         else:
             _tell_damage(opened)
     shown = [each for each in found if everything or each.state == "waits"]
     if as_json:
-        print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
+        console.print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
     else:
         _print_list(shown)
     if match and problems:
@@ -127,7 +102,7 @@ def show(
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
     if as_json:
-        print_json(
+        console.print_json(
             {
                 "match": match,
                 "corrections": [each.model_dump(mode="json") for each in opened.corrections],
@@ -141,13 +116,13 @@ def show(
         return
     states = [*((each, "applied") for each in opened.corrections), *opened.stale]
     for correction, state in states:
-        line(f"{correction.id}  {correction.who}, {when(correction.made_at)}")
-        line(f"  {in_words(correction)}")
-        line(f"  {state if state == 'applied' else f'no longer applies: {state}'}")
+        console.line(f"{correction.id}  {correction.who}, {when(correction.made_at)}")
+        console.line(f"  {in_words(correction)}")
+        console.line(f"  {state if state == 'applied' else f'no longer applies: {state}'}")
     if not states:
-        line("no corrections")
+        console.line("no corrections")
     for name, origin in marked.items():
-        line(f"{name}: {origin}")
+        console.line(f"{name}: {origin}")
 
 
 @commands.command()
@@ -199,7 +174,7 @@ def correct(
     store = Store.open(project)
     said = verdicts.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
     found = {"corrections": [each.model_dump(mode="json") for each in said]}
-    answer(as_json, found, *describe_corrections(said), _next_command(match))
+    console.answer(as_json, found, *describe_corrections(said), _next_command(match))
 
 
 @commands.command()
@@ -221,7 +196,7 @@ def withdraw(
     store = Store.open(project)
     verdicts.withdraw(store, open_match(store, match), [correction], who=who, why=why)
     told = f"withdrawn: {correction}"
-    answer(as_json, {"withdrawn": correction}, told, _next_command(match))
+    console.answer(as_json, {"withdrawn": correction}, told, _next_command(match))
 
 
 @commands.command()
@@ -235,18 +210,18 @@ def resume(
     store = Store.open(project)
     resumed = verdicts.resume(store, open_match(store, match))
     told = f"resumed {len(resumed)} runs of {match}; a serving process takes them up"
-    answer(as_json, {"resumed": resumed}, told)
+    console.answer(as_json, {"resumed": resumed}, told)
 
 
 @commands.command()
 def serve(
-    port: PortOption = PAGES_PORT,
-    host: HostOption = "127.0.0.1",
-    names: NamesOption = None,
-    certificate: CertificateOption = None,
-    key: KeyOption = None,
-    token: TokenOption = None,
-    users: UsersOption = None,
+    port: options.PortOption = options.PAGES_PORT,
+    host: options.HostOption = "127.0.0.1",
+    names: options.NamesOption = None,
+    certificate: options.CertificateOption = None,
+    key: options.KeyOption = None,
+    token: options.TokenOption = None,
+    users: options.UsersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
 ) -> None:
     """Serve the review pages to browsers until interrupted.
@@ -258,7 +233,7 @@ def serve(
     from flows.web.app import address
     from flows.web.app import serve as serve_pages
 
-    tls = certificate_and_key(certificate, key)
+    tls = options.certificate_and_key(certificate, key)
     access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     logging.getLogger("worldpose.pages").setLevel(logging.INFO)
@@ -268,7 +243,7 @@ def serve(
     is_shown = token is None and users is None
     shown = where if is_shown else where.partition("#")[0]
     told = f"review pages of {Store.open(project).url}: {shown}"
-    serve_pages(project, access, host=host, port=port, tls=tls, announce=lambda: line(told))
+    serve_pages(project, access, host=host, port=port, tls=tls, announce=lambda: console.line(told))
 
 
 def _decide(
@@ -292,7 +267,7 @@ def _decide(
         edits=_read_edits(edits) if edits else (),
     )
     said = [each.model_dump(mode="json") for each in corrections]
-    answer(
+    console.answer(
         as_json,
         {"verdict": verdict, "reviews": ids, "corrections": said},
         *(f"{verdict}: {name}" for name in ids),
@@ -322,7 +297,7 @@ def _next_command(match: str) -> str:
 
 def _tell_damage(match: Match) -> None:
     for text in match.journal.damage:
-        line(f"warning: {text}", to=errors)
+        console.line(f"warning: {text}", to=console.errors)
 
 
 review_exchange.add_to(commands)
@@ -331,30 +306,30 @@ review_exchange.add_to(commands)
 def _print_list(shown: list[Review]) -> None:
     """Print review requests, each with its state and reasons."""
     if not shown:
-        line("nothing waits for review")
+        console.line("nothing waits for review")
     for each in shown:
         request = each.request
-        line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
+        console.line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
         for reason in request.reasons:
-            line(f"  {reason_words(reason)}")
+            console.line(f"  {reason_words(reason)}")
 
 
 def _print_review(shown: Review, as_json: bool) -> None:
     """Print one review request, its verdict, and all metrics."""
     if as_json:
-        print_json(review_json(shown))
+        console.print_json(review_json(shown))
         return
     request, decision = shown.request, shown.decision
-    line(f"{request.id}: {shown.state}")
-    line(f"  {shown.question}")
+    console.line(f"{request.id}: {shown.state}")
+    console.line(f"  {shown.question}")
     for reason in request.reasons:
-        line(f"  because {reason_words(reason)}")
+        console.line(f"  because {reason_words(reason)}")
     if decision is not None:
-        line(f"  {decision.verdict} by {decision.who}, {when(decision.decided_at)}")
-        line(f"  {decision.why or '(no reason given)'}")
+        console.line(f"  {decision.verdict} by {decision.who}, {when(decision.decided_at)}")
+        console.line(f"  {decision.why or '(no reason given)'}")
     for unit, key in request.keys.items():
-        line(f"  {unit} {key}, run {request.run_id}")
-    print_table("metrics", ("metric", ">value", "unit"), _metric_rows(shown))
+        console.line(f"  {unit} {key}, run {request.run_id}")
+    console.print_table("metrics", ("metric", ">value", "unit"), _metric_rows(shown))
 
 
 def _metric_rows(shown: Review) -> list[tuple[str, str, str]]:

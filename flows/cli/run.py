@@ -13,23 +13,13 @@ import typer
 from pydantic import JsonValue
 
 from data_contracts.run import EXIT_CODES, GatePolicy, RunRecord
+from flows.cli import console, options
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     MatchArgument,
     ProjectOption,
     VerboseOption,
-    errors,
-    line,
-    print_json,
-    print_table,
-    progress,
-)
-from flows.cli.options import (
-    BodyFolderOption,
-    DaskOption,
-    TimeLimitOption,
-    WorkersOption,
 )
 from flows.cli.settings import print_known
 from flows.iterate import Iteration, Iterations, iterate_match
@@ -61,12 +51,12 @@ def run(
         list[str] | None, typer.Option("--set", metavar="STAGE.NAME=VALUE")
     ] = None,
     default_settings: Annotated[bool, typer.Option("--default-settings")] = False,
-    dask: DaskOption = None,
-    workers: WorkersOption = None,
-    time_limits: TimeLimitOption = None,
+    dask: options.DaskOption = None,
+    workers: options.WorkersOption = None,
+    time_limits: options.TimeLimitOption = None,
     gates: Annotated[GatePolicy | None, typer.Option(metavar="POLICY")] = None,
     iterations: Annotated[str | None, typer.Option(metavar="N")] = None,
-    body_folder: BodyFolderOption = None,
+    body_folder: options.BodyFolderOption = None,
     verbose: VerboseOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -106,11 +96,11 @@ def run(
         iterations=None if iterations is None else parse_iterations(iterations),
         body_folder=None if body_folder is None else str(body_folder.expanduser().absolute()),
     )
-    with progress(verbose=verbose):
+    with console.progress(verbose=verbose):
         opened = find_match(store, match)
         require_no_other_run(store, opened.match_id)
         for text in warnings_of(opened):
-            line(f"warning: {text}", to=errors)
+            console.line(f"warning: {text}", to=console.errors)
         opened, request = settle(store, opened, request)
         most = request.most_iterations
         passes = None if most == 1 else iterate_match(store, opened, request, most)
@@ -123,7 +113,7 @@ def run(
         *click_advice(record.figures, record.settings),
     ]
     if as_json:
-        print_json(
+        console.print_json(
             {
                 "run": record.run_id,
                 "executed": len(record.executed),
@@ -147,13 +137,15 @@ def run(
             print_iterations(store, passes)
         _print(record, store.url, seconds)
         for path in exported:
-            line(f"exported {path}")
+            console.line(f"exported {path}")
     reservations = record.usability.reservations
     for text in dict.fromkeys((*reservations, *warned)):
         kind = "reservation" if text in reservations else "warning"
-        line(f"{kind}: {text}", to=errors)
+        console.line(f"{kind}: {text}", to=console.errors)
     if problem is not None:
-        line(f"error: the run is kept, and its exports failed: {problem}", to=errors)
+        console.line(
+            f"error: the run is kept, and its exports failed: {problem}", to=console.errors
+        )
     raise typer.Exit(EXIT_CODES[record.state] if problem is None else 1)
 
 
@@ -170,24 +162,24 @@ def _export(
 def _print(record: RunRecord, project: str, seconds: float) -> None:
     by = " until the review" if record.waiting and not record.failed else " by that"
     blocked = f" and {len(record.blocked)} blocked{by}" if record.blocked else ""
-    line(
+    console.line(
         f"run {record.run_id} of {record.match_id} is {record.state}: "
         f"{len(record.executed)} computed, {len(record.reused)} reused, "
         f"{len(record.failed)} failed{blocked}, gates {record.gates}, {seconds:.1f} s"
     )
     count = len(record.usability.reservations)
     verdict = f"{record.usability.verdict}{f' ({count} below)' if count else ''}"
-    line(f"the results are {verdict}")
+    console.line(f"the results are {verdict}")
     _print_waiting(record)
     key = "median_stature_m"
     statures = sorted(each[key] for each in record.figures.values() if key in each)
     if statures:
         clips = f" in {len(statures)} clips" if len(statures) > 1 else ""
-        line(f"median stature of the people: {statures[len(statures) // 2]:.2f} m{clips}")
+        console.line(f"median stature of the people: {statures[len(statures) // 2]:.2f} m{clips}")
     if not (record.executed or record.failed or record.waiting):
-        line("Nothing to do: every result is current.")
-    line(f"results: {project}/results/{record.match_id}")
-    line(f"next: {_next_command(record)}")
+        console.line("Nothing to do: every result is current.")
+    console.line(f"results: {project}/results/{record.match_id}")
+    console.line(f"next: {_next_command(record)}")
 
 
 def _next_command(record: RunRecord) -> str:
@@ -208,11 +200,11 @@ def _print_waiting(record: RunRecord) -> None:
     undecided = sum(not unit.rejected for unit in record.waiting)
     rejected = len(record.waiting) - undecided
     also = f", {rejected} rejected and to be corrected" if rejected else ""
-    line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
+    console.line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
     for unit in record.waiting[:MAX_LISTED]:
-        line(f"  {unit.request}: {all_reasons(unit.reasons)}")
+        console.line(f"  {unit.request}: {all_reasons(unit.reasons)}")
     if len(record.waiting) > MAX_LISTED:
-        line(f"  and {len(record.waiting) - MAX_LISTED} more")
+        console.line(f"  and {len(record.waiting) - MAX_LISTED} more")
 
 
 def parse_iterations(text: str) -> int | Literal["auto"]:
@@ -298,9 +290,11 @@ def print_iterations(store: Store, found: Iterations) -> None:
     kinds = dict.fromkeys(kind for each in marks for kind in each)
     rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in kinds]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
-    print_table("iterations", ("metric", *heads), rows)
-    line("b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)")
-    line(
+    console.print_table("iterations", ("metric", *heads), rows)
+    console.line(
+        "b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)"
+    )
+    console.line(
         f"iteration {found.kept.number} stands, as run {found.record.run_id}: {found.ended}; "
         "a later one is kept only if people are foreseen better in cameras left out"
     )

@@ -8,21 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flows.cli import options
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, answer, errors, line
-from flows.cli.options import (
-    PAGES_PORT,
-    CertificateOption,
-    DaskOption,
-    HostOption,
-    KeyOption,
-    NamesOption,
-    PortOption,
-    TimeLimitOption,
-    TokenOption,
-    UsersOption,
-    WorkersOption,
-    certificate_and_key,
-)
 from flows.orchestration.time_limits import parse_time_limits
 from worldpose.errors import UsageError
 
@@ -38,17 +25,17 @@ def serve(
     check: Annotated[bool, typer.Option("--check")] = False,
     test_alerts: Annotated[bool, typer.Option("--test-alerts")] = False,
     max_concurrent: Annotated[int, typer.Option(min=1)] = 1,
-    dask: DaskOption = None,
-    workers: WorkersOption = None,
-    time_limits: TimeLimitOption = None,
+    dask: options.DaskOption = None,
+    workers: options.WorkersOption = None,
+    time_limits: options.TimeLimitOption = None,
     name: str = "worldpose",
-    port: PortOption = PAGES_PORT,
+    port: options.PortOption = options.PAGES_PORT,
     prefect_port: Annotated[int, typer.Option(min=1, max=65535)] = 4200,
     metrics_port: Annotated[int, typer.Option(min=1, max=65535)] = 8573,
-    host: HostOption = "127.0.0.1",
-    names: NamesOption = None,
-    certificate: CertificateOption = None,
-    key: KeyOption = None,
+    host: options.HostOption = "127.0.0.1",
+    names: options.NamesOption = None,
+    certificate: options.CertificateOption = None,
+    key: options.KeyOption = None,
     settle_time: Annotated[float, typer.Option(min=0)] = 30.0,
     poll_interval: Annotated[float, typer.Option(min=0.1)] = 15.0,
     schedule: Annotated[list[str] | None, typer.Option(metavar="FLOW=CRON")] = None,
@@ -57,8 +44,8 @@ def serve(
     stall_minutes: Annotated[float, typer.Option(min=0.5)] = 10.0,
     history_days: Annotated[float, typer.Option(min=1)] = 30.0,
     state: Path | None = None,
-    token: TokenOption = None,
-    users: UsersOption = None,
+    token: options.TokenOption = None,
+    users: options.UsersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -113,7 +100,7 @@ def serve(
     from flows.web.access import access_for
 
     channels_of(os.environ, folder.alert_settings)  # refused here, not in an unread log
-    tls = certificate_and_key(certificate, key)
+    tls = options.certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
         raise UsageError(
             "--inbox",

@@ -18,14 +18,7 @@ from flows.layers import (
     read_layer,
 )
 from flows.registering import find_match
-from flows.settings import (
-    as_text,
-    known_settings,
-    parse_value,
-    require_known,
-    resolve,
-    save_layer,
-)
+from flows.settings import as_text, known_settings, parse_value, require_known, resolve, save_layer
 from worldpose.errors import UsageError, unknown_name
 from worldpose.store.store import Store
 

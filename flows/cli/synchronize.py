@@ -11,17 +11,8 @@ import typer
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import ClipSpec, ClockOffset, MatchSpec
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    errors,
-    line,
-    print_json,
-    print_table,
-    progress,
-)
+from flows.cli import console
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
 from flows.cli.options import WorkersOption
 from flows.registering import find_match
 from flows.results.best_results import static_cameras
@@ -93,7 +84,7 @@ def synchronize(
     if plot is not None:
         require_plot(plot)
     store = Store.open_or_new(project)
-    with progress(verbose=False):
+    with console.progress(verbose=False):
         opened = find_match(store, match)
         spec = opened.folder.spec
         chosen_clip = choose_clip(spec, clip)
@@ -117,7 +108,7 @@ def synchronize(
 
         write_offsets(opened.folder.folder, changed)
     if as_json:
-        print_json(
+        console.print_json(
             {
                 "clip": chosen_clip,
                 "cameras": [row._asdict() for row in rows],
@@ -127,10 +118,10 @@ def synchronize(
     else:
         _print(rows, changed, plot, applied=apply)
     if len(apart) > 1:
-        line(
+        console.line(
             f"warning: {len(apart)} groups of cameras share no person: {'; '.join(apart)}. Offsets "
             "are relative to the first camera of each group; those between groups are unknown.",
-            to=errors,
+            to=console.errors,
         )
     raise typer.Exit(0 if known.all() and len(apart) == 1 else 4)
 
@@ -287,15 +278,15 @@ def _print(
         for row in rows
     ]
     head = ("camera", ">offset_frames", ">by the people", ">standard deviation", ">proposed", "")
-    print_table("clock offsets of the cameras", head, shown)
+    console.print_table("clock offsets of the cameras", head, shown)
     if plot is not None:
-        line(f"wrote {plot}")
+        console.line(f"wrote {plot}")
     if not changed:
-        line("match.yaml needs no change.")
+        console.line("match.yaml needs no change.")
     elif applied:
-        line(f"wrote offset_frames of {', '.join(changed)} into match.yaml")
+        console.line(f"wrote offset_frames of {', '.join(changed)} into match.yaml")
     else:
-        line("Add --apply to write the proposed offsets into match.yaml.")
+        console.line("Add --apply to write the proposed offsets into match.yaml.")
     if any(
         row.found is not None
         and row.std is not None
@@ -303,7 +294,7 @@ def _print(
         and abs(row.found - row.proposed) > max(MIN_OFFSET_FRAMES, 3.0 * row.std)
         for row in rows
     ):
-        line(
+        console.line(
             "The fraction of a frame remains; worldpose run --set "
             "triangulation.correct_clocks=true corrects it."
         )

@@ -7,15 +7,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.reports.match_pictures import shown_pitch
-from flows.results.best_results import (
-    body_tracks,
-    clip_title,
-    joint_tracks,
-)
+from flows.results.best_results import body_tracks, clip_title, joint_tracks
 from flows.results.broadcast_views import broadcast_cameras, broadcast_unit, clip_of
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
@@ -102,9 +98,7 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
     return pictures
 
 
-def _given_curves(
-    match: Match, view: str, images: NDArray[np.int64]
-) -> dict[str, NDArray[np.float64]] | None:
+def _given_curves(match: Match, view: str, images: Integers) -> dict[str, Floats] | None:
     """Return the curves of a view's camera data at images (frames,); None without data."""
     if view not in match.folder.camera_data:
         return None
@@ -184,7 +178,7 @@ def video_step(match: Match) -> int:
     return max(1, round(match.folder.spec.fps / FRAME_RATE))
 
 
-def broadcast_video_frames(run: Run, match: Match, view: str) -> NDArray[np.int64]:
+def broadcast_video_frames(run: Run, match: Match, view: str) -> Integers:
     """Return the indices of the frames of a view's video: the part of the largest error."""
     expected = np.nan_to_num(run[f"broadcast_calibration/{view}"]["reprojection_error"].values)
     most = round(MAX_VIDEO_S * match.folder.spec.fps)

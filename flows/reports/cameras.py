@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.match import MatchSpec
 from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from flows.reports.match_pictures import background_image, shown_pitch
@@ -244,7 +244,7 @@ def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
     return tuple(str(name) for name in result["point"].values[wrong])
 
 
-def _clicked_places(run: Run, camera_id: str) -> dict[str, NDArray[np.float64]]:
+def _clicked_places(run: Run, camera_id: str) -> dict[str, Floats]:
     """Return the clicks that the run used: those of the folder may have changed since.
 
     A camera without clicks was proposed from its image.

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Image, Integers
 from flows.reports.broadcast import (
     MAX_VIDEO_S,
     broadcast_video_frames,
@@ -15,12 +15,7 @@ from flows.reports.broadcast import (
     write_broadcast_video,
 )
 from flows.reports.match_pictures import frame_pictures, shown_pitch
-from flows.results.best_results import (
-    body_tracks,
-    joint_tracks,
-    placed_joints,
-    static_cameras,
-)
+from flows.results.best_results import body_tracks, joint_tracks, placed_joints, static_cameras
 from flows.results.broadcast_views import broadcast_views
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera
@@ -71,7 +66,7 @@ def write_clip_video(
     cameras = Camera.stack([camera])[np.zeros(len(frames), dtype=np.intp)]
     width, height = camera.image_size.tolist()
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
+    def pictures() -> Iterator[Image]:
         for picture in frame_pictures(store, match, owner, frames.tolist()):
             dark = np.zeros((height, width, 3), dtype=np.uint8)  # where the camera has no frame
             yield dark if picture is None else picture
@@ -82,7 +77,7 @@ def write_clip_video(
     write_video(file, drawn, match.folder.spec.fps / video_step(match), quality=23)
 
 
-def video_frames(run: Run, match: Match, clip: str, owner: str) -> NDArray[np.int64]:
+def video_frames(run: Run, match: Match, clip: str, owner: str) -> Integers:
     """Return the match frames of a clip's video, as `write_clip_video` writes it for `owner`."""
     if owner in broadcast_views(run):
         frames = run[f"broadcast_calibration/{owner}"]["frame"].values

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
 from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
 from flows.results.best_results import (
@@ -80,9 +79,7 @@ def clip_pictures(
     return pictures
 
 
-def _image_with_people(
-    store: Store, match: Match, camera_id: str, frame: int
-) -> NDArray[np.uint8] | None:
+def _image_with_people(store: Store, match: Match, camera_id: str, frame: int) -> Image | None:
     """Return a camera's image in a clip's first frame, else the still, which was taken then."""
     image = frame_picture(store, match, camera_id, frame)
     return background_image(store, match, camera_id) if image is None else image
@@ -144,7 +141,7 @@ def _plot_view(
     clip: str,
     tracks: JointTracks,
     place: tuple[int, int],
-    seen: NDArray[np.bool_] | None = None,
+    seen: Flags | None = None,
     part: tuple[Floats, Floats] | None = None,
 ) -> bytes:
     """Return a PNG of detections and reconstruction in one view.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Image, Integers
 from data_contracts.pitch import PitchSpec
 from flows.results.best_results import estimated_pitch
 from flows.stage import Match
@@ -20,7 +20,7 @@ def shown_pitch(run: Run, match: Match, clip: str | None = None) -> PitchSpec | 
     return estimated_pitch(run, match.folder.pitch, match.folder.spec, clip)
 
 
-def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.uint8] | None:
+def background_image(store: Store, match: Match, camera_id: str) -> Image | None:
     """Return an image (height, width, 3) RGB that shows what a static camera sees.
 
     It is the still of the match folder or, without one, the first readable image of the camera's
@@ -42,7 +42,7 @@ def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.u
     return None
 
 
-def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray[np.uint8] | None:
+def frame_picture(store: Store, match: Match, owner: str, frame: int) -> Image | None:
     """Return a camera's image (height, width, 3) RGB in a match frame; None if there is none.
 
     The owner is a static camera or a broadcast view; here and below.
@@ -55,7 +55,7 @@ def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray
 
 def frame_pictures(
     store: Store, match: Match, owner: str, frames: Sequence[int]
-) -> Iterator[NDArray[np.uint8] | None]:
+) -> Iterator[Image | None]:
     """Yield the images of ascending match frames, decoded once and in order.
 
     Raises:
@@ -71,9 +71,7 @@ def frame_pictures(
         yield from pictures_at(video, numbers)
 
 
-def _numbers(
-    store: Store, match: Match, owner: str, frames: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _numbers(store: Store, match: Match, owner: str, frames: Integers) -> Integers:
     """Return the video frames of match frames; -1 if there is none."""
     results = store.run(match.match_id).results if store.runs(match.match_id) else {}
     key = results.get(f"ingest/{owner}")

@@ -22,12 +22,7 @@ from data_contracts.review import (
     ReviewRequest,
     Withdrawal,
 )
-from flows.reports.cameras import (
-    camera_pictures,
-    camera_table,
-    health_picture,
-    paint_pictures,
-)
+from flows.reports.cameras import camera_pictures, camera_table, health_picture, paint_pictures
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures, disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables, people_tables
@@ -43,12 +38,7 @@ from flows.results.broadcast_views import broadcast_cameras, broadcast_views
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
-from worldpose.dataset.statistics import (
-    clip_statistics,
-    data_set_statistics,
-    kind_of,
-    most_moving,
-)
+from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of, most_moving
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.reports.data_set import counted_section

@@ -31,12 +31,7 @@ from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
-from worldpose.formats.viewer_file import (
-    ViewerClip,
-    ViewerPerson,
-    viewer_pieces,
-    write_viewer,
-)
+from worldpose.formats.viewer_file import ViewerClip, ViewerPerson, viewer_pieces, write_viewer
 from worldpose.reports.html_page import EmbeddedPage
 from worldpose.store.store import Run
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.evaluation import Evaluation, MethodScore
 from flows.results.evaluation import cameras_of, reference_side
 from worldpose.body.body_file import OPEN_BODY, find_body
@@ -86,12 +86,7 @@ def score_methods(
             result.joints.frames + first, result.joints.person_ids, result.joints.joints
         )
         evaluation, _ = evaluate_joints(
-            joints,
-            truth.joints,
-            settings,
-            fps=rate,
-            camera=camera,
-            boxes=_boxes(result, camera),
+            joints, truth.joints, settings, fps=rate, camera=camera, boxes=_boxes(result, camera)
         )
         scores.append(
             MethodScore(
@@ -151,7 +146,7 @@ def _image_size(camera: Camera | None) -> tuple[int, int]:
     return width, height
 
 
-def _boxes(result: MethodResult, camera: Camera | None) -> NDArray[np.float64] | None:
+def _boxes(result: MethodResult, camera: Camera | None) -> Floats | None:
     """Return the method's boxes in the camera's image [px]."""
     if result.boxes is None or camera is None or result.image_size is None:
         return result.boxes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
@@ -193,7 +193,7 @@ def joint_tracks(
 
 
 def _identity_certainty(
-    run: Run, clip: str, frames: NDArray[np.int64], people: NDArray[np.integer]
+    run: Run, clip: str, frames: Integers, people: NDArray[np.integer]
 ) -> Floats | None:
     """Return the probability (frames, people) of identities; NaN where feet place the people.
 
@@ -424,8 +424,8 @@ def _stage_joints(run: Run, clip: str, stage: str) -> xr.Dataset:
 
 
 def _with_tracked_joints(
-    run: Run, clip: str, joints: Floats, views: NDArray[np.int64]
-) -> tuple[Floats, NDArray[np.int64]]:
+    run: Run, clip: str, joints: Floats, views: Integers
+) -> tuple[Floats, Integers]:
     """Return joints (frames, persons, 17, 3) [m] and views (frames, persons, 17) of a clip.
 
     The frames that triangulation skipped have those of the tracker.

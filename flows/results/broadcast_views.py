@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-import numpy as np
-from numpy.typing import NDArray
-
+from data_contracts.arrays import Integers
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.store.store import Run
 
@@ -36,7 +34,7 @@ def broadcast_unit(run: Run, view: str) -> str:
     return pooled if pooled in run else f"{BROADCAST}{view}"
 
 
-def camera_in_frames(run: Run, view: str, frames: NDArray[np.int64]) -> Camera:
+def camera_in_frames(run: Run, view: str, frames: Integers) -> Camera:
     """Return the camera of a broadcast view in these match frames, NaN where it is unknown."""
     found = run[broadcast_unit(run, view)]
     by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
@@ -45,7 +43,7 @@ def camera_in_frames(run: Run, view: str, frames: NDArray[np.int64]) -> Camera:
 
 
 def moving_cameras(
-    run: Run, clip: str, frames: NDArray[np.int64], static: Collection[str] = ()
+    run: Run, clip: str, frames: Integers, static: Collection[str] = ()
 ) -> dict[str, Camera]:
     """Return the moving cameras of a clip in these frames: by view, `broadcast` if alone.
 

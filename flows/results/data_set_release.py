@@ -241,8 +241,7 @@ def _name_subjects(
 
 
 def _count_public(
-    counted: Mapping[str, contracts.ClipStatistics],
-    clips: Mapping[str, contracts.ReleasedSequence],
+    counted: Mapping[str, contracts.ClipStatistics], clips: Mapping[str, contracts.ReleasedSequence]
 ) -> contracts.DataSetStatistics:
     """Return the statistics of all clips but those of the test part."""
     public = (clip.subjects for clip in clips.values() if clip.split != "test")
@@ -381,10 +380,7 @@ def _read_boxes(part: Path, view: str) -> dict[str, Floats]:
 
 
 def _clip_findings(
-    part: Path,
-    name: str,
-    clip: contracts.ReleasedSequence,
-    stated: contracts.ClipStatistics | None,
+    part: Path, name: str, clip: contracts.ReleasedSequence, stated: contracts.ClipStatistics | None
 ) -> Iterator[contracts.Finding]:
     """Yield statements that disagree with the poses, joints and boxes of the clip."""
     poses, model = joints_file.read_poses(part / "poses" / f"{name}.npz")

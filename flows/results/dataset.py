@@ -12,7 +12,6 @@ from data_contracts.release import CheckReport, DataSetStatistics, Finding
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import camera_files, list_clips, read_clip
-from worldpose.dataset.faults import CheckSettings
 from worldpose.dataset.manifest import (
     changed_files,
     clip_frame_rate,
@@ -88,7 +87,7 @@ def check(
             rate or USUAL_FPS,
             pitch and (manifest is None or manifest.pitch),
         )
-        figures[name], found = check_clip(shipped, CheckSettings())
+        figures[name], found = check_clip(shipped)
         findings += found
     return CheckReport(clips=figures, findings=tuple(findings))
 

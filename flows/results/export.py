@@ -12,60 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from data_contracts.triangulation import CameraChange
-from flows.results.best_results import (
-    PLANE,
-    Origin,
-    all_clips,
-    bodies_unit,
-    clip_positions,
-    estimated_pitch,
-    filmed_cameras,
-    fitted_bodies,
-    person_kinds,
-    placed_joints,
-)
+from flows.results import best_results
 from flows.results.broadcast_views import broadcast_views, moving_cameras
-from flows.results.outputs import (
-    RELEASE,
-    VIEWER_SUFFIX,
-    record_owner,
-    require_own,
-    write_whole,
-)
+from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
 from flows.results.tool_exports import TOOL_EXPORTS
-from worldpose.dataset.manifest import (
-    FRAME_RATES,
-    KINDS,
-    ORIGINS,
-    origins_of,
-    read_manifest,
-    released_files,
-    write_frame_rates,
-    write_kinds,
-    write_manifest,
-    write_origins,
-)
+from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
+from worldpose.formats import challenge
 from worldpose.formats.baselines.result import (
     write_baseline_settings,
     write_slahmr_cameras,
     write_tracks,
-)
-from worldpose.formats.challenge import (
-    ChallengeClip,
-    ChallengeTruth,
-    Edition,
-    challenge_truth,
-    fill_submission,
-    write_challenge,
-    write_challenge_camera,
-    write_pitch_points,
-    write_submission,
 )
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
@@ -88,7 +50,7 @@ PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
 
 
-def export_joints(origin: Origin, out: Path) -> Iterator[Path]:
+def export_joints(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `joints.npz`, or `<clip>.joints.npz` per clip if there are several."""
     for clip in origin.clips:
         path = out / ("joints.npz" if len(origin.clips) == 1 else f"{clip}.joints.npz")
@@ -96,7 +58,7 @@ def export_joints(origin: Origin, out: Path) -> Iterator[Path]:
         yield path
 
 
-def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
+def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `<camera>.json` for each static camera, in `<clip>/` if there are several.
 
     Raises:
@@ -111,7 +73,10 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
         )
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        placed, frames = placed_joints(origin.run, clip), tracks.frames.astype(np.int64)
+        placed, frames = (
+            best_results.placed_joints(origin.run, clip),
+            tracks.frames.astype(np.int64),
+        )
         inliers = placed["inliers"]
         changes = [CameraChange.model_validate(each) for each in placed.attrs["changes"]]
         for camera_id, camera in origin.static_cameras.items():
@@ -135,19 +100,23 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
             yield path
 
 
-def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
+def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz` (X3).
 
     A clip without bodies has no poses. Other lenses than Brown's are fitted by it;
     `lens_errors.json` states the largest error.
     """
-    for clip in all_clips(origin.run):
-        if bodies_unit(origin.run, clip) in origin.run:
-            model, poses, _ = fitted_bodies(origin.run, clip)
+    for clip in best_results.all_clips(origin.run):
+        if best_results.bodies_unit(origin.run, clip) in origin.run:
+            model, poses, _ = best_results.fitted_bodies(origin.run, clip)
             path = out / "poses" / f"{clip}.npz"
             write_poses(path, poses, model.name)
             yield path
-        moving = filmed_cameras(origin.run, clip) if broadcast_views(origin.run, clip) else {}
+        moving = (
+            best_results.filmed_cameras(origin.run, clip)
+            if broadcast_views(origin.run, clip)
+            else {}
+        )
         for view, camera in moving.items():
             path = out / "cameras" / f"{view}.npz"
             write_moving_camera(path, camera)
@@ -167,34 +136,36 @@ def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
         yield path
 
 
-def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iterator[Path]:
+def export_challenge(
+    origin: best_results.Origin, out: Path, edition: challenge.Edition = 2026
+) -> Iterator[Path]:
     """Write cameras, boxes, skeletons, pitch points and the submission, of each broadcast view."""
     filmed = _filmed(origin)
-    together: dict[str, ChallengeClip] = {}
-    submissions: dict[str, NDArray[np.float64]] = {}
+    together: dict[str, challenge.ChallengeClip] = {}
+    submissions: dict[str, Floats] = {}
     filled: dict[str, int] = {}
     for view, (clip, camera) in filmed.items():
-        model, poses, _ = fitted_bodies(origin.run, clip)
-        truth = challenge_truth(model, poses, camera)
+        model, poses, _ = best_results.fitted_bodies(origin.run, clip)
+        truth = challenge.challenge_truth(model, poses, camera)
         submissions[view], added = _by_given_rows(origin, clip, truth)
         if added:
             filled[view] = added
         path = out / "cameras" / f"{view}.npz"
-        write_challenge_camera(path, camera, edition)
+        challenge.write_challenge_camera(path, camera, edition)
         yield path
         if edition == 2025:
             together[view] = truth.clip
         else:
-            yield from write_challenge(out, {view: truth.clip}, edition)
+            yield from challenge.write_challenge(out, {view: truth.clip}, edition)
     if edition == 2025:
-        yield from write_challenge(out, together, edition)
+        yield from challenge.write_challenge(out, together, edition)
     if origin.pitch is not None:
         path = out / "pitch_points.txt"
         samples = PitchTemplate.from_spec(origin.pitch).sample_lines(PITCH_SPACING)
-        write_pitch_points(path, samples.points_world)
+        challenge.write_pitch_points(path, samples.points_world)
         yield path
     path = out / "submission.zip"
-    write_submission(path, submissions)
+    challenge.write_submission(path, submissions)
     yield path
     if filled:
         path = out / "filled_poses.json"
@@ -203,8 +174,8 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iter
 
 
 def _by_given_rows(
-    origin: Origin, clip: str, truth: ChallengeTruth
-) -> tuple[NDArray[np.float64], int]:
+    origin: best_results.Origin, clip: str, truth: challenge.ChallengeTruth
+) -> tuple[Floats, int]:
     """Return a clip's submission, and the poses that fill gaps of given boxes.
 
     Where boxes with identities were given, the rows are theirs.
@@ -213,15 +184,15 @@ def _by_given_rows(
     rows = run[name].attrs.get("given_people") if name in run else None
     if rows is None:
         return truth.submission, 0
-    tracked, persons = run[name], fitted_bodies(run, clip)[2][truth.persons]
+    tracked, persons = run[name], best_results.fitted_bodies(run, clip)[2][truth.persons]
     joints = np.full((rows, *truth.submission.shape[1:]), np.nan)
     places = np.full((rows, joints.shape[1], 2), np.nan)
     joints[persons] = truth.submission
     places[tracked["person"].values] = tracked["ground"].values.swapaxes(0, 1)
-    return fill_submission(joints, places)
+    return challenge.fill_submission(joints, places)
 
 
-def _filmed(origin: Origin) -> dict[str, tuple[str, Camera]]:
+def _filmed(origin: best_results.Origin) -> dict[str, tuple[str, Camera]]:
     """Return the clip and the moving camera of every broadcast view.
 
     Raises:
@@ -229,28 +200,28 @@ def _filmed(origin: Origin) -> dict[str, tuple[str, Camera]]:
     """
     found: dict[str, tuple[str, Camera]] = {}
     for clip in origin.clips:
-        fitted_bodies(origin.run, clip)
-        cameras = filmed_cameras(origin.run, clip)
+        best_results.fitted_bodies(origin.run, clip)
+        cameras = best_results.filmed_cameras(origin.run, clip)
         found |= {view: (clip, camera) for view, camera in cameras.items()}
     return found
 
 
-def export_tracks(origin: Origin, out: Path) -> Iterator[Path]:
+def export_tracks(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `tracks/<view>.txt`, our boxes in the broadcast image, and the paper's settings."""
     yield _write_baseline_settings(out)
     for view, (clip, camera) in _filmed(origin).items():
-        model, poses, persons = fitted_bodies(origin.run, clip)
-        truth = challenge_truth(model, poses, camera)
+        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        truth = challenge.challenge_truth(model, poses, camera)
         path = out / "tracks" / f"{view}.txt"
         write_tracks(path, truth.clip.boxes, persons[truth.persons].astype(np.int64))
         yield path
 
 
-def export_slahmr_cameras(origin: Origin, out: Path) -> Iterator[Path]:
+def export_slahmr_cameras(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `slahmr/cameras/<view>/shot-0/cameras.npz`, and the paper's settings."""
     yield _write_baseline_settings(out)
-    for clip in all_clips(origin.run) or origin.clips:
-        for view, camera in filmed_cameras(origin.run, clip).items():
+    for clip in best_results.all_clips(origin.run) or origin.clips:
+        for view, camera in best_results.filmed_cameras(origin.run, clip).items():
             path = out / "slahmr" / "cameras" / view / "shot-0" / "cameras.npz"
             write_slahmr_cameras(path, camera)
             yield path
@@ -262,7 +233,7 @@ def _write_baseline_settings(out: Path) -> Path:
     return path
 
 
-def export_recording(origin: Origin, out: Path) -> Iterator[Path]:
+def export_recording(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `rerun/<clip>.rrd` for the rerun viewer."""
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.rerun_recording import write_recording
@@ -276,20 +247,20 @@ def export_recording(origin: Origin, out: Path) -> Iterator[Path]:
             tracks,
             origin.spec.fps,
             cameras=origin.static_cameras | moving,
-            pitch=estimated_pitch(origin.run, origin.pitch, origin.spec, clip),
+            pitch=best_results.estimated_pitch(origin.run, origin.pitch, origin.spec, clip),
         )
         yield path
 
 
-def export_positions(origin: Origin, out: Path) -> Iterator[Path]:
+def export_positions(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `positions/<clip>.csv`: people on the pitch, triangulated or placed by their feet."""
     for clip in origin.clips:
         path = out / "positions" / f"{clip}.csv"
-        write_positions(path, clip_positions(origin.run, clip), origin.spec.fps)
+        write_positions(path, best_results.clip_positions(origin.run, clip), origin.spec.fps)
         yield path
 
 
-def export_minimap(origin: Origin, out: Path) -> Iterator[Path]:
+def export_minimap(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `minimap/<clip>.mp4`: the pitch from above with all people and their kind.
 
     Raises:
@@ -308,19 +279,19 @@ def export_minimap(origin: Origin, out: Path) -> Iterator[Path]:
     for clip in origin.clips:
         path = out / "minimap" / f"{clip}.mp4"
         path.parent.mkdir(parents=True, exist_ok=True)
-        frames = minimap_frames(clip_positions(origin.run, clip), origin.pitch)
+        frames = minimap_frames(best_results.clip_positions(origin.run, clip), origin.pitch)
         write_video(path, frames, origin.spec.fps)
         yield path
 
 
-def export_viewer(origin: Origin, out: Path) -> list[Path]:
+def export_viewer(origin: best_results.Origin, out: Path) -> list[Path]:
     """Write `viewer/<clip>.html`, or one file with all clips where `out` ends with .html."""
     from flows.reports.viewer import write_viewers  # late: it loads matplotlib, which takes 0.5 s
 
     return write_viewers(origin, out)
 
 
-EXPORTS: dict[str, Callable[[Origin, Path], Iterable[Path]]] = {
+EXPORTS: dict[str, Callable[[best_results.Origin, Path], Iterable[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
     "worldpose": export_worldpose,
@@ -339,13 +310,15 @@ EXPORTS: dict[str, Callable[[Origin, Path], Iterable[Path]]] = {
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
-SHARED = {FRAME_RATES, KINDS}
+SHARED = {manifests.FRAME_RATES, manifests.KINDS}
 """Files to which exports of further clips are added."""
 COUNTED = {"joints", *CLASHING}
 """Formats that `check` and `statistics` read, and that lack the frame rate."""
 
 
-def export(origin: Origin, forms: list[str], out: Path, *, overwrite: bool = False) -> list[Path]:
+def export(
+    origin: best_results.Origin, forms: list[str], out: Path, *, overwrite: bool = False
+) -> list[Path]:
     """Write a run in several formats into one folder; return the files.
 
     Formats that `check` and `statistics` read also get frame_rates.json, and filled joints get
@@ -373,11 +346,11 @@ def export(origin: Origin, forms: list[str], out: Path, *, overwrite: bool = Fal
         for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
             tracks = origin.tracks(clip)
             written.append(place / "origins" / f"{clip}.npz")
-            write_origins(written[-1], tracks, origins_of(tracks))
+            manifests.write_origins(written[-1], tracks, manifests.origins_of(tracks))
         if not COUNTED & set(forms):
             return written
-        rates = dict.fromkeys(all_clips(origin.run), origin.spec.fps)
-        return [*written, write_frame_rates(place, rates)]
+        rates = dict.fromkeys(best_results.all_clips(origin.run), origin.spec.fps)
+        return [*written, manifests.write_frame_rates(place, rates)]
 
     match_id = origin.spec.match_id
 
@@ -397,7 +370,7 @@ def _file_for_folder(out: Path, forms: list[str]) -> UsageError:
     )
 
 
-def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
+def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Path]:
     """Write formats like `export`, also for a release, whose manifest has the frame rate.
 
     If a broadcast camera alone films people, kinds.json tells that they are not triangulated.
@@ -413,14 +386,18 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
             todo="Export them into different folders.",
         )
     written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
-    on_plane = [clip for clip in all_clips(origin.run) if f"{PLANE}/{clip}" in origin.run]
+    on_plane = [
+        clip
+        for clip in best_results.all_clips(origin.run)
+        if f"{best_results.PLANE}/{clip}" in origin.run
+    ]
     if on_plane:
-        kinds = {clip: person_kinds(origin.run, clip) for clip in on_plane}
-        written.append(write_kinds(out, kinds))
+        kinds = {clip: best_results.person_kinds(origin.run, clip) for clip in on_plane}
+        written.append(manifests.write_kinds(out, kinds))
     return written
 
 
-def keep_run(store: Store, origin: Origin, name: str) -> bool:
+def keep_run(store: Store, origin: best_results.Origin, name: str) -> bool:
     """Pin the run of a release, never to be garbage collected; return whether the pin is new.
 
     Raises:
@@ -441,7 +418,7 @@ def keep_run(store: Store, origin: Origin, name: str) -> bool:
 
 
 def release(
-    store: Store, origin: Origin, forms: list[str], out: Path, name: str, licence: str
+    store: Store, origin: best_results.Origin, forms: list[str], out: Path, name: str, licence: str
 ) -> list[Path]:
     """Write a release: the formats, origins/<clip>.npz and manifest.json; return the files.
 
@@ -456,7 +433,7 @@ def release(
         raise _file_for_folder(out, forms)
     origin = replace(origin, licence=licence)
     record, spec = origin.run.record, origin.spec
-    frozen = read_manifest(out)
+    frozen = manifests.read_manifest(out)
     ours = {
         "release": name,
         "match_id": spec.match_id,
@@ -484,7 +461,7 @@ def release(
 
 
 def _write_release(
-    origin: Origin, forms: list[str], out: Path, ours: Mapping[str, Any]
+    origin: best_results.Origin, forms: list[str], out: Path, ours: Mapping[str, Any]
 ) -> list[Path]:
     """Write the files of a release; the manifest, with these entries, is the last."""
     record, spec = origin.run.record, origin.spec
@@ -492,17 +469,17 @@ def _write_release(
     clips = {}
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        origins = origins_of(tracks)
+        origins = manifests.origins_of(tracks)
         written.append(out / "origins" / f"{clip}.npz")
-        write_origins(written[-1], tracks, origins)
-        counts = np.bincount(origins.ravel(), minlength=len(ORIGINS))
+        manifests.write_origins(written[-1], tracks, origins)
+        counts = np.bincount(origins.ravel(), minlength=len(manifests.ORIGINS))
         clips[clip] = ReleasedClip(
             first_frame=int(tracks.frames[0]) if len(tracks.frames) else 0,
             frame_count=len(tracks.frames),
             person_ids=tuple(tracks.person_ids.tolist()),
-            origins=dict(zip(ORIGINS, counts.tolist(), strict=True)),
+            origins=dict(zip(manifests.ORIGINS, counts.tolist(), strict=True)),
         )
-    bodies = [bodies_unit(origin.run, clip) for clip in origin.clips]
+    bodies = [best_results.bodies_unit(origin.run, clip) for clip in origin.clips]
     models = {origin.run[unit].attrs["body_model"] for unit in bodies if unit in origin.run}
     pictures = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
     manifest = ReleaseManifest(
@@ -523,6 +500,6 @@ def _write_release(
         worldpose=version("worldpose"),
         versions=record.versions,
         settings=record.settings,
-        files=released_files(out, written),
+        files=manifests.released_files(out, written),
     )
-    return [*written, write_manifest(out, manifest)]
+    return [*written, manifests.write_manifest(out, manifest)]

@@ -13,28 +13,13 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.run import BODY_STAGES, JOINT_STAGES
-from flows.results.best_results import (
-    PLANE,
-    Origin,
-    bodies_unit,
-    clip_positions,
-    estimated_pitch,
-    fitted_bodies,
-    person_kinds,
-)
+from flows.results import best_results
 from flows.results.broadcast_views import moving_cameras
 from worldpose.errors import UsageError
+from worldpose.formats import motion_capture
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
 from worldpose.formats.joints_file import JointTracks
-from worldpose.formats.motion_capture import (
-    OPENSIM_CONVENTION,
-    opensim_coordinates,
-    stretches,
-    write_markers,
-    write_motion,
-    write_opensim_motion,
-)
 from worldpose.formats.tables import (
     joints_table,
     people_table,
@@ -52,10 +37,10 @@ OPEN_BODY = "open-neutral"
 """Names of the body model that ships begin so."""
 
 
-def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
+def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
     """Return what the files of a clip say about themselves, by a short name."""
     stages = [stage for stage in reversed(JOINT_STAGES) if f"{stage}/{clip}" in origin.run]
-    stage = origin.stage or (stages[0] if stages else PLANE)
+    stage = origin.stage or (stages[0] if stages else best_results.PLANE)
     notes = {
         "software": f"worldpose {version('worldpose')}",
         "match": origin.spec.match_id,
@@ -72,7 +57,7 @@ def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
         else "joints without a contributing camera come from the motion or the rest of the body",
         "licence": origin.licence or "not stated: ask the owner of the recording",
     }
-    unit = bodies_unit(origin.run, clip)
+    unit = best_results.bodies_unit(origin.run, clip)
     if unit in origin.run:
         model = str(origin.run[unit].attrs["body_model"])
         terms = "CC0 1.0" if model.startswith(OPEN_BODY) else "the terms of its publisher apply"
@@ -104,32 +89,32 @@ def _keypoint_source(run: Run) -> str:
     return f"{pose.rpartition('/')[2]}, SHA-256 {digest[:16]}"
 
 
-def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
+def _joint_definition(origin: best_results.Origin, clip: str, stage: str) -> str:
     if stage in BODY_STAGES:
         model = origin.run[f"{stage}/{clip}"].attrs["body_model"]
         owner = "detector sees" if origin.definition == "detector" else "model has"
         alone = ", from one camera by feet on the pitch and a monocular method's poses"
-        how = alone if f"{PLANE}/{clip}" in origin.run else ""
+        how = alone if f"{best_results.PLANE}/{clip}" in origin.run else ""
         return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them{how}"
-    if stage == PLANE:
+    if stage == best_results.PLANE:
         return "none: people are placed on the pitch by their feet"
     return "COCO-17 keypoints of the detector, triangulated"
 
 
-def export_markers(origin: Origin, out: Path) -> Iterator[Path]:
+def export_markers(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `markers/<clip>/person_<id>.trc` for every person with a joint."""
     for clip in origin.clips:
         tracks = origin.tracks(clip)
         for person, person_id in _people_with_joints(tracks):
             path = out / "markers" / clip / f"person_{person_id:03d}.trc"
-            write_markers(path, tracks, person, origin.spec.fps)
+            motion_capture.write_markers(path, tracks, person, origin.spec.fps)
             yield path
 
 
-def export_c3d(origin: Origin, out: Path) -> Iterator[Path]:
+def export_c3d(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `markers/<clip>/person_<id>.c3d` for every person with a joint."""
     for clip in origin.clips:
-        tracks, kinds = origin.tracks(clip), person_kinds(origin.run, clip)
+        tracks, kinds = origin.tracks(clip), best_results.person_kinds(origin.run, clip)
         notes = describe_clip(origin, clip)
         for person, person_id in _people_with_joints(tracks):
             path = out / "markers" / clip / f"person_{person_id:03d}.c3d"
@@ -145,49 +130,49 @@ def _people_with_joints(tracks: JointTracks) -> Iterator[tuple[int, int]]:
             yield person, person_id
 
 
-def export_motion(origin: Origin, out: Path) -> Iterator[Path]:
+def export_motion(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted interval."""
     for clip in origin.clips:
-        model, poses, _ = fitted_bodies(origin.run, clip)
+        model, poses, _ = best_results.fitted_bodies(origin.run, clip)
         for name, person, part in _motions(origin, clip):
             path = out / "motion" / clip / f"{name}.bvh"
-            write_motion(path, model, poses[person, part], origin.spec.fps)
+            motion_capture.write_motion(path, model, poses[person, part], origin.spec.fps)
             yield path
 
 
-def export_opensim(origin: Origin, out: Path) -> Iterator[Path]:
+def export_opensim(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `opensim/<clip>/person_<id>_frame_<first>.mot` for every uninterrupted interval."""
     for clip in origin.clips:
-        model, poses, persons = fitted_bodies(origin.run, clip)
-        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
-        kinds = person_kinds(origin.run, clip)
+        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
+        kinds = best_results.person_kinds(origin.run, clip)
         notes = describe_clip(origin, clip) | {
             "world": "x as in the world of the match, y up, z = minus its y",
-            "joints": OPENSIM_CONVENTION,
+            "joints": motion_capture.OPENSIM_CONVENTION,
             "units": "degrees, metres, seconds; time is match frame / frames per second",
         }
         for name, person, part in _motions(origin, clip):
             path = out / "opensim" / clip / f"{name}.mot"
-            write_opensim_motion(
+            motion_capture.write_opensim_motion(
                 path,
-                opensim_coordinates(model, poses[person, part]),
+                motion_capture.opensim_coordinates(model, poses[person, part]),
                 frames[part] / origin.spec.fps,
                 notes | {"kind": kinds[int(persons[person])]},
             )
             yield path
 
 
-def _motions(origin: Origin, clip: str) -> Iterator[tuple[str, int, slice]]:
+def _motions(origin: best_results.Origin, clip: str) -> Iterator[tuple[str, int, slice]]:
     """Yield name, person index and frames of every uninterrupted interval of a clip's bodies."""
-    _, poses, persons = fitted_bodies(origin.run, clip)
-    frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+    _, poses, persons = best_results.fitted_bodies(origin.run, clip)
+    frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
     for person, person_id in enumerate(persons):
-        for part in stretches(poses[person]):
+        for part in motion_capture.stretches(poses[person]):
             yield f"person_{person_id:03d}_frame_{frames[part.start]:06d}", person, part
 
 
 def export_scenes(
-    origin: Origin, out: Path, suffix: str, write: Callable[..., None]
+    origin: best_results.Origin, out: Path, suffix: str, write: Callable[..., None]
 ) -> Iterator[Path]:
     """Write `scenes/<clip>.<suffix>`: bodies, cameras and the pitch.
 
@@ -197,10 +182,10 @@ def export_scenes(
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings
 
-    pitch = estimated_pitch(origin.run, origin.pitch, origin.spec)
+    pitch = best_results.estimated_pitch(origin.run, origin.pitch, origin.spec)
     for clip in origin.clips:
-        model, poses, persons = fitted_bodies(origin.run, clip)
-        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
         free = model.name.startswith(OPEN_BODY)
         if origin.surface and not free and origin.licence is None:
             raise UsageError(
@@ -212,7 +197,7 @@ def export_scenes(
         cameras = origin.static_cameras | moving_cameras(
             origin.run, clip, frames, origin.static_cameras
         )
-        kinds = person_kinds(origin.run, clip)
+        kinds = best_results.person_kinds(origin.run, clip)
         people = [
             AnimatedBody(
                 f"person_{person_id:03d}",
@@ -239,7 +224,7 @@ def export_scenes(
 
 
 def export_tables(
-    origin: Origin,
+    origin: best_results.Origin,
     out: Path,
     suffix: str,
     write: Callable[[Path, pd.DataFrame, Mapping[str, str]], list[Path]],
@@ -250,15 +235,15 @@ def export_tables(
         notes = {**describe_clip(origin, clip), "units": "in the name of each column"}
         tracks = origin.tracks(clip)
         tables = {
-            "joints": joints_table(tracks, fps, person_kinds(origin.run, clip)),
-            "people": people_table(clip_positions(origin.run, clip), fps),
+            "joints": joints_table(tracks, fps, best_results.person_kinds(origin.run, clip)),
+            "people": people_table(best_results.clip_positions(origin.run, clip), fps),
             "strides": strides_table(tracks, fps),
         }
         for name, table in tables.items():
             yield from write(out / "tables" / f"{clip}.{name}.{suffix}", table, notes)
 
 
-TOOL_EXPORTS: dict[str, Callable[[Origin, Path], Iterator[Path]]] = {
+TOOL_EXPORTS: dict[str, Callable[[best_results.Origin, Path], Iterator[Path]]] = {
     "trc": export_markers,
     "c3d": export_c3d,
     "bvh": export_motion,

@@ -14,11 +14,9 @@ from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyParameters
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
-from worldpose.simulation.image_formation import RenderedFrame
-from worldpose.simulation.mannequins import Surfaces
-from worldpose.simulation.renderer import open_view, render_frame
+from worldpose.simulation.mannequins import Surfaces, assign_roles, dress_people
+from worldpose.simulation.renderer import RenderedFrame, open_view, render_frame
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import (
     PATTERNS,

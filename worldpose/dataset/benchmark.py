@@ -16,7 +16,7 @@ from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import ShippedClip, camera_files, list_clips, read_clip
-from worldpose.dataset.faults import CheckSettings, camera_faults
+from worldpose.dataset.faults import LIMITS, camera_faults
 from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
 from worldpose.errors import InputError
 from worldpose.evaluation import matching, metrics
@@ -81,12 +81,8 @@ def score_folders(
     Tracks are matched by boxes in the reference's camera. A prediction's boxes are those of
     `boxes/<clip>.npz`, or of its joints in its own camera, or in that of the reference.
 
-    Args:
-        reference: true clips.
-        predictions: folder of each method, by title; further clips do not count.
-        body: body model of pose files that name none.
-        match_in: broadcast camera of clips with several; None = the first.
-        fps: frames per second [1/s]; None = what the reference states.
+    `body` is the model of pose files that name none, `match_in` the broadcast camera of clips with
+    several, by default the first, `fps` [1/s] by default what the reference states.
 
     Raises:
         InputError: a clip is missing, has other frames, or its camera has another convention; the
@@ -211,7 +207,7 @@ def _true_camera(truth: _People) -> Camera | None:
     if truth.camera is None:
         return None
     known = {fault.name for fault in camera_faults()} | {"frame_offset", "sees_nobody"}
-    for finding in check_clip(truth.clip, CheckSettings())[1]:
+    for finding in check_clip(truth.clip)[1]:
         if f"cameras/{truth.camera.stem}" in finding.where and finding.fault in known:
             raise _convention(truth.camera, finding.says)
     return _read_camera(truth.camera, truth)
@@ -277,7 +273,7 @@ def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
         known = np.linalg.norm(away[np.isfinite(away).all(-1)], axis=-1)
         errors[late] = float(known.mean()) if len(known) else np.inf
     best = min(errors, key=lambda late: (errors[late], abs(late)))
-    if not errors[best] < CheckSettings().max_share_left * errors[0]:
+    if not errors[best] < LIMITS.max_share_left * errors[0]:
         return {}
     says = f"people are {abs(best)} frames {'late' if best > 0 else 'early'}: corrected, the error"
     return {where: f"{says} falls from {1000 * errors[0]:.1f} to {1000 * errors[best]:.1f} mm"}

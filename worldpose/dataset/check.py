@@ -9,32 +9,10 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.release import ClipFigures, Finding
-from worldpose.dataset.contents import (
-    PointSource,
-    ShippedClip,
-    convention,
-    sample_evenly,
-)
-from worldpose.dataset.faults import (
-    SOUND,
-    Agreement,
-    CheckSettings,
-    agreement_findings,
-    axis_orders,
-    compare_view,
-)
-from worldpose.dataset.plausibility import (
-    BONES,
-    body_findings,
-    camera_findings,
-    ground_findings,
-    is_blind,
-    pitch_findings,
-    plausible_share,
-    turning_findings,
-    visibility_findings,
-    world_fault,
-)
+from worldpose.dataset import faults as known_faults
+from worldpose.dataset import plausibility
+from worldpose.dataset.contents import PointSource, ShippedClip, convention, sample_evenly
+from worldpose.dataset.faults import LIMITS
 from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.boxes import box_iou
 
@@ -77,12 +55,7 @@ def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]
 
 
 def skeleton_findings(
-    skel_3d: Floats,
-    skel_2d: Floats,
-    skeleton: tuple[str, ...],
-    rows: CameraRows,
-    clip: str,
-    settings: CheckSettings,
+    skel_3d: Floats, skel_2d: Floats, skeleton: tuple[str, ...], rows: CameraRows, clip: str
 ) -> Iterator[Finding]:
     """Yield 3D skeletons in camera axes that no translation brings onto their 2D.
 
@@ -99,10 +72,10 @@ def skeleton_findings(
     picked = sample_evenly(len(frame), _BODIES)
     frame, person = frame[picked], person[picked]
     bodies, pixels = skel_3d[frame, person], skel_2d[frame, person]
-    upper, lower = (skeleton.index(f"left_{name}") for name in BONES["thighs"])
+    upper, lower = (skeleton.index(f"left_{name}") for name in plausibility.BONES["thighs"])
     thigh = float(np.median(np.linalg.norm(bodies[:, upper] - bodies[:, lower], axis=-1)))
     for unit, size in (("millimetres", 1000.0), ("centimetres", 100.0)):
-        if settings.bones_m[0] <= thigh / size <= settings.bones_m[1]:
+        if LIMITS.bones_m[0] <= thigh / size <= LIMITS.bones_m[1]:
             says = f"skeletons are in {unit} and not in metres"
             yield convention(unit, says, *where, thigh=thigh)
             bodies = bodies / size
@@ -114,7 +87,7 @@ def skeleton_findings(
         return
     row, bodies, plane, focal = row[told], bodies[told], plane[told], focal[told]
     guesses = {_AS_SHIPPED: bodies}
-    for name, axes in axis_orders():
+    for name, axes in known_faults.axis_orders():
         guesses[f"the camera's {name}"] = bodies @ axes
     turned = rows.rotation[row]
     posed = np.isfinite(turned).all((-1, -2))
@@ -124,7 +97,7 @@ def skeleton_findings(
         left["the world's x, y, z"] = _left(in_world, plane[posed], focal[posed])
     best = min(left, key=lambda name: left[name])
     shipped, least = left[_AS_SHIPPED], left[best]
-    if shipped - least > settings.min_gain_px and least < settings.max_share_left * shipped:
+    if shipped - least > LIMITS.min_gain_px and least < LIMITS.max_share_left * shipped:
         says = f"x, y, z of the skeletons are {best} and not the camera's"
         figures = {"shipped_median_px": min(shipped, 1e6), "explained_median_px": least}
         yield convention("skeleton_axes", says, *where, **figures)
@@ -143,10 +116,8 @@ def _overlap(boxes: Floats, skel_2d: Floats) -> float:
 def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
     """Return the median 2D residual [px] of bodies after optimal translation.
 
-    Args:
-        bodies: (n, points, 3) [m], camera axes.
-        plane: (n, points, 2), the undistorted 2D at depth 1.
-        focal: (n, 2) [px].
+    `bodies` (n, points, 3) [m] are in camera axes, `plane` (n, points, 2) the undistorted 2D at
+    depth 1, `focal` (n, 2) [px].
     """
     # x (Z + tz) = X + tx, and the same for y: linear in the translation.
     ones, zeros = np.ones_like(plane[..., 0]), np.zeros_like(plane[..., 0])
@@ -164,7 +135,7 @@ def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
     return float(np.median(np.where(seen[..., 2] > 0.0, far, np.inf)))
 
 
-def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures, list[Finding]]:
+def check_clip(clip: ShippedClip) -> tuple[ClipFigures, list[Finding]]:
     """Return metrics and findings of one clip.
 
     2D data takes precedence: a fault is named if its repair makes 3D and 2D agree. Remaining
@@ -176,38 +147,38 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         found
         for source in clip.sources
         for view in clip.views
-        if (found := compare_view(source, view, settings)) is not None
+        if (found := known_faults.compare_view(source, view)) is not None
     ]
-    named = {one.source for one in agreements if one.fault is not SOUND}
+    named = {one.source for one in agreements if one.fault is not known_faults.SOUND}
     slips = [
         found
         for source in clip.sources
         for view in clip.views
         if source.name not in named
-        for found in turning_findings(source, view, settings)
+        for found in plausibility.turning_findings(source, view)
     ]
     slipped = {slip.where[0] for slip in slips}
     findings += [
         found
-        for found in agreement_findings(agreements, settings)
+        for found in known_faults.agreement_findings(agreements)
         if found.fault != "reprojection" or found.where[0] not in slipped
     ]
-    findings += [*slips, *_challenge_findings(clip, settings)]
+    findings += [*slips, *_challenge_findings(clip)]
     faults = {one.view: one.fault for one in agreements if one.fault.camera is not None}
     shares = []
     for source in clip.sources:
         repaired = _repair_source(source, agreements)
         if not clip.pitch:
-            findings += body_findings(repaired, clip.fps, settings)
+            findings += plausibility.body_findings(repaired, clip.fps)
             continue
         blind = [
             view
             for view in clip.views
             if view.name not in {one.view for one in agreements}
-            and is_blind(repaired, view.rows, settings)
+            and plausibility.is_blind(repaired, view.rows)
         ]
-        fault, before, after = world_fault(repaired, settings)
-        shares.append(plausible_share(repaired, settings))
+        fault, before, after = plausibility.world_fault(repaired)
+        shares.append(plausibility.plausible_share(repaired))
         if fault is not None and fault.points is not None:
             repair = {"shipped_plausible_share": before, "explained_plausible_share": after}
             says = f"{fault.says}: so people stand on the pitch"
@@ -215,18 +186,18 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
             points = fault.points(repaired)
             repaired = repaired if points is None else repaired.with_points(points)
         if repaired is source and source.name not in {one.source for one in agreements}:
-            findings += ground_findings(source, settings)
-        findings += body_findings(repaired, clip.fps, settings)
-        findings += pitch_findings(repaired, settings)
-        blind = [view for view in blind if is_blind(repaired, view.rows, settings)]
-        for finding, reason in visibility_findings(repaired, blind, settings):
+            findings += plausibility.ground_findings(source)
+        findings += plausibility.body_findings(repaired, clip.fps)
+        findings += plausibility.pitch_findings(repaired)
+        blind = [view for view in blind if plausibility.is_blind(repaired, view.rows)]
+        for finding, reason in plausibility.visibility_findings(repaired, blind):
             findings.append(finding)
             if reason is not None:
                 faults |= {place.removeprefix("cameras/"): reason for place in finding.where}
     for view in clip.views:
-        fault = faults.get(view.name, SOUND)
+        fault = faults.get(view.name, known_faults.SOUND)
         rows = view.rows if fault.camera is None else fault.camera(view.rows)
-        findings += camera_findings(view.name, rows, settings)
+        findings += plausibility.camera_findings(view.name, rows)
     seen = [one.median_px for one in agreements]
     worst = max(seen) if seen and max(seen) < float("inf") else None
     figures = ClipFigures(
@@ -241,7 +212,7 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
     return figures, list(_merge_findings(findings))
 
 
-def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[Finding]:
+def _challenge_findings(clip: ShippedClip) -> Iterator[Finding]:
     """Yield findings on boxes and skeletons relative to the mid-hip."""
     if clip.given is None:
         return
@@ -249,16 +220,13 @@ def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[
     for view in clip.views:
         if view.name == clip.name:
             yield from skeleton_findings(
-                clip.given.skel_3d,
-                clip.given.skel_2d,
-                view.skeleton,
-                view.rows,
-                clip.name,
-                settings,
+                clip.given.skel_3d, clip.given.skel_2d, view.skeleton, view.rows, clip.name
             )
 
 
-def _repair_source(source: PointSource, agreements: Iterable[Agreement]) -> PointSource:
+def _repair_source(
+    source: PointSource, agreements: Iterable[known_faults.Agreement]
+) -> PointSource:
     """Repair the source for the fault that its 2D data indicates most often."""
     faults = [a.fault for a in agreements if a.source == source.name and a.fault.points is not None]
     if not faults:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
@@ -46,7 +46,7 @@ class PointSource:
     pelvis."""
     in_degrees: Floats | None = None
     """The points if the file's angles were degrees; None if they cannot be."""
-    frames: NDArray[np.int64] | None = None
+    frames: Integers | None = None
     """(frames,) match frames, ascending; None if the file numbers none."""
 
     def with_points(self, points: Floats) -> PointSource:
@@ -73,7 +73,7 @@ class View:
         """Whether the camera has a row per frame."""
         return len(self.rows.rotation) > 1
 
-    def shared_points(self, source: PointSource) -> tuple[Floats, NDArray[np.int64]] | None:
+    def shared_points(self, source: PointSource) -> tuple[Floats, Integers] | None:
         """Return the 2D of the points that a source also has, and their indices in the source.
 
         None without 2D, or if the numbers of people differ.
@@ -85,7 +85,7 @@ class View:
         return pixels, np.array([source.skeleton.index(name) for name in shared], dtype=np.int64)
 
 
-def sample_evenly(count: int, most: int) -> NDArray[np.int64]:
+def sample_evenly(count: int, most: int) -> Integers:
     """Return at most so many of the indices from 0 to `count` - 1, evenly spread."""
     return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
 
@@ -119,9 +119,8 @@ def implausible(fault: str, says: str, *where: str, **figures: float) -> Finding
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:
     """Return a mask of missing persons and frames of a file, and findings on it.
 
-    Args:
-        name: the file.
-        arrays: (rows, columns, ...), which must be missing together.
+    The arrays (rows, columns, ...) of a file must be missing together. A row is missing if it is so
+    in any array, or zero in all.
 
     Returns:
         (rows, columns) bool, missing in any array or zero in all; and findings.

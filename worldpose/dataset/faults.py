@@ -5,14 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
 
-from data_contracts.arrays import Floats
-from data_contracts.records import Positive, Record, Share
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View, sample_evenly
 from worldpose.formats.release_cameras import CameraRows
@@ -23,43 +20,46 @@ LATEST: Final = 3
 _LENS: Final = "k1 k2 p1 p2 k3"
 
 
-class CheckSettings(Record):
+class Limits(NamedTuple):
     """Thresholds beyond which a fault is reported."""
 
-    max_sample: int = Field(default=3000, ge=100, le=1_000_000)
+    max_sample: int = 3000
     """Maximum number of 2D points per camera to test faults: their median is accurate to a few
     percent."""
-    max_error: float = Field(default=0.06, ge=1e-6, le=10)
+    max_error: float = 0.06
     """Tolerated median reprojection error [height of a person in the image]: detected keypoints
     are within it; a broken convention exceeds it or has an explanation."""
-    max_share_left: float = Field(default=0.7, gt=0, lt=1)
+    max_share_left: float = 0.7
     """A fault is named if its repair leaves at most this share of the median error [1]."""
-    min_gain_px: float = Field(default=0.3, ge=1e-6, le=100)
+    min_gain_px: float = 0.3
     """And removes at least this much [px]: rounded pixels must not cause a fault."""
-    max_error_left: float = Field(default=0.2, ge=1e-6, le=100)
+    max_error_left: float = 0.2
     """And leaves at most this [height of a person in the image]: random data has no explanation."""
-    min_ground_m: float = Field(default=-0.4, ge=-100, le=0)
+    min_ground_m: float = -0.4
     """Minimum median height of the lower foot [m]: a pitch falls by 0.2 m to its edges, and fits
     sink by some centimetres."""
-    max_ground_m: float = Field(default=0.13, ge=0, le=100)
+    max_ground_m: float = 0.13
     """Maximum median height of the lower foot [m]: heels and toes are some cm above the ground."""
-    bounds_m: tuple[Positive, Positive] = (65.0, 46.0)
+    bounds_m: tuple[float, float] = (65.0, 46.0)
     """Maximum |x| and |y| of people [m]: the pitch of 105 x 68 m and 12 m around it."""
-    min_plausible_share: Share = 0.9
+    min_plausible_share: float = 0.9
     """Minimum share of bodies near the ground, head up, within the bounds [1]."""
-    max_speed_m_s: Positive = 13.0
+    max_speed_m_s: float = 13.0
     """Maximum speed of a person's hips [m/s]; the fastest sprinters reach 12.4."""
-    max_fast_share: Share = 0.002
+    max_fast_share: float = 0.002
     """Tolerated share of faster steps [1]: noise of a single frame at 50 frames/s."""
-    bones_m: tuple[Positive, Positive] = (0.15, 0.62)
+    bones_m: tuple[float, float] = (0.15, 0.62)
     """Minimum and maximum length of a person's upper arm, forearm, thigh and shin [m]."""
-    max_center_drift_m: Positive = 0.05
+    max_center_drift_m: float = 0.05
     """Maximum distance of a moving camera's centre from its median [m]: the release's cameras
     rotate and zoom, and never translate."""
-    max_rotation_error: Positive = 1e-4
+    max_rotation_error: float = 1e-4
     """Largest element of R'R - 1 [1]: files in single precision stay far below."""
-    min_visible_share: Share = 0.02
+    min_visible_share: float = 0.02
     """Minimum share of people that a camera must show in some frame [1]."""
+
+
+LIMITS: Final = Limits()
 
 
 @dataclass(frozen=True)
@@ -219,8 +219,6 @@ def _turn_vectors(rotation: Floats, vectors: Floats) -> Floats:
     return np.asarray((rotation @ vectors[..., None])[..., 0])
 
 
-Ints = NDArray[np.int64]
-
 SOUND = Fault("none", "as shipped")
 """No repair."""
 
@@ -245,27 +243,27 @@ class Agreement:
 class _Sample:
     """2D points of a view, each with its frame, person and index in the source's skeleton."""
 
-    frame: Ints
-    person: Ints
-    point: Ints
+    frame: Integers
+    person: Integers
+    point: Integers
     pixels: Floats
 
 
-def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Agreement | None:
+def compare_view(source: PointSource, view: View) -> Agreement | None:
     """Return the residuals between a source and a view, and the fault that explains them best.
 
     A fault is named if its repair removes most of the error; a 2D point that the camera cannot see
     has infinite error. Frame offsets are also searched with whole bodies. None if source and view
     have no points in common.
     """
-    sample = _sample(source, view, settings.max_sample)
+    sample = _sample(source, view, LIMITS.max_sample)
     if sample is None:
         return None
     errors = _errors(source.points, view.rows, sample, SOUND)
     shipped = _median(errors)
     best, least = SOUND, shipped
     for fault in (*camera_faults(), *frame_faults(view.is_moving), *point_faults()):
-        if shipped < settings.min_gain_px:
+        if shipped < LIMITS.min_gain_px:
             break
         points = source.points if fault.points is None else fault.points(source)
         if points is None:
@@ -277,10 +275,10 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
             best, least = fault, error
     # This order also works for infinity.
     height = _height(view)
-    explains = shipped - least > settings.min_gain_px and least < settings.max_share_left * shipped
-    explains = explains and least <= settings.max_error_left * height
-    if not explains and np.isfinite(shipped) and shipped > settings.min_gain_px:
-        found = find_frame_offset(source, view, settings)
+    explains = shipped - least > LIMITS.min_gain_px and least < LIMITS.max_share_left * shipped
+    explains = explains and least <= LIMITS.max_error_left * height
+    if not explains and np.isfinite(shipped) and shipped > LIMITS.min_gain_px:
+        found = find_frame_offset(source, view)
         if found is not None:
             explains, best = True, found
             least = _median(_errors(source.points, view.rows, sample, best))
@@ -295,13 +293,13 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
     )
 
 
-def agreement_findings(found: Iterable[Agreement], settings: CheckSettings) -> Iterator[Finding]:
+def agreement_findings(found: Iterable[Agreement]) -> Iterator[Finding]:
     """Yield findings, one per fault of a source, with the cameras that show it."""
     named: dict[tuple[str, str, str], list[Agreement]] = {}
     for one in found:
         if one.fault is not SOUND:
             named.setdefault((one.source, one.fault.name, one.fault.says), []).append(one)
-        elif one.median_px > settings.max_error * one.height_px:
+        elif one.median_px > LIMITS.max_error * one.height_px:
             named.setdefault((one.source, "reprojection", _UNEXPLAINED), []).append(one)
     for (source, name, says), group in named.items():
         yield Finding(
@@ -344,8 +342,8 @@ def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
 
 
 def _later(
-    frame: Ints, count: int, rows: CameraRows, fault: Fault
-) -> tuple[NDArray[np.bool_], Ints, Camera]:
+    frame: Integers, count: int, rows: CameraRows, fault: Fault
+) -> tuple[Flags, Integers, Camera]:
     """Return which frames remain when a fault shifts them, their 3D frames, and the camera there.
 
     The camera is a batch if it moves.
@@ -398,7 +396,7 @@ _BODIES: Final = 1500
 """Maximum number of sampled bodies."""
 
 
-def find_frame_offset(source: PointSource, view: View, settings: CheckSettings) -> Fault | None:
+def find_frame_offset(source: PointSource, view: View) -> Fault | None:
     """Return the frame offset that explains the errors of whole bodies in a view."""
     shared = view.shared_points(source)
     if shared is None:
@@ -429,5 +427,5 @@ def find_frame_offset(source: PointSource, view: View, settings: CheckSettings) 
         left = error(fault)
         if left < least - 1e-9:
             best, least = fault, left
-    explains = shipped - least > settings.min_gain_px
-    return best if explains and least < settings.max_share_left * shipped else None
+    explains = shipped - least > LIMITS.min_gain_px
+    return best if explains and least < LIMITS.max_share_left * shipped else None

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
+from data_contracts.arrays import Flags, Image
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.release import DataSetManifest, ReleaseManifest
 from data_contracts.run import StoredFile
@@ -155,16 +155,12 @@ ORIGINS: Final = ("absent", "automatic", "filled", "corrected")
 """Meanings of the origin codes."""
 
 
-def origins_of(
-    tracks: JointTracks, corrected: NDArray[np.bool_] | None = None
-) -> NDArray[np.uint8]:
+def origins_of(tracks: JointTracks, corrected: Flags | None = None) -> Image:
     """Return the origin of joints (frames, persons, 17), indices of `ORIGINS`.
 
     A joint without a contributing camera was filled in, from motion or from the rest of the body.
 
-    Args:
-        tracks: joints with their views; unknown views count as seen.
-        corrected: (frames, persons, 17), set or confirmed by a person.
+    A person set or confirmed `corrected` (frames, persons, 17). Unknown views count as seen.
     """
     origin = np.full(tracks.joints.shape[:3], ORIGINS.index("automatic"), dtype=np.uint8)
     if tracks.views is not None:
@@ -175,7 +171,7 @@ def origins_of(
     return origin
 
 
-def write_origins(path: Path, tracks: JointTracks, origin: NDArray[np.uint8]) -> None:
+def write_origins(path: Path, tracks: JointTracks, origin: Image) -> None:
     """Write origins/<clip>.npz: `frames`, `person_ids`, `origin`, and the meanings of its codes."""
     write_archive(
         path,

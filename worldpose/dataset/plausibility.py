@@ -6,20 +6,13 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.release import Finding
-from worldpose.dataset.contents import (
-    PointSource,
-    View,
-    convention,
-    implausible,
-    sample_evenly,
-)
+from worldpose.dataset.contents import PointSource, View, convention, implausible, sample_evenly
 from worldpose.dataset.faults import (
     LATEST,
-    CheckSettings,
+    LIMITS,
     Fault,
     camera_faults,
     frame_faults,
@@ -38,7 +31,7 @@ BONES = {
 }
 
 
-def plausible_share(source: PointSource, settings: CheckSettings) -> float:
+def plausible_share(source: PointSource) -> float:
     """Return the share of bodies near the ground, head up, within the bounds.
 
     A body counts if its nose is 0.3 to 2.3 m above its lowest foot: this includes a kneeling person
@@ -51,18 +44,18 @@ def plausible_share(source: PointSource, settings: CheckSettings) -> float:
         return 0.0
     height, middle = (nose[..., 2] - feet)[here], nose[here]
     good = (height > 0.3) & (height < 2.3) & (np.abs(feet[here]) < 1.5)
-    good &= (np.abs(middle[:, :2]) <= np.array(settings.bounds_m)).all(-1)
+    good &= (np.abs(middle[:, :2]) <= np.array(LIMITS.bounds_m)).all(-1)
     return float(good.mean())
 
 
-def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | None, float, float]:
+def world_fault(source: PointSource) -> tuple[Fault | None, float, float]:
     """Return the fault whose repair places people on the pitch; plausible share before and after.
 
     Among equally good faults the one with feet nearest to the ground is returned, and among these
     the first.
     """
-    before = plausible_share(source, settings)
-    if before >= settings.min_plausible_share:
+    before = plausible_share(source)
+    if before >= LIMITS.min_plausible_share:
         return None, before, before
     best, most, nearest = None, before, np.inf
     for fault in point_faults():
@@ -70,11 +63,11 @@ def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | N
         if points is None:
             continue
         moved = source.with_points(points)
-        share = plausible_share(moved, settings)
+        share = plausible_share(moved)
         height = abs(foot_height(moved))
         if share > most + 0.01 or (share >= most - 0.01 and height < nearest - 0.02):
             best, most, nearest = fault, share, height
-    return (best, before, most) if most >= settings.min_plausible_share else (None, before, before)
+    return (best, before, most) if most >= LIMITS.min_plausible_share else (None, before, before)
 
 
 def foot_height(source: PointSource) -> float:
@@ -83,23 +76,23 @@ def foot_height(source: PointSource) -> float:
     return float(np.median(feet[np.isfinite(feet)])) if np.isfinite(feet).any() else np.nan
 
 
-def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
+def ground_findings(source: PointSource) -> Iterator[Finding]:
     """Yield feet above or below the pitch, and for poses whether their pivot explains it."""
     height = foot_height(source)
-    if np.isnan(height) or settings.min_ground_m <= height <= settings.max_ground_m:
+    if np.isnan(height) or LIMITS.min_ground_m <= height <= LIMITS.max_ground_m:
         return
     says = f"people's lower foot is {height:.2f} m from the ground in half of all frames"
     fault, left, make = "feet_off_the_ground", height, implausible
     if source.pivot is not None:
         moved = source.with_points(source.points + source.pivot[:, :, None])
         left = foot_height(moved)
-        if settings.min_ground_m <= left <= settings.max_ground_m and abs(left) < 0.5 * abs(height):
+        if LIMITS.min_ground_m <= left <= LIMITS.max_ground_m and abs(left) < 0.5 * abs(height):
             fault, make = "root_about_origin", convention
             says += "; on the ground if global_orient turned about the model's origin"
     yield make(fault, says, source.name, foot_height_m=height, explained_height_m=left)
 
 
-def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> Iterator[Finding]:
+def body_findings(source: PointSource, fps: float) -> Iterator[Finding]:
     """Yield implausible limb lengths and speeds."""
     for name, (upper, lower) in BONES.items():
         bone = np.stack(
@@ -113,7 +106,7 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         )
         seen = np.flatnonzero(np.isfinite(bone).any((0, 2)))
         lengths = np.array([np.nanmedian(bone[:, person]) for person in seen])
-        low, high = settings.bones_m
+        low, high = LIMITS.bones_m
         if (wrong := (lengths < low) | (lengths > high)).any():
             says = f"{name} of {int(wrong.sum())} people are not of human length"
             figures = {"least_m": float(lengths.min()), "greatest_m": float(lengths.max())}
@@ -123,24 +116,24 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
     speed = speed[np.isfinite(speed)]
     if (
         len(speed)
-        and (share := float((speed > settings.max_speed_m_s).mean())) > settings.max_fast_share
+        and (share := float((speed > LIMITS.max_speed_m_s).mean())) > LIMITS.max_fast_share
     ):
-        says = f"people move faster than {settings.max_speed_m_s:g} m/s"
+        says = f"people move faster than {LIMITS.max_speed_m_s:g} m/s"
         figures = {"share_of_steps": share, "fastest_m_per_s": float(speed.max())}
         yield implausible("speed", says, source.name, **figures)
 
 
-def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
+def pitch_findings(source: PointSource) -> Iterator[Finding]:
     """Yield people off the pitch."""
     middle = _hips(source)
     here = np.isfinite(middle).all(-1)
-    away = np.abs(middle[here][:, :2]) > np.array(settings.bounds_m)
-    if len(away) and (share := float(away.any(-1).mean())) > 1.0 - settings.min_plausible_share:
+    away = np.abs(middle[here][:, :2]) > np.array(LIMITS.bounds_m)
+    if len(away) and (share := float(away.any(-1).mean())) > 1.0 - LIMITS.min_plausible_share:
         says = "people are far off the pitch"
         yield implausible("off_the_pitch", says, source.name, share_of_bodies=share)
 
 
-def camera_findings(name: str, rows: CameraRows, settings: CheckSettings) -> Iterator[Finding]:
+def camera_findings(name: str, rows: CameraRows) -> Iterator[Finding]:
     """Yield invalid rotations, and a moving camera's centre that is not constant."""
     rotation, translation = rows.rotation, rows.translation
     known = np.isfinite(rotation).all((-1, -2)) & np.isfinite(translation).all(-1)
@@ -149,7 +142,7 @@ def camera_findings(name: str, rows: CameraRows, settings: CheckSettings) -> Ite
         return
     where = (f"cameras/{name}",)
     residual = float(np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max())
-    if residual > settings.max_rotation_error:
+    if residual > LIMITS.max_rotation_error:
         yield Finding(
             fault="rotation_not_orthonormal",
             kind="damage",
@@ -161,7 +154,7 @@ def camera_findings(name: str, rows: CameraRows, settings: CheckSettings) -> Ite
     if (np.linalg.det(rotation) < 0.0).any():
         yield convention("mirrored_rotation", "R mirrors: its determinant is -1", *where)
     drift = float(np.linalg.norm(centers(rows) - camera_center(rows), axis=-1).max())
-    if drift > settings.max_center_drift_m:
+    if drift > LIMITS.max_center_drift_m:
         says = "the camera's centre -R't is not in one place"
         yield implausible("moving_center", says, *where, drift_m=drift)
 
@@ -225,10 +218,8 @@ FAR: Final = 500.0
 def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
     """Return the share of people that a camera shows upright and at a person's size.
 
-    Args:
-        source: names of the points.
-        points: (frames, persons, points, 3) [m], world.
-        rows: the camera; with an implausible or varying position its share is zero.
+    `points` (frames, persons, points, 3) [m] are in the world. A camera with an implausible or
+    varying position has the share zero.
     """
     people = 4000  # maximum number of sampled bodies
     # Distance of a camera's centre from its median beyond which its pose is invalid [m].
@@ -258,14 +249,14 @@ def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> floa
     return float(shown.mean())
 
 
-def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> bool:
+def is_blind(source: PointSource, rows: CameraRows) -> bool:
     """Return whether a camera shows fewer people than expected.
 
     A static camera can show an empty part of the pitch: it is only expected to be upright in the
     stadium with the pitch in the centre of its image. For a moving camera nothing is known without
     people in frames with a pose.
     """
-    if visible_share(source, source.points, rows) >= settings.min_visible_share:
+    if visible_share(source, source.points, rows) >= LIMITS.min_visible_share:
         return False
     if len(rows.rotation) > 1:
         posed = np.all(np.isfinite(rows.rotation), axis=(-1, -2))[: len(source.points)]
@@ -275,11 +266,11 @@ def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> 
     if not STAND[0] < center[2] < STAND[1] or not forward[2] < 0.0 or not down[2] < 0.0:
         return True
     middle = center - forward * center[2] / forward[2]
-    return bool((np.abs(middle[:2]) > np.array(settings.bounds_m)).any())
+    return bool((np.abs(middle[:2]) > np.array(LIMITS.bounds_m)).any())
 
 
 def visibility_findings(
-    source: PointSource, views: Sequence[View], settings: CheckSettings
+    source: PointSource, views: Sequence[View]
 ) -> Iterator[tuple[Finding, Fault | None]]:
     """Yield findings on cameras that show too few people, and the fault that explains each.
 
@@ -296,7 +287,7 @@ def visibility_findings(
             for column, view in enumerate(views):
                 rows = view.rows if fault.camera is None else fault.camera(view.rows)
                 share[row, column] = visible_share(source, points, rows)
-    share[share < 10.0 * settings.min_visible_share] = 0.0
+    share[share < 10.0 * LIMITS.min_visible_share] = 0.0
     left = np.ones(len(views), dtype=np.bool_)
     while left.any():
         worth = (share > 0.0)[:, left].sum(1) + share[:, left].mean(1)
@@ -311,7 +302,7 @@ def visibility_findings(
 
 
 def _make_finding(
-    views: Sequence[View], which: NDArray[np.bool_], fault: Fault | None, share: Floats
+    views: Sequence[View], which: Flags, fault: Fault | None, share: Floats
 ) -> Finding:
     where = tuple(f"cameras/{view.name}" for view, ours in zip(views, which, strict=True) if ours)
     figures = {"explained_share_seen": float(share[which].min())}
@@ -328,7 +319,7 @@ _POINTS: Final = 30
 """Minimum number of points of a frame for a rotation estimate: more than one person."""
 
 
-def turning_findings(source: PointSource, view: View, settings: CheckSettings) -> Iterator[Finding]:
+def turning_findings(source: PointSource, view: View) -> Iterator[Finding]:
     """Yield the frame offset that explains a source and a camera's 2D, independent of its poses."""
     posed = np.isfinite(view.rows.rotation).all((-1, -2))
     shared = view.shared_points(source)
@@ -339,10 +330,7 @@ def turning_findings(source: PointSource, view: View, settings: CheckSettings) -
     seen, points = shared[0], source.points[:, :, shared[1]]
     left = {late: _left(seen, points, view.rows, late) for late in range(-LATEST, LATEST + 1)}
     best = min(left, key=lambda late: (left[late], abs(late)))
-    if (
-        left[0] - left[best] > settings.min_gain_px
-        and left[best] < settings.max_share_left * left[0]
-    ):
+    if left[0] - left[best] > LIMITS.min_gain_px and left[best] < LIMITS.max_share_left * left[0]:
         (fault,) = (f for f in frame_faults(moving=False) if f.later_points == best)
         figures = {"shipped_median_px": min(left[0], 1e6), "explained_median_px": left[best]}
         where = source.name, f"cameras/{view.name}"

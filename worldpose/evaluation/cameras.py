@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from data_contracts.arrays import Floats
 from data_contracts.evaluation import CameraErrors, CameraEvaluation
 from data_contracts.records import Record
 from worldpose.errors import InputError
@@ -41,15 +41,15 @@ class CameraScore(Record):
 class CameraSamples:
     """Individual errors of one camera, the input of its metrics."""
 
-    center: NDArray[np.float64]
+    center: Floats
     """(frames,) distance of the centres [m]; here and below, NaN without an estimate."""
-    rotation: NDArray[np.float64]
+    rotation: Floats
     """(frames,) angle between the orientations [rad]."""
-    focal: NDArray[np.float64]
+    focal: Floats
     """(frames,) error over true focal length, mean of x and y [1]."""
-    ground: NDArray[np.float64]
+    ground: Floats
     """(points,) on the pitch surface [m], of all frames."""
-    reprojection: NDArray[np.float64]
+    reprojection: Floats
     """(points,) at player height [px], of all frames."""
 
 
@@ -61,11 +61,8 @@ def evaluate_cameras(
 ) -> tuple[CameraEvaluation | None, tuple[CameraScore, ...]]:
     """Return errors of all static and all broadcast cameras, and of each camera.
 
-    Args:
-        estimated: single cameras or batches (frames,), by camera or clip id.
-        true: single cameras or batches (frames,); the function skips ids that only one side has.
-        pitch: the surface; without one there are neither ground nor reprojection errors.
-        settings: the defaults if None.
+    Cameras are single or batches (frames,), by id; ids that only one side has are skipped. Without
+    a pitch there are neither ground nor reprojection errors.
 
     Raises:
         InputError: an estimated and a true camera have different numbers of frames.
@@ -117,8 +114,8 @@ def camera_samples(
     focal = np.abs(estimated.focal / true.focal - 1.0).mean(-1)
     known = np.isfinite(center) & np.isfinite(focal)
     angle = np.where(known, _angle(turn.rotation), np.nan)
-    ground: list[NDArray[np.float64]] = []
-    reprojection: list[NDArray[np.float64]] = []
+    ground: list[Floats] = []
+    reprojection: list[Floats] = []
     if pitch is not None:
         surface, raised = _points(pitch, settings)
         reach = float(np.hypot(pitch.length, pitch.width))
@@ -140,19 +137,17 @@ def camera_samples(
     )
 
 
-def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
+def surface_points(rays: Rays, pitch: PitchTemplate) -> Floats:
     """Return the first intersections of rays from above with the pitch surface (..., 3) [m], world.
 
     NaN if a ray is missing or passes above the horizon.
 
-    Args:
-        rays: (...) rays.
-        pitch: the surface, extended beyond the touch lines.
+    The surface extends beyond the touch lines.
     """
     newton_steps = 8  # each step squares the error; the surface is within 0.2 m of the start plane
     origins, directions = rays.origins, rays.directions
 
-    def height(along: NDArray[np.float64]) -> NDArray[np.float64]:
+    def height(along: Floats) -> Floats:
         """Return the height of the rays above the surface [m]."""
         points = origins + along[..., None] * directions
         return np.asarray(points[..., 2] - pitch.height(points[..., 0], points[..., 1]))
@@ -168,15 +163,13 @@ def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
         return np.where(met[..., None], origins + along[..., None] * directions, np.nan)
 
 
-def _capped_lengths(vectors: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+def _capped_lengths(vectors: Floats, most: float) -> Floats:
     """Return the lengths of vectors; at most, and for a missing vector, `most`."""
     lengths = np.linalg.norm(vectors, axis=-1)
     return np.minimum(np.where(np.isnan(lengths), most, lengths), most)
 
 
-def _select_visible(
-    camera: Camera, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _select_visible(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
     """Return the points inside the camera's image, and their pixels."""
     pixels = camera.project(points)
     with np.errstate(invalid="ignore"):
@@ -184,9 +177,7 @@ def _select_visible(
     return points[inside], pixels[inside]
 
 
-def _points(
-    pitch: PitchTemplate, settings: CameraErrorSettings
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _points(pitch: PitchTemplate, settings: CameraErrorSettings) -> tuple[Floats, Floats]:
     """Return a grid (n, 3) on the surface, and the same grid at player height [m]."""
     along, across = (
         np.linspace(-0.5 * side, 0.5 * side, int(np.ceil(side / settings.spacing_m)) + 1)
@@ -218,7 +209,7 @@ def _figures(samples: Sequence[CameraSamples]) -> CameraErrors:
     return CameraErrors(cameras=len(samples), coverage=float(known.mean()), **figures)
 
 
-def _angle(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def _angle(rotation: Floats) -> Floats:
     """Return the angle of rotation matrices (...) [rad], accurate also for small angles."""
     trace = np.trace(rotation, axis1=-2, axis2=-1)
     skew = rotation - np.swapaxes(rotation, -1, -2)

@@ -39,9 +39,7 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
 
     A person is the same row on both sides, as in the challenge, which gives the boxes.
 
-    Args:
-        prediction: a submission: zip, npz or parquet.
-        reference: true poses in the same layout; NaN without a person.
+    Predictions are a zip, npz or parquet; true poses are in the same layout, NaN without a person.
 
     Raises:
         InputError: a clip, person or pose of the reference is missing in the prediction.

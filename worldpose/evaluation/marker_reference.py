@@ -9,10 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17
 from worldpose.errors import DegenerateError, InputError, say_failure
 from worldpose.evaluation.matching import (
@@ -49,7 +48,7 @@ class Markers:
     rate: float
     """Samples per second [1/s]."""
     names: tuple[str, ...]
-    points: NDArray[np.float64]
+    points: Floats
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
 
 
@@ -106,7 +105,7 @@ def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
     return people
 
 
-def marker_joints(markers: Markers, people: People) -> NDArray[np.float64]:
+def marker_joints(markers: Markers, people: People) -> Floats:
     """Return joints (samples, persons, 17, 3) [m] in the system's world; NaN where missing.
 
     A joint is the mean of its markers, and missing if one of them is missing.
@@ -169,7 +168,7 @@ def c3d_labels(reader: Any) -> tuple[str, ...]:  # noqa: ANN401
         number += 1
 
 
-def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], str]:
+def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str]:
     """Return rate [1/s], names, points (samples, markers, 3) in the file's unit, and that unit."""
     # The first line has the path, in the bytes of the writer's system; only numbers matter.
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -189,7 +188,7 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], 
 
 
 def _check_markers(
-    path: Path, rate: float, names: tuple[str, ...], points: NDArray[np.float64], unit: str
+    path: Path, rate: float, names: tuple[str, ...], points: Floats, unit: str
 ) -> Markers:
     unit = UNIT_NAMES.get(unit, unit)
     if unit not in METRES or not rate > 0.0 or len(names) != points.shape[1]:
@@ -221,10 +220,7 @@ class ReferenceAlignment:
 
 
 def align_reference(
-    prediction: JointTracks,
-    joints: Floats,
-    rate: float,
-    fps: float,
+    prediction: JointTracks, joints: Floats, rate: float, fps: float
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Return the reference in the prediction's frames and world, and its alignment.
 
@@ -232,11 +228,8 @@ def align_reference(
     offset, then a refinement with fixed matches. The motion is rigid: a wrong size of the
     prediction remains an error.
 
-    Args:
-        prediction: estimated joints.
-        joints: (samples, persons, 17, 3) [m] in the reference's world; NaN where missing.
-        rate: samples per second [1/s].
-        fps: match frames per second [1/s].
+    `joints` (samples, persons, 17, 3) [m] are in the reference's world, NaN where missing, at
+    `rate` samples per second [1/s].
 
     Raises:
         DegenerateError: prediction and reference match at no offset.
@@ -263,10 +256,7 @@ def align_reference(
 
     # Tenths of a millisecond: a millimetre of a runner's path.
     found = minimize_scalar(
-        error,
-        bounds=(offset - step_s, offset + step_s),
-        method="bounded",
-        options={"xatol": 1e-4},
+        error, bounds=(offset - step_s, offset + step_s), method="bounded", options={"xatol": 1e-4}
     )
     moved = sample_joints(joints, rate, times + found.x)
     motion, residual = _fit_motion(prediction.joints, moved, match)
@@ -293,7 +283,7 @@ def sample_joints(joints: Floats, rate: float, times: Floats) -> Floats:
     return np.where(inside[:, None, None, None], between, np.nan)
 
 
-def _match_cost(people: Floats, reference: Floats) -> tuple[float, NDArray[np.int64] | None]:
+def _match_cost(people: Floats, reference: Floats) -> tuple[float, Integers | None]:
     """Return the sum of joint distances, clipped at the gate, and the match after registration."""
     # Maximum mean joint distance of matched persons after alignment [m], as in the
     # evaluation.
@@ -313,9 +303,7 @@ def _match_cost(people: Floats, reference: Floats) -> tuple[float, NDArray[np.in
     return float(total + missing), match
 
 
-def _fit_motion(
-    people: Floats, reference: Floats, match: NDArray[np.int64]
-) -> tuple[Similarity, float]:
+def _fit_motion(people: Floats, reference: Floats, match: Integers) -> tuple[Similarity, float]:
     """Return the rigid motion of the reference onto matched people, and the rms residual [m]."""
     target = take_matched(people, match).reshape(-1, 3)
     motion = align(reference.reshape(-1, 3), target, with_scale=False)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Record
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
@@ -66,18 +66,12 @@ class IdentityScores:
 
 
 def identity_scores(
-    distances: NDArray[np.float64],
-    true_exists: NDArray[np.bool_],
-    predicted_exists: NDArray[np.bool_],
-    gate: float,
+    distances: Floats, true_exists: Flags, predicted_exists: Flags, gate: float
 ) -> IdentityScores:
     """Return the identity scores of predicted tracks against true people.
 
-    Args:
-        distances: (frames, true persons, predicted persons) [m]; infinite where either is absent.
-        true_exists: (frames, true persons).
-        predicted_exists: (frames, predicted persons).
-        gate: maximum distance between matched persons [m].
+    `distances` (frames, true, predicted persons) [m] are infinite where either is absent; `gate`
+    [m] is the maximum of a match.
 
     Note:
         IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations: Bernardin and Stiefelhagen,
@@ -104,9 +98,7 @@ def identity_scores(
     )
 
 
-def _interruptions(
-    distances: NDArray[np.float64], true_exists: NDArray[np.bool_], gate: float
-) -> tuple[int, int]:
+def _interruptions(distances: Floats, true_exists: Flags, gate: float) -> tuple[int, int]:
     """Return the numbers of switches and fragmentations.
 
     In every frame, true people keep the prediction of the frame before while it is within the
@@ -139,10 +131,8 @@ def _interruptions(
 
 
 def _hota_parts(
-    similarity: NDArray[np.float64],
-    true_exists: NDArray[np.bool_],
-    predicted_exists: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    similarity: Floats, true_exists: Flags, predicted_exists: Flags
+) -> tuple[Floats, Floats]:
     """Return detection and association accuracy at every level (levels,)."""
     true_count, predicted_count = true_exists.sum(0), predicted_exists.sum(0)
     either = similarity.sum(-1, keepdims=True) + similarity.sum(-2, keepdims=True) - similarity
@@ -161,7 +151,7 @@ def _hota_parts(
     return detection, association
 
 
-def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def joint_boxes(joints: Floats, camera: Camera) -> Floats:
     """Return boxes around projected joints (frames, persons, 4) x0 y0 x1 y1 [px].
 
     Joints are (frames, persons, joints, 3) [m], world, NaN where missing; there is one camera, or
@@ -177,7 +167,7 @@ def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float
     return np.where(np.isfinite(boxes), boxes, np.nan)
 
 
-def box_overlaps(predicted: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_overlaps(predicted: Floats, true: Floats) -> Floats:
     """Return intersection over union of all pairs (frames, true, predicted) [0..1].
 
     Boxes are (frames, persons, 4) x0 y0 x1 y1 [px]. The value is NaN where one is missing, and 0
@@ -191,9 +181,7 @@ _CHUNK: Final = 64
 """Frames per batch of distances: tens of megabytes for 25 people on either side."""
 
 
-def select_frames(
-    rows: NDArray[np.float64], own_frames: NDArray[np.int64], frames: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def select_frames(rows: Floats, own_frames: Integers, frames: Integers) -> Floats:
     """Return rows (own frames, ...) at other frames (frames, ...), NaN in frames without a row."""
     selected = np.full((len(frames), *rows.shape[1:]), np.nan)
     _, own, places = np.intersect1d(own_frames, frames, assume_unique=True, return_indices=True)
@@ -201,9 +189,7 @@ def select_frames(
     return selected
 
 
-def joint_distances(
-    predicted: NDArray[np.float64], true: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def joint_distances(predicted: Floats, true: Floats) -> Floats:
     """Return the distance of every pair of people in every frame (frames, true, predicted) [m].
 
     The distance is the mean over common joints, infinite without common joints. People are
@@ -221,7 +207,7 @@ def joint_distances(
     return distances
 
 
-def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int64]:
+def match_people(distances: Floats, gate: float) -> Integers:
     """Return the predicted person matched to each true one (frames, true), -1 for none.
 
     One-to-one per frame, with the least sum of distances (frames, true persons, predicted persons)
@@ -237,7 +223,7 @@ def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int6
     return match
 
 
-def match_boxes(overlap: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+def match_boxes(overlap: Floats, least: float) -> Integers:
     """Return the predicted person matched to each true one (frames, true), -1 for none.
 
     One-to-one and greedy per frame, by falling overlap (frames, true persons, predicted persons)
@@ -256,16 +242,15 @@ def match_boxes(overlap: NDArray[np.float64], least: float) -> NDArray[np.int64]
     return match
 
 
-def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray[np.int64]:
+def merge_tracks(pairs: Integers, cost: Floats) -> Integers:
     """Return the predicted person of each true one (frames, true), by whole tracks.
 
     A track belongs to the true person of its most frequent match, in all its frames: after an
     identity switch it is wrong, however near another person is. The function merges tracks of one
     true person; if several exist in one frame, it takes the one of least cost.
 
-    Args:
-        pairs: (frames, true persons) matches per frame, -1 for none.
-        cost: (frames, true persons, predicted persons); infinite where either does not exist.
+    `pairs` (frames, true persons) are matches per frame, -1 for none; `cost` (frames, true,
+    predicted persons) is infinite where either does not exist.
 
     Note:
         E3.
@@ -283,7 +268,7 @@ def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray
     return np.where(known, cheapest, -1)
 
 
-def take_matched(people: NDArray[np.float64], match: NDArray[np.int64]) -> NDArray[np.float64]:
+def take_matched(people: Floats, match: Integers) -> Floats:
     """Return predicted people in the order of the true ones (frames, true, joints, 3).
 
     The match (frames, true persons) has the index of the predicted person; -1, none, gives NaN.
@@ -300,19 +285,15 @@ _PAIRS: Final = 400
 """Maximum pairs of people to try, by falling number of common joints: all of 20 against 20."""
 
 
-def register_world(
-    predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float
-) -> Similarity | None:
+def register_world(predicted: Floats, true: Floats, gate: float) -> Similarity | None:
     """Return the similarity that matches most predicted people to true ones, None if none match.
 
     Every pair of a predicted and a true person gives a candidate, from their whole paths. The
     candidate with the least sum of distances from true to predicted people, each clipped at the
     gate, wins; a fit to all its matches refines it.
 
-    Args:
-        predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
-        true: (frames, true persons, joints, 3) [m]; NaN where missing.
-        gate: maximum distance between matched persons after the motion [m].
+    Both are (frames, persons, joints, 3) [m], NaN where missing; `gate` [m] is the maximum distance
+    of matched people after the motion.
     """
     rounds = 3  # iterations of matching and alignment, enough to converge
     shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
@@ -344,19 +325,17 @@ def register_world(
     return motion
 
 
-def _any_joint(people: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _any_joint(people: Floats) -> Flags:
     """Return the mask of frames with at least one person (frames,)."""
     return np.asarray(np.isfinite(people[..., 0]).any((-1, -2)))
 
 
-def move_people(motion: Similarity, people: NDArray[np.float64]) -> NDArray[np.float64]:
+def move_people(motion: Similarity, people: Floats) -> Floats:
     """Return people (frames, persons, joints, 3) [m] after a motion of the world."""
     return motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
 
 
-def _pairs(
-    predicted: NDArray[np.float64], true: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pairs(predicted: Floats, true: Floats) -> tuple[Integers, Integers]:
     """Return true and predicted persons of the pairs with most common joints."""
     known_true = np.isfinite(np.swapaxes(true[..., 0], 0, 1)).reshape(true.shape[1], -1)
     known = np.isfinite(np.swapaxes(predicted[..., 0], 0, 1)).reshape(predicted.shape[1], -1)
@@ -367,7 +346,7 @@ def _pairs(
     return rows, columns
 
 
-def _middles(people: NDArray[np.float64]) -> NDArray[np.float64]:
+def _middles(people: Floats) -> Floats:
     """Return the mean joint of every person (frames, persons, 3), NaN without joints."""
     known = np.isfinite(people).all(-1, keepdims=True)
     count = known.sum(-2)
@@ -377,9 +356,7 @@ def _middles(people: NDArray[np.float64]) -> NDArray[np.float64]:
     return middles
 
 
-def _unmatched_distance(
-    predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float
-) -> float:
+def _unmatched_distance(predicted: Floats, true: Floats, gate: float) -> float:
     """Return the summed distance of true people to the nearest predicted one, clipped at gate."""
     distance = np.linalg.norm(predicted[:, None] - true[:, :, None], axis=-1)
     nearest = np.where(np.isnan(distance), gate, distance).min(axis=-1)
@@ -391,24 +368,20 @@ def _one(motions: Similarity, index: int) -> Similarity:
 
 
 def match_tracks(
-    people: NDArray[np.float64],
-    true: NDArray[np.float64],
-    distances: NDArray[np.float64],
-    match: NDArray[np.int64],
+    people: Floats,
+    true: Floats,
+    distances: Floats,
+    match: Integers,
     camera: Camera | None,
-    boxes: NDArray[np.float64] | None,
+    boxes: Floats | None,
     settings: EvaluationSettings,
-) -> NDArray[np.int64]:
+) -> Integers:
     """Return the predicted person of each true one (frames, true), by whole tracks (E3).
 
-    Args:
-        people: (frames, predicted persons, 17, 3) [m]; NaN where missing.
-        true: (frames, true persons, 17, 3) [m]; NaN where missing.
-        distances: (frames, true persons, predicted persons) [m] of all pairs.
-        match: (frames, true persons), matches by these distances.
-        camera: compares boxes in its image; None = match by distance.
-        boxes: (frames, predicted persons, 4) [px] of the prediction there; None = of its joints.
-        settings: minimum overlap, gate, and threshold for registration.
+    `people` and `true` are (frames, persons, 17, 3) [m], NaN where missing, `distances` (frames,
+    true, predicted persons) [m], `match` (frames, true persons) the matches by these. With a
+    camera, boxes in its image are compared: `boxes` (frames, predicted persons, 4) [px], or those
+    of the joints.
 
     Raises:
         InputError: camera and truth have different numbers of frames.

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
 from worldpose.evaluation.matching import (
@@ -40,7 +40,7 @@ LIMBS: Final = {
 mid-shoulder to the middle of the ears."""
 
 
-def limb_ends(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+def limb_ends(joints: Floats) -> Floats:
     """Return both ends of every limb of COCO-17 joints (..., 17, 3) [m]; NaN where one is missing.
 
     Returns:
@@ -55,9 +55,7 @@ def limb_ends(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def correct_limbs(
-    predicted: NDArray[np.float64], true: NDArray[np.float64], alpha: float
-) -> NDArray[np.bool_]:
+def correct_limbs(predicted: Floats, true: Floats, alpha: float) -> Flags:
     """Return a mask of correct limbs (..., 10): mean error of ends at most alpha times length.
 
     Joints are (..., 17, 3) [m]; a limb with a missing joint is wrong.
@@ -72,18 +70,18 @@ def correct_limbs(
     return np.asarray(error <= alpha * length)
 
 
-def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+def paper_joints(joints: Floats) -> Floats:
     """Return the joints of E4 (..., 14, 3) [m] from COCO-17 (..., 17, 3), NaN where missing."""
     neck = joints[..., 5:7, :].mean(axis=-2, keepdims=True)
     return np.concatenate([joints[..., :1, :], neck, joints[..., 5:, :]], axis=-2)
 
 
-def challenge_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+def challenge_joints(joints: Floats) -> Floats:
     """Return the joints (..., 13, 3) [m] that the challenge shares with COCO-17 (..., 17, 3)."""
     return np.concatenate([joints[..., :1, :], joints[..., 5:, :]], axis=-2)
 
 
-def mid_hip(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+def mid_hip(joints: Floats) -> Floats:
     """Return the middle of the hips (..., 3) [m] of COCO-17 joints, NaN if one is missing."""
     return np.asarray(joints[..., 11:13, :].mean(axis=-2))
 
@@ -95,11 +93,11 @@ class AlignedErrors:
     Distances are (frames, persons, 14) [m], on the joints of E4.
     """
 
-    shared: NDArray[np.float64]
+    shared: Floats
     """One alignment for all people's whole trajectories (E1)."""
-    per_person: NDArray[np.float64]
+    per_person: Floats
     """One alignment for each person's whole trajectory (E2)."""
-    per_frame: NDArray[np.float64]
+    per_frame: Floats
     """One alignment for each person in each frame (E1)."""
     scale: float
     """Scale of the shared alignment: true over predicted size; 1 if rigid, NaN without common
@@ -107,19 +105,12 @@ class AlignedErrors:
 
 
 def aligned_errors(
-    predicted: NDArray[np.float64],
-    true: NDArray[np.float64],
-    *,
-    with_scale: bool,
-    min_joints: int,
+    predicted: Floats, true: Floats, *, with_scale: bool, min_joints: int
 ) -> AlignedErrors:
     """Return joint errors after the three alignments of the paper.
 
-    Args:
-        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing or not counted.
-        with_scale: similarities if true, rigid motions if not.
-        min_joints: minimum common joints of a person for the alignment per frame.
+    Both are (frames, persons, 17, 3) [m], in the order of the true people, NaN where missing or not
+    counted. `with_scale` asks for similarities instead of rigid motions.
     """
     source, target = paper_joints(predicted), paper_joints(true)
     frames, persons, joints, _ = target.shape
@@ -147,7 +138,7 @@ def aligned_errors(
     )
 
 
-def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDArray[np.float64]:
+def path_lengths(true: Floats, compared: Flags) -> Floats:
     """Return the length of every true person's path (persons,) [m].
 
     The path of the mid-hip of joints (frames, persons, 17, 3) [m] through the compared frames
@@ -162,9 +153,7 @@ def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDAr
     return lengths
 
 
-def drift_per_meter(
-    errors: NDArray[np.float64], lengths: NDArray[np.float64], min_length: float
-) -> float | None:
+def drift_per_meter(errors: Floats, lengths: Floats, min_length: float) -> float | None:
     """Return the mean over people of mean error over path length [1], None without long paths.
 
     Errors are (frames, persons, joints) [m], NaN where missing; path lengths (persons,) [m].
@@ -182,9 +171,7 @@ def drift_per_meter(
     return float((total[far] / count[far] / lengths[far]).mean())
 
 
-def challenge_errors(
-    predicted: NDArray[np.float64], true: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def challenge_errors(predicted: Floats, true: Floats) -> tuple[Floats, Floats]:
     """Return global and local joint errors (frames, persons, 13) [m], without any alignment.
 
     Local errors are relative to the mid-hip of each side. Joints are (frames, persons, 17, 3) [m],
@@ -195,12 +182,7 @@ def challenge_errors(
     return np.linalg.norm(offset, axis=-1), np.linalg.norm(offset - roots, axis=-1)
 
 
-def acceleration_errors(
-    predicted: NDArray[np.float64],
-    true: NDArray[np.float64],
-    frames: NDArray[np.int64],
-    fps: float,
-) -> NDArray[np.float64]:
+def acceleration_errors(predicted: Floats, true: Floats, frames: Integers, fps: float) -> Floats:
     """Return errors of joint acceleration (frames - 2, persons, 14) [m/s^2], NaN where unknown.
 
     Second differences of three successive frames at the minimum step, on the joints of E4. Joints
@@ -285,7 +267,7 @@ def evaluate_joints(
     *,
     fps: float | None = None,
     camera: Camera | None = None,
-    boxes: NDArray[np.float64] | None = None,
+    boxes: Floats | None = None,
 ) -> tuple[Evaluation, tuple[PersonScore, ...]]:
     """Return metrics over all frames of the reference, and per true person.
 
@@ -352,10 +334,7 @@ def evaluate_joints(
 
 
 def _tally(
-    predicted: NDArray[np.float64],
-    true: NDArray[np.float64],
-    present: NDArray[np.bool_],
-    alpha: float,
+    predicted: Floats, true: Floats, present: Flags, alpha: float
 ) -> Callable[[slice | int], dict[str, float | None]]:
     """Compare matched people (frames, persons, 17, 3) [m]; return metrics by true persons."""
     error = np.linalg.norm(predicted - true, axis=-1)
@@ -381,13 +360,13 @@ def _ratio(part: float, whole: float) -> float | None:
     return float(part / whole) if whole else None
 
 
-def _mean(values: NDArray[np.float64], factor: float = 1.0) -> float | None:
+def _mean(values: Floats, factor: float = 1.0) -> float | None:
     """Return the mean of finite values times a factor, None without any."""
     known = np.isfinite(values)
     return _ratio(factor * np.where(known, values, 0.0).sum(), int(known.sum()))
 
 
-def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> NDArray[np.bool_]:
+def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> Flags:
     """Return the mask of true joints that count (frames, persons, 17)."""
     exists = np.isfinite(reference.joints[..., 0])
     counts = exists
@@ -397,17 +376,17 @@ def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> ND
     return np.asarray(counts & enough[..., None])
 
 
-def _minutes(frames: NDArray[np.int64], fps: float | None) -> float | None:
+def _minutes(frames: Integers, fps: float | None) -> float | None:
     if fps is None or not len(frames):
         return None
     return float(frames[-1] - frames[0] + 1) / fps / 60.0
 
 
 def _track_figures(
-    predicted: NDArray[np.float64],
-    true: NDArray[np.float64],
-    present: NDArray[np.bool_],
-    frames: NDArray[np.int64],
+    predicted: Floats,
+    true: Floats,
+    present: Flags,
+    frames: Integers,
     fps: float | None,
     settings: EvaluationSettings,
 ) -> tuple[dict[str, float | None], list[dict[str, float | None]]]:

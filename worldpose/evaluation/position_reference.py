@@ -7,15 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
 
 
-def read_positions(path: Path) -> tuple[NDArray[np.int64], tuple[str, ...], Floats]:
+def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats]:
     """Return frames (frames,), names of people, and their places (frames, persons, 2) [m].
 
     The file is a CSV of `worldpose export --format positions`, or of kloppy's `to_df`: columns
@@ -60,10 +59,7 @@ def align_positions(
     Axes of providers may point the other way: of the four ways, the one is taken that clearly
     agrees with the prediction.
 
-    Args:
-        path: as for `read_positions`.
-        prediction: the joints of the same people.
-        first: match frame of the file's first row; None = its frames are match frames.
+    `first` is the match frame of the file's first row; None = its frames are match frames.
 
     Raises:
         InputError: the file is invalid, or no way of its axes clearly agrees.
@@ -72,7 +68,7 @@ def align_positions(
     frames, names, xy = read_positions(path)
     frames = frames if first is None else frames - frames[0] + first
 
-    def on_ground(frames: NDArray[np.int64], places: Floats) -> JointTracks:
+    def on_ground(frames: Integers, places: Floats) -> JointTracks:
         joints = np.full((*places.shape[:2], 17, 3), np.nan)
         joints[:, :, hips, :2] = places[:, :, None]
         joints[:, :, hips, 2] = np.where(np.isfinite(places[..., :1]), 0.0, np.nan)

@@ -12,7 +12,7 @@ import scipy.sparse
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image, Singles
+from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.geometry.cameras import Camera
@@ -24,14 +24,7 @@ from worldpose.geometry.rasters import (
     outline_surfaces,
     resolve,
 )
-from worldpose.reports.drawing import (
-    WIDTH,
-    draw_label,
-    markings,
-    person_color,
-    picture_panels,
-    png,
-)
+from worldpose.reports.drawing import WIDTH, draw_label, markings, person_color, picture_panels, png
 
 _SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
 """Direction to the light, world: high, from the main camera's side."""
@@ -43,9 +36,9 @@ _FACING: Final = 0.25
 class BodyTracks:
     """Bodies of all people in a clip's frames."""
 
-    frames: NDArray[np.int64]
+    frames: Integers
     """(frames,) match frames."""
-    person_ids: NDArray[np.int64]
+    person_ids: Integers
     """(persons,)."""
     poses: BodyParameters
     """A batch (frames, persons); NaN where a person is missing."""
@@ -70,20 +63,16 @@ def paint_bodies(
     canvas: Image,
     camera: Camera,
     bodies: Floats,
-    faces: NDArray[np.int64],
+    faces: Integers,
     colors: Floats,
     *,
     opacity: float = 1.0,
 ) -> None:
     """Draw bodies over an image with a depth test.
 
-    Args:
-        canvas: (height, width, 3), RGB, modified in place.
-        camera: the image's camera, single.
-        bodies: (persons, vertices, 3) [m], world, finite.
-        faces: (triangles, 3), counter-clockwise seen from outside.
-        colors: (persons, 3) colors in 0..1.
-        opacity: opacity of the bodies; 1 is opaque. Below 1, each body has an opaque rim.
+    `canvas` (height, width, 3) RGB is changed in place. `bodies` (persons, vertices, 3) [m], world,
+    are finite; `faces` (triangles, 3) are counter-clockwise seen from outside; `colors` (persons,
+    3) are in 0..1. Below opacity 1, each body has an opaque rim.
     """
     height, width = canvas.shape[:2]
     surfaces = bodies.astype(np.float32)
@@ -116,7 +105,7 @@ def paint_bodies(
         canvas[rim] = np.rint(255.0 * colors[owner[rim]]).astype(np.uint8)
 
 
-def _rim(owner: NDArray[np.int16]) -> NDArray[np.bool_]:
+def _rim(owner: NDArray[np.int16]) -> Flags:
     """Return the mask (height, width) of body pixels next to background or another body."""
     around = np.pad(owner, 1, mode="edge")
     inner = around[1:-1, 1:-1]
@@ -159,8 +148,8 @@ def plot_bodies(
     camera: Camera,
     title: str,
     surfaces: Floats,
-    faces: NDArray[np.int64],
-    person_ids: Sequence[int] | NDArray[np.int64],
+    faces: Integers,
+    person_ids: Sequence[int] | Integers,
     *,
     still: Image | None = None,
     pitch: PitchSpec | None = None,
@@ -199,12 +188,12 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
     size = np.asarray(camera.image_size, dtype=np.float64)
     side = image_share * size
     middles = camera.project(bodies.mean(axis=1))
-    inside: NDArray[np.bool_] = np.all((middles >= 0.0) & (middles < size), axis=-1)
+    inside: Flags = np.all((middles >= 0.0) & (middles < size), axis=-1)
     if not inside.any():
         return np.full(2, -0.5), size
     middles = middles[inside]
     apart = np.abs(middles[:, None] - middles)
-    together: NDArray[np.bool_] = np.all(apart < 0.45 * side, axis=-1)
+    together: Flags = np.all(apart < 0.45 * side, axis=-1)
     around = middles[together[np.argmax(together.sum(axis=1))]].mean(axis=0)
     return np.clip(around - 0.5 * side, -0.5, size - 0.5 - side), side
 
@@ -227,7 +216,7 @@ def _background(
     for line in markings(pitch) if pitch is not None else ():
         pixels = camera.project(line)
         # Points far outside do not fit into 32 bits, and are not visible.
-        near: NDArray[np.bool_] = np.all(np.abs(pixels) < 1e4, axis=-1)
+        near: Flags = np.all(np.abs(pixels) < 1e4, axis=-1)
         for start in np.flatnonzero(near[:-1] & near[1:]):
             a, b = np.rint(pixels[start : start + 2] * 2**subpixel).astype(int).tolist()
             cv2.line(canvas, a, b, (255, 255, 255), 3, cv2.LINE_AA, subpixel)

@@ -8,9 +8,8 @@ from typing import Final
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image, Integers
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.shots import Shot
 from worldpose.formats.joints_file import JointTracks
@@ -32,7 +31,7 @@ _STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
 
 
 def plot_camera_course(
-    frame: NDArray[np.int64],
+    frame: Integers,
     camera: Camera,
     covariance: Floats,
     before: Camera | None = None,
@@ -42,13 +41,9 @@ def plot_camera_course(
 
     Bands are two standard deviations to either side; frames without a camera stay empty.
 
-    Args:
-        frame: (frames,) match frames.
-        camera: a batch (frames,).
-        covariance: (frames, 7, 7) covariance of a step, in the order of
-            `data_contracts.broadcast_calibration.FRAME_STEP`.
-        before: the same frames, independent and without smoothing; drawn below.
-        given: what camera data state instead, by the name of a curve.
+    `camera` is a batch (frames,), `covariance` (frames, 7, 7) that of a step, in the order of
+    `data_contracts.broadcast_calibration.FRAME_STEP`. `before` are the same frames, independent and
+    without smoothing, drawn below; `given` is what camera data state, by the name of a curve.
     """
     curves = _curves(camera)
     rough = {} if before is None else _curves(before)
@@ -122,7 +117,7 @@ def plot_before_after(
     frame: int,
     person: int,
     *,
-    still: NDArray[np.uint8],
+    still: Image,
     seen: Floats,
     pitch: PitchSpec | None = None,
 ) -> bytes:
@@ -147,11 +142,7 @@ def plot_before_after(
 
 
 def plot_flow(
-    still: NDArray[np.uint8],
-    start: Floats,
-    end: Floats,
-    rejected: NDArray[np.bool_],
-    predicted: Floats,
+    still: Image, start: Floats, end: Floats, rejected: Flags, predicted: Floats
 ) -> bytes:
     """Return a PNG of the optical flow from a frame, RGB, to the next, with inliers and outliers.
 
@@ -202,7 +193,7 @@ def programme_sheet(shots: Sequence[Shot]) -> bytes:
     return coded.tobytes()
 
 
-def _row(shot: Shot) -> NDArray[np.uint8]:
+def _row(shot: Shot) -> Image:
     shown = 5  # frames per clip, in order and evenly spaced
     places = np.linspace(0, len(shot.pictures) - 1, shown).round().astype(int)
     pictures = np.hstack([shot.pictures[place] for place in places])
@@ -211,7 +202,7 @@ def _row(shot: Shot) -> NDArray[np.uint8]:
     return np.vstack([_text(bar, said), pictures])
 
 
-def _text(bar: NDArray[np.uint8], said: str) -> NDArray[np.uint8]:
+def _text(bar: Image, said: str) -> Image:
     white = (255, 255, 255)
     cv2.putText(bar, said, (6, _BAR - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, white, 1, cv2.LINE_AA)
     return bar

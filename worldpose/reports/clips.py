@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
@@ -96,15 +96,13 @@ def plot_paths(
     return png(figure)
 
 
-def _ground(tracks: JointTracks) -> NDArray[np.float64]:
+def _ground(tracks: JointTracks) -> Floats:
     """Return mid-hips on the ground (frames, persons, 2) [m]."""
-    middle: NDArray[np.float64] = tracks.joints[..., HIPS, :2].mean(axis=-2)
+    middle: Floats = tracks.joints[..., HIPS, :2].mean(axis=-2)
     return middle
 
 
-def _frame(
-    points: NDArray[np.float64], margin: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _frame(points: Floats, margin: float) -> tuple[Floats, Floats]:
     """Return the corners of a box around points, widened to 4:3 so that both plots fit."""
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     half = 0.5 * (high - low)
@@ -123,7 +121,7 @@ def plot_camera_view(
     tracks: JointTracks,
     frame: int,
     *,
-    still: NDArray[np.uint8] | None = None,
+    still: Image | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
     """Return a PNG of markings and people projected into one single camera.
@@ -193,7 +191,7 @@ def plot_stadium(
     return png(figure)
 
 
-def visible_ground(camera: Camera) -> NDArray[np.float64]:
+def visible_ground(camera: Camera) -> Floats:
     """Return corners (n, 2) [m] of the ground in a camera's field of view, to `VIEW_LENGTH_M`.
 
     The ground is the plane z = 0, world.
@@ -241,7 +239,7 @@ class ReconstructedPeople:
     """(persons, 17, 3) [m], world; NaN where missing."""
     person_ids: NDArray[np.integer]
     """(persons,)."""
-    seen: NDArray[np.bool_]
+    seen: Flags
     """(persons,) whether the drawn camera's own detections support any joint of the person."""
 
 
@@ -250,7 +248,7 @@ def plot_detections(
     detections: ImageDetections,
     people: ReconstructedPeople,
     *,
-    still: NDArray[np.uint8] | None = None,
+    still: Image | None = None,
     pitch: PitchSpec | None = None,
     part: tuple[Floats, Floats] | None = None,
 ) -> bytes:

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.release import CheckReport, DataSetManifest, DataSetStatistics
 from worldpose.dataset.benchmark import Sample
 from worldpose.reports.drawing import GRASS, INK, PALE, draw_skeleton, person_color, png, style
@@ -186,14 +186,14 @@ def plot_statistics(statistics: DataSetStatistics) -> bytes:
     return png(figure)
 
 
-def bin_edges(values: Sequence[float]) -> NDArray[np.float64]:
+def bin_edges(values: Sequence[float]) -> Floats:
     """Return edges from 0 to beyond the maximum, 1, 2 or 5 times a power of ten apart."""
     top = max(values, default=0.0)
     if top <= 0.0:
         return np.array([0.0, 1.0])
     power = 10.0 ** np.floor(np.log10(top / BINS))
     width = next(power * step for step in (1.0, 2.0, 5.0, 10.0) if power * step * BINS >= top)
-    edges: NDArray[np.float64] = np.arange(np.floor(top / width) + 2.0) * width
+    edges: Floats = np.arange(np.floor(top / width) + 2.0) * width
     return edges
 
 
@@ -215,7 +215,7 @@ def plot_methods(sample: Sample) -> bytes:
     """
     count, camera = len(sample.found), sample.camera
 
-    def views(people: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def views(people: Floats) -> tuple[Floats, Floats]:
         return people[..., :2] if camera is None else camera.project(people), people[..., 1:]
 
     corners = []

@@ -26,7 +26,7 @@ from matplotlib.quiver import Quiver
 from matplotlib.text import Annotation
 from numpy.typing import ArrayLike, NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
@@ -96,12 +96,12 @@ def draw_people(axes: Axes, camera: Camera, tracks: JointTracks, frame: int) -> 
         draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
 
 
-def pitch_corners(pitch: PitchSpec) -> NDArray[np.float64]:
+def pitch_corners(pitch: PitchSpec) -> Floats:
     """Return two opposite corners of the pitch (2, 2) [m]."""
     return 0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]])
 
 
-def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
+def markings(pitch: PitchSpec) -> list[Floats]:
     """Return the painted lines as polylines (n, 3) [m], world, sampled every half metre."""
     template = PitchTemplate.from_spec(pitch)
     samples = template.sample_lines(0.5)
@@ -142,13 +142,9 @@ def picture_panels(
 
     Places are computed, not adjusted to the text, which takes 0.1 s.
 
-    Args:
-        titles: one for each panel.
-        corner: (2,) upper left corner of the part [px].
-        side: (2,) width and height of the part [px].
-        still: the camera's image (height, width, 3), RGB; None = plain ground.
-        ground: colour of plain ground.
-        below: free height below the panels [px].
+    The part has its upper left `corner` (2,) and size `side` (2,) [px] in the image `still`
+    (height, width, 3) RGB; without it, the ground has one colour. `below` [px] stays free below the
+    panels.
     """
     dpi = 110  # resolution of a figure [px/in]
     (left, top), (across, down) = np.asarray(corner, float), np.asarray(side, float)

@@ -32,12 +32,7 @@ def write_recording(
 
     In the image of each static camera, the markings are where its lens shows them.
 
-    Args:
-        path: the file.
-        tracks: joints of all people; missing joints are left out.
-        fps: frames per second [1/s].
-        cameras: by id, single or one per frame of the tracks; NaN where missing.
-        pitch: draw its markings; None without a pitch.
+    Cameras are single, or one per frame of the tracks, NaN where missing.
 
     Raises:
         UsageError: rerun-sdk is not installed.

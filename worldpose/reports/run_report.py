@@ -95,11 +95,7 @@ MEANINGS: Final = {
         "%",
         "true positives among all true and predicted people",
     ),
-    "association_accuracy": (
-        "association part of it",
-        "%",
-        "how pure and complete the tracks are",
-    ),
+    "association_accuracy": ("association part of it", "%", "how pure and complete the tracks are"),
     "switches": ("Switches", "", "times that a true person continues under another id"),
     "switches_per_minute": ("Switches", "per minute", "of the match, all people together"),
     "fragmentations": ("Fragmentations", "", "times that a track of a true person is interrupted"),
@@ -121,11 +117,7 @@ CAMERA_MEANINGS: Final = {
         "px",
         "distance in the image, for points at player height above the pitch, median",
     ),
-    "reprojection_error_p95_px": (
-        "reprojection error, 95 %",
-        "px",
-        "the same, 95th percentile",
-    ),
+    "reprojection_error_p95_px": ("reprojection error, 95 %", "px", "the same, 95th percentile"),
     "center_error_m": ("centre", "m", "distance from the true position, mean"),
     "rotation_error_deg": ("rotation", "deg", "angle to the true orientation, mean"),
     "focal_error_percent": ("focal length", "%", "difference to the true focal length, mean"),
@@ -155,12 +147,7 @@ def score_rows(scores: Evaluation) -> list[tuple[str, str, str, str]]:
         for name, value in errors.items():
             label, shown, meaning = _score_row(CAMERA_MEANINGS[name], name, value)
             rows.append(
-                (
-                    f"cameras.{kind}.{name}",
-                    f"{kind.capitalize()} cameras: {label}",
-                    shown,
-                    meaning,
-                )
+                (f"cameras.{kind}.{name}", f"{kind.capitalize()} cameras: {label}", shown, meaning)
             )
     return rows
 

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import (
@@ -40,7 +39,7 @@ class Click(NamedTuple):
     """A clicked point of the template at a place (2,) [px], and whether the fit includes it."""
 
     name: str
-    place: NDArray[np.float64]
+    place: Floats
     inlier: bool
 
 
@@ -50,26 +49,24 @@ class ErrorMap(NamedTuple):
     NaN outside the field of view.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    expected: NDArray[np.float64]
+    x: Floats
+    y: Floats
+    expected: Floats
 
 
 def plot_health(
     cameras: Sequence[str],
-    frame: NDArray[np.int64],
+    frame: Integers,
     badness: Floats,
     missing: Floats,
     marks: Sequence[tuple[str, int | None, str]],
 ) -> bytes:
     """Return a PNG of the health of cameras over time, a row each.
 
-    Args:
-        cameras: (rows,) names.
-        frame: (bins + 1,) first match frame of each bin, and the frame after the last.
-        badness: (bins, rows), above 1 somebody should look; NaN where nothing is known.
-        missing: (bins, rows) share of frames without an image; NaN where not known.
-        marks: camera, match frame of a sudden change (None = it lasts), and what is written there.
+    `frame` (bins + 1,) are the first match frames of the bins, and the frame after the last.
+    `badness` (bins, rows), above 1 somebody should look, and `missing` (bins, rows), the share of
+    frames without an image, are NaN where not known. `marks` are camera, match frame of a sudden
+    change (None = it lasts), and what is written there.
     """
     height = 1.6 + 0.32 * len(cameras)
     figure = Figure(figsize=(14.0, height), dpi=110, layout="constrained", facecolor="white")
@@ -102,7 +99,7 @@ def plot_calibration(
     pitch: PitchSpec,
     *,
     clicks: Sequence[Click] = (),
-    still: NDArray[np.uint8] | None = None,
+    still: Image | None = None,
     error_map: ErrorMap | None = None,
 ) -> bytes:
     """Return a PNG with the template and all clicks over the still, and the coverage map below.
@@ -165,7 +162,7 @@ NEAR_PAINT_PX: Final = 12.0
 """Maximum distance of samples to paint [px]; beyond, they are occluded, or their paint is faint."""
 
 
-def detect_paint(still: Image) -> NDArray[np.bool_]:
+def detect_paint(still: Image) -> Flags:
     """Return the mask (height, width) of pixels of a still, RGB, that look like paint.
 
     They are colourless, bright, brighter than both sides, and part of a long region.
@@ -177,7 +174,7 @@ def detect_paint(still: Image) -> NDArray[np.bool_]:
     bright = np.asarray(cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, disc)) > contrast
     # Paint is colourless; shirts and boards mostly are not.
     spread = still.max(-1).astype(np.int16) - still.min(-1)
-    found: NDArray[np.bool_] = bright & (spread < 70) & (grey > 90)
+    found: Flags = bright & (spread < 70) & (grey > 90)
     # Remove specks.
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
     long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * max_width_px
@@ -185,7 +182,7 @@ def detect_paint(still: Image) -> NDArray[np.bool_]:
     return np.asarray(long[labels])
 
 
-def distance_to(paint: NDArray[np.bool_]) -> NDArray[np.float32]:
+def distance_to(paint: Flags) -> Singles:
     """Return the distance (height, width) of every pixel to the nearest paint [px]."""
     if not paint.any():
         return np.full(paint.shape, np.inf, dtype=np.float32)
@@ -193,9 +190,7 @@ def distance_to(paint: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.asarray(away, dtype=np.float32)
 
 
-def marking_distances(
-    camera: Camera, pitch: PitchSpec, distance: NDArray[np.float32]
-) -> NDArray[np.float64]:
+def marking_distances(camera: Camera, pitch: PitchSpec, distance: Singles) -> Floats:
     """Return distances of projected marking samples to paint (n,) [px].
 
     The camera is single, the distance that of `distance_to`. The result omits samples without paint
@@ -206,7 +201,7 @@ def marking_distances(
     with np.errstate(invalid="ignore"):
         inside = ((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5)).all(-1)
     u, v = np.rint(pixels[inside]).astype(int).T
-    found: NDArray[np.float64] = distance[v, u].astype(np.float64)
+    found: Floats = distance[v, u].astype(np.float64)
     return np.asarray(found[found < NEAR_PAINT_PX])
 
 

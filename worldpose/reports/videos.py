@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Floats, Image, Integers
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
@@ -32,7 +32,7 @@ def overlay_frames(
     pictures: Iterable[Image],
     camera: Camera,
     tracks: JointTracks,
-    frames: NDArray[np.int64],
+    frames: Integers,
     pitch: PitchSpec | None = None,
     bodies: BodyTracks | None = None,
 ) -> Iterator[Image]:

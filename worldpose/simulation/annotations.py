@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
@@ -62,14 +61,8 @@ def click(
 ) -> Clicks:
     """Return a person's clicks on named points, and lines if points are few.
 
-    Args:
-        camera: the true one.
-        pitch: the painted pitch.
-        people: joints (persons, 17, 3) [m], world, of possible occluders.
-        settings: number and accuracy of clicks.
-        clustered: all points come from one part of the image.
-        mistaken: one point has a wrong name or a gross error, each in every second such camera.
-        rng: this camera's own.
+    `people` are joints (persons, 17, 3) [m], world, of possible occluders. All points come from one
+    part of the image if `clustered`; one has a wrong name or a gross error if `mistaken`.
     """
     names = list(pitch.points)
     places = pitch.positions(names)
@@ -111,9 +104,7 @@ def _person_boxes(camera: Camera, people: Floats) -> Floats:
     return np.concatenate([low - more, high + more, depth[seen].mean(axis=1)[:, None]], axis=1)
 
 
-def _are_visible(
-    camera: Camera, places: Floats, pixels: Floats, boxes: Floats
-) -> NDArray[np.bool_]:
+def _are_visible(camera: Camera, places: Floats, pixels: Floats, boxes: Floats) -> Flags:
     """Return which points (n,) are in the image and not occluded by people."""
     depth = camera.cam_from_world.apply(places)[:, 2]
     inside = (pixels >= BORDER) & (pixels <= camera.image_size - 1.0 - BORDER)
@@ -124,14 +115,14 @@ def _are_visible(
 
 
 def _choose_points(
-    there: NDArray[np.int64],
+    there: Integers,
     x: Floats,
     places: Floats,
     width: float,
     settings: ClickSettings,
     clustered: bool,
     rng: np.random.Generator,
-) -> NDArray[np.int64]:
+) -> Integers:
     """Return indices of the points to click, in random order."""
     tries = 50  # draws of points before collinear ones are accepted
     low, high = settings.clustered_points if clustered else settings.points
@@ -172,7 +163,7 @@ def _make_mistake(
     taken = list(clicked)
     victim = taken[rng.integers(len(taken))]
     others = [name for name in _confusable_names(victim) if name in names and name not in clicked]
-    angle, far = 2.0 * np.pi * rng.random(), rng.uniform(*settings.wrong_distance_px)
+    angle, far = 2.0 * np.pi * rng.random(), rng.uniform(20.0, 60.0)
     if rng.random() < 0.5 and others:
         named = others[rng.integers(len(others))]
         return {named if name == victim else name: xy for name, xy in clicked.items()}, {
@@ -209,7 +200,7 @@ def _draw_markings(
         if len(seen) < 2 or np.ptp(seen, axis=0).max() < SHORT:
             continue
         # Clicks are at about even steps, wherever a sample is near.
-        steps = np.linspace(0.0, len(seen) - 1.0, settings.drawn_points).round().astype(int)
+        steps = np.linspace(0.0, len(seen) - 1.0, 8).round().astype(int)
         points = seen[np.unique(steps)]
         points = points + settings.noise_px * rng.standard_normal(points.shape)
         drawn.append(DrawnMarking(name=name, xy=tuple(_place_click(camera, xy) for xy in points)))
@@ -229,20 +220,15 @@ COMPARED_FRAMES: Final = 5
 def click_key_frames(
     cameras: Camera,
     pitch: PitchTemplate,
-    people: NDArray[np.float64],
+    people: Floats,
     settings: ClickSettings,
     count: int,
     rng: np.random.Generator,
 ) -> KeyFrames:
     """Return clicks in frames spread over the clip, each at a local maximum of clickable markings.
 
-    Args:
-        cameras: the true ones, a batch (frames,).
-        pitch: the painted pitch.
-        people: joints (frames, persons, 17, 3) [m], world, of possible occluders.
-        settings: accuracy; lines and arcs are always drawn.
-        count: number of key frames.
-        rng: random generator of the clicks.
+    `cameras` is a batch (frames,), `people` are joints (frames, persons, 17, 3) [m], world, of
+    possible occluders. Lines and arcs are always drawn.
     """
     # Search range for a key frame around its even place, as a share of the clip's length [1].
     search_range = 0.1
@@ -281,10 +267,7 @@ def _information(clicks: Clicks) -> int:
 def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchSpec:
     """Return the pitch with all its points as measured, to a millimetre.
 
-    Args:
-        painted: the true pitch.
-        error: error of a point, standard deviation along each axis [m].
-        rng: the surveyor's own.
+    `error` is the standard deviation of a point along each axis [m].
     """
     points = {}
     for name, place in PitchTemplate.from_spec(painted).points.items():
@@ -296,13 +279,7 @@ def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchS
 def add_calibration_errors(
     cameras: dict[str, Camera], errors: CalibrationErrors, rng: np.random.Generator
 ) -> dict[str, Camera]:
-    """Return the true cameras with the errors of the settings.
-
-    Args:
-        cameras: the true ones by id.
-        errors: spreads; all zero returns the true cameras.
-        rng: draws the errors, and which cameras are bad.
-    """
+    """Return the true cameras with the errors of the settings."""
     if errors == CalibrationErrors():
         return cameras
     bad = rng.permutation(len(cameras))[: errors.bad_cameras]
@@ -316,9 +293,7 @@ def add_calibration_errors(
     return given
 
 
-def _move_camera(
-    camera: Camera, turn: NDArray[np.float64], shift: NDArray[np.float64], scale: float
-) -> Camera:
+def _move_camera(camera: Camera, turn: Floats, shift: Floats, scale: float) -> Camera:
     # Distance of the point whose projection an error of the center leaves unchanged [m].
     pivot = 60.0
     pose = camera.cam_from_world

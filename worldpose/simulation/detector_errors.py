@@ -7,7 +7,7 @@ broadcast images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,10 +22,10 @@ from worldpose.body.occlusions import TRUNK, facing_axes, find_hiders
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.gait import walk
+from worldpose.simulation.crowd import walk
 from worldpose.simulation.paths import STEP, GroundPath, bursts, drift, sample_times
 from worldpose.simulation.reference import Report, list_detections
-from worldpose.simulation.settings import ObservationNoise, Scenario
+from worldpose.simulation.settings import Scenario
 from worldpose.simulation.skeletons import draw_body
 
 
@@ -59,12 +59,9 @@ def project_bodies(
 ) -> Projections:
     """Return the exact pixels of bodies, and the occlusions of joints by nearer bodies.
 
-    Args:
-        camera: a single camera, or one for every frame.
-        joints: (frames, persons, 17, 3) [m], world; NaN where absent.
-        heights: (persons,) [m].
-        bias: (frames, persons, 17, 3) [m], world, from a joint to the detector's joint; None =
-            zero.
+    `joints` (frames, persons, 17, 3) [m], world, are NaN where absent; `heights` (persons,) [m];
+    `bias` [m], world, leads from each joint to the detector's; None = zero. The camera is single,
+    or a batch (frames,).
     """
     frames, persons = joints.shape[:2]
 
@@ -97,127 +94,180 @@ MIRRORED: Final = np.array(
     ]
 )
 """The same joint on the other side."""
+FLOOR: Final = 0.5
+"""Added to white errors in squares [px]: the limit of a heatmap's grid."""
+POSTURES: Final = 12.0
+"""Length of the walk that supplies postures of false positives [s]."""
 _SIDE: Final = np.array([("left" in name) - ("right" in name) for name in COCO17], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
-class SystematicErrors:
-    """Systematic errors of one detector.
+class Detector:
+    """A detector with the systematic errors of one match, the same in all cameras.
 
     Attributes:
+        scenario: people, rates, spreads and frame rate.
+        pitch: the ground under false positives.
         joint_bias: (17, 3) forward, left, up [standard deviations], a mirror image of itself.
         view_bias: (17, 2, 2) of the cosine and the sine of twice the azimuth, along the image
             axes [standard deviations].
+        own_bias: (persons, 17, 3) as `joint_bias`, of each person.
     """
 
+    scenario: Scenario
+    pitch: PitchTemplate
     joint_bias: Floats
     view_bias: Floats
+    own_bias: Floats
 
+    @classmethod
+    def draw(
+        cls, scenario: Scenario, pitch: PitchTemplate, own_bias: Floats, rng: np.random.Generator
+    ) -> Detector:
+        """Return a detector whose systematic errors are drawn."""
+        joint_bias = rng.standard_normal((17, 3))
+        for joint, mirror in enumerate(MIRRORED):
+            if _SIDE[joint] < 0.0:
+                joint_bias[joint] = joint_bias[mirror] * [1.0, -1.0, 1.0]
+        joint_bias[_SIDE == 0.0, 1] = 0.0
+        return cls(scenario, pitch, joint_bias, rng.standard_normal((17, 2, 2)), own_bias)
 
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """Detections of every body, in the bodies' order.
+    def at_rate(self, fps: float) -> Detector:
+        """Return the same detector for videos of another frame rate."""
+        return replace(self, scenario=self.scenario.model_copy(update={"fps": fps}))
 
-    Attributes:
-        keypoints: (frames, persons, 17, 2) [px]; NaN where not found.
-        confidence: (frames, persons, 17); NaN where not found.
-        displaced: (frames, persons, 17), joints with gross errors.
-        merged_into: (frames, persons) int16, the person whose box includes this lost one; -1 =
-            none.
-    """
+    def perceive(self, joints: Floats) -> Floats:
+        """Return offsets (frames, persons, 17, 3) [m], world, to the detector's joints."""
+        noise = self.scenario.noise
+        front, left = facing_axes(joints)
+        up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
+        offsets = noise.shared_bias_m * self.joint_bias + noise.own_bias_m * self.own_bias
+        return np.asarray(offsets @ np.stack([front, left, up], axis=-2))
 
-    keypoints: Floats
-    confidence: Floats
-    displaced: Flags
-    merged_into: NDArray[np.int16]
+    def film(
+        self, camera: Camera, joints: Floats, heights: Floats, rng: np.random.Generator
+    ) -> tuple[Report, Flags]:
+        """Return a camera's detections of people (frames, persons, 17, 3) [m] and false positives.
 
+        The second value tells the joints in the image that no other person occludes.
+        """
+        noise, persons = self.scenario.noise, joints.shape[1]
+        people = project_bodies(camera, joints, heights, self.perceive(joints))
+        keypoints, confidence, displaced, merged_into = self._detect(people, rng)
+        figures = project_bodies(camera, *self._draw_false_positives(len(joints), rng))
+        others = self._detect(figures, rng)
+        dropped = bursts(noise.dropped_share, 0.06, (len(joints),), self.scenario.fps, rng)
+        keypoints = np.concatenate([keypoints, others[0]], axis=1)
+        # A detector is less sure of false positives.
+        confidence = np.concatenate([confidence, 0.6 * others[1]], axis=1)
+        displaced = np.concatenate([displaced, others[2]], axis=1)
+        size = np.concatenate([people.size, figures.size], axis=1)
+        boxes = _bounding_boxes(keypoints, merged_into, size)
+        found = list_detections(
+            keypoints,
+            np.where(dropped[:, None, None], np.nan, confidence),
+            displaced,
+            np.concatenate([np.arange(persons), np.full(keypoints.shape[1] - persons, -1)]),
+            lambda order, keypoints, found: np.take_along_axis(boxes, order[..., None], axis=1),
+            rng,
+        )
+        return found, people.seen
 
-def draw_systematic_errors(rng: np.random.Generator) -> SystematicErrors:
-    """Return a detector's systematic errors, drawn once per match for all cameras and people."""
-    joint_bias = rng.standard_normal((17, 3))
-    for joint, mirror in enumerate(MIRRORED):
-        if _SIDE[joint] < 0.0:
-            joint_bias[joint] = joint_bias[mirror] * [1.0, -1.0, 1.0]
-    joint_bias[_SIDE == 0.0, 1] = 0.0
-    return SystematicErrors(joint_bias, rng.standard_normal((17, 2, 2)))
+    def _detect(
+        self, projections: Projections, rng: np.random.Generator
+    ) -> tuple[Floats, Floats, Flags, NDArray[np.int16]]:
+        """Return keypoints [px], confidence, gross errors, and who has whose box, by body.
 
+        The first two are NaN where not found. The last (frames, persons) is the person whose box
+        includes this lost one, -1 for none.
+        """
+        drop = 8.0  # a joint with error e [person height] has confidence exp(-drop e)
+        far_off = (4.0, 10.0)  # offset of displaced joints, in standard deviations of their error
+        mostly_hidden = 0.7  # share of hidden joints above which a person is mostly hidden
+        few_joints = 5  # fewer joints in the image are no body
+        noise, fps = self.scenario.noise, self.scenario.fps
+        pixels, size, hider = projections.keypoints, projections.size, projections.hider
+        hidden, shape = hider >= 0, hider.shape
+        spread = size[..., None] * DIFFICULTY
+        error = self._draw_errors(pixels, spread, rng)
+        error *= (1.0 + hidden)[..., None]  # guessed from the rest of the body
+        far = np.linalg.norm(error, axis=-1) / size[..., None]
+        # Confidence reflects random errors, not systematic ones.
+        confidence = np.exp(-drop * far) * (1.0 + 0.05 * rng.standard_normal(shape))
+        confidence = np.clip(confidence * (1.0 - 0.5 * hidden), 0.01, 1.0)
+        twice = 2.0 * projections.azimuth
+        waves = np.stack([np.cos(twice), np.sin(twice)], axis=-1)
+        view = np.einsum("fpw,jwa->fpja", waves, self.view_bias)
+        error = error + projections.bias + noise.view_bias * spread[..., None] * view
 
-def detect(
-    projections: Projections,
-    noise: ObservationNoise,
-    systematic: SystematicErrors,
-    fps: float,
-    rng: np.random.Generator,
-) -> Detections:
-    """Return a detector's reports.
+        thrown = rng.random(shape) < noise.displaced
+        angle = 2.0 * np.pi * rng.random(shape)
+        sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, FLOOR)
+        throw = rng.uniform(*far_off, shape) * sigma * thrown
+        error = error + throw[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        keypoints = pixels + error
+        stolen = bursts(noise.stolen, 0.15, shape, fps, rng) & hidden
+        frame, person, joint = np.nonzero(stolen)
+        theirs = pixels[frame, hider[frame, person, joint], joint]
+        there = np.isfinite(theirs[:, 0])
+        at = (frame[there], person[there], joint[there])
+        keypoints[at] = theirs[there] + error[at]
 
-    Args:
-        projections: true keypoints and occlusions in the image.
-        noise: rates and spreads.
-        systematic: the detector's systematic errors.
-        fps: [1/s].
-        rng: this camera's own.
-    """
-    displaced = (4.0, 10.0)  # offset of displaced joints, in standard deviations of their error
-    mostly_hidden = 0.7  # share of hidden joints above which a person is mostly hidden
-    pixels, size, hider = projections.keypoints, projections.size, projections.hider
-    hidden, shape = hider >= 0, hider.shape
-    spread = size[..., None] * DIFFICULTY
-    error = _draw_errors(pixels, spread, noise, fps, rng)
-    error *= (1.0 + noise.hidden_std * hidden)[..., None]
-    far = np.linalg.norm(error, axis=-1) / size[..., None]
-    doubt = 1.0 + noise.confidence_std * rng.standard_normal(shape)
-    confidence = np.exp(-noise.confidence_drop * far) * doubt
-    confidence = np.clip(confidence * (1.0 - noise.hidden_doubt * hidden), 0.01, 1.0)
-    twice = 2.0 * projections.azimuth
-    waves = np.stack([np.cos(twice), np.sin(twice)], axis=-1)
-    view = np.einsum("fpw,jwa->fpja", waves, systematic.view_bias)
-    error = error + projections.bias + noise.view_bias * spread[..., None] * view
+        lost = rng.random(shape) < np.where(hidden, noise.hidden_joint_missed, 0.02)
+        small = size < 60.0  # [px]
+        missed = _draw_bursts_by_size(0.03, 0.2, small, fps, rng)
+        overlapped = hidden.mean(axis=-1) >= mostly_hidden
+        overlapped &= rng.random(small.shape) < 0.9  # two boxes with that much overlap become one
+        merges = overlapped & (rng.random(small.shape) < noise.merged)
+        outside = np.isnan(pixels[..., 0])
+        few = (~outside).sum(axis=-1) < few_joints
+        lost |= outside | (missed | overlapped | few)[..., None]
+        swapped = _draw_bursts_by_size(noise.swapped, 0.15, small, fps, rng)
+        for array in (keypoints, lost, confidence, thrown):
+            array[swapped] = array[swapped][:, MIRRORED]
+        keypoints[lost], confidence[lost] = np.nan, np.nan
+        return keypoints, confidence, thrown & ~lost, np.where(merges, hider.max(axis=-1), -1)
 
-    thrown = rng.random(shape) < noise.displaced
-    angle = 2.0 * np.pi * rng.random(shape)
-    sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, noise.floor_px)
-    throw = rng.uniform(*displaced, shape) * sigma * thrown
-    error = error + throw[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    keypoints = pixels + error
-    stolen = bursts(noise.stolen, noise.stolen_time_s, shape, fps, rng) & hidden
-    frame, person, joint = np.nonzero(stolen)
-    theirs = pixels[frame, hider[frame, person, joint], joint]
-    there = np.isfinite(theirs[:, 0])
-    at = (frame[there], person[there], joint[there])
-    keypoints[at] = theirs[there] + error[at]
+    def _draw_errors(self, pixels: Floats, spread: Floats, rng: np.random.Generator) -> Floats:
+        """Return errors of zero mean (frames, persons, 17, 2) [px]: white, slow and by motion."""
+        slow_time = 0.3  # time constant of the slow part [s]: a fraction of a stride
+        noise, fps = self.scenario.noise, self.scenario.fps
+        white = rng.standard_normal(pixels.shape)
+        slow = drift(pixels.shape, slow_time, fps, rng)
+        along = rng.standard_normal((*spread.shape, 1))
+        error: Floats = np.hypot(noise.white * spread, FLOOR)[..., None] * white
+        error += (noise.slow * spread)[..., None] * slow
+        if len(pixels) > 1 and noise.blur_s > 0.0:
+            motion = np.gradient(pixels, axis=0) * fps
+            # At the image border the motion is unknown; blur is negligible there.
+            error += noise.blur_s * np.where(np.isfinite(motion), motion, 0.0) * along
+        return error
 
-    lost = rng.random(shape) < np.where(hidden, noise.hidden_joint_missed, noise.joint_missed)
-    small = size < noise.small_px
-    missed = _draw_bursts_by_size(noise.person_missed, noise.person_missed_time_s, small, fps, rng)
-    overlapped = hidden.mean(axis=-1) >= mostly_hidden
-    overlapped &= rng.random(small.shape) < noise.hidden_person_missed
-    merges = overlapped & (rng.random(small.shape) < noise.merged)
-    outside = np.isnan(pixels[..., 0])
-    few = (~outside).sum(axis=-1) < noise.min_joints
-    lost |= outside | (missed | overlapped | few)[..., None]
-    swapped = _draw_bursts_by_size(noise.swapped, noise.swapped_time_s, small, fps, rng)
-    for array in (keypoints, lost, confidence, thrown):
-        array[swapped] = array[swapped][:, MIRRORED]
-    keypoints[lost], confidence[lost] = np.nan, np.nan
-    merged_into = np.where(merges, hider.max(axis=-1), -1)
-    return Detections(keypoints, confidence, thrown & ~lost, merged_into)
+    def _draw_false_positives(self, frames: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Return joints (frames, n, 17, 3) and heights (n,) [m] of motionless false positives.
 
-
-def _draw_errors(
-    pixels: Floats, spread: Floats, noise: ObservationNoise, fps: float, rng: np.random.Generator
-) -> Floats:
-    """Return errors of zero mean (frames, persons, 17, 2) [px]: white, slow and by motion."""
-    white = rng.standard_normal(pixels.shape)
-    slow = drift(pixels.shape, noise.slow_time_s, fps, rng)
-    along = rng.standard_normal((*spread.shape, 1))
-    error: Floats = np.hypot(noise.white * spread, noise.floor_px)[..., None] * white
-    error += (noise.slow * spread)[..., None] * slow
-    if len(pixels) > 1 and noise.blur_s > 0.0:
-        motion = np.gradient(pixels, axis=0) * fps
-        # At the image border the motion is unknown; blur is negligible there.
-        error += noise.blur_s * np.where(np.isfinite(motion), motion, 0.0) * along
-    return error
+        They appear and vanish at random places on and around the area of the scenario.
+        """
+        most = 2  # maximum number of false positives at a time in one camera
+        crowd, share = self.scenario.crowd, self.scenario.noise.false_people / most
+        on = bursts(share, 0.3, (frames, most), self.scenario.fps, rng)
+        body = draw_body(crowd.height_m, rng)
+        # Any moment of a walk serves as a posture; every appearance draws another.
+        path = _walk_in_circle(rng)
+        appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
+        times = rng.uniform(0.0, POSTURES, appeared.shape)
+        joints, _ = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
+        joints = joints.reshape(*appeared.shape, 17, 3)
+        joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)
+        place = rng.uniform(-1.0, 1.0, (*appeared.shape, 2))
+        place = np.array(crowd.area_center_m) + np.array(crowd.area_size_m) * place
+        joints[..., :2] += place[:, :, None]
+        joints[..., 2] += self.pitch.height(place[..., 0], place[..., 1])[..., None]
+        # A false person keeps the posture of its appearance.
+        since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
+        joints = np.take_along_axis(joints, since[..., None, None], axis=0)
+        joints[~on] = np.nan
+        return joints, np.full(most, body.height)
 
 
 def _draw_bursts_by_size(
@@ -228,46 +278,9 @@ def _draw_bursts_by_size(
     return np.asarray(both[..., 0] | (both[..., 1] & small))
 
 
-ROOM: Final = 0.06
-"""Margin of a box around the keypoints, for head, hands and feet [person height]."""
-
-
-def report(
-    real: Detections,
-    false: Detections,
-    size: Floats,
-    false_doubt: float,
-    dropped: Flags,
-    rng: np.random.Generator,
-) -> Report:
-    """Return detections in shuffled order, and the person of each.
-
-    Args:
-        real: detections of people.
-        false: false positives.
-        size: (frames, people and false positives) [px]; scales the margins of boxes.
-        false_doubt: reduction of the confidence of false positives, as a share of it [1].
-        dropped: (frames,), frames without any detection.
-        rng: shuffles every frame independently.
-    """
-    keypoints = np.concatenate([real.keypoints, false.keypoints], axis=1)
-    confidence = [real.confidence, false.confidence * (1.0 - false_doubt)]
-    displaced = np.concatenate([real.displaced, false.displaced], axis=1)
-    boxes = _bounding_boxes(keypoints, real.merged_into, size)
-    persons = real.merged_into.shape[1]
-    return list_detections(
-        keypoints,
-        np.where(dropped[:, None, None], np.nan, np.concatenate(confidence, axis=1)),
-        displaced,
-        np.concatenate([np.arange(persons), np.full(keypoints.shape[1] - persons, -1)]),
-        lambda order, keypoints, found: np.take_along_axis(boxes, order[..., None], axis=1),
-        rng,
-    )
-
-
 def _bounding_boxes(keypoints: Floats, merged_into: NDArray[np.int16], size: Floats) -> Floats:
     """Return boxes (frames, bodies, 4) [px]; a merged one includes the lost person's width."""
-    room = ROOM * size[..., None]
+    room = 0.06 * size[..., None]  # for head, hands and feet
     missing = np.isnan(keypoints)
     low = np.where(missing, np.inf, keypoints).min(axis=2) - room
     high = np.where(missing, -np.inf, keypoints).max(axis=2) + room
@@ -278,48 +291,6 @@ def _bounding_boxes(keypoints: Floats, merged_into: NDArray[np.int16], size: Flo
     low[frame, into, 0] -= np.where(lost % 2 == 0, 0.0, half)
     high[frame, into, 0] += np.where(lost % 2 == 0, half, 0.0)
     return np.concatenate([low, high], axis=-1)
-
-
-POSTURES: Final = 12.0
-"""Length of the walk that supplies postures [s]."""
-
-
-def draw_false_positives(
-    scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
-) -> tuple[Floats, Floats]:
-    """Return joints (frames, n, 17, 3) and heights (n,) [m] of motionless false positives.
-
-    They appear and vanish at random places on and around the area of the scenario.
-
-    Args:
-        scenario: area and the rates of false positives.
-        pitch: the ground under them.
-        frames: number of frames.
-        rng: generator of this camera alone, so that false positives of cameras are independent.
-    """
-    max_false_positives = 2  # maximum number of false positives at a time in one camera
-    noise, crowd = scenario.noise, scenario.crowd
-    share = noise.false_people / max_false_positives
-    shape = (frames, max_false_positives)
-    on = bursts(share, noise.false_people_time_s, shape, scenario.fps, rng)
-    body = draw_body(crowd.height_m, rng)
-    # Any moment of a walk serves as a posture; every appearance draws another.
-    path = _walk_in_circle(rng)
-    appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
-    times = rng.uniform(0.0, POSTURES, appeared.shape)
-    joints, _ = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
-    joints = joints.reshape(*appeared.shape, 17, 3)
-    joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)
-    place = np.array(crowd.area_center_m) + np.array(crowd.area_size_m) * rng.uniform(
-        -1.0, 1.0, (*appeared.shape, 2)
-    )
-    joints[..., :2] += place[:, :, None]
-    joints[..., 2] += pitch.height(place[..., 0], place[..., 1])[..., None]
-    # A false person keeps the posture of its appearance.
-    since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
-    joints = np.take_along_axis(joints, since[..., None, None], axis=0)
-    joints[~on] = np.nan
-    return joints, np.full(max_false_positives, body.height)
 
 
 def _walk_in_circle(rng: np.random.Generator) -> GroundPath:
@@ -366,13 +337,8 @@ def estimate_bodies(
     [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. The order of a frame's rows does not
     identify persons.
 
-    Args:
-        model: the bodies' model.
-        bodies: (frames, persons), world; NaN where missing.
-        camera: batch (frames,).
-        fps: [1/s].
-        errors: errors of the method.
-        rng: draws the same numbers for any people in the image.
+    `bodies` (frames, persons) are in the world, NaN where missing; `camera` is a batch (frames,).
+    `rng` draws the same numbers for any people in the image.
     """
     frames, persons = bodies.batch_shape
     given = np.concatenate([bodies.global_orient, bodies.body_pose], axis=-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -10,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image, Singles
+from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from worldpose.body.body_file import load_open_body
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.simulation.settings import PATTERNS, Pattern
+from worldpose.simulation.settings import PATTERNS, CrowdSettings, Pattern
 
 CELL: Final = 0.03
 """Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px."""
@@ -33,7 +34,7 @@ class Mannequin:
 
     body: BodyModel
     """The body from which a part of the vertices is kept."""
-    kept: NDArray[np.int64]
+    kept: Integers
     """(vertices,) indices of the kept vertices of the body."""
     clothed: Floats
     """(vertices, 3) [m], the mean body in T-pose with the thickness of clothes and hair."""
@@ -41,13 +42,13 @@ class Mannequin:
     """(vertices, 3) unit normals of the same."""
     correctives: Singles
     """(207, 3 vertices) [m] for each unit of the pose feature."""
-    bones: NDArray[np.int64]
+    bones: Integers
     """(vertices, 4) joints that move each vertex."""
     shares: Singles
     """(vertices, 4) skinning weights of these joints, with sum 1."""
     faces: NDArray[np.int32]
     """(triangles, 3), counter-clockwise seen from outside."""
-    backs: NDArray[np.bool_]
+    backs: Flags
     """(triangles,) whether a triangle faces backwards in the T-pose."""
     texels: Singles
     """(vertices, 2) column and row in a kit's textures."""
@@ -105,10 +106,8 @@ def shape_people(mannequin: Mannequin, betas: Floats) -> Singles:
 def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) -> Surfaces:
     """Return posed surfaces.
 
-    Args:
-        mannequin: common model of the people.
-        shaped: (persons, vertices, 3) vertices of `shape_people`.
-        poses: poses of the same people, a batch (persons,); NaN = missing.
+    `shaped` (persons, vertices, 3) are of `shape_people`; `poses` are a batch (persons,), NaN =
+    missing.
     """
     posed = mannequin.body.articulate(poses)
     motions = np.concatenate(
@@ -125,7 +124,7 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
     return Surfaces(vertices, normals / np.maximum(length, np.float32(1e-6)))
 
 
-def _normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
+def _normals(vertices: Floats, faces: Integers) -> Floats:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)
@@ -135,9 +134,7 @@ def _normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
     return unit
 
 
-def _cluster_vertices(
-    vertices: Floats, faces: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cluster_vertices(vertices: Floats, faces: Integers) -> tuple[Integers, Integers]:
     """Return the kept vertices and the faces between them: one per cell, nearest to its mean.
 
     No cell crosses the middle of the body, so legs stay apart.
@@ -272,10 +269,7 @@ def _jitter_color(color: Floats, rng: np.random.Generator) -> Floats:
 def paint_person(kit: Kit, number: int | None, rng: np.random.Generator) -> Image:
     """Return the textures (2, SIZE, SIZE, 3) of one person's front and back, in the T-pose.
 
-    Args:
-        kit: the person's clothes.
-        number: on shirt and shorts.
-        rng: draws skin, hair, boots and the folds of the cloth.
+    `rng` draws skin, hair, boots and the folds of the cloth.
     """
     x = LEFT + TEXEL * (np.arange(SIZE) + 0.5)
     y = TOP - TEXEL * (np.arange(SIZE) + 0.5)
@@ -383,3 +377,57 @@ def _folds(rng: np.random.Generator) -> Floats:
     broad = cv2.GaussianBlur(grain, (0, 0), 5.0)
     creases = cv2.GaussianBlur(grain, (0, 0), 1.5)
     return np.asarray(1.0 + 0.09 * broad / broad.std() + 0.05 * creases / creases.std())
+
+
+@dataclass(frozen=True, eq=False)
+class Cast:
+    """Dressed people before they are posed.
+
+    Attributes:
+        mannequin: common model of all people.
+        shaped: (persons, vertices, 3) [m], clothed and unposed.
+        images: (persons, 2, rows, columns, 3) RGB, kits from the front and the back.
+    """
+
+    mannequin: Mannequin
+    shaped: Singles
+    images: Image
+
+    def pose(self, poses: BodyParameters) -> Surfaces:
+        """Return their surfaces in the poses (persons,) at one time; NaN = missing."""
+        return pose_people(self.mannequin, self.shaped, poses)
+
+
+def dress_people(
+    betas: Floats, roles: Sequence[Role], seed: int, patterns: tuple[Pattern, ...] = PATTERNS
+) -> Cast:
+    """Return a cast; a person's looks depend on the seed and the person's number alone.
+
+    `betas` (persons, 10) are of the open body.
+    """
+    mannequin = open_mannequin()
+    kits = draw_kits(np.random.default_rng([seed, 5]), patterns)
+    numbers: dict[Role, int] = {"first keeper": 0, "second keeper": 0}
+    images = []
+    for person, role in enumerate(roles):
+        numbers[role] = numbers.get(role, 1) + 1
+        number = None if role == "official" else numbers[role]
+        rng = np.random.default_rng([seed, 6, person])
+        images.append(paint_person(kits[role], number, rng))
+    shape = (len(roles), *(images[0].shape if images else (2, 1, 1, 3)))
+    return Cast(
+        mannequin, shape_people(mannequin, betas), np.array(images, dtype=np.uint8).reshape(shape)
+    )
+
+
+def assign_roles(crowd: CrowdSettings, persons: int) -> list[Role]:
+    """Return everyone's role, in the order of `worldpose.simulation.movements`."""
+    roles: list[Role] = ["first" if person % 2 == 0 else "second" for person in range(persons)]
+    if crowd.movement == "football":
+        keepers: list[Role] = ["first keeper", "second keeper"]
+        roles[:2] = keepers[: min(2, persons)]
+        for official in range(max(persons - crowd.officials, 0), persons):
+            roles[official] = "official"
+    elif crowd.movement == "corner" and persons:
+        roles[-1] = "second keeper"
+    return roles

@@ -26,13 +26,18 @@ from worldpose.ingest.footage import write_still
 from worldpose.ingest.writing import MatchAnnotations, write_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click_key_frames
-from worldpose.simulation.cast import Cast, assign_roles, dress_people
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
-from worldpose.simulation.image_formation import Moment, RenderedFrame
+from worldpose.simulation.mannequins import Cast, assign_roles, dress_people
 from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.recordings import read_clip, read_trajectories
 from worldpose.simulation.reference import CLIP_ID, write_reference
-from worldpose.simulation.renderer import film_broadcast, open_view, render_frame
+from worldpose.simulation.renderer import (
+    Moment,
+    RenderedFrame,
+    film_broadcast,
+    open_view,
+    render_frame,
+)
 from worldpose.simulation.scene import Scene, broadcast_id, simulate_scene
 from worldpose.simulation.settings import CalibrationErrors, Scenario
 from worldpose.simulation.venues import build_venue
@@ -186,12 +191,8 @@ def simulate_match(
 
     docs/explanation/simulation.md describes the files.
 
-    Args:
-        scenario: the scenario to simulate.
-        seed: seed from 0.
-        out: absent or an empty folder; the write is atomic.
-        options: changes of the scenario, and which files to write; the defaults if None.
-        advance: receives the filming's progress.
+    `out` is absent or an empty folder; the write is atomic. `advance` receives the filming's
+    progress.
 
     Returns:
         The match's match.yaml. Its id names scenario, seed and overrides of the scenario.

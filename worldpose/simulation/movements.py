@@ -39,12 +39,8 @@ def _steer(
 ) -> list[GroundPath]:
     """Return paths of people (n) from their starts (n, 2) [m] to their targets.
 
-    Args:
-        time: (samples,) of `sample_times`.
-        start: (n, 2) [m].
-        wish: the targets.
-        space: distance below which people make way for each other [m].
-        yields: (n, n), whether a person heeds another one; None = everyone heeds everyone.
+    `time` (samples,) is of `sample_times`. People make way for each other below the distance
+    `space` [m]; `yields` (n, n) tells whether a person heeds another one, None = all do.
     """
     turn_time = 0.15  # time constant of a body's turn to its direction of movement or gaze [s]
     turn_rate = 6.0  # maximum turn rate of a body [rad/s]
@@ -138,11 +134,8 @@ def wander(
 ) -> list[GroundPath]:
     """Return paths of people who go from goal to goal in the area with changing speed.
 
-    Args:
-        crowd: area, speeds and personal space.
-        duration: time covered besides the margins [s].
-        rngs: one per person. People heed earlier ones alone, so that an additional person changes
-            no earlier path.
+    `duration` [s] is covered besides the margins. People heed earlier ones alone and have a
+    generator each, so that an additional person changes no earlier path.
     """
     arrived = 1.5  # A wandering person that near a goal goes for the next one [m]
     # Minimum distance between people at the start of their paths [m], where there is room.
@@ -187,11 +180,6 @@ def take_corner(
 
     The last person keeps the goal; of the others, every second one attacks and the next marks that
     attacker. The goal is at the end of the area that is farther from the halfway line.
-
-    Args:
-        crowd: people, area and fastest speed.
-        duration: time covered besides the margins [s].
-        rng: draws everything.
     """
     feint = 0.6  # length of a feint along each axis [m], standard deviation
     ball_every = 5.0  # interval between balls in longer clips [s]
@@ -253,13 +241,7 @@ def _draw_steps(time: Floats, count: int, rng: np.random.Generator) -> Floats:
 def run_through(
     crowd: CrowdSettings, duration: float, rng: np.random.Generator
 ) -> list[GroundPath]:
-    """Return paths of people who run through the area's middle and back, half of them in pairs.
-
-    Args:
-        crowd: people, area and speeds.
-        duration: time covered besides the margins [s].
-        rng: draws everything.
-    """
+    """Return paths of people who run through the area's middle and back, half of them in pairs."""
     # Desired lateral distance of pairs of runners [m]; shoulders keep them farther apart.
     beside = 0.1
     count, center = crowd.people, np.array(crowd.area_center_m)
@@ -313,11 +295,6 @@ def play(
     Players steer for their place in a formation that shifts with the ball (samples, 2) [m], the
     nearest of each team for the ball, a sprinter for open space, the referee for a place near play,
     assistants along the touch lines.
-
-    Args:
-        crowd: number of people and of officials among them.
-        duration: time covered besides the margins [s].
-        rng: draws play.
     """
     body_space = 1.3  # distance below which players make way for each other [m]
     # A player that near the target stands [m], until the target is that far away [m].

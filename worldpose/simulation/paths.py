@@ -62,11 +62,7 @@ class GroundPath:
 def drift(shape: tuple[int, ...], time: float, fps: float, rng: np.random.Generator) -> Floats:
     """Return a stationary first-order autoregressive process of unit variance along the first axis.
 
-    Args:
-        shape: (frames, ...).
-        time: time constant [s].
-        fps: [1/s].
-        rng: draws `shape` normal numbers.
+    `shape` is (frames, ...), `time` the time constant [s].
     """
     keep = float(np.exp(-1.0 / (time * fps)))
     process = rng.standard_normal(shape)
@@ -82,12 +78,8 @@ def bursts(
 ) -> Flags:
     """Return a stationary on-off process along the first axis: on for a given share of the frames.
 
-    Args:
-        share: share of frames that are on, below 1.
-        time: mean length of an interval that is on [s]; at least one frame.
-        shape: (frames, ...).
-        fps: [1/s].
-        rng: draws `shape` uniform numbers.
+    `shape` is (frames, ...). Intervals that are on take `time` on average [s], at least one frame;
+    `share` is below 1.
     """
     draws = rng.random(shape)
     # A draw below `start` switches on, one above 1 - stop switches off, others change nothing.

@@ -135,12 +135,9 @@ def follow_track(
 ) -> tuple[Floats, Floats]:
     """Return places (samples, 2) [m] and headings (samples,) [rad] of a tracked person.
 
-    Args:
-        times: (samples,) desired [s], evenly spaced.
-        clock: (rows,) clock of the tracking data [s].
-        xy: (rows, 2) [m].
-        smoothing_s: standard deviation of the smoothing in time [s].
-        scale: (2,) scale of this pitch to the pitch of the data [1].
+    `times` (samples,) [s] are desired and evenly spaced; `clock` (rows,) [s] and `xy` (rows, 2) [m]
+    are the data, `smoothing_s` is a standard deviation in time, `scale` (2,) that of this pitch to
+    theirs.
     """
     fastest = 9.0  # [m/s]
     coast = 0.5  # time in which people come to a stop before and after the data [s]
@@ -166,11 +163,8 @@ def follow_track(
 def turn_along(aim: Floats, going: Flags, begin: float, step: float) -> Floats:
     """Return headings (samples,) [rad] along an aim (samples, 2), kept where a person is not going.
 
-    Args:
-        aim: (samples, 2) direction.
-        going: (samples,) whether the person turns to it.
-        begin: heading of a person who never goes [rad].
-        step: time between samples [s].
+    `going` (samples,) tells whether the person turns to the aim; one who never goes has heading
+    `begin` [rad]. `step` is the time between samples [s].
     """
     heading = np.full(len(aim), begin)
     if going.any():
@@ -203,9 +197,6 @@ def read_bvh(path: Path) -> Capture:
 
     A joint's rotation is the product of its rotation channels in the file's order; position
     channels replace its offset, the convention of exporters.
-
-    Args:
-        path: text with a HIERARCHY and a MOTION part.
 
     Raises:
         InputError: not a BVH file, unknown channels, or rows of a wrong length.

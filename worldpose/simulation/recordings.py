@@ -33,10 +33,7 @@ def read_trajectories(
 
     The longest chunk is used, with the people who are present in all of it.
 
-    Args:
-        path: the file.
-        duration: maximum duration of the clip [s], from the chunk's beginning.
-        max_people: maximum number of people, in file order.
+    The clip ends after `duration` [s]; people beyond `max_people` are left out, in file order.
 
     Raises:
         InputError: unreadable, wrong shapes, or no person present for 0.2 s.
@@ -80,8 +77,7 @@ def read_clip(path: Path) -> Clip:
     Up is the axis along which shoulders are above hips, y or z; the unit is the one with plausible
     leg lengths; the floor is at the lowest ankles.
 
-    Args:
-        path: a BVH file, or an npz with `joints` (frames, joints, 3), `joint_names` and `fps`.
+    The file is BVH, or an npz with `joints` (frames, joints, 3), `joint_names` and `fps`.
 
     Raises:
         InputError: unreadable, or joints are missing.
@@ -114,10 +110,7 @@ def read_clip(path: Path) -> Clip:
 def clip_path(clip: Clip, like: GroundPath, body: Body) -> GroundPath:
     """Return the path of a person who plays a clip from time 0 on, and then stands.
 
-    Args:
-        clip: clip as read.
-        like: place of the person at time 0, and times of the path.
-        body: target of the clip's leg length.
+    `like` gives the person's place at time 0, and the times of the path.
     """
     x, y, heading = (
         float(np.interp(0.0, like.time, axis)) for axis in (*like.position.T, like.heading)
@@ -138,12 +131,7 @@ def clip_path(clip: Clip, like: GroundPath, body: Body) -> GroundPath:
 def play_clip(body: Body, clip: Clip, times: Floats, ground: Ground, gait: Floats) -> Floats:
     """Return joints (frames, 17, 3) [m], world: the clip's bone directions with the body's lengths.
 
-    Args:
-        body: measures.
-        clip: clip in its place.
-        times: (frames,) [s].
-        ground: height of the ground [m] at x and y [m].
-        gait: (frames, 17, 3) joints of a person on the clip's path, used before and after it.
+    `times` (frames,) [s]; before and after the clip, people have the joints `gait` (frames, 17, 3).
     """
     last = (14, 16)
     ease = 0.5  # time at the end of a clip in which it blends into standing [s]

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.archives import write_archive
@@ -43,20 +43,16 @@ def list_detections(
     keypoints: Floats,
     confidence: Floats,
     displaced: Flags,
-    whose: NDArray[np.int64],
-    box: Callable[[NDArray[np.int64], Floats, Flags], Floats],
+    whose: Integers,
+    box: Callable[[Integers, Floats, Flags], Floats],
     rng: np.random.Generator,
 ) -> Report:
     """Return the detections of bodies, in shuffled order.
 
-    Args:
-        keypoints: (frames, bodies, 17, 2) [px].
-        confidence: (frames, bodies, 17); NaN where not found.
-        displaced: (frames, bodies, 17), joints with gross errors.
-        whose: (bodies,) the person of each body, -1 for none.
-        box: returns boxes (frames, detections, 4) [px] for the order (frames, detections) of the
-            bodies, their keypoints, and which are found.
-        rng: shuffles every frame independently.
+    Of the bodies: `keypoints` (frames, bodies, 17, 2) [px], `confidence` (frames, bodies, 17), NaN
+    where not found, `displaced` alike, gross errors, and `whose` (bodies,), their persons, -1 for
+    none. `box` returns boxes (frames, detections, 4) [px] for the order (frames, detections) of the
+    bodies, their keypoints, and which are found.
     """
     found: Flags = np.asarray(np.isfinite(confidence).any(axis=-1))
     order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
@@ -91,14 +87,8 @@ def write_reference(
 ) -> None:
     """Write the ground truth of a match.
 
-    Args:
-        folder: reference/ of the match.
-        truth: the joints.
-        defined: the same joints where the detector takes them to be; None without detections.
-        cameras: the true static cameras.
-        reports: detections by camera or clip.
-        records: content of JSON files by name.
-        pitch: the painted pitch, if there is one.
+    `defined` are the joints where the detector takes them to be; None without detections. `reports`
+    are by camera or clip, `records` the content of JSON files by name.
     """
     write_joints(folder / "joints.npz", truth)
     if defined is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -13,7 +13,6 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyParameters
-from worldpose.body.occlusions import facing_axes
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -21,15 +20,8 @@ from worldpose.ingest.clock import camera_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import Clicks, add_calibration_errors, click, every, survey
 from worldpose.simulation.crowd import Crowd, gather
-from worldpose.simulation.detector_errors import (
-    SystematicErrors,
-    detect,
-    draw_false_positives,
-    draw_systematic_errors,
-    project_bodies,
-    report,
-)
-from worldpose.simulation.paths import Clip, GroundPath, bursts, drift
+from worldpose.simulation.detector_errors import Detector
+from worldpose.simulation.paths import Clip, GroundPath, drift
 from worldpose.simulation.reference import CLIP_ID, Report
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
 
@@ -38,11 +30,7 @@ GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 def place_camera(
-    rig: RigSettings,
-    index: int,
-    target: NDArray[np.float64],
-    pitch: PitchSpec,
-    rng: np.random.Generator,
+    rig: RigSettings, index: int, target: Floats, pitch: PitchSpec, rng: np.random.Generator
 ) -> Camera:
     """Return the static camera with this number.
 
@@ -51,12 +39,7 @@ def place_camera(
     principal point a few pixels off the centre and the mild barrel distortion (k1, k2) of a stadium
     lens (C5).
 
-    Args:
-        rig: seats, distances, heights and image size.
-        index: number from 0.
-        target: (3,) [m], world; aim of the ring.
-        pitch: off which the ring's cameras stand.
-        rng: this camera's own.
+    `target` (3,) [m], world, is the aim of the ring.
     """
     if index < len(rig.seats):
         seat = rig.seats[index]
@@ -78,12 +61,8 @@ def place_camera(
 
 
 def _place_in_ring(
-    rig: RigSettings,
-    index: int,
-    target: NDArray[np.float64],
-    pitch: PitchSpec,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    rig: RigSettings, index: int, target: Floats, pitch: PitchSpec, rng: np.random.Generator
+) -> tuple[Floats, Floats, float]:
     """Return center and aim (3,) [m], world, and focal length [px]."""
     standard_person = 1.8  # body height for `RigSettings.person_height_px` [m]
     azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
@@ -98,7 +77,7 @@ def _place_in_ring(
     return center, aim, rig.person_height_px * far / (standard_person * distance / far)
 
 
-def look_at(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:
+def look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
     """Return the pose of a camera at `center` that looks at `aim`, rolled by an angle [rad]."""
     forward = (aim - center) / np.linalg.norm(aim - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -129,28 +108,26 @@ def move_broadcast_camera(
     the zoom varies between wide and close. Radial distortion grows with the focal length, as in the
     released clips: k1 0.1 to 1, k2 0.6 to 4.3.
 
-    Args:
-        settings: place, zoom and operator.
-        times: (frames,) [s], of the camera's own images.
-        action: (samples, 2) [m], world; place of the action.
-        action_times: (samples,) [s], from `WARM_UP` before the first frame to the last.
-        image_size: width, height [px].
-        rng: the camera's and the operator's own.
+    `times` (frames,) [s] are those of the camera's own images. `action` (samples, 2) [m], world, is
+    the place of the action at `action_times` (samples,) [s], from `WARM_UP` before the first frame
+    to the last.
     """
     center = np.array(
         [
             rng.uniform(-settings.aside_m, settings.aside_m),
-            -rng.uniform(*settings.setback_m),
+            -rng.uniform(67.0, 88.0),
             rng.uniform(*settings.height_m),
         ]
     )
+    lag = 0.5  # with which the operator follows the action: a reaction, and a damped head [s]
+    sway = 4.0  # drift of the aim off the action along x: operators lead and trail play [m]
     hand = np.arange(times[0] - WARM_UP, times[-1] + 2.0 * CALM, CALM)
     aim = np.stack([np.interp(hand, action_times, axis) for axis in action.T], axis=-1)
-    aim[:, 0] += settings.sway_m * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)
+    aim[:, 0] += sway * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)
     aim[:, 0] += settings.sweep_m * np.sin(2.0 * np.pi * (hand / 8.0 + rng.random()))
     # The image centre stays within the pitch, nearer to the camera than the action's far side.
     aim = np.clip(0.9 * aim, [-40.0, -22.0], [40.0, 26.0])
-    aim = _smooth(_smooth(aim, 0.5 * settings.lag_s), 0.5 * settings.lag_s)
+    aim = _smooth(_smooth(aim, 0.5 * lag), 0.5 * lag)
     aim = np.stack([np.interp(times, hand, axis) for axis in aim.T], axis=-1)
 
     width, scale = np.array(image_size, dtype=np.float64), image_size[0] / 1920.0
@@ -223,7 +200,7 @@ class StaticViews:
 
     detections: KeypointDetections
     person: NDArray[np.int16]
-    displaced: NDArray[np.bool_]
+    displaced: Flags
 
     def index(self, persons: int) -> NDArray[np.int16]:
         """Return each person's detection index (frames, cameras, persons); -1 = not found."""
@@ -285,45 +262,6 @@ class Scene:
         return StaticViews(detections, person, displaced)
 
 
-@dataclass(frozen=True, eq=False)
-class _World:
-    """Subject of all cameras, with the detector's systematic errors."""
-
-    scenario: Scenario
-    crowd: Crowd
-    pitch: PitchTemplate
-    systematic: SystematicErrors
-    own_bias: Floats
-
-    def perceive(self, joints: Floats) -> Floats:
-        """Return offsets (frames, persons, 17, 3) [m], world, to the detector's joints."""
-        noise = self.scenario.noise
-        front, left = facing_axes(joints)
-        up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
-        shared = noise.shared_bias_m * self.systematic.joint_bias
-        offsets = shared + noise.own_bias_m * self.own_bias
-        return np.asarray(offsets @ np.stack([front, left, up], axis=-2))
-
-    def film(self, camera: Camera, joints: Floats, seed: Seed) -> tuple[Report, Flags]:
-        """Return a camera's detections of people (frames, persons, 17, 3) [m] and false positives.
-
-        The second value tells the joints in the image that no other person occludes.
-        """
-        scenario, noise = self.scenario, self.scenario.noise
-        rng = np.random.default_rng(seed)
-        bias = self.perceive(joints)
-        projected = project_bodies(camera, joints, self.crowd.heights, bias)
-        real = detect(projected, noise, self.systematic, scenario.fps, rng)
-        figures = draw_false_positives(scenario, self.pitch, len(joints), rng)
-        unreal = project_bodies(camera, *figures)
-        false = detect(unreal, noise, self.systematic, scenario.fps, rng)
-        size = np.concatenate([projected.size, unreal.size], axis=1)
-        lost = (noise.dropped_share, noise.dropped_time_s, (len(joints),), scenario.fps)
-        dropped = bursts(*lost, rng)
-        found = report(real, false, size, noise.false_doubt, dropped, rng)
-        return found, projected.seen
-
-
 def simulate_scene(
     scenario: Scenario,
     seed: int,
@@ -336,11 +274,7 @@ def simulate_scene(
     Every person and every camera draws from a separate stream: an additional camera changes no
     existing number, and an additional person no motion of those who wander.
 
-    Args:
-        scenario: everything but the seed.
-        seed: seed from 0.
-        driven: paths of the people, instead of the scenario's movement.
-        clip: motion capture for one of them.
+    People are `driven` along paths, instead of the scenario's movement; one of them plays `clip`.
     """
     people_seed, rig_seed, systematic_seed, broadcast_seed, error_seed, survey_seed, click_seed = (
         Seed(seed).spawn(7)
@@ -349,8 +283,7 @@ def simulate_scene(
     crowd = gather(scenario, pitch, people_seed, driven, clip)
     common, *own = systematic_seed.spawn(1 + len(crowd.paths))
     own_bias = np.array([_rng(each).standard_normal((17, 3)) for each in own]).reshape(-1, 17, 3)
-    systematic = draw_systematic_errors(_rng(common))
-    world = _World(scenario, crowd, pitch, systematic, own_bias)
+    detector = Detector.draw(scenario, pitch, own_bias, _rng(common))
     times = np.arange(round(scenario.duration * scenario.fps)) / scenario.fps
     joints = crowd.joints(times)
     x, y = scenario.crowd.area_center_m
@@ -367,7 +300,7 @@ def simulate_scene(
         clocks[name] = scenario.rig.clock_std_frames * float(_rng(clock).standard_normal())
         late = clocks[name] / scenario.fps
         seen = joints if late == 0.0 else crowd.joints(times + late)
-        reports[name], visible = world.film(camera, seen, detections)
+        reports[name], visible = detector.film(camera, seen, crowd.heights, _rng(detections))
         views += visible
         clicks[name] = click(
             camera,
@@ -384,12 +317,12 @@ def simulate_scene(
         place, detections = broadcast_seed.spawn(2)
         name = view_name(scenario, number)
         broadcast[name] = view = _move(settings, scenario, crowd, len(times), _rng(place))
-        faster = replace(world, scenario=scenario.model_copy(update={"fps": view.fps}))
         seen = joints if view.fps == scenario.fps else crowd.joints(view.times)
-        reports[name], _ = faster.film(view.camera, seen, detections)
+        faster = detector.at_rate(view.fps)
+        reports[name], _ = faster.film(view.camera, seen, crowd.heights, _rng(detections))
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(len(own)), joints, views=views),
-        defined=joints + world.perceive(joints),
+        defined=joints + detector.perceive(joints),
         crowd=crowd,
         poses=crowd.poses(times),
         cameras=cameras,

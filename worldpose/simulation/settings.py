@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, get_args
 
 from pydantic import Field
 
@@ -11,17 +11,7 @@ from data_contracts.records import Count, FramesPerSecond, ImageLength, Name, Po
 
 Pattern = Literal["plain", "sleeves", "stripes", "hoops", "band", "halves", "sash", "chequers"]
 
-PATTERNS: Final[tuple[Pattern, ...]] = (
-    "plain",
-    "plain",
-    "sleeves",
-    "stripes",
-    "hoops",
-    "band",
-    "halves",
-    "sash",
-    "chequers",
-)
+PATTERNS: Final[tuple[Pattern, ...]] = ("plain", *get_args(Pattern))
 """Patterns of shirts; plain shirts are the most common."""
 
 
@@ -55,7 +45,7 @@ class ObservationNoise(Record):
     """Errors of a 2D pose detector on people who are small in the image.
 
     A joint's error is a bias (`shared_bias_m`, `own_bias_m`, `view_bias`), a part that drifts
-    (`slow`) and one that is independent per frame (`white`, `floor_px`, `blur_s`). White noise
+    (`slow`) and one that is independent per frame (`white`, `blur_s`). White noise
     alone would average out over ten views and fifty frames per second.
 
     Spreads are standard deviations per image axis. Those relative to a person's height in the image
@@ -69,10 +59,6 @@ class ObservationNoise(Record):
     slow: float = Field(default=0.015, ge=0, le=10)
     """Error that drifts [person height]: a pose, a shirt or a background misleads for a while, so
     that averaging over frames does not remove it."""
-    slow_time_s: float = Field(default=0.3, gt=0, le=100)
-    """Time constant of the drift's correlation [s]: a fraction of a stride."""
-    floor_px: float = Field(default=0.5, ge=0, le=100)
-    """Added to `white` in squares [px]: the limit of a heatmap's grid."""
     blur_s: float = Field(default=0.002, ge=0, le=1)
     """Error along a joint's motion in the image, as the time in which the joint moves that far [s]:
     a share of the exposure, 4 to 10 ms under floodlight."""
@@ -85,63 +71,22 @@ class ObservationNoise(Record):
     view_bias: float = Field(default=0.005, ge=0, le=1)
     """Bias that varies with the viewing direction of a body, with two periods per turn (front and
     back are alike, sides differ) [person height]; the same for all people and cameras."""
-    min_joints: int = Field(default=5, ge=0, le=1000)
-    """A person with fewer joints in the image is not found [1]: detectors need a body, not a hand
-    at the border."""
-    joint_missed: float = Field(default=0.02, ge=0, le=1)
-    """Share of visible joints not reported [1]: detectors omit those of low confidence."""
-    person_missed: float = Field(default=0.03, ge=0, lt=1)
-    """Share of frames in which a visible person is not found at all [1]."""
-    person_missed_time_s: float = Field(default=0.2, gt=0, le=100)
-    """Mean length of a gap [s]: misses come in bursts, because the image hardly changes."""
-    hidden_std: float = Field(default=1.0, ge=0, le=100)
-    """Additional error of a joint hidden behind a person, in units of its usual one [1]: the
-    detector guesses from the rest of the body; 1 doubles the error."""
     hidden_joint_missed: float = Field(default=0.4, ge=0, le=1)
     """Share of hidden joints not reported [1]."""
     stolen: float = Field(default=0.1, ge=0, lt=1)
     """Share of hidden joints reported at the same joint of the occluding person [1]."""
-    stolen_time_s: float = Field(default=0.15, gt=0, le=100)
-    """Mean length of such an interval [s]."""
-    hidden_person_missed: float = Field(default=0.9, ge=0, le=1)
-    """Share of frames in which a mostly hidden person is not found [1]: two boxes with that much
-    overlap become one."""
     merged: float = Field(default=0.5, ge=0, le=1)
     """Share of those lost persons whose box is merged: the nearer person's box then covers both
     [1]."""
     swapped: float = Field(default=0.02, ge=0, lt=1)
     """Share of person-frames with a left-right swap [1]: a back that looks like a front."""
-    swapped_time_s: float = Field(default=0.15, gt=0, le=100)
-    """Mean length of such a swap [s]."""
-    small_px: float = Field(default=60.0, ge=0, le=10000)
-    """People smaller than this in the image have twice the rate of misses and swaps [px]."""
     displaced: float = Field(default=0.0, ge=0, lt=1)
     """Share of joints with gross errors of 4 to 10 standard deviations, at full confidence [1]; the
     ground truth flags them."""
     dropped_share: float = Field(default=0.0, ge=0, lt=1)
     """Share of frames that a camera lost [1]."""
-    dropped_time_s: float = Field(default=0.06, gt=0, le=10)
-    """Mean length of such a gap [s]."""
     false_people: float = Field(default=0.1, ge=0, lt=1)
     """False positives, mean number per frame and camera [1]: shadows, boards."""
-    false_people_time_s: float = Field(default=0.3, gt=0, le=100)
-    """Mean duration of one [s]."""
-    false_doubt: float = Field(default=0.4, ge=0, lt=1)
-    """Reduction of their confidence, as a share of it [1]."""
-    confidence_drop: float = Field(default=8.0, ge=0, le=1000)
-    """A joint with error e [person height], biases aside, has confidence exp(-drop e) [1]: 0.85 at
-    2 %; confidence reflects random errors, not systematic ones."""
-    hidden_doubt: float = Field(default=0.5, ge=0, lt=1)
-    """Reduction of a hidden joint's confidence, as a share of it [1]."""
-    confidence_std: float = Field(default=0.05, ge=0, le=10)
-    """Error of the confidence itself, relative [1]: confidence reflects the error without revealing
-    it."""
-
-    @classmethod
-    def none(cls) -> Self:
-        """Return a detector that reports every joint in the image exactly, with confidence 1."""
-        rates = [name for name in cls.model_fields if not name.endswith("_time_s")]
-        return cls(**dict.fromkeys(rates, 0.0))
 
 
 Value = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -171,12 +116,10 @@ class CrowdSettings(Record):
     height_m: Range = (1.70, 1.95)
     """Shortest and tallest body height [m]: professional players."""
     leavers: int = Field(default=0, ge=0, le=1000)
-    """Number of people, the first ones, whom no camera sees for `away_s` [1]; they come back."""
+    """Number of people, the first ones, whom no camera sees for 10 s [1]; they come back."""
     substitutes: int = Field(default=0, ge=0, le=500)
-    """Number of people after those who leave for good [1], each replaced after `away_s` by one of
-    as many people after them, whom no camera saw before."""
-    away_s: float = Field(default=10.0, ge=0, le=10000)
-    """Time without these people [s], in the middle of the match."""
+    """Number of people after those who leave for good [1], each replaced after 10 s by one of as
+    many people after them, whom no camera saw before."""
 
 
 class Seat(Record):
@@ -219,8 +162,6 @@ class BroadcastSettings(Record):
     Ranges are those of 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose).
     """
 
-    setback_m: Range = (67.0, 88.0)
-    """Distance from the long axis of the pitch [m], at negative y."""
     height_m: Range = (12.0, 19.0)
     """Above the pitch [m]."""
     aside_m: float = Field(default=0.3, ge=0, le=100)
@@ -231,11 +172,6 @@ class BroadcastSettings(Record):
     zoom_period_s: Range = (10.0, 24.0)
     """Time from wide to close and back [s]; the focal length then changes by at most about 20 px
     per frame."""
-    lag_s: float = Field(default=0.5, gt=0, le=100)
-    """Time constant with which the operator follows the action [s]: a reaction, and a damped
-    head."""
-    sway_m: float = Field(default=4.0, ge=0, le=1000)
-    """Drift of the aim off the action along x [m]: operators lead and trail play."""
     sweep_m: float = Field(default=0.0, ge=0, le=100)
     """Amplitude along x of a steady pan back and forth around the action [m]."""
     fps: FramesPerSecond | None = None
@@ -282,12 +218,8 @@ class ClickSettings(Record):
     wrong: float = Field(default=0.2, ge=0, le=1)
     """Share of cameras with one wrong click [1]: every second of them a point with another's name,
     the other a slip."""
-    wrong_distance_px: Range = (20.0, 60.0)
-    """Distance of a slip [px]."""
     enough: int = Field(default=8, ge=0, le=1000)
     """If fewer points are visible, lines and arcs are drawn, too [1]."""
-    drawn_points: int = Field(default=8, ge=2, le=1000)
-    """Maximum number of points along a drawn marking [1]; their errors are those of the others."""
 
 
 class Scenario(Record):

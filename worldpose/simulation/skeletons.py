@@ -193,12 +193,9 @@ def solve_body(body: Body, joints: Floats, ground: Ground, courses: Floats) -> P
     leave open: the spine bends and twists evenly, the neck turns half as far as the head, hands
     continue forearms, feet are flat where they stand and stay above the ground elsewhere.
 
-    Args:
-        body: the person.
-        joints: (frames, 17, 3) [m], world, COCO-17, of bones about as long as the body's.
-        ground: height of the ground at x and y [m], world.
-        courses: (frames, 2) [rad] from the x axis towards y, direction of left and right foot when
-            they tread, within what a hip can turn.
+    `joints` (frames, 17, 3) [m], world, are COCO-17, of bones about as long as the body's.
+    `courses` (frames, 2) [rad], from the x axis towards y, are directions of left and right foot
+    when they tread, within what a hip can turn.
     """
     rest = body.joints
     turns = np.empty((len(joints), len(rest), 3, 3))
@@ -271,12 +268,9 @@ def _rotate_foot(
 ) -> tuple[Floats, Floats]:
     """Return rotations of foot and toes (frames, 3, 3).
 
-    Args:
-        body: the person.
-        turned: (frames, 3, 3), rotation of the shank.
-        shank: (frames, 3) [m].
-        clear: (frames,) [m], height of the ankle above that of a flat foot.
-        course: (frames,) [rad], direction of the foot when it treads.
+    `turned` (frames, 3, 3) is the rotation of the shank (frames, 3) [m], `clear` (frames,) [m] the
+    height of the ankle above that of a flat foot, `course` (frames,) [rad] the direction of the
+    foot when it treads.
     """
     # An ankle higher than a standing one by this much no longer levels the foot's roll [m].
     levelled = 0.15

@@ -99,10 +99,8 @@ def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
 def paint_cover(paint: Floats, place: Floats) -> float:
     """Return the painted share of a pixel.
 
-    Args:
-        paint: (n, 8) rows of `paint_rows`.
-        place: (8,) x y on the surface, their changes by a pixel to the right and one down, and by
-            a metre of height.
+    `paint` (n, 8) has the rows of `paint_rows`; `place` (8,) is x y on the surface, their changes
+    by a pixel to the right and one down, and by a metre of height.
     """
     bare = 1.0
     reach = _HALF + 0.5 * (abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5]))
@@ -172,12 +170,8 @@ def grass(
 ) -> tuple[float, float]:
     """Return brightness (1 on average) and yellowness of the grass.
 
-    Args:
-        table: (64, 64) table of numbers about 0 with spread 1.
-        place: place as in `paint_cover`.
-        length: length of the pitch [m].
-        width: width of the pitch [m].
-        stripes: brightness of a stripe against its neighbour [1].
+    `table` (64, 64) has numbers about 0 with spread 1; `place` is as in `paint_cover`; length and
+    width are the pitch's [m]; `stripes` is the brightness of a stripe against its neighbour.
     """
     stripe = 5.5  # width of a mown stripe: a third of the penalty area's depth [m]
     x, y = place[0], place[1]
@@ -292,14 +286,8 @@ def scenery(
 ) -> tuple[float, float, float, float]:
     """Return the colour at a ray's end, and the distance in steps; grass gives (-1, 0, 0).
 
-    Args:
-        o: (3,) origin of the ray [m], world.
-        dx: direction along x.
-        dy: direction along y.
-        dz: direction upwards.
-        half: (2,) half the distances between the boards along x and y [m].
-        bend: (2,) bend of the surface, see `surface_hit`.
-        look: seed of the stadium's look.
+    The ray begins at `o` (3,) [m], world. `half` (2,) are half the distances between the boards
+    along x and y [m], `bend` (2,) is that of `surface_hit`, `look` seeds the stadium's look.
     """
     stand_top = 24.0
     stand_slope = 0.55

@@ -75,13 +75,9 @@ def paint_scene(
 ) -> None:
     """Write the colour of every pixel, and its place on the pitch; NaN beyond the boards.
 
-    Args:
-        grid: (rows, columns, 3) directions of rays at `grid_pixels`, world.
-        o: (3,) origin of the rays.
-        stadium: pitch, boards and look.
-        color: (height, width, 3), written.
-        ground: (height, width, 2), written.
-        distance: (height, width) distance from the origin [m], written; infinite in the sky.
+    `grid` (rows, columns, 3) are directions of rays at `grid_pixels`, world, from `o` (3,). Written
+    are `color` (height, width, 3), `ground` (height, width, 2) and `distance` (height, width) [m],
+    infinite in the sky.
     """
     paint, table, scene, half, look = stadium
     place, ray = np.empty(8), np.empty((3, 3))
@@ -279,11 +275,8 @@ def _lights(kind: str, turn: float, side: float) -> tuple[Floats, ...]:
 def paint_venue(venue: Venue, grid: Floats, origin: Floats, size: tuple[int, int]) -> Image:
     """Return the empty stadium along rays (height, width, 3), RGB, with the stand's shadow.
 
-    Args:
-        venue: the stadium.
-        grid: (rows, columns, 3) directions of rays at `grid_pixels`, world.
-        origin: (3,) of the rays [m], world.
-        size: width and height of the image [px].
+    `grid` (rows, columns, 3) are directions of rays at `grid_pixels`, from `origin` (3,) [m],
+    world; `size` is the width and height of the image [px].
     """
     width, height = size
     pitch, settings = venue.pitch, venue.settings

@@ -78,8 +78,7 @@ class Board:
     def others(self, image: Image) -> Iterator[tuple[Board, str]]:
         """Yield boards that are perhaps meant, each with a sentence about the difference.
 
-        Args:
-            image: (height, width[, 3]), in which no board was found.
+        No board was found in the image (height, width[, 3]).
         """
         given = f"{self.columns} x {self.rows}"
         if self.dictionary is None:
@@ -213,10 +212,7 @@ def calibrate_lens(
     corners are not on a plane, or that contradict the others, are left out. The standard deviations
     are those of leaving out one image at a time (jackknife).
 
-    Args:
-        camera: its name.
-        views: the board in each image; None where it was not found.
-        size: width and height of all images [px].
+    `views` has None where no board was found; `size` is the width and height of all images [px].
 
     Raises:
         InputError: too few images with a board, or the boards do not determine the focal length.

@@ -20,10 +20,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.covariance import invert_free
 from worldpose.geometry.optimize.levenberg_marquardt import Damping, minimize
 from worldpose.pitch.template import Surface
-from worldpose.static_calibration.fit import (
-    CameraProblem,
-    compute_residuals,
-)
+from worldpose.static_calibration.fit import CameraProblem, compute_residuals
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import CameraOnPitch, step_camera, step_jacobian
 from worldpose.static_calibration.residuals import PRIORS, prior_residuals
@@ -111,10 +108,7 @@ def weight_residuals(
     root[drawn] = 1.0 / np.hypot(1.0, scale * residuals[drawn] / problem.drawn_loss)
     prior, by_surface = surface.whiten(problem.evidence.surface)
     own = np.concatenate([np.zeros((2, STEP)), by_surface], axis=1)
-    return (
-        np.concatenate([root * residuals, prior]),
-        np.concatenate([root[:, None] * rows, own]),
-    )
+    return (np.concatenate([root * residuals, prior]), np.concatenate([root[:, None] * rows, own]))
 
 
 def whiten_residuals(

@@ -65,19 +65,13 @@ class ClickEvidence:
     def on_surface(self, surface: Floats) -> ClickEvidence:
         """Return the evidence at its places on another surface.
 
-        Args:
-            surface: (2,) crown and end fall [m].
+        The surface is (2,) crown and end fall [m].
         """
         change = surface - self.surface
         points, samples = self.points_world.copy(), self.samples_world.copy()
         points[:, 2] += self.points_by_surface @ change
         samples[:, 2] += self.samples_by_surface @ change
-        return replace(
-            self,
-            points_world=points,
-            samples_world=samples,
-            surface=surface,
-        )
+        return replace(self, points_world=points, samples_world=samples, surface=surface)
 
 
 def gather_evidence(

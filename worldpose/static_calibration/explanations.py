@@ -23,14 +23,8 @@ from worldpose.static_calibration.click_outliers import (
     negative_log_posterior,
     scale_noise,
 )
-from worldpose.static_calibration.evidence import (
-    describe_clicks,
-    has_enough_points,
-)
-from worldpose.static_calibration.fit import (
-    CameraProblem,
-    fit_cameras,
-)
+from worldpose.static_calibration.evidence import describe_clicks, has_enough_points
+from worldpose.static_calibration.fit import CameraProblem, fit_cameras
 from worldpose.static_calibration.ground_error import points_off_line, propose_clicks
 from worldpose.static_calibration.initialization import (
     cameras_from_homographies,

@@ -108,10 +108,7 @@ _NAMED_POINTS = 4
 
 
 def propose_clicks(
-    estimate: CameraEstimate,
-    pitch: PitchTemplate,
-    clicked: tuple[str, ...],
-    noise: float,
+    estimate: CameraEstimate, pitch: PitchTemplate, clicked: tuple[str, ...], noise: float
 ) -> tuple[str, ...]:
     """Return the points and markings whose clicks would lower the expected ground error most.
 

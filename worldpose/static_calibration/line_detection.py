@@ -85,13 +85,10 @@ def find_bars(
 ) -> None:
     """Write the bright bars found across places, the strongest first.
 
-    Args:
-        grey: (height, width).
-        sections: n places on lines.
-        reaches: (n,) half width of the search [px]; negative = no search.
-        contrast: minimum brightness above both sides [levels of 255].
-        offsets: (n, CANDIDATES) along the normal [px], written; NaN where there are no more.
-        strengths: (n, CANDIDATES) brightness above the brighter side, written.
+    `sections` are n places on lines, `reaches` (n,) half the width of the search [px], negative =
+    none; `contrast` is the minimum brightness above both sides. Written, (n, CANDIDATES): `offsets`
+    along the normal [px], NaN where there are no more, and `strengths`, brightness above the
+    brighter side.
     """
     places, normals = sections.places, sections.normals
     widths, curvatures = sections.widths, sections.curvatures
@@ -185,13 +182,9 @@ def fit_bars(
 ) -> None:
     """Write the subpixel offsets of bars and their variances.
 
-    Args:
-        grey: (height, width).
-        sections: n places on lines.
-        starts: (n,) along the normal [px], accurate to about a pixel; NaN = none.
-        contrast: minimum brightness above both sides [levels of 255].
-        offsets: (n,) along the normal [px], written; NaN where no bar fits.
-        variances: (n,) [px^2], written.
+    `starts` (n,) along the normal of `sections` [px] are accurate to about a pixel, NaN = none;
+    `contrast` is the minimum brightness above both sides. Written: `offsets` (n,) along the normal
+    [px], NaN where no bar fits, and `variances` (n,) [px^2].
     """
     max_pixels = 1000  # no bar is 190 px wide
     places, normals = sections.places, sections.normals

@@ -37,11 +37,7 @@ from worldpose.static_calibration.curvature_correction import (
 )
 from worldpose.static_calibration.fit import CameraProblem
 from worldpose.static_calibration.line_detection import brightness
-from worldpose.static_calibration.line_samples import (
-    PaintNoise,
-    sample_markings,
-    thin_samples,
-)
+from worldpose.static_calibration.line_samples import PaintNoise, sample_markings, thin_samples
 from worldpose.static_calibration.line_search import Bars, LineFit, LineSearch
 from worldpose.static_calibration.parameters import CameraOnPitch
 from worldpose.static_calibration.settings import (
@@ -115,15 +111,9 @@ def refine_on_lines(
     The start's covariance gives samples and search widths: the search begins with samples of small
     projected uncertainty, which reduce the uncertainty of the others.
 
-    Args:
-        start: camera from clicks; its covariance is the Gaussian prior, and parameters without
-            variance stay fixed.
-        pitch: the template; its surface is where to linearize.
-        picture: (height, width) or (height, width, 3) RGB.
-        settings: the defaults if None.
-        survey_error: survey error of the template's points from the painted ones, each axis,
-            standard deviation [m].
-        begin: camera to begin the search at, if more accurate than the prior; the start if None.
+    Parameters without variance stay fixed. The template's surface is where to linearize;
+    `survey_error` is that of its points from the painted ones, each axis, standard deviation [m].
+    The search begins at `begin`, if it is more accurate than the start.
 
     Raises:
         InputError: the image size is not that of the start's camera.

@@ -351,13 +351,9 @@ def clear(
 ) -> Flags:
     """Return a mask of places (n,) with no structure but their own marking within a distance.
 
-    Args:
-        camera: a single camera.
-        whites: white structures of the template.
-        half_width: half of the width of paint and posts [m].
-        places: (n, 2) places of samples [px].
-        room: (n,) minimum distance to other structures [px].
-        marking: (n,) the samples' own labels.
+    `whites` are white structures of the template, `half_width` [m] is that of paint and posts.
+    `places` (n, 2) [px] of samples need `room` (n,) [px] to other structures than their own
+    `marking` (n,).
     """
     depth = camera.cam_from_world.apply(whites.points_world)[:, 2]
     corners = camera.project(whites.points_world)

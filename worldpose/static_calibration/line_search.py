@@ -142,14 +142,11 @@ def solve_line_step(
     Gaussian priors: a thousand samples of one line determine its paint, but the camera only within
     the survey error of the line's ends.
 
-    Args:
-        offsets: (n,) measured minus projected, along the normal [px]; NaN = no measurement.
-        variances: (n,) [px^2].
-        by_camera: (n, f) derivatives of the projection by the free parameters.
-        by_paint: (n, k) derivatives of the projection by unknowns of the paint.
-        unknowns: (n, k) indices of these unknowns.
-        prior: information (f, f) and mean (f,) of the step.
-        scales: scales of the loss [standard deviations], one per iteration.
+    `offsets` (n,) are measured minus projected, along the normal [px], NaN = no measurement, with
+    `variances` (n,) [px^2]. `by_camera` (n, f) and `by_paint` (n, k) are derivatives of the
+    projection by free parameters and by the paint's unknowns, `unknowns` (n, k) the indices of
+    these. The prior is information (f, f) and mean (f,) of the step; `scales` of the loss are one
+    per iteration [standard deviations].
     """
     known = np.isfinite(offsets)
     weights = known.astype(np.float64)

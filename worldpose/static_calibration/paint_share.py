@@ -17,11 +17,6 @@ def paint_share(picture: Image, camera: Camera, pitch: PitchTemplate) -> float |
 
     By chance it is a third. A camera that is right has 0.6 and more: people hide the rest.
 
-    Args:
-        picture: (height, width, 3) RGB.
-        camera: the camera, with its pose on the pitch.
-        pitch: the pitch.
-
     Returns:
         None if the image would show too few markings to tell.
     """

@@ -132,10 +132,5 @@ def project_with_jacobian(camera: Camera, points_world: ArrayLike) -> tuple[Floa
 def by_step(camera: Camera, seen: Projection) -> Floats:
     """Return derivatives (n, 2, 12) by a step, from those of a single camera's projection."""
     by_focal = (seen.d_intrinsics[..., :2] * camera.focal).sum(axis=-1, keepdims=True)
-    parts = (
-        seen.d_pose,
-        by_focal,
-        seen.d_intrinsics[..., 2:],
-        seen.d_distortion[..., [0, 1, 4]],
-    )
+    parts = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., [0, 1, 4]])
     return np.concatenate(parts, axis=-1)

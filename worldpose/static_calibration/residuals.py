@@ -65,12 +65,8 @@ def linearize(
 ) -> float:
     """Return the objective at a camera (WIDTH,); write its Gauss-Newton matrix and gradient.
 
-    Args:
-        c: (WIDTH,) camera.
-        given: evidence and prior.
-        information: (12, 12), written; zero for fixed parameters.
-        observed: (12, 12) the part of clicks and drawn markings, written.
-        gradient: (12,), written.
+    `c` is (WIDTH,), `information` (12, 12), zero for fixed parameters, `observed` (12, 12) the part
+    of clicks and drawn markings, `gradient` (12,); the last three are written.
     """
     n, d = len(given.points_world), len(given.drawn_image)
     click, by_click = np.empty((n, 2)), np.empty((n, 2, STEP))

@@ -99,10 +99,7 @@ def turn_name(name: str) -> str:
 
 
 def decide_sides(
-    seen: Mapping[str, SeenPeople],
-    stated: Collection[str],
-    pitch: PitchTemplate,
-    seconds: Floats,
+    seen: Mapping[str, SeenPeople], stated: Collection[str], pitch: PitchTemplate, seconds: Floats
 ) -> dict[str, SideDecision]:
     """Return for every camera whether it has to be turned by half a turn.
 

@@ -139,11 +139,7 @@ class Venue:
 
 
 def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
-    """Return stored calibrations on the pitch that all of them show.
-
-    Args:
-        calibrations: arrays of each camera.
-    """
+    """Return stored calibrations on the pitch that all of them show."""
     cameras = [camera_from_arrays(each) for each in calibrations]
     unknown = np.full((STEP, STEP), np.nan)
     covariance = np.array([np.asarray(each.get("covariance", unknown)) for each in calibrations])

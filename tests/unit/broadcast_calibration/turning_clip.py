@@ -11,9 +11,8 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.cast import dress_people
-from worldpose.simulation.image_formation import Moment
-from worldpose.simulation.renderer import film_broadcast
+from worldpose.simulation.mannequins import dress_people
+from worldpose.simulation.renderer import Moment, film_broadcast
 from worldpose.simulation.scene import look_at
 from worldpose.simulation.settings import RenderingSettings
 from worldpose.simulation.venues import build_venue

@@ -3,7 +3,7 @@
 import numpy as np
 from camera_builders import look_at_camera
 
-from worldpose.dataset.check import CheckSettings, check_clip
+from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import list_clips, read_clip
 from worldpose.geometry.rigid import Rigid
 
@@ -19,7 +19,7 @@ def looking(center, target, focal, distortion=(0.0,) * 5):
 def findings(folder, model, pitch=True):
     clips = list_clips(folder)
     clip = read_clip(folder, clips[0], clips, lambda name: model, None, FPS, pitch)
-    return check_clip(clip, CheckSettings())
+    return check_clip(clip)
 
 
 def edit(path, change):

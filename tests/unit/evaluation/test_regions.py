@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joint_regions import region_counts
+from second_world import region_counts
 
-from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 
 
@@ -37,9 +36,3 @@ def test_missing_joints_frames_and_unseen_joints_do_not_count():
     three = {name: getattr(prediction, name)[:3] for name in ("frames", "joints", "covariance")}
     counts = region_counts(replace(prediction, **three), replace(truth, views=views))
     assert sum(total for _, total in counts.values()) == 3 * 2 * 17 - 2
-
-
-def test_joints_without_covariance_are_refused():
-    prediction, truth = people(frames=2)
-    with pytest.raises(InputError, match="covariance"):
-        region_counts(replace(prediction, covariance=None), truth)

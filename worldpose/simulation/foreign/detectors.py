@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Record
 from worldpose.body.occlusions import facing_axes
 from worldpose.simulation.foreign.rigs import View
@@ -197,10 +196,7 @@ def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detecto
 def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floats:
     """Return the joints as the detector defines them (frames, persons, 17, 3) [m], world.
 
-    Args:
-        joints: anatomical ones (frames, persons, 17, 3) [m], world.
-        detector: definitions.
-        personal: (persons, 17, 3) each person's own offsets, in units of the profile's.
+    `personal` (persons, 17, 3) are each person's own offsets, in units of the profile's.
     """
     _, left = facing_axes(joints)
     along = joints - joints[:, :, _PARENT]
@@ -222,21 +218,15 @@ def detect_people(
     detector: Detector,
     view: View,
     defined: Floats,
-    image_size: NDArray[np.int64],
+    image_size: Integers,
     fps: float,
     lost: float,
     rng: np.random.Generator,
 ) -> Report:
     """Return the detections in a camera's images.
 
-    Args:
-        detector: detector of the match.
-        view: people in the camera's images.
-        defined: pixels (frames, persons, 17, 2) of the joints as the detector defines them [px].
-        image_size: width and height [px].
-        fps: [1/s].
-        lost: share of frames that the camera lost [1].
-        rng: this camera's own.
+    `defined` (frames, persons, 17, 2) are pixels of the joints as the detector defines them, `lost`
+    is the share of frames that the camera lost.
     """
     profile = detector.profile
     frames, persons = view.size.shape
@@ -279,7 +269,7 @@ def detect_people(
     keypoints = np.where(there[..., None], keypoints, np.nan)
     confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
 
-    def box(order: NDArray[np.int64], places: Floats, found: Flags) -> Floats:
+    def box(order: Integers, places: Floats, found: Flags) -> Floats:
         low = np.where(np.isfinite(places), places, np.inf).min(axis=2, initial=np.inf)
         high = np.where(np.isfinite(places), places, -np.inf).max(axis=2, initial=-np.inf)
         tall = np.where(found[..., None], high - low, 0.0)
@@ -415,7 +405,7 @@ def _draw_confidence(
 def _draw_false_positives(
     profile: DetectorProfile,
     size: Floats,
-    image_size: NDArray[np.int64],
+    image_size: Integers,
     frames: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:

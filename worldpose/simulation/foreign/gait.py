@@ -8,8 +8,8 @@ Gait patterns and the speed of walking, 1968.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -39,85 +39,38 @@ _HOLD: Final = (0.04, 0.42, 0.24)
 """Rest of the ankle: from this share of the cycle to these, walking and running [1]."""
 
 
-@dataclass(frozen=True)
-class Manner:
-    """Style of one person's posture and gait.
-
-    Attributes:
-        lean: forward lean of the trunk [rad].
-        swing: swing of the arms, relative to the usual [1].
-        elbow: further bend of the elbows [rad].
-        splay: outward angle of the arms [rad].
-        stride: length of steps relative to the usual [1].
-        sway: turning of pelvis and shoulders relative to the usual [1].
-        width: width of the steps, as a share of the hips' width [1].
-    """
-
-    lean: float
-    swing: float
-    elbow: float
-    splay: float
-    stride: float
-    sway: float
-    width: float
-
-
-@dataclass(frozen=True)
-class Gesture:
-    """An action besides walking, which rises from zero to its peak and falls back.
-
-    Attributes:
-        kind: one of `GESTURES`.
-        time: time of its peak [s].
-        length: duration from begin to end [s].
-        strength: 1 = fully.
-        side: the arm, 0 left, 1 right.
-        towards: direction of an arm (forward, left, up).
-    """
+class Gesture(NamedTuple):
+    """An action besides walking, which rises from zero to its peak and falls back."""
 
     kind: str
+    """One of `GESTURES`."""
     time: float
+    """Time of its peak [s]."""
     length: float
+    """Duration from begin to end [s]."""
     strength: float
+    """1 = fully."""
     side: int
-    towards: tuple[float, float, float]
+    """The arm, 0 left, 1 right."""
+    towards: Floats
+    """Direction (3,) of an arm: forward, left, up."""
 
 
 GESTURES: Final = ("point", "both_arms", "bend", "crouch", "hips", "twist")
 
 
-def draw_manner(rng: np.random.Generator) -> Manner:
-    """Return one person's manner."""
-    return Manner(
-        lean=np.radians(3.0 + 3.0 * rng.standard_normal()),
-        swing=float(np.exp(0.3 * rng.standard_normal())),
-        elbow=np.radians(12.0 * rng.standard_normal()),
-        splay=np.radians(9.0 + 4.0 * rng.standard_normal()),
-        stride=float(np.exp(0.06 * rng.standard_normal())),
-        sway=float(np.exp(0.3 * rng.standard_normal())),
-        width=float(rng.uniform(0.45, 1.15)),
-    )
-
-
-def draw_gestures(
+def _draw_gestures(
     rate: float, begin: float, end: float, rng: np.random.Generator
-) -> tuple[Gesture, ...]:
+) -> list[Gesture]:
     """Return gestures between two times [s], `rate` per minute."""
     drawn = []
     for _ in range(rng.poisson(rate * (end - begin) / 60.0)):
         direction = rng.normal([0.8, 0.0, 0.3])
         direction /= np.linalg.norm(direction)
-        drawn.append(
-            Gesture(
-                kind=str(rng.choice(GESTURES)),
-                time=float(rng.uniform(begin, end)),
-                length=float(rng.uniform(0.9, 2.6)),
-                strength=float(rng.uniform(0.5, 1.0)),
-                side=int(rng.integers(2)),
-                towards=(float(direction[0]), float(direction[1]), float(direction[2])),
-            )
-        )
-    return tuple(drawn)
+        kind, time = str(rng.choice(GESTURES)), rng.uniform(begin, end)
+        length, strength = rng.uniform(0.9, 2.6), rng.uniform(0.5, 1.0)
+        drawn.append(Gesture(kind, time, length, strength, int(rng.integers(2)), direction))
+    return drawn
 
 
 def walk_posture(
@@ -125,20 +78,14 @@ def walk_posture(
     root: Floats,
     heading: Floats,
     leg: float,
-    manner: Manner,
-    gestures: tuple[Gesture, ...],
+    gesture_rate: float,
     rng: np.random.Generator,
 ) -> Posture:
     """Return the posture of a person who walks or runs along a trajectory.
 
-    Args:
-        times: (frames,) [s], evenly spaced.
-        root: (frames, 2) middle of the hips in plan [m], world.
-        heading: (frames,) direction that the body faces [rad].
-        leg: its length [m].
-        manner: the person's style.
-        gestures: the person's gestures.
-        rng: draws the first step and the gaze.
+    `times` (frames,) [s] are evenly spaced, `root` (frames, 2) [m] is the middle of the hips in
+    plan, world, `heading` (frames,) [rad] the direction that the body faces; gestures come at a
+    rate [1/min]. `rng` draws the person's manner and gestures, the first step and the gaze.
     """
     still = 0.05  # A slower person keeps both feet down [m/s]
     # Maximum distance of the hips past a resting ankle; then the heel rises [share of the
@@ -146,6 +93,14 @@ def walk_posture(
     roll = 0.5
     flight = 0.05  # rise and fall of a runner's pelvis, peak to peak [share of the leg]
     running_from = (1.9, 2.6)  # speeds between which a walk becomes a run [m/s]
+    own_lean = np.radians(3.0 + 3.0 * rng.standard_normal())  # of the trunk, forward
+    own_swing = float(np.exp(0.3 * rng.standard_normal()))  # of the arms, relative to the usual
+    own_bend = np.radians(12.0 * rng.standard_normal())  # of the elbows, further
+    own_splay = np.radians(9.0 + 4.0 * rng.standard_normal())  # of the arms, outward
+    own_stride = float(np.exp(0.06 * rng.standard_normal()))  # relative to the usual
+    own_sway = float(np.exp(0.3 * rng.standard_normal()))  # of pelvis and shoulders
+    own_width = float(rng.uniform(0.45, 1.15))  # of the steps, as a share of the hips' width
+    gestures = _draw_gestures(gesture_rate, times[0], times[-1], rng)
     step = times[1] - times[0]
     velocity = np.gradient(root, step, axis=0)
     pace = np.linalg.norm(velocity, axis=-1)
@@ -153,7 +108,7 @@ def walk_posture(
     ahead = (velocity * np.stack([np.cos(heading), np.sin(heading)], axis=-1)).sum(-1)
     run = np.clip((pace - running_from[0]) / np.diff(running_from), 0.0, 1.0)
     run = run**2 * (3.0 - 2.0 * run)
-    rate = _stride_rate(pace, leg, run) / manner.stride
+    rate = _stride_rate(pace, leg, run) / own_stride
     cycle = rng.random() + np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
 
     moving = np.clip(pace / 0.6, 0.0, 1.0)
@@ -162,7 +117,7 @@ def walk_posture(
     )
     flexed = [_angles((cycle + half) % 1.0, size, np.abs(size), run) for half in (0.0, 0.5)]
     angles = np.stack(flexed, axis=1)  # (frames, 2, 2): side, hip and knee
-    inward = 0.5 * (manner.width - 1.0) * 0.11
+    inward = 0.5 * (own_width - 1.0) * 0.11
     outward = np.array([1.0, -1.0]) * inward
     thigh = _sagittal(angles[..., 0], outward)
     shank = _sagittal(angles[..., 0] - angles[..., 1], outward)
@@ -172,21 +127,21 @@ def walk_posture(
         4.0 * np.pi * (cycle - 0.42)
     )
 
-    swing = manner.sway * moving * np.sin(2.0 * np.pi * cycle + 0.6)
+    swing = own_sway * moving * np.sin(2.0 * np.pi * cycle + 0.6)
     up = np.array([0.0, 0.0, 1.0])
     tilt = np.radians(3.0) * moving * np.cos(2.0 * np.pi * cycle)
     hips = _lateral_axis(np.radians(6.0) * swing) + tilt[:, None] * up
-    lean = manner.lean + np.radians(7.0) * run + 0.5 * np.arctan(np.gradient(ahead, step) / 9.81)
+    lean = own_lean + np.radians(7.0) * run + 0.5 * np.arctan(np.gradient(ahead, step) / 9.81)
     lean = gaussian_filter1d(lean, 0.15 / step, mode="nearest")
     look = _random_course(times, 2.5, rng) * np.radians(28.0)
     nod = _random_course(times, 3.0, rng) * np.radians(9.0) - np.radians(6.0)
     arm = np.empty((len(times), 2, 2))
     for side, sign in enumerate((1.0, -1.0)):
-        reach = manner.swing * np.radians(14.0 + 22.0 * run) * moving
+        reach = own_swing * np.radians(14.0 + 22.0 * run) * moving
         arm[:, side, 0] = -sign * reach * np.sin(2.0 * np.pi * cycle + 1.5) - np.radians(4.0)
-        bend = np.radians(14.0 + 10.0 * moving + 62.0 * run) + manner.elbow
+        bend = np.radians(14.0 + 10.0 * moving + 62.0 * run) + own_bend
         arm[:, side, 1] = np.clip(bend + 0.35 * arm[:, side, 0], 0.03, 2.4)
-    splay = np.array([1.0, -1.0]) * manner.splay
+    splay = np.array([1.0, -1.0]) * own_splay
     hold = _HOLD[1] + (_HOLD[2] - _HOLD[1]) * run - _HOLD[0]
     hold = np.minimum(hold, roll * leg * rate / np.maximum(pace, 1e-9))
     part = np.stack([cycle % 1.0, (cycle + 0.5) % 1.0], axis=1)
@@ -286,7 +241,7 @@ def _add_gesture(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
     if gesture.kind in ("point", "both_arms"):
         for side in (0, 1) if gesture.kind == "both_arms" else (gesture.side,):
             mirror = np.array([1.0, sign * (1.0 - 2.0 * side), 1.0])
-            goal = mirror * np.array(gesture.towards)
+            goal = mirror * gesture.towards
             # An upper arm does not reach across the body.
             goal[1] = (1.0 - 2.0 * side) * max((1.0 - 2.0 * side) * goal[1], -0.2)
             arms[:, side] = _blend(arms[:, side], goal, on)

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.static_calibration import ClickedMarkings
@@ -24,7 +23,7 @@ from worldpose.simulation.foreign.detectors import (
     detect_people,
     draw_detector,
 )
-from worldpose.simulation.foreign.gait import draw_gestures, draw_manner, walk_posture
+from worldpose.simulation.foreign.gait import walk_posture
 from worldpose.simulation.foreign.recordings import Recordings, play_motion, read_recordings
 from worldpose.simulation.foreign.rigs import (
     Layout,
@@ -118,14 +117,8 @@ def simulate_foreign_scene(
 ) -> ForeignScene:
     """Return a match of the second simulator; the same arguments give the same numbers.
 
-    Args:
-        scenario: ranges.
-        seed: seed from 0.
-        duration: [s], instead of the scenario's.
-        cameras: number of them, instead of the scenario's.
-        people: number of them, instead of the scenario's.
-        recordings: motion capture and tracking data to replay; None = all motion is computed.
-        calibrated: return the exact cameras.
+    `duration` [s], `cameras` and `people` take the place of the scenario's; `calibrated` returns
+    the exact cameras. Without recordings, all motion is computed.
     """
     streams = np.random.SeedSequence([seed, *scenario.name.encode()]).spawn(6)
     rng = np.random.default_rng(streams[0])
@@ -230,7 +223,7 @@ def simulate_foreign_scene(
     )
 
 
-def _motion_times(frames: int, fps: float) -> tuple[Floats, NDArray[np.int64]]:
+def _motion_times(frames: int, fps: float) -> tuple[Floats, Integers]:
     """Return the times of the motion [s], and which of them are frames."""
     # Minimum rate of the motion's computation [1/s], a multiple of the frame rate.
     motion_rate = 100.0
@@ -290,11 +283,8 @@ def _draw_people(
     for person, (skeleton, rng) in enumerate(zip(skeletons, rngs, strict=True)):
         trajectory, posture = known[person], replayed.get(person)
         if posture is None:
-            manner = draw_manner(rng)
-            gestures = draw_gestures(scenario.gestures, times[0], times[-1], rng)
-            posture = walk_posture(
-                times, trajectory.root, trajectory.heading, skeleton.leg, manner, gestures, rng
-            )
+            course = (trajectory.root, trajectory.heading)
+            posture = walk_posture(times, *course, skeleton.leg, scenario.gestures, rng)
         joints = place_joints(skeleton, posture, trajectory.root, trajectory.heading, fps, ground)
         people.append(Person(skeleton, joints, trajectory.source))
     return people
@@ -366,15 +356,8 @@ def simulate_foreign_match(
 
     docs/explanation/simulation.md describes the files.
 
-    Args:
-        scenario: ranges.
-        seed: seed from 0.
-        out: absent or an empty folder; the write is atomic.
-        duration: [s], instead of the scenario's.
-        cameras: number of them, instead of the scenario's.
-        people: number of them, instead of the scenario's.
-        recordings: folder with npz files of motion capture and tracking data (`read_recordings`).
-        calibrated: write the exact cameras.
+    `out` is absent or an empty folder; the write is atomic. `recordings` is as for
+    `read_recordings`, other options as for `simulate_foreign_scene`.
 
     Returns:
         The match's match.yaml.

@@ -110,12 +110,8 @@ def play_motion(
     Part, direction, tempo and left-right mirroring are random; at the ends of the recording the
     playback reverses.
 
-    Args:
-        motion: the recording.
-        skeleton: the person's bones.
-        times: (frames,) [s], evenly spaced; the clip begins at 0.
-        place: (2,) position of the person in the middle of `times` [m].
-        rng: draws part, direction, tempo and side.
+    `times` (frames,) [s] are evenly spaced, and the clip begins at 0; `place` (2,) [m] is the
+    person's in the middle of them.
     """
     tempo, mirrored = float(rng.uniform(TEMPO[0], TEMPO[1])), bool(rng.random() < 0.5)
     length = (motion.frames - 1) / motion.fps

@@ -73,7 +73,7 @@ class RigCamera:
         towards = np.stack([np.cos(order * angle + phase), np.sin(order * angle - phase)], axis=-1)
         return np.asarray(pixels + swirl[..., None] * towards)
 
-    def sees(self, pixels: Floats) -> NDArray[np.bool_]:
+    def sees(self, pixels: Floats) -> Flags:
         """Return which pixels (..., 2) lie in the image."""
         with np.errstate(invalid="ignore"):
             inside = (pixels >= -0.5) & (pixels <= self.camera.image_size - 0.5)
@@ -85,12 +85,8 @@ def draw_rig(
 ) -> list[RigCamera]:
     """Return cameras that look at the action.
 
-    Args:
-        count: number of cameras.
-        layout: their arrangement.
-        field: length and width of the pitch, or of the space that a lab's people move in [m].
-        action: (places, 3) [m], positions of heads, hips and feet; cameras aim among them.
-        rng: draws everything.
+    `field` is the length and width of the pitch, or of the space that a lab's people move in [m].
+    Cameras aim among `action` (places, 3) [m], positions of heads, hips and feet.
     """
     rig: list[RigCamera] = []
     start = float(rng.uniform(0.0, 2.0 * np.pi))
@@ -258,11 +254,8 @@ def view_people(
 ) -> View:
     """Return positions of people in the image and their occlusions.
 
-    Args:
-        camera: true camera.
-        joints: (frames, persons, 17, 3) [m], world.
-        statures: (persons,) [m].
-        pillar: left and right border of an occluded strip [px], or None.
+    `joints` (frames, persons, 17, 3) [m], world; `statures` (persons,) [m]; `pillar` is the left
+    and right border of an occluded strip [px].
     """
     pixels = camera.project(joints)
     inside = camera.sees(pixels)
@@ -367,13 +360,7 @@ def visible_points(camera: RigCamera, pitch: PitchTemplate) -> list[str]:
 def click_points(
     camera: RigCamera, pitch: PitchTemplate, rng: np.random.Generator
 ) -> tuple[ClickedMarkings, dict[str, str]]:
-    """Return a person's clicks, and by wrong name the name of the point under it.
-
-    Args:
-        camera: the true one.
-        pitch: the painted pitch.
-        rng: this camera's own.
-    """
+    """Return a person's clicks, and by wrong name the name of the point under it."""
     misnamed = 0.04  # share of cameras with a click under a wrong name [1]
     click_tail = 4.0  # degrees of freedom of clicks (Student's t) [1]
     spread = rng.uniform(CLICK[0], CLICK[1]) * np.sqrt(camera.camera.image_size[0] / 1920.0)
@@ -410,7 +397,7 @@ def click_points(
     return markings, {new: name for name, new in names.items() if new != name}
 
 
-def _is_inside(camera: RigCamera, pixels: Floats) -> NDArray[np.bool_]:
+def _is_inside(camera: RigCamera, pixels: Floats) -> Flags:
     with np.errstate(invalid="ignore"):
         inside = (pixels > _MARGIN) & (pixels < camera.camera.image_size - 1.0 - _MARGIN)
     return np.asarray(inside.all(axis=-1))
@@ -424,10 +411,7 @@ def _round_click(camera: RigCamera, xy: Floats) -> tuple[float, float]:
 def measure_camera(camera: Camera, accuracy: float, rng: np.random.Generator) -> Camera:
     """Return a camera with the errors of another calibration.
 
-    Args:
-        camera: the true one.
-        accuracy: 1 = 0.3 mrad, 2 cm, 0.05 % and a thousandth of k1; in proportion.
-        rng: this camera's own.
+    Accuracy 1 is 0.3 mrad, 2 cm, 0.05 % and a thousandth of k1; others in proportion.
     """
     turn = accuracy * 3e-4 * rng.standard_normal(3)
     center = camera.center + accuracy * 0.02 * rng.standard_normal(3)

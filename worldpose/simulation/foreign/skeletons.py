@@ -164,13 +164,8 @@ def place_joints(
     foot is planted, the shift fades over to the next in between, the pelvis sinks where the legs do
     not reach, and knees follow from thigh and shank.
 
-    Args:
-        skeleton: the person's bones.
-        posture: directions relative to the heading.
-        root: (frames, 2) middle of the hips in plan [m], world.
-        heading: (frames,) angle from the x axis towards y [rad].
-        fps: frame rate [1/s].
-        ground: height of the ground under the feet.
+    `root` (frames, 2) [m] is the middle of the hips in plan, world; `heading` (frames,) is the
+    angle from the x axis towards y [rad].
     """
     # Ratio of the ears' distance before the neck's base to their height above it [1].
     neck_forward = 0.6

@@ -60,13 +60,8 @@ def wander(
 ) -> list[Trajectory]:
     """Return trajectories of people who keep clear of each other within an area.
 
-    Args:
-        times: (samples,) [s], evenly spaced.
-        roles: one per person; duels are with the previous person in the list.
-        center: (2,) center of the area [m].
-        size: (2,) size of the area [m].
-        obstacles: people with fixed trajectories; the others avoid them.
-        rng: draws places, goals and speeds.
+    `times` (samples,) [s] are evenly spaced; the area has center and size (2,) [m]. Duels are with
+    the previous person in the list of roles. `obstacles` have fixed trajectories.
     """
     hardest = (6.0, 25.0)  # maximum acceleration by legs, and by others [m/s^2]
     relaxation = 0.45  # time constant of a person's velocity [s]

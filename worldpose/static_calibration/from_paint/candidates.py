@@ -336,10 +336,7 @@ def score_candidates(
     """
     chance_rate = 0.05  # of paint near a place without a marking
     hit_rate = 0.7  # players, shadows and wear hide the rest
-    gain, loss = (
-        np.log(hit_rate / chance_rate),
-        np.log((1.0 - hit_rate) / (1.0 - chance_rate)),
-    )
+    gain, loss = (np.log(hit_rate / chance_rate), np.log((1.0 - hit_rate) / (1.0 - chance_rate)))
     scores = np.zeros(len(candidates))
     for first in range(0, len(candidates), 1000):
         part = slice(first, first + 1000)

@@ -64,11 +64,8 @@ def find_paint(
 ) -> Iterator[PaintMap]:
     """Yield the paint of an image, once for every lens that it may have, the likely one first.
 
-    Args:
-        picture: (height, width, 3) RGB.
-        lens: focal length, principal point and distortion of the image; None = not known. Then the
-            distortion is the one that makes the most paint straight.
-        where: file or camera, for messages.
+    `picture` (height, width, 3) is RGB. Without the lens, the distortion is the one that makes the
+    most paint straight. Messages begin with `where`.
 
     Raises:
         InputError: the image has no color or shows no grass.
@@ -403,12 +400,7 @@ def _fit_line(
 ) -> tuple[Flags, Floats, float]:
     """Return the mask of a line's pixels, its normal (2,) and its offset [px]."""
     near = np.zeros(len(points), np.bool_)
-    for tolerance in (
-        3.0 * _TOLERANCE,
-        2.0 * _TOLERANCE,
-        1.5 * _TOLERANCE,
-        _TOLERANCE,
-    ):
+    for tolerance in (3.0 * _TOLERANCE, 2.0 * _TOLERANCE, 1.5 * _TOLERANCE, _TOLERANCE):
         turned = _angle_between(angles, np.arctan2(across[1], across[0]))
         near = (np.abs(points @ across - offset) < tolerance) & (turned < 0.3)
         if np.count_nonzero(near) < 10:

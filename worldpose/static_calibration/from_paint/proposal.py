@@ -190,13 +190,7 @@ def propose_camera(
 
     If the image as it is has no clear one, the search is repeated with restored colors.
 
-    Args:
-        picture: (height, width, 3) RGB.
-        pitch: the stadium's template.
-        side: where the camera stands.
-        prior: heights, distances, focal lengths; the defaults if None.
-        lens: a lens that was calibrated before.
-        where: file or camera, for messages.
+    `picture` (height, width, 3) is RGB; the camera stands at `side`. Messages begin with `where`.
 
     Raises:
         InputError: there is no grass, or too little paint for a camera.
