@@ -9,6 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
+from data_contracts.cameras import COEFFICIENTS
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
 from flows.cli.console import (
@@ -262,7 +263,8 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json:
     for name, lens in lenses.items():
         x, y = lens.principal_point_px
         line(
-            f"{name}: focal length {lens.focal_px:.1f} px (standard deviation "
+            f"{name}: {lens.lens_model} lens ({', '.join(COEFFICIENTS[lens.lens_model])}), focal "
+            f"length {lens.focal_px:.1f} px (standard deviation "
             f"{lens.focal_std_px:.1f}), principal point {x:.1f}, {y:.1f} "
             f"({lens.principal_point_std_px:.1f}), the image's corner "
             f"{100 * lens.distortion_std:.2g} % of its distance; its pose comes from clicks"

@@ -23,6 +23,7 @@ from worldpose.formats.keypoint_sets import (
     SIZES,
     PeopleFile,
     clean_points,
+    frame_numbers,
     order_by_points,
     people_by_frame,
 )
@@ -33,13 +34,12 @@ KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypo
 """Of OpenPose's version 1 and later, of its versions 0, and of other programs."""
 BOX_COLUMNS: Final = range(6, 11)
 """Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9."""
-_NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
 
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     """Return the people of one camera; `worldpose.formats.keypoint_sets` tells their points.
 
-    The last number in a file's name is its frame. An empty file is a frame without people.
+    `frame_numbers` finds the frame in a file's name. An empty file is a frame without people.
 
     Args:
         folder: holds a JSON file for each frame.
@@ -73,24 +73,25 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
 
 
 def _frame_files(folder: Path) -> dict[int, Path]:
+    there = {file.name: file for file in sorted(folder.glob("*.[jJ][sS][oO][nN]"))}
+    numbers = frame_numbers(there)
     files: dict[int, Path] = {}
-    for file in sorted(folder.glob("*.[jJ][sS][oO][nN]")):
-        number = _NUMBER.search(file.name)
-        if number is None or int(number[1]) > FRAME_LIMIT:
+    for name, file in there.items():
+        if numbers.get(name, FRAME_LIMIT + 1) > FRAME_LIMIT:
             raise InputError(
                 str(file),
-                expected=f"a frame number up to {FRAME_LIMIT} at the end of the name",
-                found=file.name,
+                expected=f"a frame number up to {FRAME_LIMIT} in the name",
+                found=name,
                 todo="Name it as cam01_000012.json, or move it elsewhere.",
             )
-        if int(number[1]) in files:
+        if numbers[name] in files:
             raise InputError(
                 str(file),
                 expected="one file per frame",
-                found=f"{files[int(number[1])].name} with the same frame number",
+                found=f"{files[numbers[name]].name} with the same frame number",
                 todo="Keep the poses of one camera and one estimator in a folder.",
             )
-        files[int(number[1])] = file
+        files[numbers[name]] = file
     if not files:
         raise InputError(
             str(folder),

@@ -17,7 +17,7 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import LeftOut, camera_id
+from worldpose.formats.calibration_files import LeftOut, camera_id, scaled
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
@@ -84,13 +84,14 @@ def import_match(
     read = {name: read_people(file) for name, file in files.items()}
     people = {name: found.people for name, found in read.items()}
     first, stop = find_people(detections, people)
-    sizes = {name: camera.image_size for name, camera in cameras.items()}
-    spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
     notes: list[str] = []
     if place is not None:
         cameras, notes = place(calibration, cameras, people, fps)
+    sizes = {name: camera.image_size for name, camera in cameras.items()}
+    notes += describe_outside(people, sizes)
+    spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec, notes + describe_left_out(left_out) + describe_people(read)
 
@@ -134,6 +135,25 @@ def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
     return notes + describe_changes(read)
 
 
+def describe_outside(
+    people: Mapping[str, KeypointDetections], sizes: Mapping[str, tuple[int, int]]
+) -> list[str]:
+    """Return a sentence about cameras many of whose keypoints are outside of their images."""
+    most = 0.02  # share of keypoints that detectors guess beyond the border [1]
+    shares = {}
+    for name, found in people.items():
+        known = found.keypoints[np.isfinite(found.confidence)]
+        off = (known < -0.5) | (known > np.array(sizes[name]) - 0.5)
+        shares[name] = float(off.any(axis=-1).mean()) if len(known) else 0.0
+    said = [f"{share:.0%} of {name}" for name, share in shares.items() if share > most]
+    if not said:
+        return []
+    return [
+        f"warning: keypoints are outside of the images of the calibration: {', '.join(said)}; are "
+        "they of images of another size, or of another camera?"
+    ]
+
+
 def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     """Return sentences about what was changed in cameras' 2D poses to read them."""
     notes = []
@@ -141,6 +161,9 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
         counts = {name: getattr(found.changes, key) for name, found in read.items()}
         if total := sum(counts.values()):
             notes.append(f"{what}: {total} ({', '.join(name for name in counts if counts[name])})")
+    steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
+    if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
+        notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
     return notes
 
 
@@ -204,6 +227,10 @@ def import_lenses(
                 found="one",
                 todo="Remove it there first.",
             )
+    from worldpose.geometry.cameras import Camera  # late: it loads the kernels
+
+    for name, lens in lenses.items():
+        Camera.from_lens(lens).require_rays(f"{files[0]}: {name}")
     with whole_file(target) as draft:
         write_lens_toml(draft, {**known, **lenses})
     return lenses
@@ -451,8 +478,6 @@ def fit_to_video(
         with open_video(file, index) as video:
             if not _has_black_bars(video.frame(0), bar):
                 raise video_size_error(file, camera, index)
-    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
-    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
     notes.append(
         f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
             *camera.image_size
@@ -460,13 +485,7 @@ def fit_to_video(
         + f"the calibration is scaled by {scale:.5f}"
         + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
     )
-    return camera.model_copy(
-        update={
-            "image_size": index.size,
-            "focal_px": tuple(scale * focal for focal in camera.focal_px),
-            "principal_point_px": tuple(middle.tolist()),
-        }
-    )
+    return scaled(camera, scale, index.size, bar)
 
 
 def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:

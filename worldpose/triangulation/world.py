@@ -19,6 +19,7 @@ from data_contracts.conventions import UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import select_busiest_frames
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_files import scaled
 from worldpose.formats.calibration_forms import form_unit_m
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, Similarity
@@ -81,6 +82,18 @@ class Walkers(NamedTuple):
                 offset = (0.024 / (each.share * STATURE[0])) ** 2 * each.offsets
                 weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
         return float(np.average(found, weights=weight)) if found else np.nan
+
+    def nose_ahead(self, up: Floats) -> float:
+        """Return the share of poses with the nose ahead of the ears; NaN if too few have both.
+
+        Ahead is right of the line from the right to the left shoulder and hip, seen from above.
+        """
+        fewest = 20  # poses
+        j = self.joints
+        ahead = np.cross(j[:, :, 5] - j[:, :, 6] + j[:, :, 11] - j[:, :, 12], up)
+        nose = ((j[:, :, 0] - 0.5 * (j[:, :, 3] + j[:, :, 4])) * ahead).sum(axis=-1)
+        known = nose[np.isfinite(nose)]
+        return float((known > 0.0).mean()) if len(known) >= fewest else np.nan
 
     def orient(self, scale: float) -> tuple[Similarity, float, bool]:
         """Return the transform to the world on whose ground people walk.
@@ -159,6 +172,8 @@ class People(NamedTuple):
         up: (3,) unit vector that points up from the ground on which they walk.
         ground: a point (3,) of that ground [unit of the world]; NaN if unknown.
         on_feet: whether standing feet determine `up`.
+        ahead: share of poses whose nose is ahead, by the sides of shoulders and hips; NaN if too
+            few tell.
     """
 
     statures: Floats
@@ -166,6 +181,7 @@ class People(NamedTuple):
     up: Floats
     ground: Floats
     on_feet: bool
+    ahead: float
 
     @property
     def stature(self) -> float:
@@ -197,12 +213,14 @@ class People(NamedTuple):
         scale = STATURE[0] / float(np.median(statures))
         legs = np.isfinite(walkers.joints[:, :, [11, 12, 15, 16], 0]).all(axis=-1)
         if not legs.any() or len(joints) < 2:
-            return cls(statures, vertical, vertical.axis, np.full(3, np.nan), on_feet=False)
+            nowhere = np.full(3, np.nan)
+            return cls(statures, vertical, vertical.axis, nowhere, on_feet=False, ahead=np.nan)
         motion, _, on_feet = walkers.orient(scale)
         ground, up = -motion.rotation.T @ motion.translation / scale, motion.rotation[2]
         # Feet of people who lie are on no ground.
         on_feet = on_feet and bool(up @ vertical.axis > LEVEL)
-        return cls(statures, vertical, up if on_feet else vertical.axis, ground, on_feet)
+        up = up if on_feet else vertical.axis
+        return cls(statures, vertical, up, ground, on_feet, walkers.nose_ahead(up))
 
 
 def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> People | None:
@@ -252,6 +270,16 @@ def doubt_statures(statures: Floats) -> str:
     return f"the mean stature of {count} people is {mean:.2f} m; {said}"
 
 
+def doubt_sides(people: People) -> str:
+    """Return a sentence if people's left and right are exchanged; else an empty one."""
+    if not people.ahead < 0.1:  # also NaN
+        return ""
+    return (
+        f"left and right are exchanged in all 2D poses, or all images are mirrored: in "
+        f"{1.0 - people.ahead:.0%} of the poses the nose points backwards"
+    )
+
+
 def doubt_world(cameras: Camera, people: People, *, sizes: bool = True) -> list[str]:
     """Return sentences about a world in which people do not stand along z, or are no adults.
 
@@ -261,7 +289,7 @@ def doubt_world(cameras: Camera, people: People, *, sizes: bool = True) -> list[
         sizes: whether lengths can be judged.
     """
     vertical, size = people.vertical, doubt_statures(people.statures) if sizes else ""
-    said = [size] if size else []
+    said = [each for each in (size, doubt_sides(people)) if each]
     if vertical.is_clear and not vertical.is_z and people.stand_along(vertical.axis, cameras):
         said.insert(
             0,
@@ -343,16 +371,30 @@ def place_cameras(
             of_what, todo = "a calibration, whose world they describe", "Add --calibration."
             raise UsageError("--unit and --up", expected=of_what, found="none", todo=todo)
         return {}, []
-    batch = Camera.stack([Camera.from_calibration(camera) for camera in cameras.values()])
-    people = None
+    batch = Camera.stack(
+        [Camera.from_calibration(each, f"{calibration}: {name}") for name, each in cameras.items()]
+    )
+    people, told = (
+        None,
+        [
+            f"warning: {name}: the lens folds within the image, {share:.1%} of which shows nothing"
+            for name, share in zip(cameras, map(Camera.blind_share, batch), strict=True)
+            if share > 0.0
+        ],
+    )
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
         people = find_people(batch, stacked, fps)
+        if people is None:
+            cameras, batch, people, said = _read_otherwise(calibration, cameras, stacked, fps)
+            told += said
     scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
     up, turned, doubt = _find_up(batch, people, stated.up)
-    notes = [doubt] if doubt else []
+    notes = [*told, doubt] if doubt else told
     if people is not None and (size := doubt_statures(scale * people.statures)):
         notes.append(f"warning: {size}")
+    if people is not None and (sides := doubt_sides(people)):
+        notes.append(f"warning: {sides}")
     if scale == 1.0 and not turned:
         return dict(cameras), [*([f"{calibration}: {unit}"] if unit else []), *notes]
     height = float(scale * people.ground @ up) if turned and people is not None else 0.0
@@ -372,6 +414,66 @@ def place_cameras(
         for (name, camera), (rotation, translation) in zip(cameras.items(), poses, strict=True)
     }
     return placed, [f"{calibration} is brought to metres with z up: {done}", *notes]
+
+
+_FLIP: Final = np.diag([1.0, -1.0, -1.0])
+_OTHER_POSES: Final = {
+    "the poses are those of the cameras in the world, not the other way: invert them": (
+        lambda pose: pose.inverse()
+    ),
+    "the cameras' y axes point up and z backward, as OpenGL's: turn R and t by diag(1, -1, -1)": (
+        lambda pose: Rigid(_FLIP @ pose.rotation, pose.translation @ _FLIP)
+    ),
+    "the poses are those of OpenGL's cameras in the world: invert them, then turn them by "
+    "diag(1, -1, -1)": (
+        lambda pose: Rigid(_FLIP @ pose.inverse().rotation, pose.inverse().translation @ _FLIP)
+    ),
+}
+"""What files that break their form's rules have in place of poses."""
+_SCALES: Final = (1 / 4, 1 / 3, 3 / 8, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 8 / 3, 3.0, 4.0)
+"""Ratios of usual image sizes."""
+
+
+def _read_otherwise(
+    calibration: Path,
+    cameras: Mapping[str, CameraCalibration],
+    detections: KeypointDetections,
+    fps: float,
+) -> tuple[Mapping[str, CameraCalibration], Camera, People | None, list[str]]:
+    """Return cameras for images of another size if people in them agree then, and what was done.
+
+    Raises:
+        InputError: people agree if the poses mean something else than the form says.
+    """
+
+    def stack(given: Mapping[str, CameraCalibration]) -> Camera:
+        return Camera.stack([Camera.from_calibration(each) for each in given.values()])
+
+    batch = stack(cameras)
+    for why, change in _OTHER_POSES.items():
+        other = replace(batch, cam_from_world=change(batch.cam_from_world))
+        if find_people(other, detections, fps) is not None:
+            raise InputError(
+                f"{calibration}: rotation and translation",
+                expected="x_cam = R x_world + t, with y down and z forward",
+                found="poses by which no two cameras agree on their people",
+                todo=f"They agree if {why}.",
+            )
+    known = detections.keypoints[np.isfinite(detections.confidence)]
+    for scale in _SCALES:
+        sizes = {n: np.rint(scale * np.array(c.image_size)) for n, c in cameras.items()}
+        if not len(known) or (known.max(axis=0) > np.min([*sizes.values()], axis=0)).any():
+            continue
+        other = {
+            name: scaled(camera, scale, (int(sizes[name][0]), int(sizes[name][1])))
+            for name, camera in cameras.items()
+        }
+        people = find_people(stack(other), detections, fps)
+        if people is not None:
+            shown = " x ".join(str(length) for length in next(iter(other.values())).image_size)
+            said = f"the calibration is scaled by {scale:.5f}, to images of {shown} px: the people "
+            return other, stack(other), people, [said + "of the 2D poses agree at this size alone"]
+    return cameras, batch, None, []
 
 
 def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
