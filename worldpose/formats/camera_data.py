@@ -184,6 +184,8 @@ def _records(content: bytes) -> Iterator[tuple[float, bytes]]:
     at = 24
     while at < len(content):
         seconds, parts, length, _ = struct.unpack_from(f"{order}4I", content, at)
+        if at + 16 + length > len(content):
+            raise struct.error("it ends within a packet")
         yield seconds + unit * parts, content[at + 16 : at + 16 + length]
         at += 16 + length
 
@@ -194,8 +196,8 @@ def _blocks(content: bytes) -> Iterator[tuple[float, bytes]]:
     order = "<" if content[8:12] == bytes.fromhex("4d3c2b1a") else ">"
     while at < len(content):
         kind, size = struct.unpack_from(f"{order}2I", content, at)
-        if size < 12:
-            raise struct.error(f"a block of {size} bytes")
+        if size < 12 or at + size > len(content):
+            raise struct.error(f"a block of {size} bytes at byte {at} of {len(content)}")
         if kind == 1:  # an interface; its option 9 is the resolution of times
             step = re.match(rb"(?s)(?:.{4})*?(?:\x09\0\x01\0|\0\x09\0\x01)(.)", content[at + 16 :])
             power = step[1][0] if step and at + 16 + step.end() <= at + size else 6

@@ -160,6 +160,8 @@ class GivenBoxes(NamedTuple):
     """(boxes, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel."""
     score: NDArray[np.float64]
     """(boxes,) in (0, 1]."""
+    changes: tuple[str, ...] = ()
+    """What was changed or left out, with its number."""
 
 
 def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
@@ -168,7 +170,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and, in truth
     of nine numbers, the class, of which 1 is a person. Frames begin at 1, and (1, 1) is the upper
-    left corner of the image.
+    left corner of the image. Trackers follow people out of the image: such boxes are left out.
 
     Args:
         file: the text.
@@ -177,8 +179,8 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     Raises:
         InputError: the file is unreadable or empty, a line has no such numbers, a frame that the
-            video lacks, an id twice in a frame, an empty box, a box outside of the image, or an
-            impossible confidence; the error names the line.
+            video lacks, an id twice in a frame, an empty box, or an impossible confidence, or most boxes
+            are outside of the image; the error names the line.
     """
     if file.suffix == ".npy":
         return _read_identified(file, frames)
@@ -195,7 +197,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     order = np.lexsort((np.arange(len(rows)), person, frame))
     again = np.zeros(len(rows), np.bool_)
     again[order[1:]] = (pairs[order[1:]] == pairs[order[:-1]]).all(axis=1)
-    far = np.array(size) - 0.5
+    outside = ((boxes[:, :2] >= np.array(size) - 0.5) | (boxes[:, 2:] <= -0.5)).any(axis=1)
     most = f"a frame from 1 to {frames}, as many as the video has"
     for wrong, key, expected in (
         (~np.isfinite(rows).all(axis=1), "", "finite numbers"),
@@ -205,12 +207,12 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
         (again & kept & (person >= 0), "id", "each id once in a frame"),
         ((box[:, 2:] <= 0.0).any(axis=1), "width, height", "more than 0 px"),
         (
-            kept & ((boxes[:, :2] >= far) | (boxes[:, 2:] <= -0.5)).any(axis=1),
+            outside & (outside.mean() > 0.5),
             "left, top, width, height",
-            f"a box in the image of {size[0]} x {size[1]} px",
+            f"a box in the image of {size[0]} x {size[1]} px, as most should be",
         ),
         (
-            (score > 1.0) | ((score < 0.0) & (score != -1.0)),
+            (score > MAX_CONFIDENCE) | ((score < 0.0) & (score != -1.0)),
             "confidence",
             "0 to 1, or -1",
         ),
@@ -224,12 +226,18 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
                 found=f"{text!r:.80}",
                 todo="Correct the file, or write it again.",
             )
+    changes = {
+        "outside of the image, which are left out": int((kept & outside).sum()),
+        "of a confidence above 1, which counts as 1": int((kept & (score > 1.0)).sum()),
+    }
+    kept &= ~outside
     chosen = order[kept[order]]
     return GivenBoxes(
         frame[chosen].astype(np.int64) - 1,
         np.maximum(person[chosen].astype(np.int64), -1),
         boxes[chosen],
-        np.where(score[chosen] == -1.0, 1.0, score[chosen]),
+        np.where(score[chosen] == -1.0, 1.0, np.minimum(score[chosen], 1.0)),
+        tuple(f"{count} boxes {what}" for what, count in changes.items() if count),
     )
 
 

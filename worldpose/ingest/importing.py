@@ -35,7 +35,7 @@ from worldpose.ingest.registration import file_state, require_settled
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
 from worldpose.video.folder import index_video, open_video
-from worldpose.video.names import VIDEO_SUFFIXES
+from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 
 Placing: TypeAlias = Callable[
@@ -410,6 +410,9 @@ def _import_found(
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)
+    there = (file for file in sorted(folder.glob("[!.]*")) if file.is_file())
+    if others := [file.name for file in there if not is_video(file)]:
+        notes.append(f"left out, as they have no ending of a video: {', '.join(others):.200}")
     sizes = {name: index.size for name, index in indices.items()}
     count = shared_length(map(len, clocks.values()))
     spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)
@@ -420,7 +423,7 @@ def _import_found(
         copy_videos(files, match)
         require_settled({files[name]: states[files[name]] for name in files}, "import again")
         if boxes is not None:
-            copy_boxes(boxes, indices, match)
+            copy_boxes(boxes, indices, match, notes)
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
     return spec, notes

@@ -254,7 +254,10 @@ def test_entities_are_refused_in_any_encoding(tmp_path):
 def test_cameras_in_one_place_are_told_to_be_lenses(tmp_path, make_camera, place):
     cameras = {}
     for n, (name, turn) in enumerate({"a": np.eye(3), "b": np.eye(3)[[1, 2, 0]]}.items()):
-        pose = {"rotation": tuple(map(tuple, turn.tolist())), "translation": tuple((-turn @ place).tolist())}
+        pose = {
+            "rotation": tuple(map(tuple, turn.tolist())),
+            "translation": tuple((-turn @ place).tolist()),
+        }
         cameras[name] = make_camera(name, 0.1 + n).model_copy(update=pose)
     write_calibration_toml(tmp_path / "c.toml", cameras)
     with pytest.raises(InputError, match=r"found all cameras in one place: .* import --lens"):
