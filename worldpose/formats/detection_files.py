@@ -179,8 +179,8 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     Raises:
         InputError: the file is unreadable or empty, a line has no such numbers, a frame that the
-            video lacks, an id twice in a frame, an empty box, or an impossible confidence, or most boxes
-            are outside of the image; the error names the line.
+            video lacks, an id twice in a frame, an empty box, an impossible confidence, or most
+            boxes are outside of the image; the error names the line.
     """
     if file.suffix == ".npy":
         return _read_identified(file, frames)

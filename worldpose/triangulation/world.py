@@ -207,9 +207,9 @@ class People(NamedTuple):
         )
         statures = walkers.statures()
         vertical = find_vertical(walkers.joints)
-        if vertical is None or not np.isfinite(statures).any():
+        statures = statures[np.isfinite(statures) & (statures > 0.0)]
+        if vertical is None or not len(statures):
             return None
-        statures = statures[np.isfinite(statures)]
         scale = STATURE[0] / float(np.median(statures))
         legs = np.isfinite(walkers.joints[:, :, [11, 12, 15, 16], 0]).all(axis=-1)
         if not legs.any() or len(joints) < 2:
@@ -243,7 +243,7 @@ def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> 
     # Rays that are nearly parallel tell no size.
     wide = [m.matches["size"] for m in matched if m.agrees and m.angle >= settings.min_angle_rad]
     sizes = np.concatenate([np.empty(0), *wide])
-    sizes = sizes[np.isfinite(sizes)]
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
     if not len(sizes):
         return None
     size = float(np.median(sizes))
@@ -452,7 +452,8 @@ def _read_otherwise(
     batch = stack(cameras)
     for why, change in _OTHER_POSES.items():
         other = replace(batch, cam_from_world=change(batch.cam_from_world))
-        if find_people(other, detections, fps) is not None:
+        people = find_people(other, detections, fps)
+        if people is not None and people.vertical.is_clear:
             raise InputError(
                 f"{calibration}: rotation and translation",
                 expected="x_cam = R x_world + t, with y down and z forward",
@@ -469,7 +470,7 @@ def _read_otherwise(
             for name, camera in cameras.items()
         }
         people = find_people(stack(other), detections, fps)
-        if people is not None:
+        if people is not None and people.vertical.is_clear:
             shown = " x ".join(str(length) for length in next(iter(other.values())).image_size)
             said = f"the calibration is scaled by {scale:.5f}, to images of {shown} px: the people "
             return other, stack(other), people, [said + "of the 2D poses agree at this size alone"]
