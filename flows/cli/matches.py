@@ -137,8 +137,8 @@ def import_command(
         changes: list[str] = []
         counts = import_boxes(boxes, out, changes)
         lines = (f"wrote {out / 'boxes' / name}.txt: {n} boxes" for name, n in counts.items())
-        about = {"folder": str(out), "boxes": counts, **({"notes": changes} if changes else {})}
-        answer(as_json, about, *lines, *changes)
+        told = {"notes": changes} if changes else {}
+        answer(as_json, {"folder": str(out), "boxes": counts, **told}, *lines, *changes)
     elif kind == "--lens" and lens is not None:
         _import_lenses(lens, out, camera, as_json=as_json)
     elif kind == "--clicks" and clicks is not None:

@@ -222,24 +222,6 @@ def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
         )
 
 
-def scaled(
-    camera: CameraCalibration,
-    scale: float,
-    image_size: tuple[int, int],
-    bar: NDArray[np.float64] | float = 0.0,
-) -> CameraCalibration:
-    """Return a camera in images `scale` times as large, perhaps with black bars (2,) [px]."""
-    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
-    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
-    return camera.model_copy(
-        update={
-            "image_size": image_size,
-            "focal_px": tuple(scale * focal for focal in camera.focal_px),
-            "principal_point_px": tuple(middle.tolist()),
-        }
-    )
-
-
 def calibration_error(where: str, expected: str, found: str) -> InputError:
     """Return the error for an entry of a calibration file."""
     return InputError(where, expected=expected, found=found, todo="Correct the calibration file.")

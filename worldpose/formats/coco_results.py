@@ -178,10 +178,11 @@ def _images(path: Path, results: list[dict[str, Any]], first: int) -> list[int |
 def _frames(path: Path, images: Sequence[int | str], listed: object) -> NDArray[np.int64]:
     """Return the frame of each result from its image's id, or from the images of the data set."""
     is_set = isinstance(listed, list) and bool(listed)
+    frame_of: dict[Any, int] = {}
     if isinstance(listed, list) and listed:
-        frame_of = _listed_frames(path, listed)
+        frame_of |= _listed_frames(path, listed)
     else:
-        frame_of = dict(frame_numbers(image for image in images if isinstance(image, str)))
+        frame_of |= frame_numbers(image for image in images if isinstance(image, str))
         _require_distinct(path, "image_id", frame_of)
     frames = np.empty(len(images), np.int64)
     for index, image in enumerate(images):

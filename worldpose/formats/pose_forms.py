@@ -59,8 +59,9 @@ def plain_entries(where: str, items: Iterable[Any]) -> Iterator[Any]:
 def _is_nested(person: Any) -> bool:  # noqa: ANN401
     """Return whether a person's points are a list of x, y, confidence for each."""
     given = person.get("keypoints") if isinstance(person, dict) else None
-    is_list = isinstance(given, list) and bool(given)
-    return is_list and all(isinstance(at, list) and len(at) == 3 for at in given)
+    if not isinstance(given, list) or not given:
+        return False
+    return all(isinstance(at, list) and len(at) == 3 for at in given)
 
 
 def _flat(person: dict[str, Any]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from worldpose.ingest.camera_videos import (
     copy_videos,
     describe_videos,
     find_videos,
+    fit_to_video,
     require_cameras,
     shared_length,
 )
@@ -36,7 +37,6 @@ from worldpose.ingest.importing import (
     describe_outside,
     describe_people,
     find_people,
-    fit_to_video,
 )
 from worldpose.ingest.writing import write_match
 from worldpose.video.folder import index_video

@@ -19,7 +19,6 @@ from data_contracts.conventions import UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import select_busiest_frames
 from worldpose.errors import InputError, UsageError
-from worldpose.formats.calibration_files import scaled
 from worldpose.formats.calibration_forms import form_unit_m
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, Similarity
@@ -34,6 +33,7 @@ from worldpose.tracking.vertical import (
     name_axis,
 )
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
+from worldpose.triangulation.other_readings import read_otherwise
 
 Placed: TypeAlias = tuple[dict[str, CameraCalibration], list[str]]
 LEVEL: Final = float(np.cos(np.radians(10.0)))
@@ -374,20 +374,25 @@ def place_cameras(
     batch = Camera.stack(
         [Camera.from_calibration(each, f"{calibration}: {name}") for name, each in cameras.items()]
     )
-    people, told = (
-        None,
-        [
-            f"warning: {name}: the lens folds within the image, {share:.1%} of which shows nothing"
-            for name, share in zip(cameras, map(Camera.blind_share, batch), strict=True)
-            if share > 0.0
-        ],
-    )
+    people = None
+    told = [
+        f"warning: {name}: the lens folds within the image, {share:.1%} of which shows nothing"
+        for n, name in enumerate(cameras)
+        if (share := batch[n].blind_share()) > 0.0
+    ]
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
         people = find_people(batch, stacked, fps)
         if people is None:
-            cameras, batch, people, said = _read_otherwise(calibration, cameras, stacked, fps)
+            cameras, said = read_otherwise(
+                calibration,
+                cameras,
+                stacked,
+                lambda other: bool((p := find_people(other, stacked, fps)) and p.vertical.is_clear),
+            )
             told += said
+            batch = Camera.stack([Camera.from_calibration(each) for each in cameras.values()])
+            people = find_people(batch, stacked, fps) if said else None
     scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
     up, turned, doubt = _find_up(batch, people, stated.up)
     notes = [*told, doubt] if doubt else told
@@ -414,67 +419,6 @@ def place_cameras(
         for (name, camera), (rotation, translation) in zip(cameras.items(), poses, strict=True)
     }
     return placed, [f"{calibration} is brought to metres with z up: {done}", *notes]
-
-
-_FLIP: Final = np.diag([1.0, -1.0, -1.0])
-_OTHER_POSES: Final = {
-    "the poses are those of the cameras in the world, not the other way: invert them": (
-        lambda pose: pose.inverse()
-    ),
-    "the cameras' y axes point up and z backward, as OpenGL's: turn R and t by diag(1, -1, -1)": (
-        lambda pose: Rigid(_FLIP @ pose.rotation, pose.translation @ _FLIP)
-    ),
-    "the poses are those of OpenGL's cameras in the world: invert them, then turn them by "
-    "diag(1, -1, -1)": (
-        lambda pose: Rigid(_FLIP @ pose.inverse().rotation, pose.inverse().translation @ _FLIP)
-    ),
-}
-"""What files that break their form's rules have in place of poses."""
-_SCALES: Final = (1 / 4, 1 / 3, 3 / 8, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 8 / 3, 3.0, 4.0)
-"""Ratios of usual image sizes."""
-
-
-def _read_otherwise(
-    calibration: Path,
-    cameras: Mapping[str, CameraCalibration],
-    detections: KeypointDetections,
-    fps: float,
-) -> tuple[Mapping[str, CameraCalibration], Camera, People | None, list[str]]:
-    """Return cameras for images of another size if people in them agree then, and what was done.
-
-    Raises:
-        InputError: people agree if the poses mean something else than the form says.
-    """
-
-    def stack(given: Mapping[str, CameraCalibration]) -> Camera:
-        return Camera.stack([Camera.from_calibration(each) for each in given.values()])
-
-    batch = stack(cameras)
-    for why, change in _OTHER_POSES.items():
-        other = replace(batch, cam_from_world=change(batch.cam_from_world))
-        people = find_people(other, detections, fps)
-        if people is not None and people.vertical.is_clear:
-            raise InputError(
-                f"{calibration}: rotation and translation",
-                expected="x_cam = R x_world + t, with y down and z forward",
-                found="poses by which no two cameras agree on their people",
-                todo=f"They agree if {why}.",
-            )
-    known = detections.keypoints[np.isfinite(detections.confidence)]
-    for scale in _SCALES:
-        sizes = {n: np.rint(scale * np.array(c.image_size)) for n, c in cameras.items()}
-        if not len(known) or (known.max(axis=0) > np.min([*sizes.values()], axis=0)).any():
-            continue
-        other = {
-            name: scaled(camera, scale, (int(sizes[name][0]), int(sizes[name][1])))
-            for name, camera in cameras.items()
-        }
-        people = find_people(stack(other), detections, fps)
-        if people is not None and people.vertical.is_clear:
-            shown = " x ".join(str(length) for length in next(iter(other.values())).image_size)
-            said = f"the calibration is scaled by {scale:.5f}, to images of {shown} px: the people "
-            return other, stack(other), people, [said + "of the 2D poses agree at this size alone"]
-    return cameras, batch, None, []
 
 
 def move_cameras(motion: Similarity, cameras: Camera) -> Camera:
