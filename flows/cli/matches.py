@@ -88,8 +88,8 @@ def import_command(
             camera; by default, images and lenses are named after cameras.
         lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
             pickle, matrix and distortion as two .npy files, or TOML.
-        camera_data: Data of the broadcast camera in every frame: FreeD packets, or a table with
-            pan, tilt, roll [deg], x, y, z, and focal_px, fov, or focal_mm.
+        camera_data: Data of the broadcast camera in every frame: FreeD packets, also in a pcap, or
+            a table with pan, tilt, roll [deg], x, y, z, and focal_px, fov, or focal_mm.
         first_frame: With --camera-data: number in the video of its first frame.
         freed_camera: With --camera-data: FreeD's number of the camera.
         zoom_table: With --camera-data: focal lengths of the lens by FreeD's zoom counts (CSV).
