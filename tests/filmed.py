@@ -43,9 +43,9 @@ def write_filmed(folder, greys, clips, *, offsets=None):
             focal_px=(50.0, 50.0),
             principal_point_px=(31.5, 23.5),
             rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            translation=(0.0, 0.0, 5.0),
+            translation=(0.01 * n, 0.0, 5.0),
         )
-        for name in greys
+        for n, name in enumerate(greys)
     }
 
     def film(folder):

@@ -125,6 +125,11 @@ THOUSANDS: Final = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 DECIMAL_POINT: Final = re.compile(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?")
 
 
+def decimal_point(text: str) -> str:
+    """Return the text of a number with a point for its decimal comma."""
+    return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
+
+
 def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[str]]], bool]:
     """Return the rows of a table as spreadsheets save it, and whether it has decimal commas.
 

@@ -9,6 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
+from data_contracts.cameras import COEFFICIENTS
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
 from flows.cli.console import (
@@ -87,8 +88,8 @@ def import_command(
             camera; by default, images and lenses are named after cameras.
         lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's
             pickle, matrix and distortion as two .npy files, or TOML.
-        camera_data: Data of the broadcast camera in every frame: FreeD packets, or a table with
-            pan, tilt, roll [deg], x, y, z, and focal_px, fov, or focal_mm.
+        camera_data: Data of the broadcast camera in every frame: FreeD packets, also in a pcap, or
+            a table with pan, tilt, roll [deg], x, y, z, and focal_px, fov, or focal_mm.
         first_frame: With --camera-data: number in the video of its first frame.
         freed_camera: With --camera-data: FreeD's number of the camera.
         zoom_table: With --camera-data: focal lengths of the lens by FreeD's zoom counts (CSV).
@@ -133,9 +134,11 @@ def import_command(
 
         place = place_as_stated(unit, up)
     if kind == "--boxes" and boxes is not None:
-        counts = import_boxes(boxes, out)
+        changes: list[str] = []
+        counts = import_boxes(boxes, out, changes)
         lines = (f"wrote {out / 'boxes' / name}.txt: {n} boxes" for name, n in counts.items())
-        answer(as_json, {"folder": str(out), "boxes": counts}, *lines)
+        told = {"notes": changes} if changes else {}
+        answer(as_json, {"folder": str(out), "boxes": counts, **told}, *lines, *changes)
     elif kind == "--lens" and lens is not None:
         _import_lenses(lens, out, camera, as_json=as_json)
     elif kind == "--clicks" and clicks is not None:
@@ -257,7 +260,8 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json:
     for name, lens in lenses.items():
         x, y = lens.principal_point_px
         line(
-            f"{name}: focal length {lens.focal_px:.1f} px (standard deviation "
+            f"{name}: {lens.lens_model} lens ({', '.join(COEFFICIENTS[lens.lens_model])}), focal "
+            f"length {lens.focal_px:.1f} px (standard deviation "
             f"{lens.focal_std_px:.1f}), principal point {x:.1f}, {y:.1f} "
             f"({lens.principal_point_std_px:.1f}), the image's corner "
             f"{100 * lens.distortion_std:.2g} % of its distance; its pose comes from clicks"

@@ -137,7 +137,10 @@ def require_optics(
     focal: NDArray[np.float64],
     principal_point: NDArray[np.float64],
 ) -> None:
-    """Raise InputError for a focal length or principal point impossible at this image size."""
+    """Raise InputError for a focal length or principal point impossible at this image size.
+
+    A principal point in the middle of an image of the exchanged size shows that it is exchanged.
+    """
     # Maximum distance of the principal point from the image center, in longer sides [1].
     center_sizes = 10
     # Minimum and maximum focal length over the image's longer side [1]: a field of view of
@@ -158,6 +161,15 @@ def require_optics(
             expected=f"pixels within {center_sizes} image sizes of the image's centre",
             found=str(principal_point.tolist()),
             todo="Give it in pixels from the image's top-left corner.",
+        )
+    away = [float(np.abs(principal_point / each - 0.5).max()) for each in (size, size[::-1])]
+    if away[0] > 0.2 and away[1] < 0.1:
+        raise InputError(
+            f"{where}: size",
+            expected=f"width and height with the principal point {principal_point.tolist()} near "
+            "the middle",
+            found=f"width {size[0]:g} and height {size[1]:g}, which seem to be exchanged",
+            todo="Exchange them.",
         )
 
 
@@ -198,15 +210,13 @@ def index_by_name(
 
 
 def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
-    """Raise InputError if the poses of several cameras are all zero."""
-    if len(cameras) > 1 and all(
-        not any(camera.translation) and (np.array(camera.rotation) == np.eye(3)).all()
-        for camera in cameras.values()
-    ):
+    """Raise InputError if several cameras are all in one place."""
+    centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
+    if len(cameras) > 1 and np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max():
         raise InputError(
             f"{path}: translation",
             expected="the poses of the cameras",
-            found="zero in all: a calibration before the poses were found",
+            found="all cameras in one place: a calibration before the poses were found",
             todo="Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
             "cameras by clicks or by worldpose locate-cameras.",
         )

@@ -295,30 +295,8 @@ def _read_pickle(file: Path) -> dict[str, Any]:
         for key, value in content.items()
         if isinstance(key, str)
     }
-    image, matrix = table.get("imageSize"), table.get("intrinsicMat")
-    if isinstance(image, list) and len(image) == 2:
-        table["imageSize"] = image[::-1]
-        _require_order(file, image[::-1], matrix)
-    return table
-
-
-def _require_order(file: Path, size: list[Any], matrix: object) -> None:
-    """Raise InputError if the principal point shows that a file has the width before the height."""
-    try:
-        middle = np.array([matrix[0][2], matrix[1][2]], np.float64)  # type: ignore[index]
-        away = [
-            float(np.abs(middle / np.array(order, np.float64) - 0.5).max())
-            for order in (size, size[::-1])
-        ]
-    except (TypeError, ValueError, IndexError):
-        return  # `read_camera_table` names what is wrong
-    if away[0] > 0.2 and away[1] < 0.1:
-        raise InputError(
-            f"{file}: imageSize",
-            expected="height, then width, with the principal point near the middle",
-            found=f"{size[::-1]}, and the principal point {middle.tolist()}",
-            todo="Exchange them.",
-        )
+    image = table.get("imageSize")
+    return {**table, "imageSize": image[::-1] if isinstance(image, list) else image}
 
 
 def _downward(file: Path, table: Mapping[str, Any]) -> NDArray[np.float64]:

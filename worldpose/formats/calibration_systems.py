@@ -23,8 +23,8 @@ from worldpose.formats.calibration_files import (
     index_by_name,
 )
 from worldpose.formats.files import SETTINGS_BYTES, parse_xml, require_file
+from worldpose.parsing import decimal_point
 
-_COMMA: Final = re.compile(r"(?<=\d),(?=\d+$)")
 LENS_ERROR_PX: Final = 0.1
 """Maximum error of OpenCV's coefficients fitted to Vicon's lens, within the image [px]: a tenth of
 the error with which a detector finds a joint."""
@@ -99,7 +99,7 @@ def _parse(where: str, text: str | None, count: int) -> NDArray[np.float64]:
         raise calibration_error(where, "a number" if count == 1 else f"{count} numbers", "nothing")
     try:
         # Some systems write decimal commas.
-        values = np.array([float(_COMMA.sub(".", each)) for each in text.split()])
+        values = np.array([float(decimal_point(each)) for each in text.split()])
     except ValueError as error:
         raise calibration_error(where, "numbers", f"{text!r:.60}") from error
     if len(values) != count:
@@ -163,7 +163,7 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
 
     left, top, right, bottom = read("fov_video", ("left", "top", "right", "bottom"))
     skew = parts["intrinsic"].get("skew", "0")
-    if skew.strip("0.+-") != "":
+    if _parse(f"{where}.intrinsic.skew", skew, 1)[0] != 0.0:
         raise calibration_error(f"{where}.intrinsic.skew", "0", repr(skew))
     axes = read("transform", [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]).reshape(3, 3)
     center = MILLIMETRE * read("transform", "xyz")

@@ -1,4 +1,4 @@
-"""Check of the unit of length of a calibration, by the distances of its cameras."""
+"""Unit of length of a calibration, by the distances of its cameras, and size of its images."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
@@ -41,4 +42,22 @@ def require_metres(
         if distance < nearest_m
         else "Divide the positions by 1000 if they are in millimetres (worldpose import --unit "
         "mm).",
+    )
+
+
+def scaled(
+    camera: CameraCalibration,
+    scale: float,
+    image_size: tuple[int, int],
+    bar: NDArray[np.float64] | float = 0.0,
+) -> CameraCalibration:
+    """Return a camera in images `scale` times as large, perhaps with black bars (2,) [px]."""
+    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
+    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
+    return camera.model_copy(
+        update={
+            "image_size": image_size,
+            "focal_px": tuple(scale * focal for focal in camera.focal_px),
+            "principal_point_px": tuple(middle.tolist()),
+        }
     )

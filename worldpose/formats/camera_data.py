@@ -1,5 +1,8 @@
 """Camera data of broadcast tracking systems: FreeD packets, and tables with a row per image.
 
+FreeD packets stand one after another, or in a capture of a network (pcap or pcapng), which has
+their times.
+
 FreeD's conventions hold for all forms: a right-handed world with z up; pan from the y axis
 clockwise as seen from above, tilt upwards, roll clockwise as seen from behind the camera.
 """
@@ -7,7 +10,8 @@ clockwise as seen from above, tilt upwards, roll clockwise as seen from behind t
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -22,6 +26,8 @@ from worldpose.parsing import read_cells
 
 _BYTES: Final = 1 << 26
 """Maximum size of a file [byte]: twelve hours of packets at 50 Hz."""
+_LENGTH: Final = 29
+"""Length of a FreeD packet with a camera's position, of type D1 [byte]."""
 COLUMNS: Final = (
     *("pan", "tilt", "roll", "x_m", "y_m", "z_m", "focal_px", "k1", "k2", "zoom"),
     *("cx_px", "cy_px"),
@@ -63,8 +69,8 @@ def read_camera_data(
     """Return the camera data of a file.
 
     Args:
-        path: FreeD packets one after another, or a table (CSV, TSV).
-        fps: images per second of the video, for time codes.
+        path: FreeD packets one after another, or in a capture (pcap), or a table (CSV, TSV).
+        fps: images per second of the video, for time codes and the times of captures.
         size: width and height of the image [px], for fields of view.
         first: number in the video of the first row; None = the table's number, else 0.
         number: FreeD's number of the camera; -1 = there is only one.
@@ -76,8 +82,12 @@ def read_camera_data(
     content = b""
     if path.is_file() and path.stat().st_size <= _BYTES:
         content = path.read_bytes()
-    is_freed = content.startswith(b"\xd1")
-    data = _read_freed(path, content, number) if is_freed else _read_table(path, fps, size)
+    if content.startswith(b"\xd1"):
+        data = _read_freed(path, content, number)
+    elif content[:4] in (*_CAPTURES, _BLOCKS):
+        data = _read_capture(path, content, number, fps)
+    else:
+        data = _read_table(path, fps, size)
     frame = data.frame if first is None else data.frame - data.frame[0] + first
     falls = np.flatnonzero(np.diff(frame) <= 0)
     if len(falls):
@@ -101,12 +111,11 @@ def _read_freed(path: Path, content: bytes, number: int) -> CameraData:
 
     Angles are signed 24-bit numbers of 1/32768 degree, positions of 1/64 mm. Zoom is a count.
     """
-    length = 29  # of a packet with a camera's position (type D1)
-    packets = [content[at : at + length] for at in range(0, len(content), length)]
+    packets = [content[at : at + _LENGTH] for at in range(0, len(content), _LENGTH)]
     for count, packet in enumerate(packets, 1):
-        checksum = (0x40 - sum(packet[:-1])) % 256
-        if len(packet) < length or packet[0] != 0xD1 or packet[-1] != checksum:
-            expected = f"{length} bytes of type D1 with the checksum {checksum:02X}"
+        if not _is_freed(packet):
+            checksum = (0x40 - sum(packet[:-1])) % 256
+            expected = f"{_LENGTH} bytes of type D1 with the checksum {checksum:02X}"
             found = f"{len(packet)} bytes of type {packet[0]:02X} with {packet[-1]:02X}"
             todo = "Cut the packet out, or record them again."
             raise _wrong(f"{path}: packet {count}", expected, found, todo)
@@ -117,7 +126,7 @@ def _read_freed(path: Path, content: bytes, number: int) -> CameraData:
         todo = "Name the camera by --freed-camera NUMBER."
         raise _wrong(str(path), expected, ", ".join(counts), todo)
     kept = [packet for packet, own in zip(packets, ids, strict=True) if number in (-1, own)]
-    raw = np.frombuffer(b"".join(kept), np.uint8).reshape(-1, length)[:, 2:23].astype(np.int64)
+    raw = np.frombuffer(b"".join(kept), np.uint8).reshape(-1, _LENGTH)[:, 2:23].astype(np.int64)
     counts_24 = raw.reshape(-1, 7, 3) @ np.array([65536, 256, 1])
     signed = counts_24 - (counts_24 >= 1 << 23) * (1 << 24)
     values = np.full((len(raw), len(COLUMNS)), np.nan)
@@ -130,12 +139,82 @@ def _read_freed(path: Path, content: bytes, number: int) -> CameraData:
     return CameraData(np.arange(len(raw)), values, tuple(notes))
 
 
+_CAPTURES: Final = {
+    bytes.fromhex("d4c3b2a1"): ("<", 1e-6),
+    bytes.fromhex("a1b2c3d4"): (">", 1e-6),
+    bytes.fromhex("4d3cb2a1"): ("<", 1e-9),
+    bytes.fromhex("a1b23c4d"): (">", 1e-9),
+}
+"""Order of bytes and unit of times [s] of pcap, by its first bytes."""
+_BLOCKS: Final = bytes.fromhex("0a0d0d0a")
+"""First bytes of pcapng."""
+
+
+def _read_capture(path: Path, content: bytes, number: int, fps: float) -> CameraData:
+    """Return the camera data of a network's capture, at the frames of the packets' times.
+
+    The frames of the network that end in a FreeD packet count, whatever they are wrapped in; of
+    several packets at one frame of the video the nearest counts.
+    """
+    try:
+        found = list(_blocks(content) if content[:4] == _BLOCKS else _records(content))
+    except struct.error as error:
+        raise _wrong(str(path), "a whole capture", str(error), "Record it again.") from error
+    packets = [(time, data[-_LENGTH:]) for time, data in found if _is_freed(data[-_LENGTH:])]
+    if not packets:
+        todo = "Capture the port of the tracking system: tcpdump -w FILE udp port NUMBER."
+        raise _wrong(str(path), "FreeD packets (D1)", f"none in {len(found)} frames", todo)
+    data = _read_freed(path, b"".join(packet for _, packet in packets), number)
+    times = np.array([time for time, packet in packets if number in (-1, packet[1])])
+    exact = (times - times[0]) * fps
+    slot = np.rint(exact).astype(np.int64)
+    order = np.lexsort((np.abs(exact - slot), slot))
+    frame, first = np.unique(slot[order], return_index=True)
+    note = f"{len(times)} packets by the capture's times; the first is frame 0 of the video"
+    return CameraData(frame, data.values[order[first]], (COUNTS, note, *data.notes[2:]))
+
+
+def _is_freed(packet: bytes) -> bool:
+    return len(packet) == _LENGTH and packet[0] == 0xD1 and sum(packet) % 256 == 0x40
+
+
+def _records(content: bytes) -> Iterator[tuple[float, bytes]]:
+    """Yield times [s] and frames of the network of a pcap file."""
+    order, unit = _CAPTURES[content[:4]]
+    at = 24
+    while at < len(content):
+        seconds, parts, length, _ = struct.unpack_from(f"{order}4I", content, at)
+        if at + 16 + length > len(content):
+            raise struct.error("it ends within a packet")
+        yield seconds + unit * parts, content[at + 16 : at + 16 + length]
+        at += 16 + length
+
+
+def _blocks(content: bytes) -> Iterator[tuple[float, bytes]]:
+    """Yield times [s] and frames of the network of a pcapng file."""
+    at, units = 0, []
+    order = "<" if content[8:12] == bytes.fromhex("4d3c2b1a") else ">"
+    while at < len(content):
+        kind, size = struct.unpack_from(f"{order}2I", content, at)
+        if size < 12 or at + size > len(content):
+            raise struct.error(f"a block of {size} bytes at byte {at} of {len(content)}")
+        if kind == 1:  # an interface; its option 9 is the resolution of times
+            step = re.match(rb"(?s)(?:.{4})*?(?:\x09\0\x01\0|\0\x09\0\x01)(.)", content[at + 16 :])
+            power = step[1][0] if step and at + 16 + step.end() <= at + size else 6
+            units.append(2.0 ** -(power & 127) if power & 128 else 10.0**-power)
+        elif kind == 6:  # a packet
+            which, high, low, length = struct.unpack_from(f"{order}4I", content, at + 8)
+            yield units[which] * (high * 2**32 + low), content[at + 28 : at + 28 + length]
+        at += size
+
+
 _TITLES: Final[Mapping[str, str]] = {
     **{"frame_number": "frame", "frame_no": "frame", "tc": "timecode", "time_code": "timecode"},
     **{"focal_length_px": "focal_px", "focal_length_mm": "focal_mm", "vfov": "fov_y"},
-    **{"fov_x": "fov", "hfov": "fov", "fov_h": "fov", "fov_v": "fov_y"},
+    **dict.fromkeys(("fov_x", "hfov", "fov_h", "fovx", "fov_horizontal", "horizontal_fov"), "fov"),
+    **dict.fromkeys(("fov_v", "fovy", "fov_vertical", "vertical_fov"), "fov_y"),
 }
-"""Other names of columns; `_deg` may follow those of angles, and a unit of length x, y, z."""
+"""Other names of columns; `_deg` or `_rad` may follow those of angles, a unit of length x, y, z."""
 _KNOWN: Final = {
     *("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y"),
 }
@@ -152,8 +231,10 @@ def _read_columns(
     codes, left_out = [], []
     for place, title in enumerate(rows[0][1] if rows else ()):
         text = re.sub(r"[^a-z0-9]+", "_", title.lower()).strip("_").removesuffix("_deg")
-        axis = re.fullmatch(r"(?:pos_|position_)?([xyz])(?:_([a-z]+))?", text)
+        axis = re.fullmatch(r"(?:pos_?|position_?)?([xyz])(?:_([a-z]+))?", text)
         factor = _METRES.get(axis[2] or "", 0.0) if axis else 1.0
+        if text.endswith("_rad"):
+            text, factor = text.removesuffix("_rad"), float(np.degrees(1.0))
         name = f"{axis[1]}_m" if axis and factor else _TITLES.get(text, text)
         cells = [row[place].strip() if place < len(row) else "" for _, row in rows[1:]]
         where = f"{path}: column {title}"

@@ -6,17 +6,16 @@ perhaps COCO's visibility 0, 1, 2) and 0 means missing; `bbox` or `box` (x y wid
 each frame, people keep the file's order. AlphaPose and detectors of COCO write this form;
 `worldpose.formats.pose_forms` brings that of others into it.
 
-The frame is a whole `image_id`, or the last number in an `image_id` that is a file's name. In a
-data set it is the last number in the `file_name` of the image. `worldpose.formats.keypoint_sets`
-says how the points are told.
+The frame is a whole `image_id`, or the number in an `image_id` that is a file's name
+(`frame_numbers`). In a data set it is that in the `file_name` of the image, or the image's
+`frame_id`. `worldpose.formats.keypoint_sets` says how the points are told.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -32,6 +31,7 @@ from worldpose.formats.keypoint_sets import (
     MAX_CONFIDENCE,
     PeopleFile,
     clean_points,
+    frame_numbers,
     order_by_names,
     order_by_points,
     people_by_frame,
@@ -42,7 +42,6 @@ from worldpose.formats.pose_forms import plain_entries
 BATCH: Final = 4096
 """Results per batch of Python objects."""
 
-_NUMBER: Final = re.compile(r"[A-Za-z]*(\d{1,18})")
 _POINTS: Final = "x, y, confidence of each point"
 _COUNT_TODO: Final = "Export all points, and 0, 0, 0 where one is missing."
 _CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 0 is missing."
@@ -67,13 +66,16 @@ def read_coco_results(path: Path) -> PeopleFile:
     keep = ("images", "categories", "meta_info")
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
     entries = plain_entries(str(path), items)
-    batches = [_read_batch(path, results, first) for first, results in _batches(path, entries)]
+    batches = [
+        _read_batch(path, _with_points(results) if items.is_mapping else results, first)
+        for first, results in _batches(path, entries)
+    ]
     if not items.has_list:
         raise InputError(
             str(path),
             expected="a list of COCO keypoint results, a COCO data set with `annotations`, or the "
             "results of MMPose or Ultralytics",
-            found=_shorten(items.other),
+            found=_shorten(items.other or ", ".join(items.seen)),
             todo="Export the poses as COCO keypoint results.",
         )
     found = _join(path, batches)
@@ -136,6 +138,13 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
         yield index + 1 - len(batch), batch
 
 
+def _with_points(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return annotations of a data set, those without points, such as of the ball, as nobody."""
+    sizes = [len(given) for each in results if isinstance(given := each.get("keypoints"), list)]
+    nobody = {"keypoints": [0.0] * max(sizes, default=51), "bbox": None, "box": None}
+    return [each if each.get("keypoints") else {**each, **nobody} for each in results]
+
+
 def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:
     max_points = 1000  # maximum points of a person
     images = _images(path, results, first)
@@ -168,51 +177,51 @@ def _images(path: Path, results: list[dict[str, Any]], first: int) -> list[int |
 
 def _frames(path: Path, images: Sequence[int | str], listed: object) -> NDArray[np.int64]:
     """Return the frame of each result from its image's id, or from the images of the data set."""
+    is_set = isinstance(listed, list) and bool(listed)
     frame_of: dict[Any, int] = {}
     if isinstance(listed, list) and listed:
-        frame_of = _listed_frames(path, listed)
+        frame_of |= _listed_frames(path, listed)
+    else:
+        frame_of |= frame_numbers(image for image in images if isinstance(image, str))
+        _require_distinct(path, "image_id", frame_of)
     frames = np.empty(len(images), np.int64)
     for index, image in enumerate(images):
-        frame = frame_of.get(image) if frame_of else image if type(image) is int else None
-        if frame is None and not frame_of:
-            frame = _last_number(str(image))
-        if frame is None:
-            what = "an id of `images`" if frame_of else "a number in the name of the image"
-            raise _result_error(path, index, "image_id", what, _shorten(image), _NUMBER_TODO)
-        if frame > FRAME_LIMIT:
-            what = f"the frame, a whole number from 0 to {FRAME_LIMIT}"
-            todo = "Write the number of the picture in the video as image_id."
-            raise _result_error(path, index, "image_id", what, _shorten(image), todo)
+        frame = frame_of.get(image, None if is_set or isinstance(image, str) else image)
+        if frame is None or frame > FRAME_LIMIT:
+            what = "an id of `images`" if is_set else "a number in the name of the image"
+            if frame is not None:
+                what = f"a frame from 0 to {FRAME_LIMIT}, in file_name where there are `images`"
+            found = _shorten(image if frame in (None, image) else f"{image}, frame {frame}")
+            raise _result_error(path, index, "image_id", what, found, _NUMBER_TODO)
         frames[index] = frame
     return frames
 
 
-def _listed_frames(path: Path, listed: Sequence[Any]) -> dict[Any, int]:
-    """Return the frame of each image of a data set: the last number in its file's name."""
-    frames: dict[Any, int] = {}
-    for index, image in enumerate(listed):
-        name = image.get("file_name") if isinstance(image, dict) else None
-        number = _last_number(name) if isinstance(name, str) else None
-        where = f"{path}: images[{index}]"
+def _listed_frames(path: Path, listed: Sequence[Any]) -> dict[int | str, int]:
+    """Return the frame of each image of a data set: that of its file's name, or its `frame_id`."""
+    names = [image.get("file_name") if isinstance(image, dict) else None for image in listed]
+    number_of = frame_numbers(name for name in names if isinstance(name, str))
+    frames: dict[int | str, int] = {}
+    for index, (image, name) in enumerate(zip(listed, names, strict=True)):
+        number = number_of.get(str(name))
+        if number is None and isinstance(image, dict) and type(image.get("frame_id")) is int:
+            number = image["frame_id"]
         if number is None or type(image.get("id")) not in (int, str):
-            raise _wrong(where, "an id, and file_name with the frame's number", _shorten(name))
+            expected = "an id, and the frame's number in file_name or frame_id"
+            raise _wrong(f"{path}: images[{index}]", expected, _shorten(name))
         frames[image["id"]] = number
-    if len(set(frames.values())) < len(listed):
-        found = f"{len(listed)} images with {len(set(frames.values()))} numbers"
-        raise _wrong(f"{path}: images", "file_names of one camera whose last numbers differ", found)
+    _require_distinct(path, "images", frames, len(listed))
     return frames
 
 
-def _last_number(name: str) -> int | None:
-    """Return the last number in the name of a file, without its folders and ending.
-
-    A part that mixes letters and digits, such as 1080p or a digest, is no number; `frame12` is 12.
-    Roboflow puts a digest after the name: `frame_12_jpg.rf.3fa9`.
-    """
-    stem = PureWindowsPath(name).stem.partition(".rf.")[0]
-    parts = re.split(r"[^A-Za-z0-9]+", stem)
-    numbers = [found[1] for part in parts if (found := _NUMBER.fullmatch(part))]
-    return int(numbers[-1]) if numbers else None
+def _require_distinct(
+    path: Path, key: str, frames: Mapping[Any, int], count: int | None = None
+) -> None:
+    """Raise InputError if several pictures have one frame: they are of several cameras."""
+    count = len(frames) if count is None else count
+    if len(set(frames.values())) < count:
+        found = f"{count} images with {len(set(frames.values()))} numbers"
+        raise _wrong(f"{path}: {key}", "names of one camera's images whose numbers differ", found)
 
 
 def _point_names(path: Path, categories: object) -> list[str]:
@@ -301,8 +310,9 @@ def _optional(
     given = [index for index, result in enumerate(results) if result.get(key) is not None]
     values = np.full((len(results), width), np.nan)
     table = _table(path, results, given, key, width, first)
-    # The last two of a box are its size; neither they nor a score can be negative.
+    # The last two of a box are its size; neither they nor a score can be negative. NaN is absent.
     fits = (np.abs(table) <= COORDINATE_LIMIT).all(axis=1) & (table[:, -2:] >= 0).all(axis=1)
+    fits |= np.isnan(table).all(axis=1)
     if not np.all(fits):
         row = int(np.argmin(fits))
         what = "a finite score from 0" if key == "score" else "x, y, width and height [px]"

@@ -23,6 +23,7 @@ from worldpose.formats.keypoint_sets import (
     SIZES,
     PeopleFile,
     clean_points,
+    frame_numbers,
     order_by_points,
     people_by_frame,
 )
@@ -33,13 +34,12 @@ KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypo
 """Of OpenPose's version 1 and later, of its versions 0, and of other programs."""
 BOX_COLUMNS: Final = range(6, 11)
 """Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9."""
-_NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
 
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     """Return the people of one camera; `worldpose.formats.keypoint_sets` tells their points.
 
-    The last number in a file's name is its frame. An empty file is a frame without people.
+    `frame_numbers` finds the frame in a file's name. An empty file is a frame without people.
 
     Args:
         folder: holds a JSON file for each frame.
@@ -73,24 +73,25 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
 
 
 def _frame_files(folder: Path) -> dict[int, Path]:
+    there = {file.name: file for file in sorted(folder.glob("*.[jJ][sS][oO][nN]"))}
+    numbers = frame_numbers(there)
     files: dict[int, Path] = {}
-    for file in sorted(folder.glob("*.[jJ][sS][oO][nN]")):
-        number = _NUMBER.search(file.name)
-        if number is None or int(number[1]) > FRAME_LIMIT:
+    for name, file in there.items():
+        if numbers.get(name, FRAME_LIMIT + 1) > FRAME_LIMIT:
             raise InputError(
                 str(file),
-                expected=f"a frame number up to {FRAME_LIMIT} at the end of the name",
-                found=file.name,
+                expected=f"a frame number up to {FRAME_LIMIT} in the name",
+                found=name,
                 todo="Name it as cam01_000012.json, or move it elsewhere.",
             )
-        if int(number[1]) in files:
+        if numbers[name] in files:
             raise InputError(
                 str(file),
                 expected="one file per frame",
-                found=f"{files[int(number[1])].name} with the same frame number",
+                found=f"{files[numbers[name]].name} with the same frame number",
                 todo="Keep the poses of one camera and one estimator in a folder.",
             )
-        files[int(number[1])] = file
+        files[numbers[name]] = file
     if not files:
         raise InputError(
             str(folder),
@@ -159,6 +160,8 @@ class GivenBoxes(NamedTuple):
     """(boxes, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel."""
     score: NDArray[np.float64]
     """(boxes,) in (0, 1]."""
+    changes: tuple[str, ...] = ()
+    """What was changed or left out, with its number."""
 
 
 def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
@@ -167,7 +170,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and, in truth
     of nine numbers, the class, of which 1 is a person. Frames begin at 1, and (1, 1) is the upper
-    left corner of the image.
+    left corner of the image. Trackers follow people out of the image: such boxes are left out.
 
     Args:
         file: the text.
@@ -176,8 +179,8 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     Raises:
         InputError: the file is unreadable or empty, a line has no such numbers, a frame that the
-            video lacks, an id twice in a frame, an empty box, a box outside of the image, or an
-            impossible confidence; the error names the line.
+            video lacks, an id twice in a frame, an empty box, an impossible confidence, or most
+            boxes are outside of the image; the error names the line.
     """
     if file.suffix == ".npy":
         return _read_identified(file, frames)
@@ -194,7 +197,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     order = np.lexsort((np.arange(len(rows)), person, frame))
     again = np.zeros(len(rows), np.bool_)
     again[order[1:]] = (pairs[order[1:]] == pairs[order[:-1]]).all(axis=1)
-    far = np.array(size) - 0.5
+    outside = ((boxes[:, :2] >= np.array(size) - 0.5) | (boxes[:, 2:] <= -0.5)).any(axis=1)
     most = f"a frame from 1 to {frames}, as many as the video has"
     for wrong, key, expected in (
         (~np.isfinite(rows).all(axis=1), "", "finite numbers"),
@@ -204,12 +207,12 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
         (again & kept & (person >= 0), "id", "each id once in a frame"),
         ((box[:, 2:] <= 0.0).any(axis=1), "width, height", "more than 0 px"),
         (
-            kept & ((boxes[:, :2] >= far) | (boxes[:, 2:] <= -0.5)).any(axis=1),
+            outside & (outside.mean() > 0.5),
             "left, top, width, height",
-            f"a box in the image of {size[0]} x {size[1]} px",
+            f"a box in the image of {size[0]} x {size[1]} px, as most should be",
         ),
         (
-            (score > 1.0) | ((score < 0.0) & (score != -1.0)),
+            (score > MAX_CONFIDENCE) | ((score < 0.0) & (score != -1.0)),
             "confidence",
             "0 to 1, or -1",
         ),
@@ -223,12 +226,18 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
                 found=f"{text!r:.80}",
                 todo="Correct the file, or write it again.",
             )
+    changes = {
+        "outside of the image, which are left out": int((kept & outside).sum()),
+        "of a confidence above 1, which counts as 1": int((kept & (score > 1.0)).sum()),
+    }
+    kept &= ~outside
     chosen = order[kept[order]]
     return GivenBoxes(
         frame[chosen].astype(np.int64) - 1,
         np.maximum(person[chosen].astype(np.int64), -1),
         boxes[chosen],
-        np.where(score[chosen] == -1.0, 1.0, score[chosen]),
+        np.where(score[chosen] == -1.0, 1.0, np.minimum(score[chosen], 1.0)),
+        tuple(f"{count} boxes {what}" for what, count in changes.items() if count),
     )
 
 

@@ -172,6 +172,8 @@ def read_text(path: Path, limit: int) -> str:
 
 def _parse(where: str, form: str, parse: Callable[[str], Any], text: str) -> Any:  # noqa: ANN401
     try:
+        if form == "JSON" and not text.strip():
+            raise ValueError("an empty file")
         return parse(text)
     except RecursionError as error:
         raise InputError(
@@ -275,6 +277,7 @@ class JsonItems:
         other: value in place of the list, None if there is no value or the list.
         has_list: whether the file has the list; set when iteration ends.
         kept: values of the other keys to keep; filled while iterating.
+        seen: keys of the mapping; filled while iterating.
     """
 
     def __init__(
@@ -299,6 +302,7 @@ class JsonItems:
         self.other: Any = None
         self.keep = frozenset(keep)
         self.kept: dict[str, Any] = {}
+        self.seen: list[str] = []
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the entries.
@@ -332,10 +336,12 @@ class JsonItems:
         elif text.ahead() == "{":
             self.is_mapping = True
             yield from self._read_mapping(text)
-        else:
+        elif text.ahead():
             self.other = text.value()
+        else:
+            raise text.error("an empty file")
         if text.ahead():
-            raise text.error("Extra data")
+            raise text.error("something after the end of the list: several lists or mappings")
 
     def _read_mapping(self, text: _Text) -> Iterator[Any]:
         text.take("{")
@@ -344,6 +350,7 @@ class JsonItems:
             if name is None:
                 raise text.error("Expecting property name enclosed in double quotes")
             text.take(":")
+            self.seen.append(name)
             if name in self.keep:
                 is_list = text.ahead() == "["
                 self.kept[name] = list(_read_list(text)) if is_list else text.value()

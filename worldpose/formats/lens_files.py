@@ -31,12 +31,16 @@ from worldpose.parsing import read_npy
 
 MATRIX_NAMES: Final = (
     *("camera_matrix", "cameraMatrix", "Camera_Matrix", "camMatrix", "mtx", "K", "matrix"),
-    *("Intrinsics", "intrinsicMat", "intrinsic_matrix", "intrinsics"),
+    *("Intrinsics", "intrinsicMat", "intrinsic_matrix", "intrinsics", "k"),
 )
 DISTORTION_NAMES: Final = (
     *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs"),
     *("dist_coefs", "dist_coeff", "distCoef", "distCoeff", "dist", "distortions", "distortion"),
-    *("distortion_coeffs", "Distortion", "D"),
+    *("distortion_coeffs", "Distortion", "D", "d"),
+)
+SIZE_NAMES: Final = (
+    *(("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height")),
+    *(("image_size",), ("size",), ("imageSize",), ("resolution",), ("img_size",), ("w", "h")),
 )
 MODEL_NAMES: Final = ("distortion_model", "lens_model", "model_type", "fisheye_model", "fisheye")
 FISHEYE_WORDS: Final = (
@@ -94,10 +98,11 @@ def read_lenses(
         matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
-    size = _image_size(given, sizes[camera])
+    if "xi" in given:
+        raise calibration_error(f"{where}: xi", "a pinhole or fisheye lens", "that of cv2.omnidir")
     table = {
-        "size": list(size),
-        "matrix": matrix.tolist(),
+        "size": list(_image_size(given, sizes[camera])),
+        "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
         "distortions": distortion.tolist(),
         "fisheye": _is_fisheye(where, given),
     }
@@ -330,13 +335,10 @@ def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
 
 def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
     """Return the image size in a file, or the camera's own if the file has none."""
-    for wide, high in (("image_width", "image_height"), ("image_Width", "image_Height")):
-        if wide in given and high in given:
-            return int(given[wide]), int(given[high])
-    for name in ("image_size", "size", "imageSize"):
-        if name in given and np.size(given[name]) == 2:
-            width, height = np.ravel(given[name]).tolist()
-            return int(width), int(height)
+    for names in SIZE_NAMES:
+        values = np.concatenate([np.ravel(given.get(name, ())) for name in names])
+        if len(values) == 2:
+            return int(values[0]), int(values[1])
     return otherwise
 
 

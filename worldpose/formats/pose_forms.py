@@ -53,7 +53,19 @@ def plain_entries(where: str, items: Iterable[Any]) -> Iterator[Any]:
                 "is named after the camera.",
             )
         else:
-            yield item
+            yield item if not _is_nested(content) else {**content, **_flat(content)}
+
+
+def _is_nested(person: Any) -> bool:  # noqa: ANN401
+    """Return whether a person's points are a list of x, y, confidence for each."""
+    given = person.get("keypoints") if isinstance(person, dict) else None
+    if not isinstance(given, list) or not given:
+        return False
+    return all(isinstance(at, list) and len(at) == 3 for at in given)
+
+
+def _flat(person: dict[str, Any]) -> dict[str, Any]:
+    return {"keypoints": [value for at in person["keypoints"] for value in at]}
 
 
 def _parse(item: Any) -> Any:  # noqa: ANN401
@@ -89,7 +101,7 @@ def plain_person(person: Any) -> dict[str, Any] | None:  # noqa: ANN401
     Lists of different lengths, and values of another type, stay for the reader to refuse.
     """
     if not isinstance(person, dict) or not _is_other(person):
-        return None
+        return _flat(person) if _is_nested(person) else None
     given = person.get("keypoints")
     if isinstance(given, dict):
         told = given.get("visible")

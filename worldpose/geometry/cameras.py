@@ -176,14 +176,19 @@ class Camera:
         )
 
     @classmethod
-    def from_calibration(cls, calibration: CameraCalibration) -> Camera:
+    def from_calibration(cls, calibration: CameraCalibration, where: str | None = None) -> Camera:
         """Return the camera of a record, its rotation replaced by the nearest exact one.
 
+        Args:
+            calibration: the record.
+            where: its place, for messages; None = the camera's id.
+
         Raises:
-            InputError: a focal length or the image size is not positive, or the rotation is not
-                orthonormal with determinant 1 within what six decimals allow.
+            InputError: a focal length or the image size is not positive, the rotation is not
+                orthonormal with determinant 1 within what six decimals allow, or the lens folds
+                within the image (`require_rays`).
         """
-        where = f"camera {calibration.id}"
+        where = f"camera {calibration.id}" if where is None else where
         if min(*calibration.focal_px, *calibration.image_size) <= 0:
             raise InputError(
                 where,
@@ -193,7 +198,7 @@ class Camera:
             )
         rotation = nearest_rotation(f"{where}: rotation", calibration.rotation)
         model = LensModel.named(calibration.lens_model)
-        return cls(
+        camera = cls(
             focal=np.array(calibration.focal_px),
             principal_point=np.array(calibration.principal_point_px),
             distortion=_spread_coefficients(where, calibration.distortion, model),
@@ -201,6 +206,8 @@ class Camera:
             image_size=np.array(calibration.image_size, dtype=np.int64),
             lens_model=model,
         )
+        camera.require_rays(where)
+        return camera
 
     @classmethod
     def from_lens(cls, lens: LensCalibration, image_size: ArrayLike | None = None) -> Camera:
@@ -364,6 +371,35 @@ class Camera:
         batch, cameras, points = self._flat("Camera.normalize: points_image", points_image, 2)
         plane, _ = _normalize(cameras, points)
         return plane.reshape((*batch, *plane.shape[1:]))
+
+    def image_grid(self) -> Floats:
+        """Return 41 by 41 pixels (1681, 2) over a single camera's image, with its border."""
+        width, height = (np.linspace(-0.5, length - 0.5, 41) for length in self.image_size)
+        return np.stack(np.meshgrid(width, height), axis=-1).reshape(-1, 2)
+
+    def blind_share(self) -> float:
+        """Return the share of a single camera's image without rays: its lens folds before it."""
+        # The image of a fisheye may be a circle with black around it.
+        if not np.isfinite(self.numbers[21]) or self.lens_model == LensModel.FISHEYE:
+            return 0.0
+        return float(np.isnan(self.normalize(self.image_grid())[:, 0]).mean())
+
+    def require_rays(self, where: str) -> None:
+        """Raise InputError if a single camera's lens folds well within the image.
+
+        There two directions have one pixel, or a pixel has none: no lens does so, but a polynomial
+        does, far from the points to which it was fitted.
+        """
+        most = 0.1  # share of the image without rays: the corners of many calibrations [1]
+        if (share := self.blind_share()) > most:
+            raise InputError(
+                f"{where}: distortion",
+                expected="a lens whose image radii grow up to the corners of the image",
+                found=f"{self.coefficients.tolist()}, by which {share:.0%} of the image has no "
+                "direction or two",
+                todo="Calibrate again with boards up to the corners, or with fewer coefficients "
+                "(k3 = 0), or with a fisheye's.",
+            )
 
     def _flat(
         self, where: str, points: ArrayLike, width: int

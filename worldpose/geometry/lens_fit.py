@@ -109,9 +109,7 @@ def refit_lens(
     not count. The new focal length starts at `stretch` times the old one, and places on the plane
     z = 1 are divided by it.
     """
-    width, height = (float(length) for length in camera.image_size)
-    across = np.meshgrid(np.linspace(-0.5, width - 0.5, 41), np.linspace(-0.5, height - 0.5, 41))
-    pixels = np.stack(across, axis=-1).reshape(-1, 2)
+    pixels = camera.image_grid()
     plane = camera.normalize(pixels)
     known = np.isfinite(plane).all(axis=1)
     lens = replace(camera, focal=stretch * camera.focal)

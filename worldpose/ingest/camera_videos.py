@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import Integers
+from data_contracts.arrays import Image, Integers
+from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import camera_id
+from worldpose.formats.calibration_unit import scaled
 from worldpose.ingest.footage import stretches
-from worldpose.video.folder import SUFFIXES
+from worldpose.video.folder import SUFFIXES, open_video
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 from worldpose.video.recordings import describe_video, join_videos
@@ -196,3 +199,80 @@ def copy_videos(files: Mapping[str, Path], folder: Path) -> None:
                 shutil.copyfile(image, target / image.name)
         else:
             shutil.copyfile(file, target)
+
+
+def fit_to_video(
+    file: Path,
+    camera: CameraCalibration,
+    index: FrameIndex,
+    notes: list[str],
+    *,
+    is_part: bool = False,
+) -> CameraCalibration:
+    """Return a camera in the pixels of its video, which may be resized, or have black bars.
+
+    Args:
+        file: the video.
+        camera: the camera in the calibrated pixels.
+        index: the video's frames.
+        notes: sentences for the user, to which a change is added.
+        is_part: whether a smaller video is the middle part of the image, as Vicon's video modes
+            are of the sensor to which the calibration belongs.
+
+    Raises:
+        InputError: the video is neither what was calibrated nor the same picture resized.
+    """
+    # Largest relative difference of two shapes of one picture [1]: sides are whole pixels.
+    same_shape = 0.002
+    if index.size == camera.image_size:
+        return camera
+    own, shown = np.array(camera.image_size), np.array(index.size)
+    if is_part and np.all(shown <= own):
+        corner = 0.5 * (own - shown)
+        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
+        middle = np.array(camera.principal_point_px) - corner
+        return camera.model_copy(
+            update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}
+        )
+    scale = float((shown / own).min())
+    bar = 0.5 * (shown - scale * own)
+    if (shown / own).max() > (1.0 + same_shape) * scale:
+        with open_video(file, index) as video:
+            if not _has_black_bars(video.frame(0), bar):
+                raise video_size_error(file, camera, index)
+    notes.append(
+        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
+            *camera.image_size
+        )
+        + f"the calibration is scaled by {scale:.5f}"
+        + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
+    )
+    return scaled(camera, scale, index.size, bar)
+
+
+def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
+    """Return whether a frame has black bars of a width on both sides of one axis, and no wider.
+
+    Args:
+        frame: (height, width, channels).
+        bar: their width along x and y [px], with a fraction.
+    """
+    # Largest mean brightness of a black bar [1, of 255]: the black of limited-range video.
+    max_black = 16.0
+    axis = int(bar.argmax())
+    width = int(bar[axis])
+    lines = frame.mean(axis=(axis, 2)).astype(np.float64)
+    black = np.concatenate([lines[:width], lines[len(lines) - width :]])
+    # The line next to a bar with a fraction is a mixture.
+    next_lines = [lines[width + 2], lines[-width - 3]]
+    return width > 0 and bool(black.max() < max_black and min(next_lines) > max_black)
+
+
+def video_size_error(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:
+    """Return the error of a video that has not the size of its calibration."""
+    return InputError(
+        str(file),
+        expected="{} x {} px, the size in the calibration".format(*camera.image_size),
+        found=f"{index.size[0]} x {index.size[1]}",
+        todo="Give the video that was calibrated, in its size: a crop has another principal point.",
+    )

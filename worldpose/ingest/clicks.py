@@ -20,6 +20,7 @@ from data_contracts.records import Record
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import (
+    IMAGE_NAME,
     SOCCERNET_MARKINGS,
     MarkedImage,
     read_marked_images,
@@ -168,7 +169,8 @@ def _assign_images(
         )
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
-        stem = PurePosixPath(image.name.replace("\\", "/")).stem
+        named = IMAGE_NAME.search(image.name)
+        stem = named[1] if named else PurePosixPath(image.name.replace("\\", "/")).stem
         # Label Studio puts eight digits before the name of an uploaded file.
         name = owner or (stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem))
         if name not in static or name in found:

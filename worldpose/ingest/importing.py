@@ -10,9 +10,7 @@ from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
@@ -27,6 +25,7 @@ from worldpose.ingest.camera_videos import (
     copy_videos,
     describe_videos,
     find_videos,
+    fit_to_video,
     require_cameras,
     shared_length,
 )
@@ -34,8 +33,8 @@ from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.registration import file_state, require_settled
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
-from worldpose.video.folder import index_video, open_video
-from worldpose.video.names import VIDEO_SUFFIXES
+from worldpose.video.folder import index_video
+from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 
 Placing: TypeAlias = Callable[
@@ -84,13 +83,14 @@ def import_match(
     read = {name: read_people(file) for name, file in files.items()}
     people = {name: found.people for name, found in read.items()}
     first, stop = find_people(detections, people)
-    sizes = {name: camera.image_size for name, camera in cameras.items()}
-    spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     for name, file in files.items():
         people[name] = on_frames(file, people[name], [(first, stop - first)])
     notes: list[str] = []
     if place is not None:
         cameras, notes = place(calibration, cameras, people, fps)
+    sizes = {name: camera.image_size for name, camera in cameras.items()}
+    notes += describe_outside(people, sizes)
+    spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec, notes + describe_left_out(left_out) + describe_people(read)
 
@@ -134,6 +134,25 @@ def describe_people(read: Mapping[str, PeopleFile]) -> list[str]:
     return notes + describe_changes(read)
 
 
+def describe_outside(
+    people: Mapping[str, KeypointDetections], sizes: Mapping[str, tuple[int, int]]
+) -> list[str]:
+    """Return a sentence about cameras many of whose keypoints are outside of their images."""
+    most = 0.02  # share of keypoints that detectors guess beyond the border [1]
+    shares = {}
+    for name, found in people.items():
+        known = found.keypoints[np.isfinite(found.confidence)]
+        off = (known < -0.5) | (known > np.array(sizes[name]) - 0.5)
+        shares[name] = float(off.any(axis=-1).mean()) if len(known) else 0.0
+    said = [f"{share:.0%} of {name}" for name, share in shares.items() if share > most]
+    if not said:
+        return []
+    return [
+        f"warning: keypoints are outside of the images of the calibration: {', '.join(said)}; are "
+        "they of images of another size, or of another camera?"
+    ]
+
+
 def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     """Return sentences about what was changed in cameras' 2D poses to read them."""
     notes = []
@@ -141,6 +160,9 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
         counts = {name: getattr(found.changes, key) for name, found in read.items()}
         if total := sum(counts.values()):
             notes.append(f"{what}: {total} ({', '.join(name for name in counts if counts[name])})")
+    steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
+    if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
+        notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
     return notes
 
 
@@ -204,6 +226,10 @@ def import_lenses(
                 found="one",
                 todo="Remove it there first.",
             )
+    from worldpose.geometry.cameras import Camera  # late: it loads the kernels
+
+    for name, lens in lenses.items():
+        Camera.from_lens(lens).require_rays(f"{files[0]}: {name}")
     with whole_file(target) as draft:
         write_lens_toml(draft, {**known, **lenses})
     return lenses
@@ -383,6 +409,9 @@ def _import_found(
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)
+    there = (file for file in sorted(folder.glob("[!.]*")) if file.is_file())
+    if others := [file.name for file in there if not is_video(file)]:
+        notes.append(f"left out, as they have no ending of a video: {', '.join(others):.200}")
     sizes = {name: index.size for name, index in indices.items()}
     count = shared_length(map(len, clocks.values()))
     spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)
@@ -393,7 +422,7 @@ def _import_found(
         copy_videos(files, match)
         require_settled({files[name]: states[files[name]] for name in files}, "import again")
         if boxes is not None:
-            copy_boxes(boxes, indices, match)
+            copy_boxes(boxes, indices, match, notes)
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
     return spec, notes
@@ -410,88 +439,3 @@ def _first_rate(files: Mapping[str, Path], indices: Mapping[str, FrameIndex]) ->
             todo="Add for example --fps 25.",
         )
     return round(rates[0], 3)
-
-
-def fit_to_video(
-    file: Path,
-    camera: CameraCalibration,
-    index: FrameIndex,
-    notes: list[str],
-    *,
-    is_part: bool = False,
-) -> CameraCalibration:
-    """Return a camera in the pixels of its video, which may be resized, or have black bars.
-
-    Args:
-        file: the video.
-        camera: the camera in the calibrated pixels.
-        index: the video's frames.
-        notes: sentences for the user, to which a change is added.
-        is_part: whether a smaller video is the middle part of the image, as Vicon's video modes
-            are of the sensor to which the calibration belongs.
-
-    Raises:
-        InputError: the video is neither what was calibrated nor the same picture resized.
-    """
-    # Largest relative difference of two shapes of one picture [1]: sides are whole pixels.
-    same_shape = 0.002
-    if index.size == camera.image_size:
-        return camera
-    own, shown = np.array(camera.image_size), np.array(index.size)
-    if is_part and np.all(shown <= own):
-        corner = 0.5 * (own - shown)
-        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
-        middle = np.array(camera.principal_point_px) - corner
-        return camera.model_copy(
-            update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}
-        )
-    scale = float((shown / own).min())
-    bar = 0.5 * (shown - scale * own)
-    if (shown / own).max() > (1.0 + same_shape) * scale:
-        with open_video(file, index) as video:
-            if not _has_black_bars(video.frame(0), bar):
-                raise video_size_error(file, camera, index)
-    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
-    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
-    notes.append(
-        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
-            *camera.image_size
-        )
-        + f"the calibration is scaled by {scale:.5f}"
-        + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
-    )
-    return camera.model_copy(
-        update={
-            "image_size": index.size,
-            "focal_px": tuple(scale * focal for focal in camera.focal_px),
-            "principal_point_px": tuple(middle.tolist()),
-        }
-    )
-
-
-def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
-    """Return whether a frame has black bars of a width on both sides of one axis, and no wider.
-
-    Args:
-        frame: (height, width, channels).
-        bar: their width along x and y [px], with a fraction.
-    """
-    # Largest mean brightness of a black bar [1, of 255]: the black of limited-range video.
-    max_black = 16.0
-    axis = int(bar.argmax())
-    width = int(bar[axis])
-    lines = frame.mean(axis=(axis, 2)).astype(np.float64)
-    black = np.concatenate([lines[:width], lines[len(lines) - width :]])
-    # The line next to a bar with a fraction is a mixture.
-    next_lines = [lines[width + 2], lines[-width - 3]]
-    return width > 0 and bool(black.max() < max_black and min(next_lines) > max_black)
-
-
-def video_size_error(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:
-    """Return the error of a video that has not the size of its calibration."""
-    return InputError(
-        str(file),
-        expected="{} x {} px, the size in the calibration".format(*camera.image_size),
-        found=f"{index.size[0]} x {index.size[1]}",
-        todo="Give the video that was calibrated, in its size: a crop has another principal point.",
-    )

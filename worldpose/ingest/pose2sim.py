@@ -25,6 +25,7 @@ from worldpose.ingest.camera_videos import (
     copy_videos,
     describe_videos,
     find_videos,
+    fit_to_video,
     require_cameras,
     shared_length,
 )
@@ -33,9 +34,9 @@ from worldpose.ingest.importing import (
     build_spec,
     camera_of,
     describe_left_out,
+    describe_outside,
     describe_people,
     find_people,
-    fit_to_video,
 )
 from worldpose.ingest.writing import write_match
 from worldpose.video.folder import index_video
@@ -140,7 +141,8 @@ def import_pose2sim(
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
-    return spec, notes + _describe_poses(folder, read)
+    sizes = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
+    return spec, notes + describe_outside(people, sizes) + _describe_poses(folder, read)
 
 
 def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:

@@ -247,12 +247,13 @@ def write_offsets(folder: Path, offsets: Mapping[str, ClockOffset]) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def import_boxes(boxes: Path, folder: Path) -> dict[str, int]:
+def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> dict[str, int]:
     """Copy boxes of people into a match folder; return the number of each camera or clip.
 
     Args:
         boxes: folder with `<camera>.txt` or `<clip>.txt` (`read_boxes`).
         folder: the match folder, with the videos.
+        notes: receives sentences about boxes that are left out or changed.
 
     Raises:
         InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
@@ -270,11 +271,14 @@ def import_boxes(boxes: Path, folder: Path) -> dict[str, int]:
         )
     asked = [file.stem for file in sorted(boxes.glob("*.txt"))]
     indices = {name: index_video(match.videos[name]) for name in asked if name in open_to}
-    return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder)
+    return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder, notes)
 
 
 def copy_boxes(
-    boxes: Path, indices: Mapping[str, FrameIndex | None], folder: Path
+    boxes: Path,
+    indices: Mapping[str, FrameIndex | None],
+    folder: Path,
+    notes: list[str] | None = None,
 ) -> dict[str, int]:
     """Check all files of boxes against the videos, then copy them; return their numbers.
 
@@ -282,6 +286,7 @@ def copy_boxes(
         boxes: folder with a file of boxes for some of the cameras.
         indices: frames of the video of each camera that may have boxes.
         folder: the match folder.
+        notes: as in `import_boxes`.
 
     Raises:
         InputError: there are no files, one of an unknown camera, or an invalid one.
@@ -300,7 +305,10 @@ def copy_boxes(
     for file in files:
         index = indices[file.stem]
         assert index is not None
-        counts[file.stem] = len(read_boxes(file, index.size, len(index)).frame)
+        read = read_boxes(file, index.size, len(index))
+        counts[file.stem] = len(read.frame)
+        if notes is not None:
+            notes += [f"{file.name}: {change}" for change in read.changes]
     (folder / "boxes").mkdir(exist_ok=True)
     for file in files:
         with whole_file(folder / "boxes" / file.name) as draft:

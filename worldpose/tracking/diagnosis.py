@@ -156,9 +156,13 @@ def _epipolar_angles(axis: Floats, p: Floats, q: Floats) -> Floats:
 
 
 def _joint_spreads(rays: Floats) -> Floats:
-    """Return root mean square angles (n,) of each detection's joints from their mean [rad]."""
+    """Return root mean square angles (n,) of each detection's joints from their mean [rad].
+
+    They are positive, also of joints that are all in one pixel.
+    """
     middle = np.nanmean(rays, axis=1, keepdims=True)
-    return np.asarray(np.sqrt(np.nanmean(((rays - middle) ** 2).sum(axis=-1), axis=1)))
+    spread = np.sqrt(np.nanmean(((rays - middle) ** 2).sum(axis=-1), axis=1))
+    return np.asarray(np.maximum(spread, 1e-9))
 
 
 def _locate_match(

@@ -33,6 +33,7 @@ from worldpose.tracking.vertical import (
     name_axis,
 )
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
+from worldpose.triangulation.other_readings import read_otherwise
 
 Placed: TypeAlias = tuple[dict[str, CameraCalibration], list[str]]
 LEVEL: Final = float(np.cos(np.radians(10.0)))
@@ -81,6 +82,18 @@ class Walkers(NamedTuple):
                 offset = (0.024 / (each.share * STATURE[0])) ** 2 * each.offsets
                 weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
         return float(np.average(found, weights=weight)) if found else np.nan
+
+    def nose_ahead(self, up: Floats) -> float:
+        """Return the share of poses with the nose ahead of the ears; NaN if too few have both.
+
+        Ahead is right of the line from the right to the left shoulder and hip, seen from above.
+        """
+        fewest = 20  # poses
+        j = self.joints
+        ahead = np.cross(j[:, :, 5] - j[:, :, 6] + j[:, :, 11] - j[:, :, 12], up)
+        nose = ((j[:, :, 0] - 0.5 * (j[:, :, 3] + j[:, :, 4])) * ahead).sum(axis=-1)
+        known = nose[np.isfinite(nose)]
+        return float((known > 0.0).mean()) if len(known) >= fewest else np.nan
 
     def orient(self, scale: float) -> tuple[Similarity, float, bool]:
         """Return the transform to the world on whose ground people walk.
@@ -159,6 +172,8 @@ class People(NamedTuple):
         up: (3,) unit vector that points up from the ground on which they walk.
         ground: a point (3,) of that ground [unit of the world]; NaN if unknown.
         on_feet: whether standing feet determine `up`.
+        ahead: share of poses whose nose is ahead, by the sides of shoulders and hips; NaN if too
+            few tell.
     """
 
     statures: Floats
@@ -166,6 +181,7 @@ class People(NamedTuple):
     up: Floats
     ground: Floats
     on_feet: bool
+    ahead: float
 
     @property
     def stature(self) -> float:
@@ -191,18 +207,20 @@ class People(NamedTuple):
         )
         statures = walkers.statures()
         vertical = find_vertical(walkers.joints)
-        if vertical is None or not np.isfinite(statures).any():
+        statures = statures[np.isfinite(statures) & (statures > 0.0)]
+        if vertical is None or not len(statures):
             return None
-        statures = statures[np.isfinite(statures)]
         scale = STATURE[0] / float(np.median(statures))
         legs = np.isfinite(walkers.joints[:, :, [11, 12, 15, 16], 0]).all(axis=-1)
         if not legs.any() or len(joints) < 2:
-            return cls(statures, vertical, vertical.axis, np.full(3, np.nan), on_feet=False)
+            nowhere = np.full(3, np.nan)
+            return cls(statures, vertical, vertical.axis, nowhere, on_feet=False, ahead=np.nan)
         motion, _, on_feet = walkers.orient(scale)
         ground, up = -motion.rotation.T @ motion.translation / scale, motion.rotation[2]
         # Feet of people who lie are on no ground.
         on_feet = on_feet and bool(up @ vertical.axis > LEVEL)
-        return cls(statures, vertical, up if on_feet else vertical.axis, ground, on_feet)
+        up = up if on_feet else vertical.axis
+        return cls(statures, vertical, up, ground, on_feet, walkers.nose_ahead(up))
 
 
 def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> People | None:
@@ -225,7 +243,7 @@ def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> 
     # Rays that are nearly parallel tell no size.
     wide = [m.matches["size"] for m in matched if m.agrees and m.angle >= settings.min_angle_rad]
     sizes = np.concatenate([np.empty(0), *wide])
-    sizes = sizes[np.isfinite(sizes)]
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
     if not len(sizes):
         return None
     size = float(np.median(sizes))
@@ -252,6 +270,16 @@ def doubt_statures(statures: Floats) -> str:
     return f"the mean stature of {count} people is {mean:.2f} m; {said}"
 
 
+def doubt_sides(people: People) -> str:
+    """Return a sentence if people's left and right are exchanged; else an empty one."""
+    if not people.ahead < 0.1:  # also NaN
+        return ""
+    return (
+        f"left and right are exchanged in all 2D poses, or all images are mirrored: in "
+        f"{1.0 - people.ahead:.0%} of the poses the nose points backwards"
+    )
+
+
 def doubt_world(cameras: Camera, people: People, *, sizes: bool = True) -> list[str]:
     """Return sentences about a world in which people do not stand along z, or are no adults.
 
@@ -261,7 +289,7 @@ def doubt_world(cameras: Camera, people: People, *, sizes: bool = True) -> list[
         sizes: whether lengths can be judged.
     """
     vertical, size = people.vertical, doubt_statures(people.statures) if sizes else ""
-    said = [size] if size else []
+    said = [each for each in (size, doubt_sides(people)) if each]
     if vertical.is_clear and not vertical.is_z and people.stand_along(vertical.axis, cameras):
         said.insert(
             0,
@@ -343,16 +371,35 @@ def place_cameras(
             of_what, todo = "a calibration, whose world they describe", "Add --calibration."
             raise UsageError("--unit and --up", expected=of_what, found="none", todo=todo)
         return {}, []
-    batch = Camera.stack([Camera.from_calibration(camera) for camera in cameras.values()])
+    batch = Camera.stack(
+        [Camera.from_calibration(each, f"{calibration}: {name}") for name, each in cameras.items()]
+    )
     people = None
+    told = [
+        f"warning: {name}: the lens folds within the image, {share:.1%} of which shows nothing"
+        for n, name in enumerate(cameras)
+        if (share := batch[n].blind_share()) > 0.0
+    ]
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
         people = find_people(batch, stacked, fps)
+        if people is None:
+            cameras, said = read_otherwise(
+                calibration,
+                cameras,
+                stacked,
+                lambda other: bool((p := find_people(other, stacked, fps)) and p.vertical.is_clear),
+            )
+            told += said
+            batch = Camera.stack([Camera.from_calibration(each) for each in cameras.values()])
+            people = find_people(batch, stacked, fps) if said else None
     scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
     up, turned, doubt = _find_up(batch, people, stated.up)
-    notes = [doubt] if doubt else []
+    notes = [*told, doubt] if doubt else told
     if people is not None and (size := doubt_statures(scale * people.statures)):
         notes.append(f"warning: {size}")
+    if people is not None and (sides := doubt_sides(people)):
+        notes.append(f"warning: {sides}")
     if scale == 1.0 and not turned:
         return dict(cameras), [*([f"{calibration}: {unit}"] if unit else []), *notes]
     height = float(scale * people.ground @ up) if turned and people is not None else 0.0

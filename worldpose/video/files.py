@@ -85,7 +85,9 @@ def index_frames(path: Path) -> FrameIndex:
         if not is_told:
             return _count_frames(path, given, len(packets), base, size)
     except (av.error.FFmpegError, OSError) as error:
-        raise _no_video(path, say_failure(error)) from error
+        is_empty = path.is_file() and not path.stat().st_size
+        found = "an empty file" if is_empty else error.strerror or say_failure(error)
+        raise _no_video(path, found) from error
     stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     key = np.array([key for _, key in packets], dtype=np.bool_)[order]

@@ -1,5 +1,7 @@
 """Camera data of tracking systems: FreeD packets by hand, tables, and the axes of both."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,56 @@ def test_a_packet_is_read_as_computed_by_hand(tmp_path):
     assert any("no focal length" in note for note in data.notes)
     mixed = read(tmp_path, PACKET + packet(b1=8, b2=0) + PACKET, number=8)
     np.testing.assert_array_equal(mixed.values[:, 0], [0.0])
+
+
+def pcap(packets, times):
+    """A capture in big-endian order with nanoseconds; UDP's 42 bytes before each packet."""
+    content = bytes.fromhex("a1b23c4d 0002 0004 00000000 00000000 0000ffff 00000001")
+    for data, time in zip(packets, times, strict=True):
+        frame = bytes(42) + data
+        head = struct.pack(">4I", int(time), round(time % 1 * 1e9), len(frame), len(frame))
+        content += head + frame
+    return content
+
+
+def pcapng(packets, times):
+    """The same in little-endian blocks, with times of 2^-10 s."""
+
+    def block(kind, body):
+        body += bytes(-len(body) % 4)
+        size = struct.pack("<I", 12 + len(body))
+        return struct.pack("<I", kind) + size + body + size
+
+    content = block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    content += block(1, bytes.fromhex("01000000 00000000 0300 0400 61626300 0900 0100 8a000000"))
+    for data, time in zip(packets, times, strict=True):
+        high, low = divmod(round(time * 1024), 2**32)
+        size = 42 + len(data)
+        content += block(6, struct.pack("<5I", 0, high, low, size, size) + bytes(42) + data)
+    return content
+
+
+@pytest.mark.parametrize("write", [pcap, pcapng])
+def test_a_capture_gives_packets_at_the_frames_of_their_times(tmp_path, write):
+    # Frames of 40 ms: the second packet is nearer to frame 1 than the third, frame 2 is lost.
+    packets = [packet(b2=n, b3=0, b4=0) for n in range(4)]
+    times = [1.7e9, 1.7e9 + 0.039, 1.7e9 + 0.055, 1.7e9 + 0.122]
+    data = read(tmp_path, write([*packets, b"other"], [*times, 1.7e9 + 0.2]))
+    assert data.frame.tolist() == [0, 1, 3]
+    np.testing.assert_array_equal(data.values[:, 0], [0.0, 2.0, 6.0])
+    two = write([PACKET, packet(b1=8, b2=0), packet(b1=8, b2=2)], [0.0, 0.01, 0.05])
+    assert read(tmp_path, two, number=8).values[:, 0].tolist() == [0.0, 4.0]
+    with pytest.raises(InputError, match="1 of camera 7, 2 of camera 8"):
+        read(tmp_path, two)
+    for content, said in ((write([b"x"], [0.0]), "none in 1 frames"), (two[:50], "whole capture")):
+        with pytest.raises(InputError, match=said):
+            read(tmp_path, content)
+
+
+def test_titles_may_have_other_spellings_and_radians(tmp_path):
+    data = read(tmp_path, "Pan_rad;tilt;PosX;Pos Y [cm];fov_vertical\n0,5;1;2;300;40\n")
+    focal = 540.0 / np.tan(np.radians(20.0))
+    np.testing.assert_allclose(data.values[0, [0, 3, 4, 6]], [np.degrees(0.5), 2.0, 3.0, focal])
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from worldpose.errors import InputError
 from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
-from worldpose.formats.keypoint_sets import order_by_names
+from worldpose.formats.keypoint_sets import frame_numbers, order_by_names
 
 # A standing person in pixels, 400 px tall, of which each set has some points.
 BODY = {
@@ -123,6 +123,7 @@ def test_points_of_human36m_are_refused_by_name(tmp_path):
         lambda name: name.replace("left_", "l_").replace("right_", "r_"),
         lambda name: "_".join(reversed(name.split("_"))) if name[:4] in ("left", "righ") else name,
         lambda name: name.replace("left_", "L").replace("right_", "R"),
+        lambda name: f"{len(name)}: {name}",
     ],
 )
 def test_names_decide_the_order_in_any_spelling(tmp_path, spell):
@@ -153,7 +154,7 @@ def test_a_data_set_gives_names_of_points_and_numbers_of_images(tmp_path):
 @pytest.mark.parametrize(
     ("images", "names", "place", "words"),
     [
-        ([{"id": 1, "file_name": "a.jpg"}], COCO17, "images[0]", "file_name with the frame"),
+        ([{"id": 1, "file_name": "a.jpg"}], COCO17, "images[0]", "in file_name or frame_id"),
         ([{"id": 1}], COCO17, "images[0]", "found nothing"),
         ([{"id": 1, "file_name": "3fa9c1.jpg"}], COCO17, "images[0]", "found '3fa9c1.jpg'"),
         (
@@ -189,8 +190,59 @@ def test_a_set_may_lack_the_face(tmp_path):
         wanted = np.array([BODY[name] for name in COCO17[5:]]) + (500, 300)
         np.testing.assert_allclose(found.people.keypoints[0, 0, 5:], wanted)
         assert np.isnan(found.people.keypoints[0, 0, :5]).all()
-    with pytest.raises(InputError, match="order of MPI, the known set of 15 points"):
+    with pytest.raises(InputError, match="in the order of MPI-15"):
         read_openpose_folder(frames(tmp_path / "c", MPI[::-1]))
+
+
+def test_a_stated_model_that_is_not_known_needs_usual_lengths(tmp_path):
+    assert read_openpose_folder(frames(tmp_path / "a", COCO17), "MY_NET").kind == "COCO-17"
+    with pytest.raises(InputError, match="of model 'MY_NET' have another order"):
+        read_openpose_folder(frames(tmp_path / "b", COCO17[::-1]), "MY_NET")
+
+
+def test_many_people_of_no_known_order_are_refused(tmp_path):
+    shuffled = [*COCO17[5:7], *COCO17[:5], *COCO17[7:11], *COCO17[:10:-1]]
+    with pytest.raises(InputError, match="expected limbs of usual lengths in the order of COCO-17"):
+        read_openpose_folder(frames(tmp_path / "a", shuffled, 24))
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted"),
+    [
+        (["3_cam1.png", "12_cam1.png"], [3, 12]),  # the camera's number does not differ
+        (["f3_1700000000480.png", "f12_1700000000840.png"], [3, 12]),  # times are no frames
+        (["2_0.5_3.JSON", "2_0.5_12.JSON"], [3, 12]),
+        (["a_1.jpg", "b_1.jpg", "c.jpg"], [1, 1]),
+    ],
+)
+def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
+    assert list(map(frame_numbers(names).get, names))[: len(wanted)] == wanted
+
+
+def test_pictures_of_one_number_are_refused_and_frame_id_helps_out(tmp_path):
+    images = [{"id": n, "file_name": f"{n}ab.jpg", "frame_id": n + 4} for n in (3, 5)]
+    found = read_coco_results(data_set(tmp_path / "a.json", images))
+    np.testing.assert_array_equal(found.people.frame, [7, 9])
+    people = [{"image_id": f"{name}_1.jpg", "keypoints": points(COCO17)} for name in "ab"]
+    (tmp_path / "b.json").write_text(json.dumps(people))
+    with pytest.raises(InputError, match=r"image_id: .* whose numbers differ, found 2"):
+        read_coco_results(tmp_path / "b.json")
+
+
+def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
+    path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}])
+    content = json.loads(path.read_text())
+    nan = {"image_id": 3, "keypoints": [float("nan")] * 51, "score": float("nan")}
+    content["annotations"] += [{"image_id": 3, "bbox": [1, 2, 3, 4]}, nan]
+    path.write_text(json.dumps(content))
+    found = read_coco_results(path)
+    assert (found.people.score.shape, found.changes.nobody) == ((1, 1), 2)
+
+
+def test_points_may_be_lists_of_three(tmp_path):
+    nested = np.reshape(points(COCO17), (17, 3)).tolist()
+    (tmp_path / "a.json").write_text(json.dumps([{"image_id": 4, "keypoints": nested}]))
+    assert_body(read_coco_results(tmp_path / "a.json").people)
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,16 @@ def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):
         read_lenses(files, "right", {"right": (1440, 1080)})
 
 
+@pytest.mark.parametrize("names", ["KDhw", "kd"])
+def test_the_nine_numbers_and_the_size_of_a_camera_info_are_read(names, tmp_path):
+    half = np.diag([0.5, 0.5, 1.0]) @ MATRIX
+    text = f"height: 540\nwidth: 960\n{names[0]}: {half.ravel().tolist()}\n"
+    (tmp_path / "info.yaml").write_text(text + f"{names[1]}: {DISTORTION[0].tolist()}\n")
+    lens = read_lenses([tmp_path / "info.yaml"], "left", SIZES)["left"]
+    assert lens.focal_px == pytest.approx(1402.0)
+    assert lens.principal_point_px == pytest.approx((970.5, 530.5))
+
+
 def test_written_lenses_are_read_back_with_their_deviations(tmp_path):
     lens = read_lenses(write_npz(tmp_path), "left", SIZES)
     lens["left"] = lens["left"].model_copy(update={"focal_std_px": 3.25, "distortion_std": 0.001})

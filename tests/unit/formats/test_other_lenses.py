@@ -92,6 +92,7 @@ def test_every_lens_file_says_which_model_it_has(model, tmp_path):
     [
         ("distortion_model: fov\nD: [0.9]", "distortion_model: expected one of .* found 'fov'"),
         ("D: [-0.05, 0.01, -0.2, 0.05]", "p1 and p2 up to 0.01.*fisheye_model: 1"),
+        ("D: [-0.2, 0.05, 0.0, 0.0]\nxi: 1.1", "xi: .* found that of cv2.omnidir"),
         ("fisheye_model: 1\nD: [-0.1, 0.0, 0.0, 0.0, 0.3]", "k1 k2 k3 k4 of a fisheye"),
     ],
 )

@@ -208,6 +208,12 @@ def _matrix(camera: CameraCalibration):
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
+def test_qualisys_numbers_may_have_decimal_commas(read):
+    commas = re.sub(r'"(-?\d+)[.](\d+)"', r'"\1,\2"', QUALISYS.replace('x="1000"', 'x="1,0E+3"'))
+    assert commas != QUALISYS
+    assert read(commas, "rig.qca.txt") == read(QUALISYS, "rig.qca.txt")
+
+
 def test_qualisys_video_that_shows_a_part_of_the_sensor_moves_the_centre(read):
     part = QUALISYS.replace('left="0" top="0"', 'left="320" top="40"')
     camera = read(part, "rig.qca.txt")["26580"]
@@ -244,9 +250,15 @@ def test_entities_are_refused_in_any_encoding(tmp_path):
         read_calibration(path)
 
 
-def test_poses_that_are_all_zero_are_told_to_be_lenses(tmp_path, make_camera):
-    zero = {"rotation": tuple(map(tuple, np.eye(3).tolist())), "translation": (0.0, 0.0, 0.0)}
-    cameras = {n: make_camera(n, 0.1).model_copy(update=zero) for n in ("a", "b")}
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (3.0, -40.0, 6.0)])
+def test_cameras_in_one_place_are_told_to_be_lenses(tmp_path, make_camera, place):
+    cameras = {}
+    for n, (name, turn) in enumerate({"a": np.eye(3), "b": np.eye(3)[[1, 2, 0]]}.items()):
+        pose = {
+            "rotation": tuple(map(tuple, turn.tolist())),
+            "translation": tuple((-turn @ place).tolist()),
+        }
+        cameras[name] = make_camera(name, 0.1 + n).model_copy(update=pose)
     write_calibration_toml(tmp_path / "c.toml", cameras)
-    with pytest.raises(InputError, match=r"found zero in all: .* worldpose import --lens"):
+    with pytest.raises(InputError, match=r"found all cameras in one place: .* import --lens"):
         read_calibration(tmp_path / "c.toml")

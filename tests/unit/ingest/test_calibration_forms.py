@@ -312,7 +312,10 @@ def test_a_bad_entry_is_refused_with_its_place(tmp_path, form, old, new, message
         ({"intrinsicMat": np.eye(2)}, r"intrinsicMat: expected numbers of shape \(3, 3\)"),
         ({"distortion": np.append(np.zeros(11), 0.1)}, "a lens model with more terms"),
         ({"imageSize": np.array([1080.0])}, r"imageSize: expected numbers of shape \(2,\)"),
-        ({"imageSize": np.array([1920.0, 1080.0])}, "imageSize: expected height, then width"),
+        (
+            {"imageSize": np.array([1920.0, 1080.0])},
+            "found width 1080 and height 1920, which seem to be exchanged",
+        ),
         ({"rotation": 2.0 * np.array(rig()[0].rotation) @ STANDING}, "rotation: expected a rota"),
         ({"rotation": np.diag([-1.0, 1.0, 1.0])}, "found a mirror image"),
         (
@@ -322,7 +325,7 @@ def test_a_bad_entry_is_refused_with_its_place(tmp_path, form, old, new, message
             },
             "board that stands or lies",
         ),
-        ({"translation": np.zeros(3)}, "positions in millimetres"),
+        ({"translation": np.full(3, 1e-3)}, "positions in millimetres"),
     ],
 )
 def test_a_bad_opencap_file_is_refused(tmp_path, changes, message):

@@ -103,6 +103,23 @@ def test_every_form_gives_the_same_clicks(tmp_path, write):
     assert len(drawn) == len(lines)
 
 
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"image": "https://store/east.png?signature=a.b/c&expires=1"},
+        {"image": "/data/local-files/?d=stills/east.png"},
+        {"project": "a match", "image": "east.png"},
+    ],
+)
+def test_an_image_is_named_in_an_address_and_beside_other_texts(tmp_path, data):
+    file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
+    tasks = json.loads(file.read_text())
+    tasks[0]["data"] = data
+    file.write_text(json.dumps(tasks))
+    import_clicks(file, match(tmp_path / "m"))
+    assert clicked(tmp_path / "m")[0].keys() == CLICKS.keys()
+
+
 @pytest.mark.parametrize("angle", [0, 90, 180, 270])
 @pytest.mark.parametrize("kind", ["polygonlabels", "vectorlabels"])
 def test_a_picture_that_the_annotator_turned_is_turned_back(tmp_path, angle, kind):

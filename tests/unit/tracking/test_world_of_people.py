@@ -1,5 +1,6 @@
 """A calibration's unit and up axis follow from the people, or from what the user states."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError, UsageError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Similarity
+from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.triangulation.world import (
     People,
     StatedWorld,
@@ -23,6 +24,7 @@ from worldpose.triangulation.world import (
 FPS = 25.0
 NOTHING = StatedWorld()
 CALIBRATION = Path("cal.mcal")
+FLIP = np.diag([1.0, -1.0, -1.0])
 LYING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation from people who stand along z to ones who lie along y."""
 
@@ -112,6 +114,62 @@ def test_what_the_user_states_holds(ring, people, seen):
     # People who contradict the stated axis are told.
     notes = placed(true, true, keypoints, read_stated_world(None, "y"))[3]
     assert "the upright axis of people is z, not y as stated" in notes[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda pose: pose.inverse(), "of the cameras in the world, not the other way"),
+        (lambda pose: Rigid(FLIP @ pose.rotation, pose.translation @ FLIP), "as OpenGL's: turn"),
+    ],
+)
+def test_poses_that_mean_something_else_are_refused_with_what_they_mean(
+    ring, people, seen, change, said
+):
+    true = ring(4)
+    given = replace(true, cam_from_world=change(true.cam_from_world))
+    with pytest.raises(InputError, match=f"They agree if .*{said}"):
+        placed(true, given, poses(*seen(true, walk(people))))
+
+
+def test_a_calibration_of_larger_images_is_scaled_to_those_of_the_people(ring, people, seen):
+    true = ring(4)
+    middle = 3.0 * (true.principal_point + 0.5) - 0.5
+    large = replace(
+        true, focal=3.0 * true.focal, principal_point=middle, image_size=3 * true.image_size
+    )
+    detections = poses(*seen(true, walk(people)))
+    found, notes = place_cameras(CALIBRATION, records(large), detections, FPS, NOTHING)
+    assert "scaled by 0.33333" in notes[1]
+    for name, camera in records(true).items():
+        assert found[name].image_size == camera.image_size
+        np.testing.assert_allclose(found[name].focal_px, camera.focal_px)
+        np.testing.assert_allclose(found[name].principal_point_px, camera.principal_point_px)
+
+
+def test_exchanged_sides_are_told(ring, people, seen):
+    true = ring(4)
+    joints = walk(people)
+    sides = [0, *(n + 1 if n % 2 else n - 1 for n in range(1, 17))]
+    assert People.of(joints, FPS).ahead == 1.0
+    assert People.of(joints[:, :, sides], FPS).ahead == 0.0
+    (*_, notes) = placed(true, true, poses(*seen(true, joints[:, :, sides])))
+    assert "left and right are exchanged in all 2D poses" in notes[1]
+
+
+def test_a_lens_that_folds_within_the_image_is_refused_and_at_the_corners_told(ring):
+    def given(k1):
+        return records(replace(ring(4), distortion=np.tile([k1, *[0.0] * 7], (4, 1))))
+
+    # r (1 + k1 r^2) grows up to r = 1 / sqrt(-3 k1), where it is two thirds of that.
+    corner = float(np.hypot(*(ring(4)[0].image_size / 2)) / ring(4)[0].focal[0])
+    with pytest.raises(InputError, match=r"c0: distortion: expected a lens whose image radii grow"):
+        place_cameras(
+            CALIBRATION, given(-((2.0 / (3.0 * 0.8 * corner)) ** 2) / 3.0), {}, FPS, NOTHING
+        )
+    folds = given(-((2.0 / (3.0 * 0.98 * corner)) ** 2) / 3.0)
+    _, (_, warning, *_) = place_cameras(CALIBRATION, folds, {}, FPS, NOTHING)
+    assert "c0: the lens folds within the image" in warning
 
 
 def test_people_who_lie_before_cameras_that_stand_turn_no_world(ring, people, seen):

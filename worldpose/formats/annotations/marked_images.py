@@ -28,6 +28,10 @@ from worldpose.formats.annotations.annotated_images import (
 )
 from worldpose.formats.annotations.programs import Answer, read_xml
 
+IMAGE_NAME: Final = re.compile(
+    r"([^/\\?&=]+)\.(?:png|jpe?g|tiff?|bmp|webp)(?=$|[?&#])", re.IGNORECASE
+)
+"""The name of an image file at the end of a path, or in an address with a query."""
 _PAIRS: Final = re.compile(r"-?[0-9.]+(?:[eE][+-]?\d+)?,-?[0-9.]+(?:[eE][+-]?\d+)?")
 
 
@@ -203,6 +207,7 @@ def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
     for number, task in enumerate(TypeAdapter(tuple[_Task, ...]).validate_python(tasks)):
         answers = [each for each in task.annotations if not each.was_cancelled]
         names = [value for value in task.data.values() if isinstance(value, str)]
+        names.sort(key=lambda name: IMAGE_NAME.search(name) is None)
         name = names[0] if names else f"task {number}"
         regions = [
             _Region.model_validate(each)

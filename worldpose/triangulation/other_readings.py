@@ -1,0 +1,81 @@
+"""Other readings of a calibration by which no two cameras agree on their people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
+from worldpose.errors import InputError
+from worldpose.formats.calibration_unit import scaled
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+
+_FLIP: Final = np.diag([1.0, -1.0, -1.0])
+_OTHER_POSES: Final[Mapping[str, Callable[[Rigid], Rigid]]] = {
+    "the poses are those of the cameras in the world, not the other way: invert them": (
+        lambda pose: pose.inverse()
+    ),
+    "the cameras' y axes point up and z backward, as OpenGL's: turn R and t by diag(1, -1, -1)": (
+        lambda pose: Rigid(_FLIP @ pose.rotation, pose.translation @ _FLIP)
+    ),
+    "the poses are those of OpenGL's cameras in the world: invert them, then turn them by "
+    "diag(1, -1, -1)": (
+        lambda pose: Rigid(_FLIP @ pose.inverse().rotation, pose.inverse().translation @ _FLIP)
+    ),
+}
+"""What files that break their form's rules have in place of poses."""
+_SCALES: Final = (1 / 4, 1 / 3, 3 / 8, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 8 / 3, 3.0, 4.0)
+"""Ratios of usual image sizes."""
+
+
+def read_otherwise(
+    calibration: Path,
+    cameras: Mapping[str, CameraCalibration],
+    detections: KeypointDetections,
+    agree: Callable[[Camera], bool],
+) -> tuple[Mapping[str, CameraCalibration], list[str]]:
+    """Return cameras for images of another size if people in them agree then, and what was done.
+
+    Args:
+        calibration: the file, for messages.
+        cameras: its cameras, by which no two of them agree on their people.
+        detections: (frames, cameras, detections) in memory.
+        agree: whether people agree in a batch of cameras.
+
+    Raises:
+        InputError: people agree if the poses mean something else than the form says.
+    """
+
+    def stack(given: Mapping[str, CameraCalibration]) -> Camera:
+        return Camera.stack([Camera.from_calibration(each) for each in given.values()])
+
+    batch = stack(cameras)
+    for why, change in _OTHER_POSES.items():
+        other = replace(batch, cam_from_world=change(batch.cam_from_world))
+        if agree(other):
+            raise InputError(
+                f"{calibration}: rotation and translation",
+                expected="x_cam = R x_world + t, with y down and z forward",
+                found="poses by which no two cameras agree on their people",
+                todo=f"They agree if {why}.",
+            )
+    known = detections.keypoints[np.isfinite(detections.confidence)]
+    for scale in _SCALES:
+        sizes = {n: np.rint(scale * np.array(c.image_size)) for n, c in cameras.items()}
+        if not len(known) or (known.max(axis=0) > np.min([*sizes.values()], axis=0)).any():
+            continue
+        resized = {
+            name: scaled(camera, scale, (int(sizes[name][0]), int(sizes[name][1])))
+            for name, camera in cameras.items()
+        }
+        if agree(stack(resized)):
+            shown = " x ".join(str(length) for length in next(iter(resized.values())).image_size)
+            said = f"the calibration is scaled by {scale:.5f}, to images of {shown} px: the people "
+            return resized, [said + "of the 2D poses agree at this size alone"]
+    return cameras, []
