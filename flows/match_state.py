@@ -27,6 +27,8 @@ from worldpose.store.store import Store
 StateName = Literal[
     "running", "calibrate", "questions", "outdated", "stopped", "failed", "partial", "new", "ready"
 ]
+UNREADABLE: Final = "cannot be opened"
+"""Words of a match that cannot be opened or planned."""
 START_SECONDS: Final = 10.0
 """Time until a run computes: its processes start [s]."""
 
@@ -236,4 +238,4 @@ def _count(number: int, one: str, many: str) -> str:
 
 def describe_problem(error: OSError | WorldposeError) -> MatchState:
     """Return the state of a match that cannot be opened or planned."""
-    return MatchState("failed", "cannot be opened", str(error))
+    return MatchState("failed", UNREADABLE, str(error))

@@ -8,6 +8,7 @@ from typing import Literal
 
 from data_contracts.run import RunRecord
 from flows.iterate import iterate_match
+from flows.overview import read_summary
 from flows.progress import reporter
 from flows.results.automatic_exports import export_after_run
 from flows.run_plan import PlannedUnit
@@ -71,6 +72,11 @@ def _reprocess(
 ) -> Reprocessed:
     status = None
     try:
+        if not request.settings:
+            found = read_summary(store, match_id)  # as cheap as it is exact
+            latest, failed = found.latest, bool(found.latest and found.latest.failed)
+            if found.is_settled and not (retry and failed):
+                return Reprocessed(match_id, "current" if latest else "never run", record=latest)
         status = run_status(store, match_id, request.settings, retry=retry)
         if status is None:
             return Reprocessed(match_id, "never run")

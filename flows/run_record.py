@@ -336,6 +336,10 @@ class RunLog:
         )
         self.gatekeeper.ask(self.run_id, self.plan.waiting, self.plan.results)
         self.store.finish_run(record)
+        from flows.overview import make_summary  # late: it reads runs
+
+        with suppress(OSError, WorldposeError):  # whoever lists the match makes it then
+            make_summary(self.store, record.match_id)
         if os.environ.get("OPENLINEAGE_URL"):
             from flows.openlineage import tell_lineage  # few runs need it
 

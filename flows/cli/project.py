@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -19,12 +20,10 @@ from flows.cli.console import (
     print_table,
     progress,
 )
-from flows.match_state import match_state
-from flows.registering import find_registration, open_match
-from flows.review.verdicts import still_waiting
-from flows.run_record import latest_run
+from flows.match_state import UNREADABLE
+from flows.overview import PAGE, read_summary
+from flows.registering import find_registration
 from flows.run_status import UnitState, find_run
-from flows.settings import resolve
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair
@@ -63,13 +62,17 @@ def status(
     """
     store = Store.open(project)
     wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
-    rows = [_match_status(store, match_id) for match_id in wanted]
     if as_json:
-        print_json({"matches": rows})
+        print_json({"matches": [_match_status(store, match_id) for match_id in wanted]})
         return
-    if not rows:
+    if not wanted:
         line("No match is registered. Register one: worldpose ingest FOLDER.")
-        return
+    for first in range(0, len(wanted), PAGE):
+        _print_status([_match_status(store, name) for name in wanted[first : first + PAGE]])
+
+
+def _print_status(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print a table of matches, and below it what is to say about each."""
     columns = (
         "match",
         "latest run",
@@ -140,36 +143,30 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "problem": None,
     }
     try:
-        status |= _recorded_status(store, match_id)
-        latest, match = latest_run(store, match_id), open_match(store, match_id)
-        status["settings"] = resolve(match.layers).overrides
-        now = match_state(store, match)
-        status["units"] |= {state.value: list(names) for state, names in now.units.items()}
-        status |= {"now": now.words, "why": now.why, "todo": now.todo}
-        status["waiting"] = [unit.unit for unit in still_waiting(store, match, latest)]
-    except (OSError, WorldposeError) as failure:  # a damaged record, a setting names a lost file
+        found = read_summary(store, match_id)
+        latest = found.latest
+        if latest is not None:
+            status |= {
+                "run": latest.run_id,
+                "failed": [failure.unit for failure in latest.failed],
+                "left_out": latest.left_out,
+                "warnings": list(latest.warnings),
+                "usability": latest.usability.model_dump(mode="json"),
+            }
+        status |= {
+            "state": "not run" if latest is None else latest.state,
+            "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
+            "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
+        }
+        if found.problem or found.words == UNREADABLE:
+            return status | {"problem": found.problem or found.why}
+        status["settings"] = found.settings
+        status["units"] |= {state: list(names) for state, names in found.units.items()}
+        status |= {"now": found.words, "why": found.why, "todo": found.todo}
+        status["waiting"] = [each.unit for each in found.waiting]
+    except (OSError, WorldposeError) as failure:  # a damaged record
         status["problem"] = str(failure)
     return status
-
-
-def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
-    """Return what the records of a match's runs tell, without its folder."""
-    latest = latest_run(store, match_id)
-    told: dict[str, Any] = {"state": "not run"}
-    if latest is not None:
-        told = {
-            "run": latest.run_id,
-            "state": latest.state,
-            "failed": [failure.unit for failure in latest.failed],
-            "left_out": latest.left_out,
-            "warnings": list(latest.warnings),
-            "usability": latest.usability.model_dump(mode="json"),
-        }
-    return {
-        **told,
-        "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
-        "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
-    }
 
 
 def verify(
