@@ -49,8 +49,8 @@ from worldpose.store.store import Store
 
 PAGE: Final = 50
 """Matches of a page."""
-FRESH_SECONDS: Final = 1.0
-"""Maximum age of the list of matches and of changes in the project, and of a row on a page."""
+TURN_SECONDS: Final = 10.0
+"""Between two looks at changes outside the project, unless there are too many matches."""
 TICK_NS: Final = 20_000_000
 """Two changes within a clock tick of the file system have the same time [ns]."""
 MOST_FILES: Final = 1000
@@ -93,65 +93,62 @@ def make_summary(store: Store, match_id: str) -> MatchSummary:
 
 @dataclass
 class Overview:
-    """The summaries of a project for lists, without their units; changed matches are read first.
+    """The summaries of a project for lists, without their units.
 
-    Each look reads as many as its time allows. A match that changed in the project and was not read
-    since is unseen. All others are read in turn, for changes outside the project.
+    A match that changed in the project and was not read since is unseen. For changes outside the
+    project, such as in match folders, the others are read in turn.
     """
 
     store: Store
     _heads: dict[str, MatchSummary] = field(default_factory=dict)
-    _changed: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    _marks: dict[str, tuple[int, ...]] = field(default_factory=dict)
     _read_at: dict[str, float] = field(default_factory=dict)
-    _listed: tuple[float, dict[str, tuple[int, ...]]] = (-math.inf, {})
     _lock: Lock = field(default_factory=Lock)
 
-    def look(self, budget: float = math.inf, shown: Iterable[str] = ()) -> list[MatchSummary]:
-        """Return all matches; at least one is read, and all within the budget [s].
+    def look(self, budget: float = math.inf) -> list[MatchSummary]:
+        """Return all matches; at least one is read, changed ones first, and all in the budget [s].
 
-        Those `shown` are read before others without a change.
+        Without a change, a match is read again after `TURN_SECONDS`.
         """
         with self._lock:
             begun, there = time.monotonic(), self._list()
-            waiting = [name for name in there if self._changed.get(name) != there[name]]
-            waiting.sort(key=lambda name: self._read_at.get(name, -math.inf))
-            turn = sorted(there, key=lambda name: self._read_at.get(name, -math.inf))
-            for number, name in enumerate(dict.fromkeys((*waiting, *shown, *turn))):
-                now = time.monotonic()
-                if number and now - begun > budget:
-                    break
-                if name not in there:
-                    continue
-                is_fresh = now - self._read_at.get(name, -math.inf) < FRESH_SECONDS
-                if not is_fresh or self._changed.get(name) != there[name]:
-                    self._read(name, there[name])
             for name in self._heads.keys() - there.keys():
-                del self._heads[name], self._changed[name], self._read_at[name]
+                del self._heads[name], self._marks[name], self._read_at[name]
+            turn = sorted(there, key=lambda name: self._read_at.get(name, -math.inf))
+            changed = [name for name in turn if self._marks.get(name) != there[name]]
+            old = [name for name in turn if begun - self._read_at.get(name, 0.0) > TURN_SECONDS]
+            for number, name in enumerate(dict.fromkeys((*changed, *old))):
+                if number and time.monotonic() - begun > budget:
+                    break
+                self._read(name, there[name])
             return [
                 self._heads[name]
-                if self._changed.get(name) == mark
+                if self._marks.get(name) == mark
                 else MatchSummary(match_id=name, is_unseen=True)
                 for name, mark in there.items()
             ]
 
+    def read(self, match_id: str) -> MatchSummary:
+        """Return the whole summary of a match, as it is now."""
+        with self._lock:
+            return self._read(match_id, self._marks.get(match_id, ()))
+
     def _list(self) -> dict[str, tuple[int, ...]]:
         """Return each match with the times of changes of its registration, runs and journal."""
-        now = time.monotonic()
-        if now - self._listed[0] > FRESH_SECONDS:
-            names = self.store.matches()
-            paths = [path for name in names for path in (registration_path(name), *_own(name))]
-            marks = iter(self.store.blobs.marks(paths))
-            self._listed = now, dict(zip(names, zip(marks, marks, marks, strict=True), strict=True))
-        return self._listed[1]
+        names = self.store.matches()
+        paths = [path for name in names for path in (registration_path(name), *_own(name))]
+        marks = iter(self.store.blobs.marks(paths))
+        return dict(zip(names, zip(marks, marks, marks, strict=True), strict=True))
 
-    def _read(self, name: str, mark: tuple[int, ...]) -> None:
+    def _read(self, name: str, mark: tuple[int, ...]) -> MatchSummary:
         try:
             found = read_summary(self.store, name)
         except (OSError, WorldposeError) as error:
             found = MatchSummary(match_id=name, problem=str(error))
         slim: dict[str, Any] = {"stages": {}, "units": {}, "watched": (), "settings": {}}
         self._heads[name] = found.model_copy(update=slim)
-        self._changed[name], self._read_at[name] = mark, time.monotonic()
+        self._marks[name], self._read_at[name] = mark, time.monotonic()
+        return found
 
 
 def is_late(found: Iterable[MatchSummary]) -> bool:
@@ -227,7 +224,7 @@ def _basis(store: Store, summary: MatchSummary) -> tuple[str, int]:
     inside = [path for path in summary.watched if not path.startswith("/")]
     marks = store.blobs.marks(inside)
     marks += [changed_at(path) for path in summary.watched if path.startswith("/")]
-    said = [_code(), os.environ.get("WORLDPOSE_BODY_FOLDER", ""), summary.open_run, *marks]
+    said = [code_digest(), os.environ.get("WORLDPOSE_BODY_FOLDER", ""), summary.open_run, *marks]
     if summary.open_run:  # it can end without a trace
         said += [run.run_id for run in runs_at_work(store, summary.match_id)]
     text = "\n".join(map(str, said))
@@ -235,7 +232,7 @@ def _basis(store: Store, summary: MatchSummary) -> tuple[str, int]:
 
 
 @cache
-def _code() -> str:
+def code_digest() -> str:
     """Return a digest of the code and the libraries of this process."""
     top = Path(__file__).parents[1]
     found = [str(sorted(libraries().items()))]
@@ -258,7 +255,7 @@ def _summarize(store: Store, match_id: str) -> dict[str, Any]:
     open_runs = store.unfinished_runs(match_id)
     last = "" if latest is None else latest.run_id
     begun = [run.started_at for run in open_runs if run_order(run.run_id) > run_order(last)]
-    stages = {} if latest is None else _stages(store, latest)
+    stages = {} if latest is None else list_units(store, latest)
     found: dict[str, Any] = {
         "latest": None if latest is None else latest.model_copy(update=NOT_KEPT),
         "stages": stages,
@@ -337,7 +334,8 @@ def _open_run(store: Store, match_id: str) -> str:
     return ""
 
 
-def _stages(store: Store, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:
+def list_units(store: Store, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:
+    """Return the units of a run by stage, in the order of the method."""
     records = read_journal(store, run.match_id).questions
     asked = requests_by_id(records)
     units: dict[str, list[UnitSummary]] = {}

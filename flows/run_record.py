@@ -6,6 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from types import MappingProxyType
@@ -33,7 +34,7 @@ from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
 from flows.usability import RunOutcome, exceeded_limits, judge_run, usable_limits
 from tasks.tracing import add_unit_span, stage_span
-from worldpose.errors import InputError
+from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.recipes import libraries
 from worldpose.store.store import Store

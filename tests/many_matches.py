@@ -37,7 +37,7 @@ def copy_match(project, match_id, count):
     for number in range(count):
         name = f"{match_id}-copy{number:03d}"
         hidden = shutil.ignore_patterns("reference", "match.yaml", "pitch.json")
-        other = folder.with_name(name)
+        other = Path(project).parent / "copies" / name
         shutil.copytree(folder, other, ignore=hidden, copy_function=os.link)
         spec = (folder / "match.yaml").read_text()
         (other / "match.yaml").write_text(spec.replace(match_id, name))

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp
 
 from data_contracts.operations import MatchSummary
 from flows.gates import GATES
-from flows.overview import Overview, age, read_summary
+from flows.overview import Overview, age
 from flows.service.layout import StateFolder
 from flows.service.plan import ServePlan
 from flows.web.host_guard import HostGuard
@@ -62,7 +62,7 @@ class ProjectMetrics(Collector):
             size = self._store_size()
         ended = [each for match in matches for each in match.bodies]
         last = sorted(matches, key=_ended_at)[-MOST_MATCHES:]
-        whole = [read_summary(self.store, each.match_id) for each in last if not each.problem]
+        whole = [self._overview.read(each.match_id) for each in last if not each.is_unseen]
         states = Counter(match.state for match in matches)
         found = {(state,): states[state] for state in STATES}
         yield _gauge("matches", "Matches by state", ["state"], found)

@@ -17,7 +17,7 @@ from starlette.background import BackgroundTask
 
 from data_contracts.operations import Arrival, MatchSummary, UnitSummary
 from flows.method import METHOD
-from flows.overview import PAGE, Overview, age, cost_of, is_late, read_summary, units_of
+from flows.overview import PAGE, Overview, age, cost_of, is_late, units_of
 from flows.review.descriptions import when
 from flows.review.metric_words import in_short, reason_words
 from flows.service.alerts import kept_alerts
@@ -49,7 +49,7 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/api/status")
     def status(page: int = 1) -> dict[str, Any]:
         found = overview.look(BUDGET_SECONDS)
-        rows = _rows(context, found, page)
+        rows = _rows(context, overview, found, page)
         return {
             "matches": [_as_json(each) for each in rows],
             "pages": -(-len(found) // PAGE),
@@ -67,7 +67,7 @@ def routes(context: PageContext) -> APIRouter:
         running = context.continuing.running()
         kept = kept_alerts(served_state(context.store.url)).values()
         text = status_html(
-            _rows(context, found, page),
+            _rows(context, overview, found, page),
             _arrivals(context),
             dashboard,
             inbox=inbox,
@@ -132,13 +132,15 @@ def _running(match: MatchSummary, running: Container[str]) -> Mapping[str, Any] 
     return {"state": "running"} if match.match_id in running else None
 
 
-def _rows(context: PageContext, found: Sequence[MatchSummary], page: int) -> list[StatusRow]:
+def _rows(
+    context: PageContext, overview: Overview, found: Sequence[MatchSummary], page: int
+) -> list[StatusRow]:
     """Return the matches of a page with their units, and their runs at work and at Prefect."""
     links = context.continuing.links()
     rows = []
     for match in found[PAGE * max(page - 1, 0) : PAGE * max(page, 1)]:
         name = match.match_id
-        whole = match if match.is_unseen or match.problem else read_summary(context.store, name)
+        whole = match if match.is_unseen else overview.read(name)
         rows.append(StatusRow(whole, context.continuing.state(name), links.get(name, "")))
     return rows
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Sequence
 from math import isfinite
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from data_contracts.review import ReviewRequest
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
 from flows.method import METHOD
-from flows.overview import PAGE, Overview, read_summary
+from flows.overview import PAGE, Overview
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
@@ -40,12 +40,8 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("")
     def matches(search: str = "", kind: str = "", page: int = 1) -> dict[str, Any]:
-        def choose(shown: Iterable[str] = ()) -> dict[str, Any]:
-            found = overview.look(BUDGET_SECONDS, shown)
-            return _choose(context, found, search.strip().lower(), kind, max(page, 1))
-
-        # What is shown is as fresh as what has changed in the project.
-        return choose(each["match"] for each in choose()["matches"])
+        found = overview.look(BUDGET_SECONDS)
+        return _choose(context, overview, found, search.strip().lower(), kind, max(page, 1))
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
@@ -53,7 +49,7 @@ def routes(context: PageContext) -> APIRouter:
         latest = latest_run(context.store, match_id)
         folder = opened.folder
         return {
-            **_glance(context, read_summary(context.store, match_id)),
+            **_glance(context, overview.read(match_id)),
             "reviews": [
                 describe_review(each) for each in reviews_of(context.store, opened, latest)
             ],
@@ -86,7 +82,12 @@ def routes(context: PageContext) -> APIRouter:
 
 
 def _choose(
-    context: PageContext, found: Sequence[MatchSummary], search: str, kind: str, page: int
+    context: PageContext,
+    overview: Overview,
+    found: Sequence[MatchSummary],
+    search: str,
+    kind: str,
+    page: int,
 ) -> dict[str, Any]:
     """Return the matches of a page of those sought, and what the page says about all."""
     running, sought = context.continuing.running(), []
@@ -99,9 +100,12 @@ def _choose(
             sought.append((ORDER.index(its_kind), -at, match.match_id, match))
     sought.sort(key=lambda each: each[:3])
     page = min(page, max(1, -(-len(sought) // PAGE)))
-    shown = [each[3] for each in sought[PAGE * (page - 1) : PAGE * page]]
+    shown = (each[3] for each in sought[PAGE * (page - 1) : PAGE * page])
     return {
-        "matches": [_glance(context, each) for each in shown],
+        "matches": [
+            _glance(context, each if each.is_unseen else overview.read(each.match_id))
+            for each in shown
+        ],
         "total": len(found),
         "sought": len(sought),
         "page": page,
