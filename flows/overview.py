@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from threading import Lock
 from typing import Any, Final
 
 from data_contracts.match import Registration
@@ -53,6 +52,8 @@ TURN_SECONDS: Final = 10.0
 """Between two looks at changes outside the project, unless there are too many matches."""
 TICK_NS: Final = 20_000_000
 """Two changes within a clock tick of the file system have the same time [ns]."""
+TURN_SHARE: Final = 0.2
+"""Share of the time of a look after which it reads only matches that changed in the project."""
 MOST_FILES: Final = 1000
 """Files of a match that are watched one by one; of more, such as images, the folders."""
 BODIES = "body_fitting"
@@ -103,35 +104,35 @@ class Overview:
     _heads: dict[str, MatchSummary] = field(default_factory=dict)
     _marks: dict[str, tuple[int, ...]] = field(default_factory=dict)
     _read_at: dict[str, float] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
+    _at_work: set[str] = field(default_factory=set)
 
     def look(self, budget: float = math.inf) -> list[MatchSummary]:
         """Return all matches; at least one is read, changed ones first, and all in the budget [s].
 
         Without a change, a match is read again after `TURN_SECONDS`.
         """
-        with self._lock:
-            begun, there = time.monotonic(), self._list()
-            for name in self._heads.keys() - there.keys():
-                del self._heads[name], self._marks[name], self._read_at[name]
-            turn = sorted(there, key=lambda name: self._read_at.get(name, -math.inf))
-            changed = [name for name in turn if self._marks.get(name) != there[name]]
-            old = [name for name in turn if begun - self._read_at.get(name, 0.0) > TURN_SECONDS]
-            for number, name in enumerate(dict.fromkeys((*changed, *old))):
-                if number and time.monotonic() - begun > budget:
-                    break
+        begun, there = time.monotonic(), self._list()
+        for name in set(self._heads) - there.keys():
+            self._heads.pop(name, None)
+        turn = sorted(there, key=lambda name: self._read_at.get(name, -math.inf))
+        changed = [name for name in turn if self._marks.get(name) != there[name]]
+        old = [name for name in turn if begun - self._read_at.get(name, 0.0) > TURN_SECONDS]
+        for number, name in enumerate(dict.fromkeys((*changed, *old))):
+            share = 1.0 if number < len(changed) else TURN_SHARE
+            if number and time.monotonic() - begun > share * budget:
+                break
+            if name not in self._at_work:  # of another thread
                 self._read(name, there[name])
-            return [
-                self._heads[name]
-                if self._marks.get(name) == mark
-                else MatchSummary(match_id=name, is_unseen=True)
-                for name, mark in there.items()
-            ]
+        return [
+            self._heads[name]
+            if self._marks.get(name) == mark
+            else MatchSummary(match_id=name, is_unseen=True)
+            for name, mark in there.items()
+        ]
 
     def read(self, match_id: str) -> MatchSummary:
         """Return the whole summary of a match, as it is now."""
-        with self._lock:
-            return self._read(match_id, self._marks.get(match_id, ()))
+        return self._read(match_id, self._marks.get(match_id, ()))
 
     def _list(self) -> dict[str, tuple[int, ...]]:
         """Return each match with the times of changes of its registration, runs and journal."""
@@ -141,13 +142,16 @@ class Overview:
         return dict(zip(names, zip(marks, marks, marks, strict=True), strict=True))
 
     def _read(self, name: str, mark: tuple[int, ...]) -> MatchSummary:
+        self._at_work.add(name)
         try:
             found = read_summary(self.store, name)
         except (OSError, WorldposeError) as error:
             found = MatchSummary(match_id=name, problem=str(error))
+        finally:
+            self._at_work.discard(name)
         slim: dict[str, Any] = {"stages": {}, "units": {}, "watched": (), "settings": {}}
-        self._heads[name] = found.model_copy(update=slim)
-        self._marks[name], self._read_at[name] = mark, time.monotonic()
+        self._heads[name], self._read_at[name] = found.model_copy(update=slim), time.monotonic()
+        self._marks[name] = mark  # last: without it the head is not used
         return found
 
 

@@ -125,6 +125,13 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     stated |= {} if request.iterations is None else {"iterations": request.iterations}
     stated |= {} if request.body_folder is None else {"body_folder": request.body_folder}
     check_general(before[-1].name, "the request", stated)
+    for name, value in stated.items():
+        was = match.layers[-1].values.get(name, value)
+        if was != value:
+            reporter().tell_kept_settings(
+                f"{match.match_id}: {name}={as_text(value)} replaces {as_text(was)}, which the "
+                "settings of the match stated"
+            )
     layers = (*before[:-1], replace(before[-1], values={**before[-1].values, **stated}))
     found = resolve(layers)
     folder = found.origins.get("body_folder")

@@ -31,7 +31,7 @@ UNSEEN_SECONDS: Final = 1
 """Until the page asks for the matches that the server has not read yet."""
 BUDGET_SECONDS: Final = 0.1
 """Time that one request spends on reading matches."""
-REST_SECONDS: Final = 2.0
+REST_SECONDS: Final = 0.5
 """Time spent on matches that were never read, after the page was sent."""
 MAX_DETAILS: Final = 20
 """Matches whose cameras are on the page at once; of more matches, the one in the address."""
@@ -66,13 +66,15 @@ def routes(context: PageContext) -> APIRouter:
         page = 1 + names.index(match) // PAGE if match in names else page
         running = context.continuing.running()
         kept = kept_alerts(served_state(context.store.url)).values()
+        alerts = [each for each in kept if each["alert"] != "digest"]
         text = status_html(
             _rows(context, overview, found, page),
             _arrivals(context),
             dashboard,
             inbox=inbox,
             opened=match,
-            alerts=[each for each in kept if each["alert"] != "digest"],
+            alerts=alerts[-PAGE:],
+            more_alerts=max(0, len(alerts) - PAGE),
             counts=Counter(StatusRow(it, _running(it, running)).kind for it in found),
             place=(page, -(-len(found) // PAGE)),
         )
@@ -153,6 +155,7 @@ def status_html(
     inbox: str = "",
     opened: str = "",
     alerts: Iterable[Mapping[str, str]] = (),
+    more_alerts: int = 0,
     counts: Counter[str] | None = None,
     place: tuple[int, int] = (1, 1),
 ) -> str:
@@ -171,6 +174,7 @@ def status_html(
         counts=(Counter(row.kind for row in rows) if counts is None else counts).most_common(),
         place=place,
         alerts=alerts,
+        more_alerts=more_alerts,
         arrivals=sorted(arrivals, key=lambda each: each.changed_at, reverse=True),
         begun={each.match_id for each in shown if each.latest is not None},
         detailed=[each for each in rows if has_all or each.match.match_id == opened],

@@ -32,8 +32,8 @@ ALERT_SECONDS: Final = 20.0
 """Between two checks for alerts."""
 RECOVERY_SECONDS: Final = 10.0
 """Between two checks for lost runs, and for runs without progress."""
-LOOK_SECONDS: Final = 0.5
-"""Time of one look at matches for alerts, if none has changed: a share of a core."""
+LOOK_SECONDS: Final = 2.0
+"""Time of one look at matches for alerts, after which metrics have their turn."""
 DELIVERY_SECONDS: Final = 2.0
 """Between two checks of a channel for outstanding alerts."""
 KEPT: Final = timedelta(days=1)
@@ -144,6 +144,7 @@ def _hold_alerts(
     def hold() -> None:
         while is_late(matches := overview.look(LOOK_SECONDS)):
             STEPS["looking for alerts"] = time.monotonic()  # it makes progress
+            time.sleep(0.1)
         arrivals = plan.state_folder.arrivals().values()
         found = alerts_now(plan, matches, arrivals, queue.runs())
         dispatcher.hold([*found, *liveness.alerts])
