@@ -237,15 +237,13 @@ def _basis(store: Store, summary: MatchSummary) -> tuple[str, int]:
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the code and the libraries of this process."""
+    """Return a digest of the code and the libraries of this process, wherever it is installed."""
     top = Path(__file__).parents[1]
-    found = [str(sorted(libraries().items()))]
+    found = hashlib.sha256(str(sorted(libraries().items())).encode())
     for package in ("data_contracts", "flows", "tasks", "worldpose"):
-        for folder, _, names in os.walk(top / package):
-            if not folder.endswith("__pycache__"):
-                paths = (f"{folder}/{name}" for name in sorted(names))
-                found += [f"{path} {changed_at(path)}" for path in paths]
-    return hashlib.sha256("\n".join(found).encode()).hexdigest()[:16]
+        for file in sorted((top / package).rglob("*.py")):
+            found.update(f"{file.relative_to(top)}\n".encode() + file.read_bytes())
+    return found.hexdigest()[:16]
 
 
 def _summarize(store: Store, match_id: str) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -48,18 +48,16 @@ def reprocess_matches(
     *,
     retry: bool = False,
     is_rehearsal: bool = False,
-) -> list[Reprocessed]:
-    """Run every match with stale results, up to the last stage of its latest run.
+) -> Iterator[Reprocessed]:
+    """Run every match with stale results, up to the last stage of its latest run; yield outcomes.
 
     A match is run with the settings that its layers give. A failure is reported for its match, and
     does not stop the others. No id means all matches. `retry` also retries
     failed units without an edit; a rehearsal only determines what would be done.
     """
     with shared_machines(store, request) as machines_for:
-        return [
-            _reprocess(store, match_id, request, machines_for, retry, is_rehearsal)
-            for match_id in match_ids or store.matches()
-        ]
+        for match_id in match_ids or store.matches():
+            yield _reprocess(store, match_id, request, machines_for, retry, is_rehearsal)
 
 
 def _reprocess(

@@ -155,7 +155,7 @@ def save_layer(
     if name.startswith(MATCHES):  # of the venue that it names now
         venues = [each.values["venue"] for each in (*given, layer) if "venue" in each.values]
         given = [each for each in given if not each.name.startswith(VENUES)]
-        given += [read_layer(store, f"{VENUES}/{venue}") for venue in venues[-1:]]
+        given += [read_layer(store, f"{VENUES}/{venue}") for venue in venues[-1:] if venue]
     resolve([*given, layer])
     write_layer(store, name, values)
 

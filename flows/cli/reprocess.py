@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Set
 from typing import Annotated, Final
 
 import typer
@@ -22,7 +22,7 @@ from flows.cli.console import (
 from flows.cli.options import DaskOption, MoreSettingsOption, TimeLimitOption, WorkersOption
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
-from flows.reprocess import Reprocessed, reprocess_matches
+from flows.reprocess import Reprocessed, State, reprocess_matches
 from flows.run_status import RunStatus
 from flows.running import RunRequest
 from flows.settings import parse_overrides
@@ -64,36 +64,38 @@ def reprocess(
     limits = parse_time_limits(time_limits or ())
     request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
     with progress(verbose=verbose):
-        found = reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run)
+        states, told = set(), []
+        for each in reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run):
+            states.add(each.state)
+            if as_json:
+                told.append(_as_json(each))
+            else:
+                _print(each)
     if as_json:
-        print_json({"matches": [_as_json(each) for each in found]})
-    else:
-        _print(found)
-    raise typer.Exit(exit_code(found))
+        print_json({"matches": told})
+    elif not states:
+        line("No match is registered. Register one: worldpose ingest FOLDER.")
+    raise typer.Exit(exit_code(states))
 
 
-def exit_code(found: Sequence[Reprocessed]) -> int:
-    """Return the exit code of the command."""
-    states = {each.state for each in found}
+def exit_code(states: Set[State]) -> int:
+    """Return the exit code of the command for the states of the matches."""
     if states & {"failed", "partial"}:
         return 1 if states == {"failed"} else 4
     return 3 if "waiting" in states else 0
 
 
-def _print(found: Sequence[Reprocessed]) -> None:
-    if not found:
-        line("No match is registered. Register one: worldpose ingest FOLDER.")
-    for each in found:
-        if each.state in ("never run", "current"):
-            line(f"{each.match_id}: {_nothing_to_do(each)}")
-            continue
-        count = 0 if each.status is None else len(each.status.to_compute)
-        run = "" if each.record is None else f", run {each.record.run_id}"
-        line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
-        if each.status is not None:
-            _print_units(each.status)
-        if each.problem is not None:
-            line(f"error: {each.problem}", to=errors)
+def _print(each: Reprocessed) -> None:
+    if each.state in ("never run", "current"):
+        line(f"{each.match_id}: {_nothing_to_do(each)}")
+        return
+    count = 0 if each.status is None else len(each.status.to_compute)
+    run = "" if each.record is None else f", run {each.record.run_id}"
+    line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
+    if each.status is not None:
+        _print_units(each.status)
+    if each.problem is not None:
+        line(f"error: {each.problem}", to=errors)
 
 
 def _nothing_to_do(each: Reprocessed) -> str:

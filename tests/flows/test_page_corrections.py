@@ -102,11 +102,8 @@ def test_a_page_names_no_command(said, shown):
 
 
 def test_an_undo_that_is_repeated_is_done_and_goes_on_to_the_one_before(ada, store):
-    ids = [f"named_track.{number:012x}" for number in range(3)]
-    for number, name in enumerate(ids):
-        edit = {"kind": "named_track", "clip": "clip", "person": 0, "name": f"Ann {number}"}
-        made = ada.post(f"{MATCH}/corrections", json={"edits": [{"id": name, "edit": edit}]})
-        assert made.status_code == 200, made.json()
+    write_corrections(store, TINY, 3)
+    ids = [*read_journal(store, TINY).standing]
     for name in (ids[2], ids[2], ids[1]):  # the answer to the first was lost
         answer = ada.post(f"{MATCH}/withdrawals", json={"correction": name})
         assert answer.json() == {"withdrawn": name}

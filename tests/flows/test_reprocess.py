@@ -184,28 +184,28 @@ def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
 
     monkeypatch.setattr(reprocess, "run_match", run)
     monkeypatch.setattr(reprocess, "shared_machines", machines)
-    real = reprocess.run_status
+    real = reprocess.read_summary
 
-    def broken(store, match_id, settings, *, retry):
+    def broken(store, match_id):
         if match_id == "halves":
             raise OSError("its folder is gone")
-        return real(store, match_id, settings, retry=retry)
+        return real(store, match_id)
 
     request = RunRequest({}, workers=3)
-    first = reprocess_matches(store, (), request)
+    first = list(reprocess_matches(store, (), request))
     assert [(each.match_id, each.state) for each in first] == [
         ("halves", "never run"),
         (TINY, "complete"),
     ]
     assert ran == [(TINY, "never", 3)]
-    monkeypatch.setattr(reprocess, "run_status", broken)
-    second = reprocess_matches(store, (), request)
+    monkeypatch.setattr(reprocess, "read_summary", broken)
+    second = list(reprocess_matches(store, (), request))
     assert [(each.state, each.problem) for each in second] == [
         ("failed", "its folder is gone"),
         ("complete", None),
     ]
     assert exit_code(second) == 4
-    rehearsed = reprocess_matches(store, (TINY,), request, is_rehearsal=True)
+    rehearsed = list(reprocess_matches(store, (TINY,), request, is_rehearsal=True))
     assert [each.state for each in rehearsed] == ["stale"]
     assert len(ran) == 2
 

@@ -156,7 +156,7 @@ def test_every_door_computes_the_same_keys(store, smpl, tiny, keys_of_run, tmp_p
         deployed.match.fn(store.url, TINY)
 
     def by_reprocess():
-        reprocess.reprocess_matches(store, [TINY], RunRequest({}))
+        list(reprocess.reprocess_matches(store, [TINY], RunRequest({})))
 
     first = keys_of_run(by_command, smpl)
     assert len(first) == 2 and first[0] != first[1]
@@ -390,12 +390,12 @@ def test_a_venue_can_be_a_number(store, tmp_path):
     ("text", "found"),
     [
         ("detection.stride=true", "true"),
-        ("triangulation.min_views=false", "false"),
+        ("tracking.gate_m=true", "true"),
         ("detection.zooms=[true, 2]", "[true, 2]"),
     ],
 )
 def test_true_is_no_number(text, found):
-    with pytest.raises(UsageError, match="expected a? ?numbers?") as refused:
+    with pytest.raises(UsageError, match="number") as refused:
         parse_overrides([text])
     assert refused.value.found == found
 
