@@ -37,7 +37,7 @@ from flows.run_record import latest_run, runs_at_work
 from flows.run_status import run_status
 from flows.settings import resolve
 from flows.stage import Match
-from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
+from worldpose.errors import InputError, StoreError, WorldposeError
 from worldpose.review.journal import last_decision, read_journal, requests_by_id
 from worldpose.store.blobs import changed_at
 from worldpose.store.documents import seal, unseal
@@ -63,33 +63,34 @@ BODIES = "body_fitting"
 def read_summary(store: Store, match_id: str) -> MatchSummary:
     """Return the summary of a match; made again unless the kept one is of what is there now."""
     path = summary_path(match_id)
-    data = store.blobs.read(path)
-    if data is not None:
-        with suppress(CorruptionError, InputError):  # of a power failure, or of another version
-            kept = unseal(MatchSummary, data, path)
-            if kept.match_id == match_id and kept.basis == _basis(store, kept)[0]:
-                return kept
+    with suppress(StoreError, InputError):  # it is damaged, or of another version
+        data = store.blobs.read(path)
+        kept = None if data is None else unseal(MatchSummary, data, path)
+        if kept and kept.match_id == match_id and kept.basis == _basis(store, kept)[0]:
+            return kept
     return make_summary(store, match_id)
 
 
 def make_summary(store: Store, match_id: str) -> MatchSummary:
-    """Make and keep the summary of a match; one that cannot be kept is made again next time."""
-    watched = _watched(store, match_id)
-    draft = MatchSummary(match_id=match_id, watched=watched, open_run=_open_run(store, match_id))
-    basis, newest = _basis(store, draft)
-    if 0 <= time.time_ns() - newest < TICK_NS:
-        time.sleep(1e-9 * TICK_NS)  # a later change has a later time
-        basis, _ = _basis(store, draft)
+    """Make and keep the summary of a match; its `problem` says what cannot be read.
+
+    It is not kept if something changed meanwhile, or if the project cannot be written.
+    """
+    draft = MatchSummary(match_id=match_id)
     try:
-        made = draft.model_copy(update=_summarize(store, match_id))
+        draft = _watch(store, draft)
+        basis, newest = _basis(store, draft)
+        if 0 <= time.time_ns() - newest < TICK_NS:
+            time.sleep(1e-9 * TICK_NS)  # a later change has a later time
+            basis, _ = _basis(store, draft)
+        made = _summarize(store, draft)
+        if _watch(store, made) == made and basis == _basis(store, made)[0]:
+            made = made.model_copy(update={"basis": basis})
+            with suppress(StoreError):
+                store.blobs.put(summary_path(match_id), seal(made))
+        return made
     except (OSError, WorldposeError) as error:
-        made = draft.model_copy(update=_say(describe_problem(error)) | {"problem": str(error)})
-    made = made.model_copy(update={"open_run": _open_run(store, match_id)})
-    if basis == _basis(store, made)[0] and watched == _watched(store, match_id):
-        made = made.model_copy(update={"basis": basis})
-        with suppress(StoreError):
-            store.blobs.put(summary_path(match_id), seal(made))
-    return made
+        return _say_problem(draft, error)
 
 
 @dataclass
@@ -143,12 +144,8 @@ class Overview:
 
     def _read(self, name: str, mark: tuple[int, ...]) -> MatchSummary:
         self._at_work.add(name)
-        try:
-            found = read_summary(self.store, name)
-        except (OSError, WorldposeError) as error:
-            found = MatchSummary(match_id=name, problem=str(error))
-        finally:
-            self._at_work.discard(name)
+        found = read_summary(self.store, name)
+        self._at_work.discard(name)
         slim: dict[str, Any] = {"stages": {}, "units": {}, "watched": (), "settings": {}}
         self._heads[name], self._read_at[name] = found.model_copy(update=slim), time.monotonic()
         self._marks[name] = mark  # last: without it the head is not used
@@ -182,8 +179,9 @@ def _own(match_id: str) -> tuple[str, str]:
     return f"runs/{match_id}", f"reviews/{match_id}"
 
 
-def _watched(store: Store, match_id: str) -> tuple[str, ...]:
-    """Return the files and folders on which the summary of a match depends."""
+def _watch(store: Store, summary: MatchSummary) -> MatchSummary:
+    """Return a summary with the files, folders and the open run that it depends on."""
+    match_id = summary.match_id
     found = [registration_path(match_id), *_own(match_id), f"results/{match_id}"]
     found += [f"results/{match_id}/{stage.name}" for stage in METHOD]
     with suppress(OSError, WorldposeError):  # the summary says what cannot be read
@@ -198,7 +196,11 @@ def _watched(store: Store, match_id: str) -> tuple[str, ...]:
         if registration := store.registration(match_id):
             found += _files_of(registration)
             found += _settings_of(store, registration)
-    return tuple(dict.fromkeys(found))
+    run = ""
+    for open_run in store.unfinished_runs(match_id)[-1:]:
+        run = f"run {open_run.run_id} on {open_run.host} has not ended"
+    watched = tuple(dict.fromkeys(found))
+    return summary.model_copy(update={"watched": watched, "open_run": run})
 
 
 def _files_of(registration: Registration) -> Iterator[str]:
@@ -246,16 +248,16 @@ def code_digest() -> str:
     return found.hexdigest()[:16]
 
 
-def _summarize(store: Store, match_id: str) -> dict[str, Any]:
-    """Return the fields of a summary that the match gives.
+def _summarize(store: Store, draft: MatchSummary) -> MatchSummary:
+    """Return a summary with what the match, its runs and its journal say.
 
     Raises:
         OSError: a file cannot be read.
-        WorldposeError: the match cannot be opened, or a record is damaged.
+        WorldposeError: a record is damaged.
     """
-    latest = latest_run(store, match_id)
-    open_runs = store.unfinished_runs(match_id)
+    match_id, latest = draft.match_id, latest_run(store, draft.match_id)
     last = "" if latest is None else latest.run_id
+    open_runs = store.unfinished_runs(match_id)
     begun = [run.started_at for run in open_runs if run_order(run.run_id) > run_order(last)]
     stages = {} if latest is None else list_units(store, latest)
     found: dict[str, Any] = {
@@ -268,15 +270,13 @@ def _summarize(store: Store, match_id: str) -> dict[str, Any]:
     try:
         match = open_for_review(store, match_id)
     except (OSError, WorldposeError) as error:  # its runs are still shown
-        return found | _say(describe_problem(error)) | {"problem": str(error)}
+        return _say_problem(draft.model_copy(update=found), error)
     try:
         now = match_state(store, match)
     except (OSError, WorldposeError) as error:  # a setting can name a missing file
         now = describe_problem(error)
     first = sum(map(is_first_click, match.corrections))
-    return {
-        **found,
-        **_say(now),
+    found |= {
         "waiting": tuple(_questions(store, match, latest)),
         "to_click": match.folder.to_click,
         "has_image": bool({*match.folder.stills, *match.folder.videos}),
@@ -287,6 +287,11 @@ def _summarize(store: Store, match_id: str) -> dict[str, Any]:
         "settings": resolve(match.layers).overrides,
         "is_settled": _is_settled(store, match_id),
     }
+    return draft.model_copy(update=found | _say(now))
+
+
+def _say_problem(summary: MatchSummary, error: OSError | WorldposeError) -> MatchSummary:
+    return summary.model_copy(update=_say(describe_problem(error)) | {"problem": str(error)})
 
 
 NOT_KEPT: Final[Mapping[str, Any]] = {
@@ -326,14 +331,6 @@ def _questions(store: Store, match: Match, latest: RunRecord | None) -> Iterator
             since=latest and latest.finished_at if review is None else review.request.created_at,
             excess=0.0 if gate is None or review is None else gate.excess(review.request.figures),
         )
-
-
-def _open_run(store: Store, match_id: str) -> str:
-    """Return the last run of a match that has not ended, in words; empty without one."""
-    with suppress(OSError, WorldposeError):
-        for run in store.unfinished_runs(match_id)[-1:]:
-            return f"run {run.run_id} on {run.host} has not ended"
-    return ""
 
 
 def list_units(store: Store, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -123,50 +124,30 @@ STATES = tuple(state.value for state in UnitState)
 
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
-    """Return one match's status; unreadable parts are reported, and do not affect other matches."""
-    status: dict[str, Any] = {
+    """Return one match's status; what cannot be read is its problem, and hides no other match."""
+    found, pins, unfinished = read_summary(store, match_id), {}, list[str]()
+    latest, problem = found.latest, found.problem or (found.words == UNREADABLE and found.why)
+    with suppress(OSError, WorldposeError):  # the problem says it
+        pins = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)}
+        unfinished = [run.run_id for run in store.unfinished_runs(match_id)]
+    return {
         "match": match_id,
-        "run": None,
-        "state": "unreadable",
-        "now": "unreadable",
-        "why": "",
-        "todo": "",
-        "units": {state: [] for state in STATES},
-        "failed": [],
-        "left_out": {},
-        "warnings": [],
-        "usability": None,
-        "waiting": [],
-        "settings": {},
-        "unfinished_runs": [],
-        "pins": {},
-        "problem": None,
+        "run": None if latest is None else latest.run_id,
+        "state": latest.state if latest else "unreadable" if found.problem else "not run",
+        "now": "unreadable" if problem else found.words,
+        "why": "" if problem else found.why,
+        "todo": "" if problem else found.todo,
+        "units": {state: list(found.units.get(state, ())) for state in STATES},
+        "failed": [failure.unit for failure in latest.failed] if latest else [],
+        "left_out": latest.left_out if latest else {},
+        "warnings": list(latest.warnings) if latest else [],
+        "usability": latest.usability.model_dump(mode="json") if latest else None,
+        "waiting": [each.unit for each in found.waiting],
+        "settings": found.settings,
+        "unfinished_runs": unfinished,
+        "pins": pins,
+        "problem": problem or None,
     }
-    try:
-        found = read_summary(store, match_id)
-        latest = found.latest
-        if latest is not None:
-            status |= {
-                "run": latest.run_id,
-                "failed": [failure.unit for failure in latest.failed],
-                "left_out": latest.left_out,
-                "warnings": list(latest.warnings),
-                "usability": latest.usability.model_dump(mode="json"),
-            }
-        status |= {
-            "state": "not run" if latest is None else latest.state,
-            "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
-            "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
-        }
-        if found.problem or found.words == UNREADABLE:
-            return status | {"problem": found.problem or found.why}
-        status["settings"] = found.settings
-        status["units"] |= {state: list(names) for state, names in found.units.items()}
-        status |= {"now": found.words, "why": found.why, "todo": found.todo}
-        status["waiting"] = [each.unit for each in found.waiting]
-    except (OSError, WorldposeError) as failure:  # a damaged record
-        status["problem"] = str(failure)
-    return status
 
 
 def verify(

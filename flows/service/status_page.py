@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -35,8 +35,6 @@ REST_SECONDS: Final = 0.5
 """Time spent on matches that were never read, after the page was sent."""
 MAX_DETAILS: Final = 20
 """Matches whose cameras are on the page at once; of more matches, the one in the address."""
-UNIT_KEYS: Final = ["unit", "state", "seconds", "figures", "objections", "waiting_since", "why"]
-"""What the page's JSON says of a unit."""
 FILES: Final = Path(__file__).with_name("status")
 """The page, its style and its script."""
 
@@ -217,23 +215,18 @@ TEMPLATE: Final = _read_page()
 
 
 def _as_json(row: StatusRow) -> dict[str, Any]:
-    match, latest, cost = row.match, row.match.latest, cost_of(row.match)
+    match, latest = row.match, row.match.latest
+    about = {"problem", "why", "stages"}
     return {
         "match": match.match_id,
         "state": match.state,
         "now": row.words,
-        "why": match.why,
-        "problem": match.problem,
-        "run": None if latest is None else latest.run_id,
-        "seconds": None if latest is None else latest.seconds,
+        "run": latest and latest.run_id,
+        "seconds": latest and latest.seconds,
         "at_work": row.at_work,
         "prefect": row.prefect,
-        "core_hours": cost.core_hours,
-        "bytes": cost.bytes,
-        "stages": {
-            stage: [{name: getattr(unit, name) for name in UNIT_KEYS} for unit in units]
-            for stage, units in match.stages.items()
-        },
+        **asdict(cost_of(match)),
+        **match.model_dump(mode="json", include=about),
     }
 
 
