@@ -172,7 +172,7 @@ class MatchSummary(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
-    basis: str = ""
+    made_from: str = ""
     """Digest of what it was made from; empty if that changed meanwhile: it is made again."""
     watched: tuple[str, ...] = ()
     """Files and folders that it was made from: of the project, or absolute."""
@@ -200,7 +200,7 @@ class MatchSummary(Record):
     """Stage to the number of its units by state."""
     open_run: str = ""
     """Last run that has not ended, in words; empty without one."""
-    at_work_since: datetime | None = None
+    running_since: datetime | None = None
     """Start of a run later than the latest finished one."""
     waiting: tuple[Question, ...] = ()
     to_click: tuple[str, ...] = ()
@@ -215,7 +215,7 @@ class MatchSummary(Record):
     """Damaged entries of its journal."""
     settings: dict[str, dict[str, JsonValue]] = {}
     """Settings of its next run that layers state, by stage."""
-    bodies: tuple[tuple[datetime, float], ...] = ()
+    poses: tuple[tuple[datetime, float], ...] = ()
     """End and number of fitted bodies of each run."""
     is_settled: bool = False
     """Whether `worldpose reprocess` without options has nothing to do."""
@@ -227,6 +227,6 @@ class MatchSummary(Record):
             return "being read"
         if self.problem:
             return "unreadable"
-        if self.at_work_since is not None:
+        if self.running_since is not None:
             return "at work"
         return "not run" if self.latest is None else self.latest.state

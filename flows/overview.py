@@ -66,7 +66,7 @@ def read_summary(store: Store, match_id: str) -> MatchSummary:
     with suppress(StoreError, InputError):  # it is damaged, or of another version
         data = store.blobs.read(path)
         kept = None if data is None else unseal(MatchSummary, data, path)
-        if kept and kept.match_id == match_id and kept.basis == _basis(store, kept)[0]:
+        if kept and kept.match_id == match_id and kept.made_from == _basis(store, kept)[0]:
             return kept
     return make_summary(store, match_id)
 
@@ -85,7 +85,7 @@ def make_summary(store: Store, match_id: str) -> MatchSummary:
             basis, _ = _basis(store, draft)
         made = _summarize(store, draft)
         if _watch(store, made) == made and basis == _basis(store, made)[0]:
-            made = made.model_copy(update={"basis": basis})
+            made = made.model_copy(update={"made_from": basis})
             with suppress(StoreError):
                 store.blobs.put(summary_path(match_id), seal(made))
         return made
@@ -264,8 +264,8 @@ def _summarize(store: Store, draft: MatchSummary) -> MatchSummary:
         "latest": None if latest is None else latest.model_copy(update=NOT_KEPT),
         "stages": stages,
         "progress": {name: dict(Counter(it.state for it in stages[name])) for name in stages},
-        "at_work_since": begun[-1] if begun else None,
-        "bodies": tuple(_bodies_of(store.run(match_id, it)) for it in store.runs(match_id)),
+        "running_since": begun[-1] if begun else None,
+        "poses": tuple(_bodies_of(store.run(match_id, it)) for it in store.runs(match_id)),
     }
     try:
         match = open_for_review(store, match_id)

@@ -60,7 +60,7 @@ class ProjectMetrics(Collector):
         with self._lock:
             matches = self._overview.look(LOOK_SECONDS)
             size = self._store_size()
-        ended = [each for match in matches for each in match.bodies]
+        ended = [each for match in matches for each in match.poses]
         last = sorted(matches, key=_ended_at)[-MOST_MATCHES:]
         whole = [self._overview.read(each.match_id) for each in last if not each.is_unseen]
         states = Counter(match.state for match in matches)

@@ -178,7 +178,7 @@ def test_a_summary_is_used_until_something_changes_that_it_was_made_from(
 ):
     monkeypatch.setenv("WORLDPOSE_BODY_FOLDER", "")
     first = make_summary(store, TINY)
-    assert first.basis and first.words == "ready"
+    assert first.made_from and first.words == "ready"
     monkeypatch.setattr(overview, "make_summary", lambda store, match_id: "made again")
     assert read_summary(store, TINY) == first
     change(store)
@@ -211,7 +211,7 @@ def test_what_changes_while_a_summary_is_made_leaves_none_behind(store, monkeypa
         return match
 
     monkeypatch.setattr(overview, "open_for_review", edit_meanwhile)
-    assert make_summary(store, TINY).basis == ""
+    assert make_summary(store, TINY).made_from == ""
     assert not store.blobs.exists(summary_path(TINY))
 
 
