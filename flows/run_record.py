@@ -6,7 +6,6 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from types import MappingProxyType
@@ -34,7 +33,7 @@ from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
 from flows.usability import RunOutcome, exceeded_limits, judge_run, usable_limits
 from tasks.tracing import add_unit_span, stage_span
-from worldpose.errors import InputError, WorldposeError
+from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.recipes import libraries
 from worldpose.store.store import Store
@@ -337,10 +336,6 @@ class RunLog:
         )
         self.gatekeeper.ask(self.run_id, self.plan.waiting, self.plan.results)
         self.store.finish_run(record)
-        from flows.overview import make_summary  # late: it reads runs
-
-        with suppress(OSError, WorldposeError):  # whoever lists the match makes it then
-            make_summary(self.store, record.match_id)
         if os.environ.get("OPENLINEAGE_URL"):
             from flows.openlineage import tell_lineage  # few runs need it
 

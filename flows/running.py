@@ -27,6 +27,7 @@ from flows.orchestration.local_cluster import (
 )
 from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
+from flows.overview import make_summary
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
@@ -222,7 +223,9 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
             }
         )
     log = RunLog.begin(store, match, stages, request.settings, policy, request.iteration)
-    return log.run_stages(compute=lambda stage, units: ())  # all results exist
+    record = log.run_stages(compute=lambda stage, units: ())  # all results exist
+    make_summary(store, record.match_id)
+    return record
 
 
 def _with_prefect(
