@@ -106,6 +106,7 @@ def serve(
     if test_alerts:
         _test_alerts(folder, as_json=as_json)
         return
+    line(f"starting Prefect, the worker and the pages for {url}", to=errors)
     from flows.service.channels import channels_of
     from flows.service.schedules import parse_schedules
     from flows.service.service_secrets import PAGES_TOKEN, secrets_of
