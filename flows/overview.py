@@ -113,7 +113,8 @@ class Overview:
         Without a change, a match is read again after `TURN_SECONDS`.
         """
         begun, there = time.monotonic(), self._list()
-        for name in set(self._heads) - there.keys():
+        for name in set(self._marks) - there.keys():
+            self._marks.pop(name, None)
             self._heads.pop(name, None)
         turn = sorted(there, key=lambda name: self._read_at.get(name, -math.inf))
         changed = [name for name in turn if self._marks.get(name) != there[name]]
