@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
-from threading import Lock
+from threading import Lock, Thread
 from typing import Any, Final
 
 from prometheus_client import CollectorRegistry
@@ -48,7 +48,8 @@ class ProjectMetrics(Collector):
     def __init__(self, overview: Overview, state: StateFolder) -> None:
         self.store, self.state = overview.store, state
         self._overview = overview
-        self._size = (float("-inf"), 0)
+        self._size: tuple[float, int | None] = (float("-inf"), None)
+        self._sum = Thread()
         self._lock = Lock()
 
     def describe(self) -> list[Metric]:
@@ -74,7 +75,8 @@ class ProjectMetrics(Collector):
         last_hour = sum(count for at, count in ended if at >= hour_ago)
         about = "Bodies fitted by runs that ended within the last hour"
         yield _gauge("poses_last_hour", about, [], {(): last_hour})
-        yield _gauge("store_bytes", "Size of the project", [], {(): size})
+        sizes = {} if size is None else {(): float(size)}
+        yield _gauge("store_bytes", "Size of the project", [], sizes)
         folder = self.state.folder if "://" in self.store.url else self.store.url
         about = "Free on the disk of the project, or of the state of a project in object storage"
         yield _gauge("disk_free_bytes", about, [], {(): shutil.disk_usage(folder).free})
@@ -85,13 +87,19 @@ class ProjectMetrics(Collector):
         kinds = Counter((each["alert"],) for each in held.values())
         yield _gauge("alerts", "Alerts that hold, by what they are about", ["alert"], kinds)
 
-    def _store_size(self) -> int:
-        at, size = self._size
-        if time.monotonic() - at > SIZE_SECONDS:
-            tops = ("matches", "results", "runs", "reviews", "staging")
-            size = sum(each.size for top in tops for each in self.store.blobs.entries(top))
-            self._size = (time.monotonic(), size)
-        return size
+    def _store_size(self) -> int | None:
+        """Return the last known size; a scrape does not wait long for a sum over all files."""
+        if not self._sum.is_alive() and time.monotonic() - self._size[0] > SIZE_SECONDS:
+            self._sum = Thread(target=self._sum_files, daemon=True)
+            self._sum.start()
+        if self._sum.is_alive():
+            self._sum.join(LOOK_SECONDS)
+        return self._size[1]
+
+    def _sum_files(self) -> None:
+        tops = ("matches", "results", "runs", "reviews", "staging")
+        size = sum(each.size for top in tops for each in self.store.blobs.entries(top))
+        self._size = (time.monotonic(), size)
 
 
 def exposition(metrics: ProjectMetrics) -> bytes:
