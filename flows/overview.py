@@ -118,6 +118,7 @@ class Overview:
             self._heads.pop(name, None)
         turn = sorted(there, key=lambda name: self._read_at.get(name, -math.inf))
         changed = [name for name in turn if self._marks.get(name) != there[name]]
+        changed.sort(key=lambda name: name not in self._heads)  # a moment ago, before the unknown
         old = [name for name in turn if begun - self._read_at.get(name, 0.0) > TURN_SECONDS]
         for number, name in enumerate(dict.fromkeys((*changed, *old))):
             share = 1.0 if number < len(changed) else TURN_SHARE
