@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import JsonValue
 
 from data_contracts.records import CONTRACT_VERSION, Amount, Count, Name, ProcessId, Record, Share
+from data_contracts.run import RunRecord
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]
 """arriving: changed recently; incomplete: something is missing; refused: invalid as a match; taken:
@@ -125,3 +126,107 @@ class Heartbeat(Record):
     doing: str
     """Stage with the units left, and the expected time left."""
     at: datetime
+
+
+UnitProgress = Literal["done", "waiting", "failed", "blocked"]
+"""waiting: for review; blocked: by a unit that is not done."""
+
+
+class UnitSummary(Record):
+    """One unit of a match's latest run."""
+
+    unit: str
+    """Name within its stage, often the id of a camera or clip."""
+    state: UnitProgress
+    seconds: Amount | None = None
+    """Computation time [s]; None if there is no result."""
+    figures: dict[str, float] = {}
+    """Its quality metrics."""
+    objections: tuple[str, ...] = ()
+    """Metrics beyond the gate's limits without an approval."""
+    waiting_since: datetime | None = None
+    """Time of the review request; None if there is none."""
+    why: str = ""
+    """Reason for the failure or the review."""
+    bytes: Count = 0
+    """Size of the files of its result [byte]."""
+
+
+class Question(Record):
+    """A result that waits for review."""
+
+    id: str
+    """Id of the review request."""
+    unit: str
+    """Unit as `stage/unit`."""
+    reasons: tuple[str, ...] = ()
+    rejected: bool = False
+    since: datetime | None = None
+    """Time of the request."""
+    excess: float = 0.0
+    """Relative excess of the worst metric over its limit [1]."""
+
+
+class MatchSummary(Record):
+    """summaries/<match>.json: what lists of matches show of one; derived from all else."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
+    made_from: str = ""
+    """Digest of what it was made from; empty if that changed meanwhile: it is made again."""
+    watched: tuple[str, ...] = ()
+    """Files and folders that it was made from: of the project, or absolute."""
+    is_unseen: bool = False
+    """Whether it was not made or verified yet; never stored."""
+    problem: str = ""
+    """Why the match cannot be opened."""
+    kind: str = ""
+    """Kind of its state (`flows.match_state.StateName`)."""
+    words: str = ""
+    """The state in a few words, such as `2 questions`."""
+    why: str = ""
+    """Reason of the state, in sentences."""
+    todo: str = ""
+    """What a person can do."""
+    seconds: Amount | None = None
+    """Expected time of the next run [s]; None if it computes nothing or is unknown."""
+    units: dict[str, tuple[str, ...]] = {}
+    """State of units relative to the latest run to their names, as `stage/unit`."""
+    latest: RunRecord | None = None
+    """Latest finished run, without its results, settings, figures and versions."""
+    stages: dict[str, tuple[UnitSummary, ...]] = {}
+    """Stage to the units of the latest run, in the order of the method."""
+    progress: dict[str, dict[UnitProgress, Count]] = {}
+    """Stage to the number of its units by state."""
+    open_run: str = ""
+    """Last run that has not ended, in words; empty without one."""
+    running_since: datetime | None = None
+    """Start of a run later than the latest finished one."""
+    waiting: tuple[Question, ...] = ()
+    to_click: tuple[str, ...] = ()
+    """Cameras that need clicks."""
+    has_image: bool = False
+    corrections: Count = 0
+    """Corrections in force, without first clicks."""
+    first_clicks: Count = 0
+    outdated: Count = 0
+    """Corrections that no longer apply."""
+    damage: tuple[str, ...] = ()
+    """Damaged entries of its journal."""
+    settings: dict[str, dict[str, JsonValue]] = {}
+    """Settings of its next run that layers state, by stage."""
+    poses: tuple[tuple[datetime, float], ...] = ()
+    """End and number of fitted bodies of each run."""
+    is_settled: bool = False
+    """Whether `worldpose reprocess` without options has nothing to do."""
+
+    @property
+    def state(self) -> str:
+        """The latest run's state, or the state before the first run."""
+        if self.is_unseen:
+            return "being read"
+        if self.problem:
+            return "unreadable"
+        if self.running_since is not None:
+            return "at work"
+        return "not run" if self.latest is None else self.latest.state

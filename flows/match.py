@@ -25,6 +25,7 @@ from data_contracts.work import Work
 from flows.orchestration.cluster_errors import require_workers
 from flows.orchestration.local_cluster import short_seconds
 from flows.orchestration.time_limits import TimeLimits, seconds_of
+from flows.overview import make_summary
 from flows.progress import reporter
 from flows.registering import open_for_review, open_match
 from flows.run_plan import PlannedUnit
@@ -137,7 +138,9 @@ def run_stages(log: RunLog, time_limits: TimeLimits) -> RunRecord:
         yield from compute(stage, missing, work)
 
     with SharedSettings.current():
-        return log.run_stages(compute_missing)
+        record = log.run_stages(compute_missing)
+    make_summary(log.store, record.match_id)
+    return record
 
 
 def compute(

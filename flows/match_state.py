@@ -13,9 +13,10 @@ from data_contracts.review import Correction, NamedTrack, Withdrawal
 from data_contracts.run import RunRecord, UnitFailure
 from flows.review.descriptions import is_first_click
 from flows.review.verdicts import still_waiting
-from flows.run_plan import PlannedUnit
+from flows.run_plan import PlannedUnit, plan_run
 from flows.run_record import expected_work, latest_run, runs_at_work
 from flows.run_status import Cause, UnitState, plan_as_latest, unit_state, unit_status
+from flows.settings import resolve
 from flows.stage import Match
 from worldpose.errors import WorldposeError
 from worldpose.ingest.match_folder import unclicked_clips
@@ -27,6 +28,8 @@ from worldpose.store.store import Store
 StateName = Literal[
     "running", "calibrate", "questions", "outdated", "stopped", "failed", "partial", "new", "ready"
 ]
+UNREADABLE: Final = "cannot be opened"
+"""Words of a match that cannot be opened or planned."""
 START_SECONDS: Final = 10.0
 """Time until a run computes: its processes start [s]."""
 
@@ -65,8 +68,10 @@ def match_state(store: Store, match: Match) -> MatchState:
         plan = plan_as_latest(store, match, latest, {})
         states = [(unit.name, unit_state(unit, latest)) for unit in plan]
         units = {state: tuple(n for n, its in states if its == state) for state in UnitState}
-    found = _find(store, match, latest, units, plan)
     missing = [unit for unit in plan if not unit.published]
+    further = _further_iterations(store, match, latest) if latest and not missing else []
+    found = _find(store, match, latest, units, plan, further)
+    missing += further
     seconds = None
     if found.name in ("outdated", "stopped", "new") and missing:
         work = sum(expected_work(store, match, missing, latest).values())
@@ -80,6 +85,7 @@ def _find(
     latest: RunRecord | None,
     units: Mapping[UnitState, tuple[str, ...]],
     plan: list[PlannedUnit],
+    further: list[PlannedUnit],
 ) -> MatchState:
     at_work, stopped = _open_runs(store, match.match_id, latest)
     to_click = (*match.folder.to_click, *(unclicked_clips(match.folder) if latest is None else ()))
@@ -116,10 +122,22 @@ def _find(
     if units[UnitState.MISSING]:
         why = "The last run was asked to end earlier."
         return MatchState("stopped", "not run to the end", why, "Continue it.")
+    if further:
+        why = f"{further[-1].iteration} iterations are set, and not all of them were run."
+        return MatchState("outdated", "out of date because of its iterations", why, "Run it again.")
     usability = latest.usability
     words = "ready" if usability.verdict == "usable" else usability.verdict
     why = " ".join(usability.reservations)
     return MatchState("ready", words, why, todo="Download the results.")
+
+
+def _further_iterations(store: Store, match: Match, latest: RunRecord) -> list[PlannedUnit]:
+    """Return the units to compute in iterations that are set beyond that of the latest run."""
+    found = resolve(match.layers)
+    most = found.general.iterations
+    numbers = range(latest.iteration + 1, 0 if most == "auto" else most + 1)
+    plans = (plan_run(store, match, found.overrides, iteration=number) for number in numbers)
+    return [unit for plan in plans for unit in plan if not unit.published]
 
 
 def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[bool, str]:
@@ -236,4 +254,4 @@ def _count(number: int, one: str, many: str) -> str:
 
 def describe_problem(error: OSError | WorldposeError) -> MatchState:
     """Return the state of a match that cannot be opened or planned."""
-    return MatchState("failed", "cannot be opened", str(error))
+    return MatchState("failed", UNREADABLE, str(error))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from data_contracts.run import RunRecord
 from flows.iterate import iterate_match
+from flows.overview import read_summary
 from flows.progress import reporter
 from flows.results.automatic_exports import export_after_run
 from flows.run_plan import PlannedUnit
@@ -47,18 +48,16 @@ def reprocess_matches(
     *,
     retry: bool = False,
     is_rehearsal: bool = False,
-) -> list[Reprocessed]:
-    """Run every match with stale results, up to the last stage of its latest run.
+) -> Iterator[Reprocessed]:
+    """Run every match with stale results, up to the last stage of its latest run; yield outcomes.
 
     A match is run with the settings that its layers give. A failure is reported for its match, and
     does not stop the others. No id means all matches. `retry` also retries
     failed units without an edit; a rehearsal only determines what would be done.
     """
     with shared_machines(store, request) as machines_for:
-        return [
-            _reprocess(store, match_id, request, machines_for, retry, is_rehearsal)
-            for match_id in match_ids or store.matches()
-        ]
+        for match_id in match_ids or store.matches():
+            yield _reprocess(store, match_id, request, machines_for, retry, is_rehearsal)
 
 
 def _reprocess(
@@ -71,6 +70,11 @@ def _reprocess(
 ) -> Reprocessed:
     status = None
     try:
+        if not request.settings:
+            found = read_summary(store, match_id)  # as cheap as it is exact
+            latest, failed = found.latest, bool(found.latest and found.latest.failed)
+            if found.is_settled and not (retry and failed):
+                return Reprocessed(match_id, "current" if latest else "never run", record=latest)
         status = run_status(store, match_id, request.settings, retry=retry)
         if status is None:
             return Reprocessed(match_id, "never run")

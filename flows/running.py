@@ -27,6 +27,7 @@ from flows.orchestration.local_cluster import (
 )
 from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
+from flows.overview import make_summary
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
@@ -125,6 +126,13 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     stated |= {} if request.iterations is None else {"iterations": request.iterations}
     stated |= {} if request.body_folder is None else {"body_folder": request.body_folder}
     check_general(before[-1].name, "the request", stated)
+    for name, value in stated.items():
+        was = match.layers[-1].values.get(name, value)
+        if was != value:
+            reporter().tell_kept_settings(
+                f"{match.match_id}: {name}={as_text(value)} replaces {as_text(was)}, which the "
+                "settings of the match stated"
+            )
     layers = (*before[:-1], replace(before[-1], values={**before[-1].values, **stated}))
     found = resolve(layers)
     folder = found.origins.get("body_folder")
@@ -215,7 +223,9 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
             }
         )
     log = RunLog.begin(store, match, stages, request.settings, policy, request.iteration)
-    return log.run_stages(compute=lambda stage, units: ())  # all results exist
+    record = log.run_stages(compute=lambda stage, units: ())  # all results exist
+    make_summary(store, record.match_id)
+    return record
 
 
 def _with_prefect(

@@ -155,7 +155,7 @@ def save_layer(
     if name.startswith(MATCHES):  # of the venue that it names now
         venues = [each.values["venue"] for each in (*given, layer) if "venue" in each.values]
         given = [each for each in given if not each.name.startswith(VENUES)]
-        given += [read_layer(store, f"{VENUES}/{venue}") for venue in venues[-1:]]
+        given += [read_layer(store, f"{VENUES}/{venue}") for venue in venues[-1:] if venue]
     resolve([*given, layer])
     write_layer(store, name, values)
 
@@ -232,13 +232,13 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
     return overrides
 
 
-def parse_value(text: str) -> JsonValue:
-    """Return the value of a setting, given as JSON or else as text."""
+def parse_value(text: str, name: str = "") -> JsonValue:
+    """Return the value of a setting, given as JSON or else as text; venues can be numbers."""
     try:
         value: JsonValue = json.loads(text)
     except (ValueError, RecursionError):  # not JSON, or unclosed brackets
         return text
-    return value
+    return text if name == "venue" and isinstance(value, int | float) else value
 
 
 def _absolute_weights(value: JsonValue) -> JsonValue:
@@ -262,8 +262,9 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
     Raises:
         UsageError: a value is invalid.
     """
+    given = dict(overrides.get(stage.name, {}))
     try:
-        return stage.settings.model_validate(dict(overrides.get(stage.name, {})))
+        settings = stage.settings.model_validate(given)
     except ValidationError as error:
         first = error.errors()[0]
         raise UsageError(
@@ -272,6 +273,22 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             found=repr(first["input"]),
             todo=LIST,
         ) from None
+    for name, value in given.items():
+        if _count_truths(getattr(settings, name)) != _count_truths(value):  # read as 1 or 0
+            raise UsageError(
+                f"--set {stage.name}.{name}",
+                expected="a number" if isinstance(value, bool) else "numbers",
+                found=as_text(value),
+                todo=LIST,
+            )
+    return settings
+
+
+def _count_truths(value: object) -> int:
+    """Return how many values are true or false, in lists too."""
+    if isinstance(value, list | tuple):
+        return sum(map(_count_truths, value))
+    return isinstance(value, bool)
 
 
 def _place(where: str, name: str, names: list[str]) -> int:

@@ -1,59 +1,78 @@
-"""A project with many matches, all copies of one that was run: only what lists of matches read."""
+"""A project with many matches, all copies of one that was run, and a season of queued runs."""
 
 import json
 import os
+import re
 import shutil
+import sqlite3
+import uuid
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from long_journal import write_corrections
+
+from data_contracts.operations import QueuedRun
 from data_contracts.run import ResultManifest, RunRecord
+from flows.method import unit_order
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.registration import register_match
 from worldpose.store.documents import seal
+from worldpose.store.paths import queue_path
 from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Store
 
+SCAN_MINUTES = 15.0
+
 
 def copy_match(project, match_id, count):
-    """Add copies of a match to a project: registrations, run records and manifests of results.
+    """Add copies of a match to a project: folders, registrations, results and run records.
 
-    The copies have the folders, runs and metrics of the match, and none of its arrays.
+    Each copy has another pitch file, and so its own identity and keys. Arrays, images and poses
+    are links to those of the match; there is no truth.
     """
     store = Store.open(str(project))
     folder = Path(store.registration(match_id).folder)
+    before = store.registration(match_id).digest_of("pitch.json")
     for number in range(count):
         name = f"{match_id}-copy{number:03d}"
-        hidden = shutil.ignore_patterns("reference")
-        other = Path(shutil.copytree(folder, folder.with_name(name), ignore=hidden))
-        spec = (other / "match.yaml").read_text()
+        hidden = shutil.ignore_patterns("reference", "match.yaml", "pitch.json")
+        other = Path(project).parent / "copies" / name
+        shutil.copytree(folder, other, ignore=hidden, copy_function=os.link)
+        spec = (folder / "match.yaml").read_text()
         (other / "match.yaml").write_text(spec.replace(match_id, name))
-        pitch = json.loads((other / "pitch.json").read_text())
-        (other / "pitch.json").write_text(json.dumps(pitch, indent=number + 1))  # its own digest
+        pitch = (folder / "pitch.json").read_text()
+        (other / "pitch.json").write_text(f"{pitch}{' ' * (number + 1)}\n")  # its own digest
         for file in ("match.yaml", "pitch.json"):
             os.utime(other / file, (1e9, 1e9))  # a file that has just changed is read again later
-        store.register(register_match(read_match(other), None))
-        copy_results(Path(project), match_id, name)
+        registration = register_match(read_match(other), None)
+        store.register(registration)
+        swapped = {before: registration.digest_of("pitch.json")}
+        copy_results(Path(project), match_id, name, swapped)
 
 
-def copy_results(project, match_id, name):
-    """Copy run records and manifests; a result's key depends on the match."""
-    keys = {}
-    for file in (project / "results" / match_id).rglob("manifest.json"):
-        manifest = renamed(ResultManifest, file.read_text(), match_id, name)
-        key = keys[file.parent.name] = recipe_key(manifest.recipe)
+def copy_results(project, match_id, name, swapped):
+    """Copy run records and results; a key depends on the match, its pitch and earlier keys."""
+    found = (project / "results" / match_id).rglob("manifest.json")
+    for file in sorted(found, key=lambda it: unit_order("/".join(it.parts[-4:-2]))):
+        manifest = renamed(ResultManifest, file.read_text(), match_id, name, swapped)
+        key = swapped[file.parent.name] = recipe_key(manifest.recipe)
         place = file.parent.parent.relative_to(project / "results" / match_id)
-        write(
-            project / "results" / name / place / key / "manifest.json",
-            manifest.model_copy(update={"key": key}),
-        )
+        result = project / "results" / name / place / key
+        result.mkdir(parents=True)
+        for each in file.parent.iterdir():
+            if each != file:
+                (result / each.name).symlink_to(each.resolve())
+        write(result / "manifest.json", manifest.model_copy(update={"key": key}))
     for file in (project / "runs" / match_id).glob("*.json"):
-        text = file.read_text()
-        for before, key in keys.items():
-            text = text.replace(before, key)
-        write(project / "runs" / name / file.name, renamed(RunRecord, text, match_id, name))
+        record = renamed(RunRecord, file.read_text(), match_id, name, swapped)
+        write(project / "runs" / name / file.name, record)
 
 
-def renamed(record, text, match_id, name):
-    content = json.loads(text.replace(f'"{match_id}"', f'"{name}"'))
+def renamed(record, text, match_id, name, swapped):
+    text = text.replace(f'"{match_id}"', f'"{name}"')
+    text = re.sub("|".join(swapped), lambda found: swapped[found[0]], text)
+    content = json.loads(text)
     if "checksum" not in record.model_fields:
         del content["checksum"]
     return record.model_validate(content)
@@ -62,3 +81,78 @@ def renamed(record, text, match_id, name):
 def write(file, record):
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(seal(record))
+
+
+def spread_corrections(project, count, each=10):
+    """Add corrections to every match in turn, `each` of them to one."""
+    store = Store.open(str(project))
+    names = store.matches()
+    step = max(1, len(names) * each // count)
+    for name in names[::step][: count // each]:
+        write_corrections(store, name, each)
+
+
+def queue_history(project, failed, days):
+    """Add failed runs, spread over the matches, and the days' scans of the inbox to the queue."""
+    store, now = Store.open(str(project)), datetime.now(UTC)
+    names = store.matches()
+    scans = int(days * 1440.0 / SCAN_MINUTES)
+    asked = [
+        ("ingest", "", "complete", now - timedelta(minutes=SCAN_MINUTES * n))
+        for n in range(1, scans)
+    ]
+    span = timedelta(days=days) / max(failed, 1)
+    asked += [
+        ("match", names[n % len(names)], "failed", now - timedelta(days=days) + span * n)
+        for n in range(failed)
+    ]
+    found = []
+    for flow, match_id, state, at in asked:
+        run = QueuedRun(
+            id=f"{at:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:12]}",
+            flow=flow,
+            name=f"{match_id or 'arrivals'}, {at:%d %b %H:%M:%S}",
+            match_id=match_id,
+            parameters={"match_id": match_id} if match_id else {},
+            flow_run=str(uuid.uuid4()),
+            asked_at=at,
+            changed_at=at,
+        )
+        for number, kind in enumerate(("asked", "begun", state), 1):
+            message = "made" if kind == "failed" else ""
+            change = {"number": number, "state": kind, "message": message}
+            write(Path(project) / queue_path(run), run.model_copy(update=change))
+        found.append(run.model_copy(update=change))
+    return found
+
+
+def prefect_history(database, runs):
+    """Write ended runs into Prefect's database as copies of one that it has of the same flow."""
+    with closing(sqlite3.connect(database, timeout=60)) as opened:
+        opened.row_factory = sqlite3.Row
+        for flow in {run.flow for run in runs}:
+            query = "select r.* from flow_run r join flow f on f.id = r.flow_id where f.name = ?"
+            sample = dict(opened.execute(f"{query} limit 1", (flow,)).fetchone())
+            rows, states = [], []
+            for run in (each for each in runs if each.flow == flow):
+                at, state = f"{run.asked_at:%Y-%m-%d %H:%M:%S.%f}", str(uuid.uuid4())
+                kind = "FAILED" if run.state == "failed" else "COMPLETED"
+                times = dict.fromkeys(
+                    ("created", "updated", "start_time", "end_time", "expected_start_time"), at
+                )
+                own = {"id": run.flow_run, "name": run.name, "idempotency_key": run.id}
+                own |= {"state_type": kind, "state_name": kind.title(), "state_id": state}
+                own |= {"state_timestamp": at, "next_scheduled_start_time": None, **times}
+                own |= {"parameters": json.dumps(run.parameters), "auto_scheduled": 0}
+                rows.append(tuple((sample | own).values()))
+                details = json.dumps({"flow_run_id": None})
+                about = (state, at, at, at, kind, kind.title(), run.message, details, "null")
+                states.append((*about, run.flow_run))
+            marks = ", ".join("?" * len(sample))
+            opened.executemany(f"insert into flow_run values ({marks})", rows)
+            opened.executemany(
+                "insert into flow_run_state (id, created, updated, timestamp, type, name, message,"
+                " state_details, data, flow_run_id) values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                states,
+            )
+        opened.commit()

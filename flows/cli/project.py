@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -10,12 +12,10 @@ import typer
 from data_contracts.pin import Pin
 from flows.cli import console
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
-from flows.match_state import match_state
-from flows.registering import find_registration, open_match
-from flows.review.verdicts import still_waiting
-from flows.run_record import latest_run
+from flows.match_state import UNREADABLE
+from flows.overview import PAGE, read_summary
+from flows.registering import find_registration
 from flows.run_status import UnitState, find_run
-from flows.settings import resolve
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair
@@ -53,13 +53,17 @@ def status(
     """
     store = Store.open(project)
     wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
-    rows = [_match_status(store, match_id) for match_id in wanted]
     if as_json:
-        console.print_json({"matches": rows})
+        console.print_json({"matches": [_match_status(store, match_id) for match_id in wanted]})
         return
-    if not rows:
+    if not wanted:
         console.line("No match is registered. Register one: worldpose ingest FOLDER.")
-        return
+    for first in range(0, len(wanted), PAGE):
+        _print_status([_match_status(store, name) for name in wanted[first : first + PAGE]])
+
+
+def _print_status(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print a table of matches, and below it what is to say about each."""
     columns = (
         "match",
         "latest run",
@@ -114,55 +118,29 @@ STATES = tuple(state.value for state in UnitState)
 
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
-    """Return one match's status; unreadable parts are reported, and do not affect other matches."""
-    status: dict[str, Any] = {
-        "match": match_id,
-        "run": None,
-        "state": "unreadable",
-        "now": "unreadable",
-        "why": "",
-        "todo": "",
-        "units": {state: [] for state in STATES},
-        "failed": [],
-        "left_out": {},
-        "warnings": [],
-        "usability": None,
-        "waiting": [],
-        "settings": {},
-        "unfinished_runs": [],
-        "pins": {},
-        "problem": None,
-    }
-    try:
-        status |= _recorded_status(store, match_id)
-        latest, match = latest_run(store, match_id), open_match(store, match_id)
-        status["settings"] = resolve(match.layers).overrides
-        now = match_state(store, match)
-        status["units"] |= {state.value: list(names) for state, names in now.units.items()}
-        status |= {"now": now.words, "why": now.why, "todo": now.todo}
-        status["waiting"] = [unit.unit for unit in still_waiting(store, match, latest)]
-    except (OSError, WorldposeError) as failure:  # a damaged record, a setting names a lost file
-        status["problem"] = str(failure)
-    return status
-
-
-def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
-    """Return what the records of a match's runs tell, without its folder."""
-    latest = latest_run(store, match_id)
-    told: dict[str, Any] = {"state": "not run"}
-    if latest is not None:
-        told = {
-            "run": latest.run_id,
-            "state": latest.state,
-            "failed": [failure.unit for failure in latest.failed],
-            "left_out": latest.left_out,
-            "warnings": list(latest.warnings),
-            "usability": latest.usability.model_dump(mode="json"),
-        }
+    """Return one match's status; what cannot be read is its problem, and hides no other match."""
+    found, pins, unfinished = read_summary(store, match_id), {}, list[str]()
+    latest, problem = found.latest, found.problem or (found.words == UNREADABLE and found.why)
+    with suppress(OSError, WorldposeError):  # the problem says it
+        pins = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)}
+        unfinished = [run.run_id for run in store.unfinished_runs(match_id)]
     return {
-        **told,
-        "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
-        "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
+        "match": match_id,
+        "run": None if latest is None else latest.run_id,
+        "state": latest.state if latest else "unreadable" if found.problem else "not run",
+        "now": "unreadable" if problem else found.words,
+        "why": "" if problem else found.why,
+        "todo": "" if problem else found.todo,
+        "units": {state: list(found.units.get(state, ())) for state in STATES},
+        "failed": [failure.unit for failure in latest.failed] if latest else [],
+        "left_out": latest.left_out if latest else {},
+        "warnings": list(latest.warnings) if latest else [],
+        "usability": latest.usability.model_dump(mode="json") if latest else None,
+        "waiting": [each.unit for each in found.waiting],
+        "settings": found.settings,
+        "unfinished_runs": unfinished,
+        "pins": pins,
+        "problem": problem or None,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Set
 from typing import Annotated, Final
 
 import typer
@@ -13,7 +13,7 @@ from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, Verbos
 from flows.cli.options import DaskOption, MoreSettingsOption, TimeLimitOption, WorkersOption
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
-from flows.reprocess import Reprocessed, reprocess_matches
+from flows.reprocess import Reprocessed, State, reprocess_matches
 from flows.run_status import RunStatus
 from flows.running import RunRequest
 from flows.settings import parse_overrides
@@ -55,36 +55,38 @@ def reprocess(
     limits = parse_time_limits(time_limits or ())
     request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
     with console.progress(verbose=verbose):
-        found = reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run)
+        states, told = set(), []
+        for each in reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run):
+            states.add(each.state)
+            if as_json:
+                told.append(_as_json(each))
+            else:
+                _print(each)
     if as_json:
-        console.print_json({"matches": [_as_json(each) for each in found]})
-    else:
-        _print(found)
-    raise typer.Exit(exit_code(found))
+        console.print_json({"matches": told})
+    elif not states:
+        console.line("No match is registered. Register one: worldpose ingest FOLDER.")
+    raise typer.Exit(exit_code(states))
 
 
-def exit_code(found: Sequence[Reprocessed]) -> int:
-    """Return the exit code of the command."""
-    states = {each.state for each in found}
+def exit_code(states: Set[State]) -> int:
+    """Return the exit code of the command for the states of the matches."""
     if states & {"failed", "partial"}:
         return 1 if states == {"failed"} else 4
     return 3 if "waiting" in states else 0
 
 
-def _print(found: Sequence[Reprocessed]) -> None:
-    if not found:
-        console.line("No match is registered. Register one: worldpose ingest FOLDER.")
-    for each in found:
-        if each.state in ("never run", "current"):
-            console.line(f"{each.match_id}: {_nothing_to_do(each)}")
-            continue
-        count = 0 if each.status is None else len(each.status.to_compute)
-        run = "" if each.record is None else f", run {each.record.run_id}"
-        console.line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
-        if each.status is not None:
-            _print_units(each.status)
-        if each.problem is not None:
-            console.line(f"error: {each.problem}", to=console.errors)
+def _print(each: Reprocessed) -> None:
+    if each.state in ("never run", "current"):
+        console.line(f"{each.match_id}: {_nothing_to_do(each)}")
+        return
+    count = 0 if each.status is None else len(each.status.to_compute)
+    run = "" if each.record is None else f", run {each.record.run_id}"
+    console.line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
+    if each.status is not None:
+        _print_units(each.status)
+    if each.problem is not None:
+        console.line(f"error: {each.problem}", to=console.errors)
 
 
 def _nothing_to_do(each: Reprocessed) -> str:

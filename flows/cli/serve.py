@@ -77,7 +77,7 @@ def serve(
         gate_hours: Age of a pending review that triggers an alert [h].
         disk_gb: Free disk space below which an alert is sent [GB].
         stall_minutes: Time without progress after which a run is ended and restarts [min].
-        history_days: Age at which ended runs are forgotten [d].
+        history_days: Age at which Prefect forgets ended runs [d].
         state: Folder of logs and Prefect's database; PROJECT/operations by default.
     """
     # Imported here: no other command needs them.
@@ -93,6 +93,7 @@ def serve(
     if test_alerts:
         _test_alerts(folder, as_json=as_json)
         return
+    line(f"starting Prefect, the worker and the pages for {url}", to=errors)
     from flows.service.channels import channels_of
     from flows.service.schedules import parse_schedules
     from flows.service.service_secrets import PAGES_TOKEN, secrets_of

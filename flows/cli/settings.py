@@ -135,7 +135,7 @@ def _change(
                 found=repr(text),
                 todo="Write it as in: --set detection.stride=2.",
             )
-        values[key] = parse_value(value)
+        values[key] = parse_value(value, key)
     for key in removed:
         if key not in values:
             raise unknown_name(f"--unset {key}", key, values)

@@ -19,7 +19,7 @@ from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import Replay, add_previous_value, current_value, replay_corrections
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
-from worldpose.review.journal import Journal, append, read_journal
+from worldpose.review.journal import MOST_KEPT, Journal, append, read_journal
 from worldpose.store.store import Store
 
 
@@ -48,7 +48,7 @@ def _replay_corrections(
 ) -> Replay:
     """Replay all corrections; corrections already replayed on the same folder are not repeated."""
     known = _REPLAYED.setdefault(store, {})
-    before, done, replay = known.get(folder.spec.match_id, (folder, (), Replay(folder)))
+    before, done, replay = known.pop(folder.spec.match_id, (folder, (), Replay(folder)))
     if before != folder or standing[: len(done)] != done:
         done, replay = (), Replay(folder)
     rest = standing[len(done) :]
@@ -56,6 +56,8 @@ def _replay_corrections(
         more = replay_corrections(replay.folder, rest)
         replay = Replay(more.folder, replay.applied + more.applied, replay.stale + more.stale)
     known[folder.spec.match_id] = (folder, standing, replay)
+    while len(known) > MOST_KEPT:
+        known.pop(next(iter(known)), None)
     return replay
 
 

@@ -273,13 +273,15 @@ def correct(
 def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str, why: str) -> None:
     """Withdraw corrections by their ids, all or none.
 
+    One that is withdrawn already stays so: a page repeats an undo whose answer it missed.
+
     Raises:
-        InputError: one of the corrections is not in force.
+        InputError: one of the corrections was never made.
     """
 
     def withdrawals(journal: Journal) -> list[Withdrawal]:
         for each in corrections:
-            if each not in journal.standing:
+            if each not in journal.corrections:
                 last = [*journal.standing][-10:]
                 raise InputError(
                     f"correction {each}",
@@ -291,6 +293,7 @@ def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str
         return [
             Withdrawal(match_id=match.match_id, correction=each, who=who, why=why, withdrawn_at=now)
             for each in corrections
+            if each in journal.standing
         ]
 
     say(store, match.match_id, withdrawals)

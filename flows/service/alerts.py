@@ -11,10 +11,11 @@ from datetime import UTC, datetime
 from threading import Lock
 from typing import Any, Final, Literal
 
-from data_contracts.operations import Arrival, QueuedRun
+from data_contracts.operations import Arrival, MatchSummary, QueuedRun
+from flows.overview import age
+from flows.review.metric_words import all_reasons
 from flows.service.channels import Channel
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, age
 from flows.service.plan import ServePlan
 from worldpose.formats.files import whole_file
 from worldpose.store.run_queue import ENDED, last_ended
@@ -62,7 +63,7 @@ class Alert:
 
 def alerts_now(
     plan: ServePlan,
-    matches: Iterable[MatchStatus],
+    matches: Iterable[MatchSummary],
     arrivals: Iterable[Arrival],
     runs: Sequence[QueuedRun],
 ) -> list[Alert]:
@@ -112,16 +113,16 @@ def _of_runs(plan: ServePlan, runs: Sequence[QueuedRun]) -> Iterator[Alert]:
             yield Alert(key, "run_stalled", text, link, run.match_id)
 
 
-def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
+def _of_match(plan: ServePlan, match: MatchSummary) -> Iterator[Alert]:
     """Yield one alert about pending reviews of a match, and one about its quality."""
     run = "" if match.latest is None else match.latest.run_id
     link = f"{plan.pages}/#/match/{match.match_id}"
     waiting = []
-    for stage, unit in match.units:
-        hours = age(unit.waiting_since) / 3600.0
-        if unit.state == "waiting" and hours >= plan.gate_hours:
-            name = f"{match.match_id}/{stage}/{unit.unit}"
-            waiting.append(f"{name} has waited for a person for {hours:.1f} h: {unit.why}")
+    for asked in match.waiting:
+        hours = age(asked.since) / 3600.0
+        if hours >= plan.gate_hours:
+            name, why = f"{match.match_id}/{asked.unit}", all_reasons(asked.reasons)
+            waiting.append(f"{name} has waited for a person for {hours:.1f} h: {why}")
     if waiting:
         text = waiting[0] + f"; and {len(waiting) - 1} more results" * (len(waiting) > 1)
         key = f"gate_waiting/{match.match_id}/{run}"

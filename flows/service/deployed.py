@@ -231,10 +231,13 @@ def reprocess(
     if runs is None:
         raise WorldposeError(f"{project} is not served on this machine")
     request = RunRequest(settings or {})
-    found = reprocess_matches(store, tuple(matches), request, retry=retry, is_rehearsal=True)
     active = {run.match_id for run in runs.queue.open_runs() if run.flow == "match"}
-    states: dict[str, str] = {each.match_id: each.state for each in found}
-    for each in found:
+    states: dict[str, str] = {}
+    unchecked = []
+    for each in reprocess_matches(store, matches, request, retry=retry, is_rehearsal=True):
+        states[each.match_id] = each.state
+        if each.problem:
+            unchecked.append(f"{each.match_id}: {each.problem}")
         if each.status is None or each.state != "stale":
             continue
         if each.match_id in active:
@@ -249,7 +252,6 @@ def reprocess(
             time_limits=None if time_limits is None else dict(time_limits),
         )
         states[each.match_id] = "started"
-    unchecked = [f"{each.match_id}: {each.problem}" for each in found if each.problem]
     if unchecked:
         raise UnprocessedError("; ".join(unchecked))
     return states

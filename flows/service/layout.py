@@ -6,8 +6,9 @@ import fcntl
 import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -60,11 +61,11 @@ class StateFolder:
         """Return the known state of the inbox, by name."""
         found = {}
         for file in sorted((self.folder / "arrivals").glob("*.json")):
-            try:
-                arrival = Arrival.model_validate_json(file.read_bytes())
-            except (FileNotFoundError, ValidationError):
-                continue  # removed meanwhile, or damaged: then it counts as a new one
-            found[arrival.name] = arrival
+            with suppress(FileNotFoundError):  # removed meanwhile
+                status = file.stat()  # it is replaced by another file; each is read once
+                arrival = _read_arrival(file, status.st_mtime_ns, status.st_ino)
+                if arrival is not None:
+                    found[arrival.name] = arrival
         return found
 
     def write_arrival(self, arrival: Arrival) -> None:
@@ -124,6 +125,15 @@ class StateFolder:
                 yield False
                 return
             yield True
+
+
+@lru_cache(maxsize=10_000)
+def _read_arrival(file: Path, changed_ns: int, number: int) -> Arrival | None:
+    """Return the state of an entry in a version of its file; None if that is damaged."""
+    try:
+        return Arrival.model_validate_json(file.read_bytes())
+    except ValidationError:
+        return None  # then it counts as a new one
 
 
 def state_folder(project: str, given: Path | None) -> StateFolder:

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
-from threading import Lock
+from threading import Lock, Thread
 from typing import Any, Final
 
 from prometheus_client import CollectorRegistry
@@ -22,17 +22,21 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from data_contracts.operations import MatchSummary
 from flows.gates import GATES
+from flows.overview import Overview, age
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, Overview, age
 from flows.service.plan import ServePlan
 from flows.web.host_guard import HostGuard
-from worldpose.store.store import Store
 
 MAX_SCRAPES: Final = 50
 """Open connections of scrapers."""
 SIZE_SECONDS: Final = 300.0
 """Maximum age of the cached store size: it is a sum over all files."""
+MOST_MATCHES: Final = 200
+"""Matches with metrics of their own: those that ran last."""
+LOOK_SECONDS: Final = 1.0
+"""Time that one scrape spends on changed matches."""
 STATES: Final = ("complete", "waiting", "partial", "failed", "at work", "not run", "unreadable")
 UNIT_STATES: Final = ("done", "waiting", "failed", "blocked")
 ARRIVAL_STATES: Final = ("arriving", "incomplete", "refused", "taken")
@@ -41,10 +45,11 @@ ARRIVAL_STATES: Final = ("arriving", "incomplete", "refused", "taken")
 class ProjectMetrics(Collector):
     """Prometheus collector for a project."""
 
-    def __init__(self, store: Store, state: StateFolder) -> None:
-        self.store, self.state = store, state
-        self._overview = Overview(store)
-        self._size = (float("-inf"), 0)
+    def __init__(self, overview: Overview, state: StateFolder) -> None:
+        self.store, self.state = overview.store, state
+        self._overview = overview
+        self._size: tuple[float, int | None] = (float("-inf"), None)
+        self._sum = Thread()
         self._lock = Lock()
 
     def describe(self) -> list[Metric]:
@@ -54,21 +59,24 @@ class ProjectMetrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield all current metrics."""
         with self._lock:
-            matches = self._overview.look()
-            ended = self._overview.poses()
+            matches = self._overview.look(LOOK_SECONDS)
             size = self._store_size()
+        ended = [each for match in matches for each in match.poses]
+        last = sorted(matches, key=_ended_at)[-MOST_MATCHES:]
+        whole = [self._overview.read(each.match_id) for each in last if not each.is_unseen]
         states = Counter(match.state for match in matches)
         found = {(state,): states[state] for state in STATES}
         yield _gauge("matches", "Matches by state", ["state"], found)
-        yield from _unit_metrics(matches)
-        yield from _quality(matches)
+        yield from _unit_metrics(matches, whole)
+        yield from _quality(whole)
         total = sum(count for _, count in ended)
         yield CounterMetricFamily("worldpose_poses", "Bodies fitted by all runs", value=total)
         hour_ago = datetime.now(UTC) - timedelta(hours=1)
         last_hour = sum(count for at, count in ended if at >= hour_ago)
         about = "Bodies fitted by runs that ended within the last hour"
         yield _gauge("poses_last_hour", about, [], {(): last_hour})
-        yield _gauge("store_bytes", "Size of the project", [], {(): size})
+        sizes = {} if size is None else {(): float(size)}
+        yield _gauge("store_bytes", "Size of the project", [], sizes)
         folder = self.state.folder if "://" in self.store.url else self.store.url
         about = "Free on the disk of the project, or of the state of a project in object storage"
         yield _gauge("disk_free_bytes", about, [], {(): shutil.disk_usage(folder).free})
@@ -79,13 +87,19 @@ class ProjectMetrics(Collector):
         kinds = Counter((each["alert"],) for each in held.values())
         yield _gauge("alerts", "Alerts that hold, by what they are about", ["alert"], kinds)
 
-    def _store_size(self) -> int:
-        at, size = self._size
-        if time.monotonic() - at > SIZE_SECONDS:
-            tops = ("matches", "results", "runs", "reviews", "staging")
-            size = sum(each.size for top in tops for each in self.store.blobs.entries(top))
-            self._size = (time.monotonic(), size)
-        return size
+    def _store_size(self) -> int | None:
+        """Return the last known size; a scrape does not wait long for a sum over all files."""
+        if not self._sum.is_alive() and time.monotonic() - self._size[0] > SIZE_SECONDS:
+            self._sum = Thread(target=self._sum_files, daemon=True)
+            self._sum.start()
+        if self._sum.is_alive():
+            self._sum.join(LOOK_SECONDS)
+        return self._size[1]
+
+    def _sum_files(self) -> None:
+        tops = ("matches", "results", "runs", "reviews", "staging")
+        size = sum(each.size for top in tops for each in self.store.blobs.entries(top))
+        self._size = (time.monotonic(), size)
 
 
 def exposition(metrics: ProjectMetrics) -> bytes:
@@ -124,15 +138,21 @@ def _gauge(name: str, about: str, labels: Sequence[str], values: Mapping[Any, fl
     return family
 
 
-def _unit_metrics(matches: list[MatchStatus]) -> Iterator[Metric]:
+def _ended_at(match: MatchSummary) -> float:
+    return 0.0 if match.latest is None else match.latest.finished_at.timestamp()
+
+
+def _unit_metrics(matches: list[MatchSummary], whole: list[MatchSummary]) -> Iterator[Metric]:
+    """Yield the units of all matches by state, and times of the `whole` ones."""
     counts: Counter[tuple[str, str]] = Counter()
     seconds, waits, runs = {}, {}, {}
     for match in matches:
-        counts.update((stage, unit.state) for stage, unit in match.units)
+        for stage, states in match.progress.items():
+            counts.update({(stage, state): number for state, number in states.items()})
+    for match in whole:
         for stage, found in match.stages.items():
             seconds[match.match_id, stage] = sum(each.seconds or 0.0 for each in found)
-        ages = [age(unit.waiting_since) for _, unit in match.units if unit.state == "waiting"]
-        waits[match.match_id,] = max(ages, default=0.0)
+        waits[match.match_id,] = max((age(each.since) for each in match.waiting), default=0.0)
         if match.latest is not None:
             runs[match.match_id,] = match.latest.seconds
     stages = sorted({stage for stage, _ in counts})
@@ -145,7 +165,7 @@ def _unit_metrics(matches: list[MatchStatus]) -> Iterator[Metric]:
     yield _gauge("run_seconds", "Time of the latest run", ["match"], runs)
 
 
-def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
+def _quality(matches: list[MatchSummary]) -> Iterator[Metric]:
     """Yield the metrics that gates judge: the worst of a match's units, and the limit."""
     worst, limits = {}, {}
     for gate in GATES.values():

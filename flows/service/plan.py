@@ -85,7 +85,7 @@ class ServePlan(Record):
     stall_minutes: float = Field(default=10.0, ge=0.5)
     """A run or scan without progress for so long is ended, and raises an alert [min]."""
     history_days: float = Field(default=30.0, ge=1.0)
-    """Ended runs are forgotten after so long, also by a Prefect server of our own [d]."""
+    """A Prefect server of our own forgets ended runs after so long [d]."""
     schedules: dict[str, Schedule] = Field(default_factory=dict)
     """Flow to its schedule, beside those that people make at the Prefect server."""
     users: Path | None = None

@@ -149,12 +149,14 @@ class _Supervisor:
         child = [sys.executable, "-m", "flows.service.child"]
         with part.log.open("ab") as output:
             part.said = output.tell()
+            # Requests come in forty threads, each of which would keep memory of its own.
+            few = {} if part.name == "worker" else {"MALLOC_ARENA_MAX": "2"}
             part.process = subprocess.Popen(
                 [*child, part.name, self.plan.model_dump_json()],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=environment_of(self.plan) | self.secrets.of(part.name, self.plan),
+                env=environment_of(self.plan) | few | self.secrets.of(part.name, self.plan),
                 start_new_session=True,  # Ctrl-C is for this process, which then ends its parts
             )
         part.began = time.monotonic()

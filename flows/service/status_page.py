@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -15,13 +15,13 @@ from fastapi.responses import FileResponse, HTMLResponse, Response
 from jinja2 import Environment, FileSystemLoader, Template
 from starlette.background import BackgroundTask
 
-from data_contracts.operations import Arrival
+from data_contracts.operations import Arrival, MatchSummary, UnitSummary
 from flows.method import METHOD
+from flows.overview import PAGE, Overview, age, cost_of, is_late, units_of
 from flows.review.descriptions import when
 from flows.review.metric_words import in_short, reason_words
 from flows.service.alerts import kept_alerts
 from flows.service.layout import served_state
-from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.web.app_context import PageContext
 from flows.web.browser_words import in_browser
 
@@ -31,12 +31,10 @@ UNSEEN_SECONDS: Final = 1
 """Until the page asks for the matches that the server has not read yet."""
 BUDGET_SECONDS: Final = 0.1
 """Time that one request spends on reading matches."""
-REST_SECONDS: Final = 2.0
+REST_SECONDS: Final = 0.5
 """Time spent on matches that were never read, after the page was sent."""
 MAX_DETAILS: Final = 20
 """Matches whose cameras are on the page at once; of more matches, the one in the address."""
-UNIT_KEYS: Final = ["unit", "state", "seconds", "figures", "objections", "waiting_since", "why"]
-"""What the page's JSON says of a unit."""
 FILES: Final = Path(__file__).with_name("status")
 """The page, its style and its script."""
 
@@ -44,29 +42,40 @@ FILES: Final = Path(__file__).with_name("status")
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the status page, and of its JSON."""
     router = APIRouter()
-    overview = Overview(context.store, with_states=True)
+    overview = Overview(context.store)
 
     @router.get("/api/status")
-    def status() -> dict[str, Any]:
+    def status(page: int = 1) -> dict[str, Any]:
+        found = overview.look(BUDGET_SECONDS)
+        rows = _rows(context, overview, found, page)
         return {
-            "matches": [_as_json(*each) for each in _with_runs(context, overview.look())],
+            "matches": [_as_json(each) for each in rows],
+            "pages": -(-len(found) // PAGE),
             "arrivals": [each.model_dump(mode="json") for each in _arrivals(context)],
         }
 
     @router.get("/status")
-    def page(match: str = "") -> HTMLResponse:
+    def page(match: str = "", page: int = 1) -> HTMLResponse:
         serving = served_state(context.store.url).read_serving()
         dashboard = "" if serving is None else serving.prefect.removesuffix("/api")
         inbox = "" if serving is None else serving.inbox
         found = overview.look(BUDGET_SECONDS)
-        rows = [StatusRow(*each) for each in _with_runs(context, found)]
+        names = [each.match_id for each in found]
+        page = 1 + names.index(match) // PAGE if match in names else page
+        running = context.continuing.running()
         kept = kept_alerts(served_state(context.store.url)).values()
         alerts = [each for each in kept if each["alert"] != "digest"]
         text = status_html(
-            rows, _arrivals(context), dashboard, inbox=inbox, opened=match, alerts=alerts
+            _rows(context, overview, found, page),
+            _arrivals(context),
+            dashboard,
+            inbox=inbox,
+            opened=match,
+            alerts=alerts,
+            counts=Counter(StatusRow(it, _running(it, running)).kind for it in found),
+            place=(page, -(-len(found) // PAGE)),
         )
-        is_whole = not any(each.is_unseen for each in found)
-        rest = None if is_whole else BackgroundTask(overview.look, REST_SECONDS)
+        rest = BackgroundTask(overview.look, REST_SECONDS) if is_late(found) else None
         return HTMLResponse(text, background=rest)
 
     @router.get("/status/page.css")
@@ -88,7 +97,7 @@ class StatusRow:
     run there; empty if unknown.
     """
 
-    match: MatchStatus
+    match: MatchSummary
     at_work: Mapping[str, Any] | None = None
     prefect: str = ""
 
@@ -99,7 +108,7 @@ class StatusRow:
             return "running"
         if self.match.problem:
             return "cannot be opened"
-        return self.match.state if self.match.now is None else self.match.now.words
+        return self.match.words or self.match.state
 
     @property
     def kind(self) -> str:
@@ -107,14 +116,32 @@ class StatusRow:
         words = re.split(r":| because", self.words)[0]
         return re.sub(r"^\d+ questions?", "with questions", words)
 
+    @property
+    def cost(self) -> str:
+        """Core hours and bytes of the latest run."""
+        return str(cost_of(self.match))
 
-def _with_runs(
-    context: PageContext, found: Iterable[MatchStatus]
-) -> list[tuple[MatchStatus, Mapping[str, Any] | None, str]]:
-    """Return each match with the state of its run at work, and the run's page at Prefect."""
+    @property
+    def units(self) -> list[tuple[str, UnitSummary]]:
+        """All units with their stage."""
+        return list(units_of(self.match))
+
+
+def _running(match: MatchSummary, running: Container[str]) -> Mapping[str, Any] | None:
+    return {"state": "running"} if match.match_id in running else None
+
+
+def _rows(
+    context: PageContext, overview: Overview, found: Sequence[MatchSummary], page: int
+) -> list[StatusRow]:
+    """Return the matches of a page with their units, and their runs at work and at Prefect."""
     links = context.continuing.links()
-    ids = ((each, each.match_id) for each in found)
-    return [(each, context.continuing.state(name), links.get(name, "")) for each, name in ids]
+    rows = []
+    for match in found[PAGE * max(page - 1, 0) : PAGE * max(page, 1)]:
+        name = match.match_id
+        whole = match if match.is_unseen else overview.read(name)
+        rows.append(StatusRow(whole, context.continuing.state(name), links.get(name, "")))
+    return rows
 
 
 def status_html(
@@ -124,24 +151,29 @@ def status_html(
     *,
     inbox: str = "",
     opened: str = "",
-    alerts: Iterable[Mapping[str, str]] = (),
+    alerts: Sequence[Mapping[str, str]] = (),
+    counts: Counter[str] | None = None,
+    place: tuple[int, int] = (1, 1),
 ) -> str:
-    """Render the page; every name and message is escaped.
+    """Render a page of matches; every name and message is escaped.
 
-    Of more matches than `MAX_DETAILS`, only the `opened` one shows its cameras.
+    Of more matches than `MAX_DETAILS`, only the `opened` one shows its cameras. `counts` are those
+    of all matches by state, `place` is the number of the page and that of pages.
     """
     seen = {stage for row in rows for stage in row.match.stages}
     shown = [row.match for row in rows]
     is_unseen = any(each.is_unseen for each in shown)
-    has_all = len(rows) <= MAX_DETAILS
-    return PAGE.render(
+    has_all = len(rows) <= MAX_DETAILS and place[1] == 1
+    return TEMPLATE.render(
         rows=rows,
         stages=[stage.name for stage in METHOD if stage.name in seen],
-        counts=Counter(row.kind for row in rows).most_common(),
-        alerts=alerts,
+        counts=(Counter(row.kind for row in rows) if counts is None else counts).most_common(),
+        place=place,
+        alerts=alerts[-PAGE:],
+        further_alerts=max(0, len(alerts) - PAGE),
         arrivals=sorted(arrivals, key=lambda each: each.changed_at, reverse=True),
         begun={each.match_id for each in shown if each.latest is not None},
-        detailed=[each for each in shown if has_all or each.match_id == opened],
+        detailed=[each for each in rows if has_all or each.match.match_id == opened],
         dashboard=dashboard,
         inbox=inbox,
         refresh=UNSEEN_SECONDS if is_unseen else REFRESH_SECONDS,
@@ -179,29 +211,27 @@ def _read_page() -> Template:
     return files.get_template("page.html")
 
 
-PAGE: Final = _read_page()
+TEMPLATE: Final = _read_page()
 
 
-def _as_json(match: MatchStatus, at_work: Mapping[str, Any] | None, prefect: str) -> dict[str, Any]:
-    latest = match.latest
+def _as_json(row: StatusRow) -> dict[str, Any]:
+    match, latest = row.match, row.match.latest
+    about = {"problem", "why", "stages"}
     return {
         "match": match.match_id,
         "state": match.state,
-        "now": StatusRow(match, at_work).words,
-        "why": "" if match.now is None else match.now.why,
-        "problem": match.problem,
-        "run": None if latest is None else latest.run_id,
-        "seconds": None if latest is None else latest.seconds,
-        "at_work": at_work,
-        "prefect": prefect,
-        "core_hours": match.cost.core_hours,
-        "bytes": match.cost.bytes,
-        "stages": {
-            stage: [{name: getattr(unit, name) for name in UNIT_KEYS} for unit in units]
-            for stage, units in match.stages.items()
-        },
+        "now": row.words,
+        "run": latest and latest.run_id,
+        "seconds": latest and latest.seconds,
+        "at_work": row.at_work,
+        "prefect": row.prefect,
+        **asdict(cost_of(match)),
+        **match.model_dump(mode="json", include=about),
     }
 
 
 def _arrivals(context: PageContext) -> list[Arrival]:
-    return list(served_state(context.store.url).arrivals().values())
+    """Return what people look for: arrivals that are no match yet, and the last matches."""
+    found = served_state(context.store.url).arrivals().values()
+    last = sorted(found, key=lambda each: (each.state == "taken", -each.changed_at.timestamp()))
+    return last[: max(PAGE, sum(each.state != "taken" for each in last))]

@@ -11,12 +11,12 @@ from datetime import timedelta
 from threading import Thread
 from typing import Final
 
+from flows.overview import Overview, is_late
 from flows.service.alerts import Alert, AlertDispatcher, alerts_now
 from flows.service.channels import Channel, channels_of
 from flows.service.inbox import watch_once
 from flows.service.match_runs import MatchRuns
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
-from flows.service.overview import Overview
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness, recover
 from flows.service.service_secrets import METRICS_TOKEN
@@ -32,8 +32,12 @@ ALERT_SECONDS: Final = 20.0
 """Between two checks for alerts."""
 RECOVERY_SECONDS: Final = 10.0
 """Between two checks for lost runs, and for runs without progress."""
+LOOK_SECONDS: Final = 2.0
+"""Time of one look at matches for alerts, after which metrics have their turn."""
 DELIVERY_SECONDS: Final = 2.0
 """Between two checks of a channel for outstanding alerts."""
+KEPT: Final = timedelta(days=1)
+"""After so long, the queue keeps only the last ended run of each match and flow."""
 TROUBLE_SECONDS: Final = 3600.0
 """Between two log lines about a lasting failure."""
 TROUBLE_LENGTH: Final = 500
@@ -48,7 +52,7 @@ LOG = logging.getLogger("worldpose.operations")
 
 def watch(plan: ServePlan) -> None:
     """Watch, and serve metrics, until this process ends."""
-    store, state = Store.create(plan.project), plan.state_folder
+    overview, state = Overview(Store.create(plan.project)), plan.state_folder
     dispatcher = AlertDispatcher(state, channels_of(os.environ, state.alert_settings))
     # Each at its own interval; a scan of the inbox takes a tenth of the time, however long it is.
     _start("looking at the inbox", INBOX_SECONDS, lambda: _look_at_inbox(plan), rest=9.0)
@@ -59,17 +63,17 @@ def watch(plan: ServePlan) -> None:
         settle = plan.settle_seconds
         fetch = lambda: bucket.fetch(time.monotonic(), settle)  # noqa: E731
         _start(BUCKET, BUCKET_SECONDS, fetch)
-    liveness, age = Liveness(plan), timedelta(days=plan.history_days)
+    liveness = Liveness(plan)
     unset = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # macOS has the second alone
     look = lambda: liveness.look(time.clock_gettime(unset), time.time())  # noqa: E731
     _start("recovering runs", RECOVERY_SECONDS, lambda: recover(plan))
     _start("looking for progress", RECOVERY_SECONDS, look)
-    _start("forgetting runs", 3600.0, lambda: queue_of(plan.project).forget_ended(age))
-    _start("looking for alerts", ALERT_SECONDS, _hold_alerts(plan, store, dispatcher, liveness))
+    _start("forgetting runs", 3600.0, lambda: queue_of(plan.project).forget_ended(KEPT))
+    _start("looking for alerts", ALERT_SECONDS, _hold_alerts(plan, overview, dispatcher, liveness))
     _start("watching the steps", ALERT_SECONDS, lambda: _watch_steps(plan, dispatcher))
     for channel in dispatcher.channels:
         Thread(target=_deliver, args=(dispatcher, channel), daemon=True).start()
-    app = metrics_app(plan, ProjectMetrics(store, state), os.environ[METRICS_TOKEN])
+    app = metrics_app(plan, ProjectMetrics(overview, state), os.environ[METRICS_TOKEN])
     serve_http(
         app,
         host=plan.host,
@@ -133,13 +137,16 @@ def _look_at_inbox(plan: ServePlan) -> None:
 
 
 def _hold_alerts(
-    plan: ServePlan, store: Store, dispatcher: AlertDispatcher, liveness: Liveness
+    plan: ServePlan, overview: Overview, dispatcher: AlertDispatcher, liveness: Liveness
 ) -> Callable[[], None]:
-    overview, queue = Overview(store), queue_of(plan.project)
+    queue = queue_of(plan.project)
 
     def hold() -> None:
+        while is_late(matches := overview.look(LOOK_SECONDS)):
+            STEPS["looking for alerts"] = time.monotonic()  # it makes progress
+            time.sleep(0.1)
         arrivals = plan.state_folder.arrivals().values()
-        found = alerts_now(plan, overview.look(), arrivals, queue.runs())
+        found = alerts_now(plan, matches, arrivals, queue.runs())
         dispatcher.hold([*found, *liveness.alerts])
 
     return hold

@@ -206,6 +206,13 @@ class Continuing:
         link = seen.served.link(last)
         return {"state": "ended", "code": code, "lines": [message], "prefect": link}
 
+    def running(self) -> set[str]:
+        """Return the matches with a run at work, or one that waits for its turn."""
+        seen = self._look()
+        if seen is None:
+            return self._local.running()
+        return {run.match_id for run in seen.open if run.state != "waiting"}
+
     def links(self) -> dict[str, str]:
         """Return the page of each match's latest run at Prefect; empty without a service."""
         seen = self._look()
@@ -312,6 +319,11 @@ class LocalRuns:
         code, said = ended
         lines = said.read_text(errors="replace").splitlines()[-LAST_LINES:]
         return {"state": "ended", "code": code, "lines": lines}
+
+    def running(self) -> set[str]:
+        """Return the match at work and those that wait for their turn."""
+        with self._lock:
+            return {name for name in (self._at_work, *dict(self._waiting)) if name is not None}
 
     def cancel(self, match_id: str) -> bool:
         """End the match's run as Ctrl-C does, or take it out of the queue; return whether."""

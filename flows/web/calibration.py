@@ -30,6 +30,7 @@ from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.evidence import PitchDrawing, Preview, preview
+from worldpose.review.journal import MOST_KEPT
 from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.video.folder import open_video
@@ -222,12 +223,13 @@ def _propose(
 
 
 def warm_up(context: PageContext) -> None:
-    """Calibrate one clicked camera, which loads kernels, and open all matches with their journals.
+    """Calibrate one clicked camera, which loads kernels, and open the matches that changed last.
 
-    The first request then waits for neither.
+    The first request then waits for neither kernels nor journals.
     """
-    is_warm = False
-    for name in context.store.matches():
+    is_warm, names = False, context.store.matches()
+    changes = context.store.blobs.marks([f"reviews/{name}" for name in names])
+    for _, name in sorted(zip(changes, names, strict=True))[-MOST_KEPT:]:
         try:
             folder = context.match(name).folder
             if folder.pitch is None or not folder.clicked or is_warm:

@@ -105,12 +105,6 @@ class Group:
         return self.corrections[0][0].id
 
 
-def count_corrections(match: Match) -> tuple[int, int]:
-    """Return the numbers of corrections in force and of first clicks."""
-    first = sum(map(is_first_click, match.corrections))
-    return len(match.corrections) - first, first
-
-
 def group_corrections(match: Match) -> list[Group]:
     """Return all corrections in force in groups, the latest group first."""
     objections = {each.id: why for each, why in match.stale}

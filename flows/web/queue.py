@@ -1,52 +1,47 @@
-"""Pending reviews of all matches: age, reason and severity."""
+"""Matches in pages with their states and pending reviews, and one match."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Hashable
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Container, Sequence
 from math import isfinite
-from pathlib import Path
-from threading import Lock
 from typing import Any, Final
 
 from fastapi import APIRouter
 
+from data_contracts.operations import MatchSummary
 from data_contracts.review import ReviewRequest
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
-from flows.layers import read_layer
-from flows.match_state import describe_problem, match_state
 from flows.method import METHOD
+from flows.overview import PAGE, Overview
 from flows.review.descriptions import review_json
-from flows.review.verdicts import Review, reviews_of, still_waiting
+from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
-from flows.service.overview import MANY
 from flows.stage import Match
 from flows.web.app_context import PageContext
-from flows.web.browser_words import describe_error, in_browser
+from flows.web.browser_words import in_browser
 from flows.web.calibration import key_frames
-from flows.web.corrections import count_corrections, describe_groups
-from worldpose.errors import WorldposeError
-from worldpose.review.journal import read_journal
-from worldpose.store.store import Store
+from flows.web.corrections import describe_groups
 
 BUDGET_SECONDS: Final = 0.25
 """Time that one request spends on changed matches; the page asks again for the others."""
-REREAD_SECONDS: Final = 60.0
-"""Age at which a summary is made again without a change: a video can be removed."""
-ALWAYS_CHECKED: Final = 8
-"""Matches that every request checks, unless there are `MANY`."""
+ORDER: Final = (
+    *("questions", "failed", "calibrate", "outdated", "stopped", "partial"),
+    *("running", "new", "ready", ""),
+)
+"""Kinds of states, the most urgent first; the last one is that of a match not read yet."""
 
 
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
-    glances = _Glances(context)
+    overview = Overview(context.store)
 
     @router.get("")
-    def matches() -> dict[str, Any]:
-        return glances.look()
+    def matches(search: str = "", kind: str = "", page: int = 1) -> dict[str, Any]:
+        found = overview.look(BUDGET_SECONDS)
+        return _choose(context, overview, found, search.strip().lower(), kind, max(page, 1))
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
@@ -54,7 +49,7 @@ def routes(context: PageContext) -> APIRouter:
         latest = latest_run(context.store, match_id)
         folder = opened.folder
         return {
-            **_glance(context, opened),
+            **_glance(context, overview.read(match_id)),
             "reviews": [
                 describe_review(each) for each in reviews_of(context.store, opened, latest)
             ],
@@ -86,89 +81,47 @@ def routes(context: PageContext) -> APIRouter:
     return router
 
 
-@dataclass
-class _Glances:
-    """Summaries of all matches for the queue; one request checks as many as its time allows.
-
-    A match is opened again only if its folder, journal or runs have changed.
-    """
-
-    context: PageContext
-    _known: dict[str, tuple[Hashable, dict[str, Any]]] = field(default_factory=dict)
-    _folders: dict[str, Path] = field(default_factory=dict)
-    _layers: dict[str, list[str]] = field(default_factory=dict)
-    _checked: dict[str, float] = field(default_factory=dict)
-    _opened: dict[str, float] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
-
-    def look(self) -> dict[str, Any]:
-        """Return all matches, those not seen yet by name only, and how many are still to check."""
-        names = self.context.store.matches()
-        with self._lock:
-            begun = time.monotonic()
-            oldest = sorted(names, key=lambda name: self._checked.get(name, 0.0))
-            left = len(oldest)
-            for number, name in enumerate(oldest):
-                is_late = time.monotonic() - begun > BUDGET_SECONDS
-                if is_late and number and (number >= ALWAYS_CHECKED or len(names) > MANY):
-                    break
-                self._check(name)
-                self._checked[name] = time.monotonic()
-                left -= 1
-            found = [
-                dict(self._known[name][1]) if name in self._known else _unseen(name)
-                for name in names
-            ]
-        for each in found:
-            # The progress of a run changes all the time.
-            each["at_work"] = _local_run(self.context, each["match"]) or each["elsewhere"]
-        return {"matches": found, "left": left}
-
-    def _check(self, name: str) -> None:
-        stamp = self._stamp(name)
-        is_old = time.monotonic() - self._opened.get(name, -REREAD_SECONDS) >= REREAD_SECONDS
-        if stamp is not None and not is_old and self._known[name][0] == stamp:
-            return
-        self._opened[name] = time.monotonic()
-        try:
-            match = self.context.match(name)
-            glance = _glance(self.context, match)
-        except (OSError, WorldposeError) as error:
-            glance = {"match": name, "problem": describe_error(error), "waiting": [], "run": None}
-            stamp = None
-        else:
-            self._folders[name] = match.folder.folder
-            self._layers[name] = [each.name for each in match.layers if each.is_stored]
-            stamp = stamp or self._stamp(name)
-        glance["elsewhere"] = _elsewhere(self.context.store, name)
-        self._known[name] = (stamp, glance)
-
-    def _stamp(self, name: str) -> Hashable:
-        """Return what a summary depends on; None if it must be read again."""
-        store, folder = self.context.store, self._folders.get(name)
-        if folder is None:
-            return None
-        try:
-            journal = read_journal(store, name)
-            files = sorted((folder / "annotations").rglob("*.json"))
-            times = [file.stat().st_mtime_ns for file in (folder / "match.yaml", *files)]
-            listed = folder.stat().st_mtime_ns
-            layers = [read_layer(store, each).revision for each in self._layers[name]]
-        except (OSError, WorldposeError):
-            return None
-        at_work = tuple(each.run_id for each in store.unfinished_runs(name))
-        return (journal.last, store.runs(name), at_work, listed, *times, *layers)
-
-
-def _unseen(name: str) -> dict[str, Any]:
+def _choose(
+    context: PageContext,
+    overview: Overview,
+    found: Sequence[MatchSummary],
+    search: str,
+    kind: str,
+    page: int,
+) -> dict[str, Any]:
+    """Return the matches of a page of those sought, and what the page says about all."""
+    running, sought = context.continuing.running(), []
+    counts: Counter[str] = Counter()
+    for match in found:
+        its_kind = _kind(match, running)
+        counts[its_kind] += 1
+        if search in match.match_id.lower() and kind in ("", its_kind):
+            at = 0.0 if match.latest is None else match.latest.finished_at.timestamp()
+            sought.append((ORDER.index(its_kind), -at, match.match_id, match))
+    sought.sort(key=lambda each: each[:3])
+    page = min(page, max(1, -(-len(sought) // PAGE)))
+    shown = (each[3] for each in sought[PAGE * (page - 1) : PAGE * page])
     return {
-        "match": name,
-        "problem": None,
-        "is_unseen": True,
-        "waiting": [],
-        "run": None,
-        "elsewhere": None,
+        "matches": [
+            _glance(context, each if each.is_unseen else overview.read(each.match_id))
+            for each in shown
+        ],
+        "total": len(found),
+        "sought": len(sought),
+        "page": page,
+        "pages": -(-len(sought) // PAGE),
+        "counts": {name: counts[name] for name in ORDER if counts[name]},
+        "left": sum(each.is_unseen for each in found),
     }
+
+
+def _kind(match: MatchSummary, running: Container[str]) -> str:
+    """Return the kind of a match's state, as pages filter by it."""
+    if match.is_unseen:
+        return ""
+    if match.problem:
+        return "failed"
+    return "running" if match.match_id in running else match.kind
 
 
 def describe_review(review: Review) -> dict[str, Any]:
@@ -177,29 +130,15 @@ def describe_review(review: Review) -> dict[str, Any]:
     return {**review_json(review), "unit": unit, "excess": _excess(review.request)}
 
 
-def _glance(context: PageContext, match: Match) -> dict[str, Any]:
-    store = context.store
-    latest = latest_run(store, match.match_id)
-    known = {each.request.id: each for each in reviews_of(store, match, latest)}
-    waiting = []
-    for unit in still_waiting(store, match, latest):
-        review = known.get(unit.request)
-        waiting.append(
-            {
-                "id": unit.request,
-                "unit": unit.unit,
-                "reasons": unit.reasons,
-                "rejected": unit.rejected or (review is not None and review.state == "reject"),
-                "since": None if review is None else review.request.created_at,
-                "excess": 0.0 if review is None else _excess(review.request),
-            }
-        )
-    folder = match.folder
-    corrections, first_clicks = count_corrections(match)
+def _glance(context: PageContext, found: MatchSummary) -> dict[str, Any]:
+    """Return a summary as JSON; while a run of these pages is at work, they show its progress."""
+    latest = found.latest
+    elsewhere = {"state": "elsewhere", "lines": [found.open_run]} if found.open_run else None
     return {
-        "match": match.match_id,
-        "problem": None,
-        "damage": match.journal.damage,
+        "match": found.match_id,
+        "is_unseen": found.is_unseen,
+        "problem": in_browser(found.problem) if found.problem else None,
+        "damage": found.damage,
         "run": None
         if latest is None
         else {
@@ -213,33 +152,21 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
             },
             "failed": len(latest.failed),
         },
-        "waiting": waiting,
-        "to_click": list(folder.to_click),
-        "has_image": bool({*folder.stills, *folder.videos}),
-        "corrections": corrections,
-        "first_clicks": first_clicks,
-        "stale": len(match.stale),
-        "state": _state(store, match),
-        "at_work": _local_run(context, match.match_id) or _elsewhere(store, match.match_id),
-    }
-
-
-def _state(store: Store, match: Match) -> dict[str, Any]:
-    """Return the state of a match as JSON, with the numbers of its units as the command has them.
-
-    While a run of these pages is at work, the pages show its progress in place of this state.
-    """
-    try:
-        found = match_state(store, match)
-    except (OSError, WorldposeError) as error:  # a setting can name a missing file
-        found = describe_problem(error)
-    return {
-        "name": found.name,
-        "words": found.words,
-        "why": in_browser(found.why),
-        "todo": found.todo,
-        "seconds": found.seconds,
-        "units": {state.value: len(names) for state, names in found.units.items()},
+        "waiting": [each.model_dump() for each in found.waiting],
+        "to_click": list(found.to_click),
+        "has_image": found.has_image,
+        "corrections": found.corrections,
+        "first_clicks": found.first_clicks,
+        "stale": found.outdated,
+        "state": {
+            "name": found.kind,
+            "words": found.words,
+            "why": in_browser(found.why),
+            "todo": in_browser(found.todo),
+            "seconds": found.seconds,
+            "units": {kind: len(names) for kind, names in found.units.items()},
+        },
+        "at_work": _local_run(context, found.match_id) or elsewhere,
     }
 
 
@@ -248,14 +175,6 @@ def _local_run(context: PageContext, match_id: str) -> dict[str, Any] | None:
     if state is None:
         return None
     return {**state, "lines": [in_browser(line) for line in state["lines"]]}
-
-
-def _elsewhere(store: Store, match_id: str) -> dict[str, Any] | None:
-    open_runs = store.unfinished_runs(match_id)
-    if not open_runs:
-        return None
-    last = open_runs[-1]
-    return {"state": "elsewhere", "lines": [f"run {last.run_id} on {last.host} has not ended"]}
 
 
 def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:

@@ -42,6 +42,8 @@ from worldpose.review.journal import read_journal
 from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
+BROADCAST_FORMATS: Final = ("challenge", "challenge-2025", "tracks", "slahmr-cameras")
+"""Formats of a calibrated broadcast camera."""
 POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
 """Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
@@ -220,6 +222,8 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     lacking = {clip: why_without_joints(run, clip) for clip in clips}
     is_3d = not clips or None in lacking.values()
     formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
+    if not any(name.startswith("broadcast_calibration/") for name in record.results):
+        formats = tuple(form for form in formats if form not in BROADCAST_FORMATS)
     return {
         "run": record.run_id,
         "state": record.state,

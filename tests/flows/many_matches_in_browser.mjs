@@ -30,8 +30,8 @@ for (const [name, [path, selector]] of Object.entries(places)) {
 await page.goto("about:blank").catch(() => page.goto("about:blank")); // the status page loads itself again
 await page.goto(`${task.base}/`);
 await page.waitForSelector(`input[placeholder="Search ${task.count} matches"]`);
-const known = () => [...document.querySelectorAll("[data-filter] b")].reduce((sum, each) => sum + Number(each.textContent), 0);
-await page.waitForFunction(`(${known})() === ${task.count}`);
+const areKnown = (count) => [...document.querySelectorAll("[data-filter] b")].reduce((sum, each) => sum + Number(each.textContent), 0) === count;
+await page.waitForFunction(areKnown, task.count);
 seen.rows = await page.locator("li.panel").count();
 await page.fill("[aria-label=Search]", "copy017");
 await page.waitForFunction(() => document.querySelectorAll("li.panel").length === 1);

@@ -10,8 +10,10 @@ from page_client import MATCH
 
 from data_contracts.review import NamedTrack, SplitTrack
 from data_contracts.run import UnitFailure
+from flows.layers import write_layer
 from flows.match_state import match_state
 from flows.method import METHOD
+from flows.overview import read_summary
 from flows.registering import open_match
 from flows.review.corrections import keep_edits
 from flows.review.verdicts import decide, withdraw
@@ -109,3 +111,13 @@ def test_a_run_that_was_killed_is_stopped_and_can_be_continued(store, monkeypatc
     assert f"Run {number} ended before it was recorded" in found.why
     store.reserve_run(TINY)  # of this process, which is at work
     assert state(store).name == "running"
+
+
+def test_a_match_is_not_ready_while_iterations_are_set_that_were_not_run(store):
+    write_layer(store, f"matches/{TINY}", {"iterations": 2})
+    found = state(store)
+    assert (found.name, found.words) == ("outdated", "out of date because of its iterations")
+    assert "2 iterations are set" in found.why and found.seconds > 10.0
+    assert not read_summary(store, TINY).is_settled  # reprocessing runs it
+    write_layer(store, f"matches/{TINY}", {"iterations": "auto"})
+    assert state(store).name == "ready"

@@ -9,11 +9,12 @@ from command_line import TINY
 from long_journal import SESSION, write_corrections
 from page_client import MATCH
 
-from data_contracts.review import MovedPoint
+from data_contracts.review import MovedPoint, Withdrawal
 from flows.registering import open_for_review, register
 from flows.review.corrections import keep_edits
 from flows.web.browser_words import in_browser
 from flows.web.corrections import SESSION_GAP
+from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
 
 
@@ -98,6 +99,17 @@ def test_first_clicks_are_no_corrections(store, ada):
 )
 def test_a_page_names_no_command(said, shown):
     assert in_browser(said) == shown
+
+
+def test_an_undo_that_is_repeated_is_done_and_goes_on_to_the_one_before(ada, store):
+    write_corrections(store, TINY, 3)
+    ids = [*read_journal(store, TINY).standing]
+    for name in (ids[2], ids[2], ids[1]):  # the answer to the first was lost
+        answer = ada.post(f"{MATCH}/withdrawals", json={"correction": name})
+        assert answer.json() == {"withdrawn": name}
+    journal = read_journal(store, TINY)
+    assert [*journal.standing] == ids[:1]
+    assert sum(isinstance(each, Withdrawal) for each in journal.records) == 2
 
 
 def test_what_is_refused_on_a_page_names_no_command(ada):

@@ -17,7 +17,7 @@ from flows.cli.reprocess import exit_code
 from flows.layers import PROJECT, write_layer
 from flows.method import METHOD
 from flows.registering import open_match, register
-from flows.reprocess import Reprocessed, reprocess_matches
+from flows.reprocess import reprocess_matches
 from flows.review.edit_conflicts import edits_since
 from flows.review.verdicts import correct
 from flows.run_status import explain_unit, run_status
@@ -184,28 +184,28 @@ def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
 
     monkeypatch.setattr(reprocess, "run_match", run)
     monkeypatch.setattr(reprocess, "shared_machines", machines)
-    real = reprocess.run_status
+    real = reprocess.read_summary
 
-    def broken(store, match_id, settings, *, retry):
+    def broken(store, match_id):
         if match_id == "halves":
             raise OSError("its folder is gone")
-        return real(store, match_id, settings, retry=retry)
+        return real(store, match_id)
 
     request = RunRequest({}, workers=3)
-    first = reprocess_matches(store, (), request)
+    first = list(reprocess_matches(store, (), request))
     assert [(each.match_id, each.state) for each in first] == [
         ("halves", "never run"),
         (TINY, "complete"),
     ]
     assert ran == [(TINY, "never", 3)]
-    monkeypatch.setattr(reprocess, "run_status", broken)
-    second = reprocess_matches(store, (), request)
+    monkeypatch.setattr(reprocess, "read_summary", broken)
+    second = list(reprocess_matches(store, (), request))
     assert [(each.state, each.problem) for each in second] == [
         ("failed", "its folder is gone"),
         ("complete", None),
     ]
-    assert exit_code(second) == 4
-    rehearsed = reprocess_matches(store, (TINY,), request, is_rehearsal=True)
+    assert exit_code({each.state for each in second}) == 4
+    rehearsed = list(reprocess_matches(store, (TINY,), request, is_rehearsal=True))
     assert [each.state for each in rehearsed] == ["stale"]
     assert len(ran) == 2
 
@@ -249,7 +249,7 @@ def test_the_deployment_starts_a_run_of_each_stale_match_in_the_background(store
 
 def test_the_exit_code_says_how_far_it_came():
     def code(*states):
-        return exit_code([Reprocessed("m", state) for state in states])
+        return exit_code(set(states))
 
     assert code() == code("current", "never run", "stale", "complete") == 0
     assert code("failed") == 1

@@ -11,7 +11,7 @@ import yaml
 from command_line import TINY
 from typer.testing import CliRunner
 
-from flows import layers, reprocess
+from flows import layers, reprocess, settings
 from flows.cli import run as run_command
 from flows.cli.app import app as worldpose
 from flows.layers import read_layer, write_layer
@@ -23,7 +23,7 @@ from flows.service.plan import ServePlan
 from flows.settings import parse_overrides, resolve
 from flows.web import app_context
 from worldpose.body.body_file import load_open_body, save_body
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
 from worldpose.store.run_queue import queue_of
 from worldpose.store.store import Store
 
@@ -156,7 +156,7 @@ def test_every_door_computes_the_same_keys(store, smpl, tiny, keys_of_run, tmp_p
         deployed.match.fn(store.url, TINY)
 
     def by_reprocess():
-        reprocess.reprocess_matches(store, [TINY], RunRequest({}))
+        list(reprocess.reprocess_matches(store, [TINY], RunRequest({})))
 
     first = keys_of_run(by_command, smpl)
     assert len(first) == 2 and first[0] != first[1]
@@ -364,3 +364,44 @@ def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
     given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
     path = f"onnx-rtmdet:{tmp_path / 'net.onnx'}"
     assert given["detection"] == {"detector": path, "pose": "embedded"}
+
+
+def test_a_stated_value_that_replaces_one_of_the_match_is_reported(store, caplog):
+    write_layer(store, f"matches/{TINY}", {"detection.stride": 3})
+    caplog.set_level("INFO")
+    for stride in (3, 2):
+        caplog.clear()
+        settle(store, open_match(store, TINY), RunRequest({"detection": {"stride": stride}}))
+        said = f"{TINY}: detection.stride=2 replaces 3, which the settings of the match stated"
+        assert (said in caplog.messages) is (stride == 2)
+
+
+def test_a_venue_can_be_a_number(store, tmp_path):
+    at = ("--project", store.url)
+    command("settings", "--venue", "2024", "--add", *at)
+    command("settings", TINY, "--set", "venue=2024", *at)
+    assert read_layer(store, f"matches/{TINY}").values == {"venue": "2024"}
+    assert shown(store, TINY)["venue"] == ("2024", "match")
+    command("settings", TINY, "--set", "venue=null", *at)
+    assert read_layer(store, f"matches/{TINY}").values == {"venue": None}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("detection.stride=true", "true"),
+        ("tracking.gate_m=true", "true"),
+        ("detection.zooms=[true, 2]", "[true, 2]"),
+    ],
+)
+def test_true_is_no_number(text, found):
+    with pytest.raises(UsageError, match="number") as refused:
+        parse_overrides([text])
+    assert refused.value.found == found
+
+
+def test_true_and_numbers_stay_what_they_are():
+    (name,) = [n for n, it in settings.known_settings().items() if it["default"] is True][:1]
+    stage, _, field = name.partition(".")
+    assert parse_overrides([f"{name}=false"]) == {stage: {field: False}}
+    assert parse_overrides(["detection.stride=2"]) == {"detection": {"stride": 2}}

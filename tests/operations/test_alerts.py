@@ -5,13 +5,13 @@ import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
 from threading import Thread
-from types import SimpleNamespace
 
 import apprise
 import pytest
 from command_line import worldpose
+from run_records import run_record
 
-from data_contracts.operations import Arrival, QueuedRun
+from data_contracts.operations import Arrival, MatchSummary, Question, QueuedRun
 from data_contracts.usability import Usability
 from flows.service.alerts import (
     LONGEST_PAUSE,
@@ -23,7 +23,6 @@ from flows.service.alerts import (
 )
 from flows.service.channels import Channel, apprise_mail, channels_of
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, UnitSummary
 from flows.service.plan import ServePlan
 from flows.service.watching import Trouble
 from worldpose.errors import UsageError
@@ -262,8 +261,9 @@ def plan(tmp_path):
 def test_a_question_is_no_alert_before_its_time(plan):
     def waiting(hours):
         since = datetime.now(UTC) - timedelta(hours=hours)
-        unit = UnitSummary("cam04", "waiting", waiting_since=since, why="clicks_wrong is 1")
-        return [MatchStatus("m", stages={"static_calibration": (unit,)})]
+        unit = "static_calibration/cam04"
+        asked = Question(id="q", unit=unit, since=since, reasons=("clicks_wrong is 1",))
+        return [MatchSummary(match_id="m", waiting=(asked,))]
 
     assert alerts_now(plan, waiting(0.9), [], []) == []
     (alert,) = alerts_now(plan, waiting(1.1), [], [])
@@ -277,8 +277,8 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     def judged(state, *reservations):
         verdict = "usable with reservations" if reservations else "usable"
         usability = Usability(verdict=verdict, reservations=reservations)
-        latest = SimpleNamespace(run_id="0001", state=state, usability=usability)
-        return MatchStatus("m", latest)
+        latest = run_record(state=state, usability=usability)
+        return MatchSummary(match_id="m", latest=latest)
 
     assert alerts_now(plan, [judged("complete")], [], []) == []
     assert alerts_now(plan, [judged("waiting", "cam1 is bad.")], [], []) == []  # it asks already
@@ -339,9 +339,11 @@ def test_a_run_that_was_ended_for_lack_of_progress_is_an_alert_until_it_ends(pla
 def test_a_match_is_one_alert_however_many_of_its_results_are_poor_or_wait(plan):
     since = datetime.now(UTC) - timedelta(hours=2)
     usability = Usability(verdict="usable with reservations", reservations=("cam1 is bad.",))
-    latest = SimpleNamespace(run_id="0001", state="partial", usability=usability)
-    waits = [UnitSummary(f"d{it}", "waiting", waiting_since=since, why="b") for it in range(6)]
-    match = MatchStatus("m", latest, stages={"static_calibration": tuple(waits)})
+    latest = run_record(state="partial", usability=usability)
+    waits = [
+        Question(id=f"q{it}", unit=f"static_calibration/d{it}", since=since) for it in range(6)
+    ]
+    match = MatchSummary(match_id="m", latest=latest, waiting=tuple(waits))
     runs = [ended("m", "failed", "dark")]
     (alert,) = alerts_now(plan, [match], [], runs)
     assert (alert.alert, alert.match_id) == ("run_failed", "m")

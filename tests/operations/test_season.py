@@ -4,11 +4,16 @@ import os
 import shutil
 import signal
 import sqlite3
+import subprocess
 import time
+import urllib.request
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 
+import psutil
 import pytest
+from command_line import TINY, WORLDPOSE
+from many_matches import copy_match, prefect_history, queue_history, spread_corrections
 from service import Browser, wait_until
 
 from flows.orchestration.prefect_api import PrefectApi
@@ -24,6 +29,11 @@ SMALL = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": 
 FAILURES = 800
 """More than four pages of Prefect's answers."""
 RESTART_SECONDS = 30.0
+MATCHES, CORRECTIONS, FAILED, DAYS = 200, 500, 500, 30.0
+"""Of the season that is listed; what it costs per match is the same with ten times as many."""
+FIRST_SECONDS, MEGABYTES = 1.0, 500.0
+TRIES = 8
+"""The machine is shared: the best try counts."""
 
 
 @pytest.mark.slow  # a service, four starts of it, and the runs of two matches
@@ -142,3 +152,52 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     assert served.end() == 0
     with capsys.disabled():
         print(f"\nseconds: {times}")
+
+
+@pytest.mark.slow  # summaries of all matches are made, and a service starts twice
+@pytest.mark.timeout(3600)
+def test_the_lists_of_a_season_are_there_within_a_second(served, project_copy, capsys):
+    copy_match(project_copy, TINY, MATCHES - 1)
+    spread_corrections(project_copy, CORRECTIONS)
+    runs = queue_history(project_copy, FAILED, DAYS)
+    served.project = project_copy
+    served.options = {"--workers": 1, "--disk-gb": 0, "--poll-interval": 15}
+    served.begin()
+    match = served.ask("/deployments/name/match/worldpose-match")["id"]
+    sample = {"name": "old", "state": {"type": "FAILED"}, "parameters": {"match_id": "old"}}
+    served.ask(f"/deployments/{match}/create_flow_run", sample)
+    assert served.end() == 0
+    prefect_history(project_copy / "operations" / "prefect" / "prefect.db", runs)
+    served.begin()
+    browser, times = Browser(served), {}
+    wait_until(lambda: not browser.ask("/api/matches")["left"], served.explain)
+
+    def first_byte(path):
+        began = time.monotonic()
+        with browser.opener.open(urllib.request.Request(browser.base + path)) as answer:
+            answer.read(1)
+            return time.monotonic() - began
+
+    of_one = f"/api/matches/{TINY}-copy017"
+    for path in ("/", "/api/matches", "/api/matches?search=copy017", "/status", of_one):
+        times[path] = min(first_byte(path) for _ in range(TRIES))
+
+    def first_line(*arguments):
+        began = time.monotonic()
+        command = [*WORLDPOSE, *arguments, "--project", str(project_copy)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            process.stdout.readline()
+            seconds = time.monotonic() - began
+            process.stdout.read()
+        return seconds
+
+    times["status"] = min(first_line("status") for _ in range(TRIES))
+    service = psutil.Process(served.process.pid)
+    sizes = [it.memory_info().rss / 1e6 for it in (service, *service.children(recursive=True))]
+    with capsys.disabled():
+        print(f"\nseconds: {times}\nMB: {[round(each) for each in sizes]}")
+    assert max(times.values()) < FIRST_SECONDS
+    assert max(sizes) < MEGABYTES
+    kept = RunQueue(LocalBlobs(project_copy)).runs()  # the last of each match, and those of a day
+    assert len(kept) < len(runs) / 2
+    assert served.end() == 0

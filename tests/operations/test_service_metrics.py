@@ -12,10 +12,10 @@ from command_line import TINY
 from prometheus_client.parser import text_string_to_metric_families
 
 from data_contracts.operations import Arrival
+from flows.overview import Overview
 from flows.service.alerts import Alert, AlertDispatcher
 from flows.service.layout import StateFolder
 from flows.service.metrics import ProjectMetrics, exposition, metrics_app
-from flows.service.overview import Overview
 from flows.service.plan import ServePlan
 from worldpose.store.store import Store
 
@@ -50,7 +50,7 @@ def served(project_copy):
         state=state.folder,
         prefect="http://127.0.0.1:4200/api",
     )
-    app = metrics_app(plan, ProjectMetrics(Store.open(str(project_copy)), state), "token")
+    app = metrics_app(plan, ProjectMetrics(Overview(Store.open(str(project_copy))), state), "token")
     client = TestClient(app, base_url="http://127.0.0.1:8573")
 
     def ask(path, token="token", **headers):
@@ -118,7 +118,7 @@ def test_metrics_are_for_those_who_name_the_server_and_have_its_token(served):
 
 def test_what_is_scraped_again_is_looked_at_anew(project_copy):
     store = Store.open(str(project_copy))
-    figures = ProjectMetrics(store, StateFolder(project_copy / "operations"))
+    figures = ProjectMetrics(Overview(store), StateFolder(project_copy / "operations"))
     before = scraped(exposition(figures).decode())
     run = store.run(TINY)
     again = run.model_copy(update={"run_id": store.reserve_run(TINY), "executed": ()})
@@ -131,12 +131,12 @@ def test_what_is_scraped_again_is_looked_at_anew(project_copy):
     # A run that computed nothing made no poses.
     assert after["worldpose_poses_total",] == before["worldpose_poses_total",]
     (match,) = Overview(store).look()
-    assert {unit.state for _, unit in match.units} == {"done"}
+    assert {state for states in match.progress.values() for state in states} == {"done"}
 
 
 def test_a_project_in_object_storage_is_told_of_the_disk_of_its_state(bucket, tmp_path):
     store = Store.create(f"{bucket}/disk")
-    found = scraped(exposition(ProjectMetrics(store, StateFolder(tmp_path))).decode())
+    found = scraped(exposition(ProjectMetrics(Overview(store), StateFolder(tmp_path))).decode())
     assert found["worldpose_disk_free_bytes",] == pytest.approx(
         shutil.disk_usage(tmp_path).free, rel=0.05
     )

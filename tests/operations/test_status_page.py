@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 import pytest
 from command_line import TINY
 
-from data_contracts.operations import Arrival
+from data_contracts.operations import Arrival, MatchSummary, UnitSummary
+from flows.overview import Overview
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, Overview, UnitSummary
 from flows.service.status_page import (
     MAX_DETAILS,
     UNSEEN_SECONDS,
@@ -77,18 +77,18 @@ def test_a_match_that_cannot_be_read_hides_no_other(project_copy):
     damaged.write_bytes(damaged.read_bytes().replace(b"complete", b"complote"))
     (match,) = Overview(store).look()
     assert match.state == "unreadable"
-    text = status_html([StatusRow(match), StatusRow(MatchStatus("other"))], [], "")
+    text = status_html([StatusRow(match), StatusRow(MatchSummary(match_id="other"))], [], "")
     assert "other" in text
     assert "0001.json" in text
 
 
 def test_the_worst_state_of_a_stage_is_what_is_seen():
     units = (
-        UnitSummary("cam00", "done", 1.0),
-        UnitSummary("cam01", "waiting", 2.0, waiting_since=datetime.now(UTC)),
-        UnitSummary("cam02", "failed", why=EVIL),
+        UnitSummary(unit="cam00", state="done", seconds=1.0),
+        UnitSummary(unit="cam01", state="waiting", seconds=2.0, waiting_since=datetime.now(UTC)),
+        UnitSummary(unit="cam02", state="failed", why=EVIL),
     )
-    match = MatchStatus("m", stages={"ingest": units[:1], "static_calibration": units})
+    match = MatchSummary(match_id="m", stages={"ingest": units[:1], "static_calibration": units})
     run = "http://127.0.0.1:4200/runs/flow-run/1f2e"
     at_work = {"state": "running", "percent": 41.6, "lines": [f"tracking {EVIL}"]}
     text = status_html([StatusRow(match, at_work, run)], [], "http://127.0.0.1:4200")
@@ -107,9 +107,9 @@ def test_an_empty_project_says_what_to_do():
 
 
 def test_cameras_of_many_matches_are_shown_for_one_of_them():
-    unit = {"ingest": (UnitSummary("cam00", "done", 1.0),)}
+    unit = {"ingest": (UnitSummary(unit="cam00", state="done", seconds=1.0),)}
     names = [f"m{number}" for number in range(MAX_DETAILS + 1)]
-    many = [StatusRow(MatchStatus(name, stages=unit)) for name in names]
+    many = [StatusRow(MatchSummary(match_id=name, stages=unit)) for name in names]
     assert status_html(many[1:], [], "").count("<details>") == MAX_DETAILS
     assert "<details>" not in status_html(many, [], "")
     text = status_html(many, [], "", opened="m3")
@@ -118,6 +118,6 @@ def test_cameras_of_many_matches_are_shown_for_one_of_them():
 
 
 def test_matches_that_were_not_read_yet_are_shown_by_name():
-    text = status_html([StatusRow(MatchStatus("m", is_unseen=True))], [], "")
+    text = status_html([StatusRow(MatchSummary(match_id="m", is_unseen=True))], [], "")
     assert "being read" in text
     assert f'content="{UNSEEN_SECONDS}"' in text

@@ -11,8 +11,8 @@ import pytest
 from command_line import WORLDPOSE, worldpose
 from page_client import log_in, served
 
+from flows.overview import Overview
 from flows.registering import register
-from flows.service.overview import Overview
 from worldpose.store.store import Store
 
 

@@ -348,8 +348,8 @@ def _import_pyarrow(where: str, otherwise: str) -> tuple[Any, Any]:
     except ImportError:
         raise UsageError(
             where,
-            expected="the package pyarrow, which reads and writes it",
+            expected="worldpose with the extra tables, which reads and writes it",
             found="none installed",
-            todo=f"Install the extra: pip install 'worldpose[tables]', or {otherwise}.",
+            todo=f"Install it: pip install 'worldpose[tables]', or {otherwise}.",
         ) from None
     return pa, parquet

@@ -43,9 +43,9 @@ def write_recording(
     except ImportError:
         raise UsageError(
             "format rerun",
-            expected="the package rerun-sdk",
+            expected="worldpose with the extra rerun",
             found="none installed",
-            todo="Install worldpose with the extra rerun.",
+            todo="Install it: pip install 'worldpose[rerun]'.",
         ) from None
     with whole_file(path) as draft:
         stream = rr.RecordingStream(NAME, recording_id=path.stem)

@@ -33,6 +33,8 @@ from worldpose.store.store import Store
 _ENTRY = re.compile(r"(\d{6,})\.json")
 READERS = 8
 """Number of parallel readers: in object storage each entry is a separate request."""
+MOST_KEPT = 50
+"""Journals that a process keeps, those read last."""
 BATCH = 64
 """Entries that one reader fetches in a row."""
 
@@ -111,7 +113,10 @@ def read_journal(store: Store, match_id: str) -> Journal:
     """
     folder = f"reviews/{checked_name(match_id)}"
     with _KNOWN_LOCK:
-        known = _KNOWN.setdefault(store, {}).setdefault(match_id, _Known())
+        kept = _KNOWN.setdefault(store, {})
+        known = kept[match_id] = kept.pop(match_id, _Known())
+        while len(kept) > MOST_KEPT:
+            del kept[next(iter(kept))]
     with known.lock:  # concurrent requests read a long journal only once
         journal = known.journal or Journal(match_id)
         if not _is_still(store, journal, known.last_data):

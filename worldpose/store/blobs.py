@@ -11,7 +11,7 @@ import hashlib
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -109,6 +109,13 @@ class Blobs(Protocol):
 
     def entries(self, prefix: str) -> list[Entry]:
         """Return all files below the folder `prefix`, sorted by path."""
+
+    def marks(self, paths: Sequence[str]) -> list[int]:
+        """Return for each file or folder a number that differs after a change; 0 if it is absent.
+
+        A folder changes when a name in it appears or disappears. On a disk it is the time of the
+        change [ns]: a change that preserves it is missed.
+        """
 
     def create_staging(self) -> Path:
         """Create a private local folder for a tree to be published."""
@@ -293,6 +300,10 @@ class LocalBlobs:
         with storage_errors(str(top)):
             return sorted(_entries_below(str(top), prefix), key=lambda entry: entry.path)
 
+    def marks(self, paths: Sequence[str]) -> list[int]:
+        """See `Blobs`."""
+        return [changed_at(f"{self.root}/{path}") for path in paths]
+
     def create_staging(self) -> Path:
         """See `Blobs`. On the project's own file system, so that a rename can publish it."""
         folder = self.root / STAGING / uuid.uuid4().hex
@@ -351,6 +362,14 @@ class LocalBlobs:
             yield path
         finally:
             path.unlink(missing_ok=True)
+
+
+def changed_at(path: str) -> int:
+    """Return the time of the last change of a file, or of a folder's names [ns]; 0 without one."""
+    try:
+        return os.stat(path).st_mtime_ns  # noqa: PTH116 (faster than a Path)
+    except OSError:
+        return 0
 
 
 def _write_synced(path: Path, data: bytes) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +28,8 @@ except ImportError as error:
         todo="Run: pip install 'worldpose[s3]'.",
     ) from error
 
+LISTINGS = 100
+"""Paths of which each folder is listed alone."""
 UPLOADS = 8
 """Concurrent uploads per result; the result exists only after the last."""
 
@@ -137,6 +139,21 @@ class ObjectBlobs:
     def entries(self, prefix: str) -> list[Entry]:
         """See `Blobs`."""
         return self._list_objects(checked_path(prefix))
+
+    def marks(self, paths: Sequence[str]) -> list[int]:
+        """See `Blobs`. Few listings: of the first folders if there are many paths."""
+        is_many = len(paths) > LISTINGS
+        parts = [path.split("/") for path in paths]
+        ends = [1 if is_many or (len(p) == 2 and p[1].endswith(".json")) else 2 for p in parts]
+        tops = ["/".join(p[:end]) for p, end in zip(parts, ends, strict=True)]
+        below: dict[str, list[str]] = {path: [] for path in paths}
+        for top in set(tops):
+            for entry in self.entries(top):
+                line, names = f"{entry.path} {entry.size} {entry.modified}", entry.path.split("/")
+                for end in range(1, len(names) + 1):
+                    below.get("/".join(names[:end]), []).append(line)
+        texts = ("\n".join(below[path]).encode() for path in paths)
+        return [int.from_bytes(hashlib.sha256(it).digest()[:7]) if it else 0 for it in texts]
 
     def all_entries(self) -> list[Entry]:
         """Return all objects below the root, sorted by path; any program can have named them."""

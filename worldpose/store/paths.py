@@ -96,6 +96,11 @@ def record_path(match_id: str, run_id: str) -> str:
     return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.json"
 
 
+def summary_path(match_id: str) -> str:
+    """Return the path of a match's summary, which is derived and may be deleted."""
+    return f"summaries/{checked_name(match_id)}.json"
+
+
 def reservation_path(match_id: str, run_id: str) -> str:
     """Return the path of a run number's reservation, valid until there is a record."""
     return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.open.json"

@@ -124,14 +124,20 @@ class RunQueue:
             return None
 
     def forget_ended(self, age: timedelta) -> None:
-        """Remove runs that ended longer ago; the last one of each match and flow stays."""
+        """Remove runs that ended longer ago; the end of the last of each match and flow stays."""
         before, runs = datetime.now(UTC) - age, self.runs()
-        last = {queue_folder(run): run.id for run in runs}
-        for run in runs:
-            is_old = run.state in ENDED and run.changed_at < before
-            if is_old and last[queue_folder(run)] != run.id:
-                for number in range(1, run.number + 1):
-                    self.blobs.delete(queue_path(run.model_copy(update={"number": number})))
+        last = {queue_folder(run): run for run in runs}.values()
+        kept = {run.id for run in (*last, *last_ended(runs))}
+        old = {
+            queue_path(run).rpartition(".")[0].rpartition(".")[0]: run
+            for run in runs
+            if run.state in ENDED and run.changed_at < before
+        }
+        for entry in self.blobs.entries("queue"):
+            found = _FILE.fullmatch(entry.path)
+            run = None if found is None else old.get(found[1])
+            if run is not None and (run.id not in kept or entry.path != queue_path(run)):
+                self.blobs.delete(entry.path)
 
     def _read(self, path: str) -> QueuedRun | None:
         data = self.blobs.read(path)
