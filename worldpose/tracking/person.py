@@ -108,6 +108,8 @@ class Person:
         number: order of birth.
         pose: (17, 3) [m], world, at the current frame; NaN for joints never determined.
         last_fixed: last frame whose rays determined the position.
+        departure: (cameras,) recent mean distance of each view's rays from those of the other
+            views, over its limit [1].
         velocity: (3,) [m/s], of the whole body.
         sightings: detections of the person, by frame.
         misfit: recent mean ray distance [m]: large where a body falls or jumps.
@@ -120,6 +122,7 @@ class Person:
     number: int
     pose: Floats
     last_fixed: int
+    departure: Floats
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
     sightings: Sightings = field(default_factory=Sightings)
     misfit: float = 0.0

@@ -90,6 +90,86 @@ def distance(x: float, y: float, z: float, center: Floats, direction: Floats) ->
 
 
 @compile_kernel
+def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floats:
+    """Return the mean distance of the rays of every two detections of each person.
+
+    Args:
+        centers: (cameras, 3) [m], world.
+        directions: (cameras, detections, joints, 3) unit rays, world; NaN where not seen.
+        index: (cameras, persons) index of the detection; -1 = not seen.
+
+    Returns:
+        (persons, cameras, cameras) [m]; infinite without a common joint.
+    """
+    cameras, _, joint_count, _ = directions.shape
+    apart = np.full((index.shape[1], cameras, cameras), np.inf)
+    for person in range(index.shape[1]):
+        for a in range(cameras):
+            for b in range(a + 1, cameras):
+                if index[a, person] < 0 or index[b, person] < 0:
+                    continue
+                x, y, z = centers[b] - centers[a]
+                total, count = 0.0, 0
+                for joint in range(joint_count):
+                    px, py, pz = directions[a, index[a, person], joint]
+                    qx, qy, qz = directions[b, index[b, person], joint]
+                    nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+                    sine = math.sqrt(nx * nx + ny * ny + nz * nz)
+                    if sine > 0.0:  # also False for NaN
+                        total += abs(x * nx + y * ny + z * nz) / sine
+                        count += 1
+                if count:
+                    apart[person, a, b] = apart[person, b, a] = total / count
+    return apart
+
+
+@compile_kernel
+def drop_lasting_strangers(apart: Floats, index: Integers, departure: Floats, gain: float) -> None:
+    """Remove a person's views whose rays are lastingly apart from those of the others.
+
+    The departure of view c is the running mean of the mean distance to the other views S,
+
+        r_c <- r_c + gain (mean_{j in S, j != c} apart_cj - r_c);
+
+    the worst view is left out of S as long as its departure exceeds 1. So the
+    views that agree decide; of the last two, the one that departed more before is left out.
+
+    Args:
+        apart: (cameras, cameras) distance of rays over its limit [1]; infinite = unknown.
+        index: (cameras,) detections; -1 = not seen. Written.
+        departure: (cameras,) [1]. Written.
+        gain: of the running mean [1].
+    """
+    matched = index >= 0
+    while True:
+        worst, most = -1, 1.0
+        for c in range(len(index)):
+            if index[c] >= 0:
+                now = _mean_departure(apart[c], index, c)
+                mean = departure[c] + gain * (now - departure[c])
+                if now >= 0.0 and mean > most:
+                    worst, most = c, mean
+        if worst < 0:
+            break
+        index[worst] = -1
+    for c in range(len(index)):
+        if matched[c]:
+            now = _mean_departure(apart[c], index, c)
+            if now >= 0.0:
+                departure[c] += gain * (now - departure[c])
+
+
+@compile_kernel
+def _mean_departure(apart: Floats, index: Integers, camera: int) -> float:
+    """Return the mean distance to the other views; -1 without any."""
+    total, count = 0.0, 0
+    for other in range(len(index)):
+        if other != camera and index[other] >= 0 and apart[other] < math.inf:
+            total, count = total + apart[other], count + 1
+    return total / count if count else -1.0
+
+
+@compile_kernel
 def match_greedily(affinity: Floats) -> Integers:
     """Return each person's detection in every camera, best pairs first.
 
