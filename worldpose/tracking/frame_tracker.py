@@ -179,7 +179,9 @@ class FrameTracker:
         self.active.sort(key=lambda person: (not self._is_confirmed(person), person.number))
         confirmed = sum(map(self._is_confirmed, self.active))
         poses = np.array([person.pose for person in self.active])
-        doubt = [person.uncertainty(frame, self.fps, settings) for person in self.active]
+        doubt = np.stack(
+            [person.uncertainty(frame, self.fps, settings) for person in self.active], axis=1
+        )
         usual = np.maximum(
             settings.gate_factor * self.gates.usual[:, None],
             settings.gate_growth * np.array([person.misfit for person in self.active]),
@@ -202,6 +204,10 @@ class FrameTracker:
         distance = -np.take_along_axis(affinity, np.maximum(index, 0)[..., None], axis=2)[..., 0]
         distance[index < 0] = np.nan
         self.gates.learn(distance)
+        for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 1).tolist():
+            (camera,) = np.flatnonzero(index[:, n] >= 0)
+            rays = directions[camera, index[camera, n]]
+            self.active[n].follow(frame, self.centers, camera, rays, self.fps, settings)
         joints = intersect_people(
             self.centers,
             directions,
@@ -278,8 +284,7 @@ class FrameTracker:
                 person = lost[back[place]]
                 self.lost.remove(person)
             else:
-                none = np.zeros(len(self.centers))
-                person = Person(self.born, group.joints, frame, departure=none)
+                person = Person(self.born, group.joints, frame, len(self.centers))
                 self.born += 1
             numbers.append(person.number)
             ground = np.nanmean(group.joints[:, :2], axis=0)
@@ -335,8 +340,10 @@ class FrameTracker:
         """End or lose people unseen for too long; unconfirmed ones have a shorter limit."""
         settings = self.settings
         for person in list(self.active):
-            patience = settings.max_coast_s if self._is_confirmed(person) else settings.min_track_s
-            if (frame - person.last_fixed) / self.fps > patience:
+            patience, since = settings.min_track_s, person.last_fixed
+            if self._is_confirmed(person):
+                patience, since = settings.max_coast_s, person.last_followed
+            if (frame - since) / self.fps > patience:
                 self.active.remove(person)
                 back = settings.causal and self._is_confirmed(person)
                 (self.lost if back else self.ended).append(person)
