@@ -36,7 +36,7 @@ SCORED: tuple[tuple[str, str | None, JointDefinition], ...] = (
     ("R", "retriangulation", "body"),
     ("B", "body_fitting", "body"),
     ("D", "body_fitting", "detector"),
-    ("E", None, "body"),
+    ("E", None, "detector"),
 )
 """Letter, stage and definition of joints; no stage = what an export has by default."""
 

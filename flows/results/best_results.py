@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17, JOINT_GROUPS
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
@@ -44,6 +45,13 @@ if TYPE_CHECKING:
 
 JointDefinition = Literal["body", "detector"]
 """Where a joint of a fitted body is: where the body model has it, or where the detector sees it."""
+OF_VIEWS = [
+    any(part in name for part in (*JOINT_GROUPS["head"], "elbow", "wrist")) for name in COCO17
+]
+"""Joints (17,) that no other part of a body determines: views determine them better."""
+ENOUGH_VIEWS = 3
+"""Views from which such a joint is triangulated rather than that of the body: two can show the
+detections of two people."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
 ADJUSTED = "bundle_adjustment/cameras"
@@ -131,7 +139,9 @@ def joint_tracks(
     """Return the joints of one clip, from the best available or the given stage.
 
     People that a broadcast camera alone films have the joints of their bodies, or NaN. Triangulated
-    joints have the detector's definition always. If the first triangulation is the best available,
+    joints have the detector's definition always. The best joints in that definition are those of
+    the bodies, and triangulated ones of face and arms that three views show; `source` tells which.
+    If the first triangulation is the best available,
     the frames that it skipped have the tracker's joints, without covariance.
 
     Raises:
@@ -168,12 +178,20 @@ def joint_tracks(
         joints = perceived_joints(joints, result["joint_offsets"].values)
     if fitted and definition == "detector":
         covariance = random_covariance(covariance, seen["common_bias"].values)
+    source = np.where(np.isfinite(joints[..., 0]), 2 if stages[0] in BODY_STAGES else 1, 0)
+    if best and fitted and definition == "detector":
+        placed = np.array(OF_VIEWS) & (views >= ENOUGH_VIEWS) & (source == 2)
+        source[placed] = 1
+        joints = np.where(placed[..., None], seen["smoothed"].values, joints)
+        given = random_covariance(seen["smoothed_covariance"].values, seen["common_bias"].values)
+        covariance = np.where(placed[..., None, None], given, covariance)
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
         joints=joints,
         covariance=covariance,
         views=views,
+        source=source,
         identity_certainty=_identity_certainty(
             run, clip, result["frame"].values, result["person"].values
         ),
@@ -322,7 +340,7 @@ class Origin:
     """Text of the data's licence; None = not stated."""
     surface: bool = False
     """Write also the surface of a body model that has terms of its own."""
-    definition: JointDefinition = "body"
+    definition: JointDefinition = "detector"
     """Definition of the joints of bodies."""
     footage: Footage | None = None
     """Videos to embed in viewer files; None = none."""

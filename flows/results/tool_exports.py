@@ -110,6 +110,8 @@ def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
         owner = "detector sees" if origin.definition == "detector" else "model has"
         alone = ", from one camera by feet on the pitch and a monocular method's poses"
         how = alone if f"{PLANE}/{clip}" in origin.run else ""
+        if origin.definition == "detector" and origin.stage is None and not how:
+            how = "; face, elbows and wrists triangulated where three views show them"
         return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them{how}"
     if stage == PLANE:
         return "none: people are placed on the pitch by their feet"

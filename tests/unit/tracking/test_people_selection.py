@@ -77,7 +77,9 @@ def track(number, frames, x, y=0.0, views=CAMERAS):
     """Return a track over a time span [s] at a position [m], one or one per frame."""
     frames = range(*(round(FPS * second) for second in frames))
     x, y = np.broadcast_to(x, len(frames)), np.broadcast_to(y, len(frames))
-    someone = Person(number, BODY, frames[-1], fixed=len(frames), evidence=float(len(frames)))
+    someone = Person(
+        number, BODY, frames[-1], CAMERAS, fixed=len(frames), evidence=float(len(frames))
+    )
     index = np.where(np.arange(CAMERAS) < views, 0, -1)
     for n, frame in enumerate(frames):
         joints = BODY + [x[n], y[n], 0.0]
