@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, MutableMapping
 from dataclasses import InitVar, dataclass, field
 from typing import Final
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
