@@ -131,8 +131,8 @@ def drop_lasting_strangers(apart: Floats, index: Integers, departure: Floats, ga
 
         r_c <- r_c + gain (mean_{j in S, j != c} apart_cj - r_c);
 
-    the worst view is left out of S as long as its departure exceeds 1. So the
-    views that agree decide; of the last two, the one that departed more before is left out.
+    the worst view is left out of S as long as its departure exceeds 1. So the views that agree
+    decide; of the last two, the one that departed more before is left out.
 
     Args:
         apart: (cameras, cameras) distance of rays over its limit [1]; infinite = unknown.
@@ -140,33 +140,22 @@ def drop_lasting_strangers(apart: Floats, index: Integers, departure: Floats, ga
         departure: (cameras,) [1]. Written.
         gain: of the running mean [1].
     """
-    matched = index >= 0
+    matched, mean = index >= 0, departure.copy()
     while True:
-        worst, most = -1, 1.0
-        for c in range(len(index)):
-            if index[c] >= 0:
-                now = _mean_departure(apart[c], index, c)
-                mean = departure[c] + gain * (now - departure[c])
-                if now >= 0.0 and mean > most:
-                    worst, most = c, mean
+        worst = -1
+        for c in np.flatnonzero(matched):
+            total, count = 0.0, 0
+            for other in range(len(index)):
+                if other != c and index[other] >= 0 and apart[c, other] < math.inf:
+                    total, count = total + apart[c, other], count + 1
+            if count:
+                mean[c] = departure[c] + gain * (total / count - departure[c])
+                if index[c] >= 0 and mean[c] > (1.0 if worst < 0 else mean[worst]):
+                    worst = c
         if worst < 0:
             break
         index[worst] = -1
-    for c in range(len(index)):
-        if matched[c]:
-            now = _mean_departure(apart[c], index, c)
-            if now >= 0.0:
-                departure[c] += gain * (now - departure[c])
-
-
-@compile_kernel
-def _mean_departure(apart: Floats, index: Integers, camera: int) -> float:
-    """Return the mean distance to the other views; -1 without any."""
-    total, count = 0.0, 0
-    for other in range(len(index)):
-        if other != camera and index[other] >= 0 and apart[other] < math.inf:
-            total, count = total + apart[other], count + 1
-    return total / count if count else -1.0
+    departure[:] = mean
 
 
 @compile_kernel
