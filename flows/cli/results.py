@@ -64,8 +64,8 @@ def export(
 
     Options:
         out: Output folder; with --format viewer also FILE.html.
-        definition: Joints where the detector sees them, of face and arms triangulated where three
-            views show them; or those of the body model.
+        definition: Joints where the detector sees them, but wrists and ankles where the body model
+            has them; or all where the model has them.
         release: Freeze the run under this name.
         licence: Text of the data licence, for a release or the files.
         filled: Interpolate and flag joints that are missing for a while.

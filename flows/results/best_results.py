@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17, JOINT_GROUPS
+from data_contracts.conventions import COCO17
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
@@ -45,13 +45,9 @@ if TYPE_CHECKING:
 
 JointDefinition = Literal["body", "detector"]
 """Where a joint of a fitted body is: where the body model has it, or where the detector sees it."""
-OF_VIEWS = [
-    any(part in name for part in (*JOINT_GROUPS["head"], "elbow", "wrist")) for name in COCO17
-]
-"""Joints (17,) that no other part of a body determines: views determine them better."""
-ENOUGH_VIEWS = 3
-"""Views from which such a joint is triangulated rather than that of the body: two can show the
-detections of two people."""
+LIMB_ENDS = [9, 10, 15, 16]
+"""Wrists and ankles in COCO-17, whose offset from body to detector nothing separates from the
+length of the limb."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
 ADJUSTED = "bundle_adjustment/cameras"
@@ -140,8 +136,8 @@ def joint_tracks(
 
     People that a broadcast camera alone films have the joints of their bodies, or NaN. Triangulated
     joints have the detector's definition always. The best joints in that definition are those of
-    the bodies, and triangulated ones of face and arms that three views show; `source` tells which.
-    If the first triangulation is the best available,
+    the bodies, at `LIMB_ENDS` where the model has them, and triangulated ones without a body;
+    `source` tells which. If the first triangulation is the best available,
     the frames that it skipped have the tracker's joints, without covariance.
 
     Raises:
@@ -178,13 +174,15 @@ def joint_tracks(
         joints = perceived_joints(joints, result["joint_offsets"].values)
     if fitted and definition == "detector":
         covariance = random_covariance(covariance, seen["common_bias"].values)
-    source = np.where(np.isfinite(joints[..., 0]), 2 if stages[0] in BODY_STAGES else 1, 0)
+    kind = 1 if stages[0] not in BODY_STAGES else 2 if definition == "detector" else 3
+    source = np.where(np.isfinite(joints[..., 0]), kind, 0)
     if best and fitted and definition == "detector":
-        placed = np.array(OF_VIEWS) & (views >= ENOUGH_VIEWS) & (source == 2)
-        source[placed] = 1
-        joints = np.where(placed[..., None], seen["smoothed"].values, joints)
-        given = random_covariance(seen["smoothed_covariance"].values, seen["common_bias"].values)
-        covariance = np.where(placed[..., None, None], given, covariance)
+        ends = np.isin(np.arange(len(COCO17)), LIMB_ENDS) & (source > 0)
+        alone = (source == 0) & np.isfinite(seen["joints"].values[..., 0])
+        for part, given, kind in ((ends, result, 3), (alone, seen, 1)):
+            joints = np.where(part[..., None], given["joints"].values, joints)
+            covariance = np.where(part[..., None, None], given["covariance"].values, covariance)
+            source[part] = kind
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),

@@ -111,7 +111,7 @@ def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
         alone = ", from one camera by feet on the pitch and a monocular method's poses"
         how = alone if f"{PLANE}/{clip}" in origin.run else ""
         if origin.definition == "detector" and origin.stage is None and not how:
-            how = "; face, elbows and wrists triangulated where three views show them"
+            how = ", but wrists and ankles where the model has them; triangulated without a body"
         return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them{how}"
     if stage == PLANE:
         return "none: people are placed on the pitch by their feet"

@@ -81,7 +81,8 @@ class JointTracks:
     not stated, None if it is nowhere."""
     source: NDArray[np.integer] | None = None
     """(frames, persons, 17) where a joint comes from: 1 = the views, triangulated; 2 = the fitted
-    body; 0 = neither, missing or interpolated. None if unknown."""
+    body, where the detector sees it; 3 = the fitted body, where the model has it; 0 = missing or
+    interpolated. None if unknown."""
 
     @property
     def markers(self) -> ExtraTracks:
