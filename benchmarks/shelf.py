@@ -219,7 +219,7 @@ def tabulate(rows: list[list[Any]]) -> Tables:
 
 def open_keys(store: Store, match: str, keys: dict[str, str]) -> Run:
     """Return results that no run has recorded as those of one."""
-    fields = {"failed": (), "blocked": (), "waiting": (), "left_out": {}, "body_folder": None}
+    fields: dict[str, Any] = {"failed": (), "blocked": (), "waiting": (), "body_folder": None}
     record = RunRecord.model_construct(run_id="0001", match_id=match, results=keys, **fields)
     return Run(store, record)
 

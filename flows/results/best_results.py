@@ -167,6 +167,8 @@ def joint_tracks(
     fitted = stages[0] in BODY_STAGES and not on_plane
     seen = placed_joints(run, clip) if fitted else result
     joints, covariance = result["joints"].values, result["covariance"].values
+    if "joint_offsets" not in result:  # a monocular method's bodies have none
+        definition = "body"
     views = seen["views"].values.astype(np.int64)
     if best and stages[0] == "triangulation":
         joints, views = _with_tracked_joints(run, clip, joints, views)

@@ -205,9 +205,9 @@ class FrameTracker:
         distance[index < 0] = np.nan
         self.gates.learn(distance)
         for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 1).tolist():
-            (camera,) = np.flatnonzero(index[:, n] >= 0)
-            rays = directions[camera, index[camera, n]]
-            self.active[n].follow(frame, self.centers, camera, rays, self.fps, settings)
+            lone = int(index[:, n].argmax())
+            rays = directions[lone, index[lone, n]]
+            self.active[n].follow(frame, self.centers[lone], lone, rays, self.fps, settings)
         joints = intersect_people(
             self.centers,
             directions,
@@ -232,8 +232,8 @@ class FrameTracker:
         than tells in one frame (`drop_lasting_strangers`).
         """
         apart = view_distances(self.centers, directions, index)
-        first, second = np.indices(apart.shape[1:])
-        noise = self.gates.pair_noise(first, second)
+        camera = np.arange(len(index))
+        noise = self.gates.pair_noise(camera[:, None], camera)
         for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 2).tolist():
             a, b = np.flatnonzero(index[:, n] >= 0)
             # Largest distance of the rays of two views of one person, in standard deviations.
@@ -342,7 +342,7 @@ class FrameTracker:
         for person in list(self.active):
             patience, since = settings.min_track_s, person.last_fixed
             if self._is_confirmed(person):
-                patience, since = settings.max_coast_s, person.last_followed
+                patience, since = settings.max_coast_s, person.last_followed(self.fps)
             if (frame - since) / self.fps > patience:
                 self.active.remove(person)
                 back = settings.causal and self._is_confirmed(person)

@@ -136,7 +136,6 @@ class Person:
     fixed: int = 0
     evidence: float = 0.0
     shown_from: int = -1
-    lone_frames: int = 0
 
     def __post_init__(self, cameras: int) -> None:
         self.departure, self.followed = np.zeros(cameras), np.full(cameras, -1)
@@ -176,35 +175,28 @@ class Person:
         if self.shown_from < 0 and self.evidence >= 1.0 - 1e-9:
             self.shown_from = frame
 
-    @property
-    def last_followed(self) -> int:
-        """Last frame in which a view, after others that determined the position, showed it."""
-        lone = min(int(self.followed.max()), self.last_fixed + self.lone_frames)
+    def last_followed(self, fps: float) -> int:
+        """Return the last frame that fixed the person, or in which one camera then followed."""
+        lone = min(int(self.followed.max()), self.last_fixed + round(LONE_S * fps))
         return max(self.last_fixed, lone)
 
     def follow(
         self,
         frame: int,
-        centers: Floats,
+        center: Floats,
         camera: int,
         rays: Floats,
         fps: float,
         settings: TrackingSettings,
     ) -> None:
-        """Move the predicted pose across the rays (17, 3) of the only camera that sees it.
-
-        The distance from the camera remains as predicted.
-        """
-        self.lone_frames = round(LONE_S * fps)
-        away = self.pose - centers[camera]
+        """Move the predicted pose across the rays (17, 3) of the only camera that sees it."""
+        away = self.pose - center
         across = (away * rays).sum(axis=-1, keepdims=True) * rays - away
-        if not np.isfinite(across).all(axis=-1).any():
-            return
-        shift = np.nanmedian(across, axis=0)
-        gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
-        self.pose = self.pose + shift
-        self.velocity = self.velocity + gain * shift * fps
-        self.followed[camera] = frame
+        if np.isfinite(across).all(axis=-1).any():
+            shift = np.nanmedian(across, axis=0)
+            gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
+            self.pose, self.velocity = self.pose + shift, self.velocity + gain * fps * shift
+            self.followed[camera] = frame
 
     def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> Floats:
         """Return the standard deviation (cameras,) of the predicted position at `frame` [m].

@@ -90,6 +90,34 @@ def distance(x: float, y: float, z: float, center: Floats, direction: Floats) ->
 
 
 @compile_kernel
+def rays_apart(
+    baseline: Floats, rays: Floats, others: Floats, most: float
+) -> tuple[float, float, int]:
+    """Return sums of distances [m] and of sines of two detections' rays, and their joints' number.
+
+    Args:
+        baseline: (3,) from the first camera to the second [m].
+        rays: (joints, 3) unit rays of the first; NaN where not seen.
+        others: (joints, 3) of the second.
+        most: sum of distances at which the rest does not count [m].
+    """
+    x, y, z = baseline
+    total, sines, count = 0.0, 0.0, 0
+    for joint in range(len(rays)):
+        px, py, pz = rays[joint]
+        qx, qy, qz = others[joint]
+        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        sine = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if sine > 0.0:  # also False for NaN
+            total += abs(x * nx + y * ny + z * nz) / sine
+            sines += sine
+            count += 1
+            if total > most:
+                break
+    return total, sines, count
+
+
+@compile_kernel
 def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floats:
     """Return the mean distance of the rays of every two detections of each person.
 
@@ -101,25 +129,19 @@ def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floa
     Returns:
         (persons, cameras, cameras) [m]; infinite without a common joint.
     """
-    cameras, _, joint_count, _ = directions.shape
-    apart = np.full((index.shape[1], cameras, cameras), np.inf)
-    for person in range(index.shape[1]):
+    cameras, persons = index.shape
+    apart = np.full((persons, cameras, cameras), np.inf)
+    for person in range(persons):
         for a in range(cameras):
             for b in range(a + 1, cameras):
-                if index[a, person] < 0 or index[b, person] < 0:
-                    continue
-                x, y, z = centers[b] - centers[a]
-                total, count = 0.0, 0
-                for joint in range(joint_count):
-                    px, py, pz = directions[a, index[a, person], joint]
-                    qx, qy, qz = directions[b, index[b, person], joint]
-                    nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-                    sine = math.sqrt(nx * nx + ny * ny + nz * nz)
-                    if sine > 0.0:  # also False for NaN
-                        total += abs(x * nx + y * ny + z * nz) / sine
-                        count += 1
-                if count:
-                    apart[person, a, b] = apart[person, b, a] = total / count
+                i, j = index[a, person], index[b, person]
+                if i >= 0 and j >= 0:
+                    baseline = centers[b] - centers[a]
+                    total, _, count = rays_apart(
+                        baseline, directions[a, i], directions[b, j], math.inf
+                    )
+                    if count:
+                        apart[person, a, b] = apart[person, b, a] = total / count
     return apart
 
 
@@ -143,7 +165,9 @@ def drop_lasting_strangers(apart: Floats, index: Integers, departure: Floats, ga
     matched, mean = index >= 0, departure.copy()
     while True:
         worst = -1
-        for c in np.flatnonzero(matched):
+        for c in range(len(index)):
+            if not matched[c]:
+                continue
             total, count = 0.0, 0
             for other in range(len(index)):
                 if other != c and index[other] >= 0 and apart[c, other] < math.inf:
