@@ -12,7 +12,7 @@ BODY = np.stack([np.zeros(17), np.zeros(17), np.linspace(0.0, 1.7, 17)], axis=1)
 
 def standing(x, y):
     """Return a person at a position [m], one or one per frame; NaN where rays give none."""
-    person = Person(0, BODY, FRAMES - 1)
+    person = Person(0, BODY, FRAMES - 1, CAMERAS)
     for frame in range(FRAMES):
         place = [np.broadcast_to(each, FRAMES)[frame] for each in (x, y)]
         joints = BODY + [*place, 0.0 if np.isfinite(place).all() else np.nan]
@@ -38,7 +38,7 @@ CAMERAS = 10
 
 def shadow_track(number, views, x, frames=range(FRAMES), joints=17):
     """Return a track at `x` [m], one or one per frame; joints from `joints` on are unknown."""
-    someone = Person(number, BODY, max(frames))
+    someone = Person(number, BODY, max(frames), CAMERAS)
     places = np.broadcast_to(x, FRAMES)
     for frame in frames:
         body = BODY + [places[frame], 0.0, 0.0]
