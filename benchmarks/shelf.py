@@ -54,8 +54,8 @@ def score_runs(options: Namespace) -> Tables:
     """DATA holds `shelf_dev`: `import/` (calibration.toml, detections), `gt.npz` and `pcp.py`.
 
     `pcp.py` is the sequence's own evaluator. Every row is a run by the command line; scored are the
-    joints of `retriangulation` and the fitted bodies, in the definition of the body model and of
-    the detector: PCP3D of actors 1 and 3 at alpha 0.5.
+    joints of `retriangulation`, the fitted bodies, in the definition of the body model and of the
+    detector, and what an export has by default: PCP3D of actors 1 and 3 at alpha 0.5.
     """
     data = options.data / "shelf_dev"
     cameras = list_cameras(data)
@@ -73,7 +73,7 @@ def score_runs(options: Namespace) -> Tables:
             match = write_case(data / "import", chosen, ALL_FRAMES, Path(temporary))
             rows.append([label, *scores(data, match, Path(temporary), *settings)])
         tell(str(rows[-1]))
-    columns = ["cameras", "joints", "bodies", "bodies as detected"]
+    columns = ["cameras", "joints", "bodies", "bodies as detected", "exported joints"]
     return {"pcp3d": Table("PCP3D", columns, rows, "%")}
 
 
@@ -83,7 +83,7 @@ def list_cameras(data: Path) -> tuple[str, ...]:
 
 
 def scores(data: Path, match: Path, folder: Path, *settings: str) -> list[float]:
-    """Return PCP3D of retriangulated joints and of bodies in both definitions [%]."""
+    """Return PCP3D of retriangulated joints, of bodies in both definitions, of the export [%]."""
     scorer, truth = load_module(data / "pcp.py"), np.load(data / "gt.npz")
     run_worldpose("run", match, "--project", folder / "project", *settings)
     run, values = open_run(str(folder / "project"), match.name), []
