@@ -145,16 +145,16 @@ def joint_tracks(
     none if the run ends with that camera. Triangulated joints have the detector's definition
     always. The best joints in that definition are those of the bodies, at `LIMB_ENDS` where the
     model has them, and triangulated ones without a body; `source` tells which. If the first
-    triangulation is the best available,
-    the frames that it skipped have the tracker's joints, without covariance.
+    triangulation is the best available, the frames that it skipped have the tracker's joints,
+    without covariance.
 
     Raises:
         UsageError: the run has no such result.
     """
     stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
     on_plane = f"{PLANE}/{clip}" in run
-    if stage is None and not stages and not on_plane and (views := broadcast_views(run, clip)):
-        frames = run[broadcast_unit(run, views[0])]["frame"].values
+    if stage is None and not stages and not on_plane and (filmed := broadcast_views(run, clip)):
+        frames = run[broadcast_unit(run, filmed[0])]["frame"].values
         return JointTracks(frames, np.zeros(0, np.int64), np.zeros((len(frames), 0, 17, 3)))
     if stage is None and on_plane and not (stages and run[f"{stages[0]}/{clip}"].sizes["person"]):
         tracked = run[f"{PLANE}/{clip}"]
