@@ -281,7 +281,7 @@ def score_panorama(folder: Path, frames: int | None) -> Metrics:
 
 
 def score_shelf(folder: Path, frames: int | None) -> Metrics:
-    """Return PCP3D of joints and bodies of the Shelf sequence [%]."""
+    """Return PCP3D of joints, bodies and the export of the Shelf sequence [%]."""
     _require(folder, ["import/calibration.toml", "import/detections", "gt.npz", "pcp.py"])
     window = shelf.ALL_FRAMES
     if frames is not None:
@@ -291,11 +291,12 @@ def score_shelf(folder: Path, frames: int | None) -> Metrics:
     with tempfile.TemporaryDirectory() as temporary:
         out, cameras = Path(temporary), shelf.list_cameras(folder)
         match = shelf.write_case(folder / "import", cameras, window, out)
-        joints, bodies, seen = shelf.scores(folder, match, out)
+        joints, bodies, seen, exported = shelf.scores(folder, match, out)
     return {
         "joints_pcp3d_percent": joints,
         "bodies_pcp3d_percent": bodies,
         "bodies_as_detected_pcp3d_percent": seen,
+        "exported_joints_pcp3d_percent": exported,
     }
 
 

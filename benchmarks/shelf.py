@@ -11,32 +11,41 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import load_module, run_in_process, run_worldpose, tell
-from registry import DATA, Table, Tables, benchmark, option
+from common import (
+    load_module,
+    run_in_process,
+    run_worldpose,
+    tell,
+)
+from registry import DATA, Table, Tables, benchmark, integer, option
 
+from data_contracts.run import RunRecord
 from flows.results.best_results import JointDefinition, joint_tracks
-from worldpose.body_fitting.evidence import perceived_joints
 from worldpose.errors import WorldposeError
 from worldpose.ingest.importing import import_match
-from worldpose.store.store import Store, open_run
+from worldpose.store.store import Run, Store, open_run
 
 FPS = 25.0
 
 ALL_FRAMES = range(1_000_000)
 
 
-STAGES = ("triangulation", "retriangulation", "body_fitting")
-
-SCORED: tuple[tuple[str, JointDefinition], ...] = (
-    *((stage, "detector") for stage in STAGES[:2]),
-    *((STAGES[2], definition) for definition in ("body", "detector")),
+SCORED: tuple[tuple[str, str | None, JointDefinition], ...] = (
+    ("T", "triangulation", "body"),
+    ("R", "retriangulation", "body"),
+    ("B", "body_fitting", "body"),
+    ("D", "body_fitting", "detector"),
+    ("E", None, "detector"),
 )
-"""Stages, and the definition of their joints."""
+"""Letter, stage and definition of joints; no stage = what an export has by default."""
 
 POINTS, MILLIMETERS = 0.3, 1.0
 """Loss through a stage that counts as worse."""
 
-LETTERS = {"triangulation": "T", "retriangulation": "R", "body_fitting": "B"}
+AWAY_M = 0.2
+"""Mean distance from which a person is another one [m]."""
+
+NOBODY = np.zeros((0, 17, 3))
 
 
 @benchmark("shelf", "Shelf through whole runs: all cameras, causally, without each camera", DATA)
@@ -44,8 +53,8 @@ def score_runs(options: Namespace) -> Tables:
     """DATA holds `shelf_dev`: `import/` (calibration.toml, detections), `gt.npz` and `pcp.py`.
 
     `pcp.py` is the sequence's own evaluator. Every row is a run by the command line; scored are the
-    joints of `retriangulation` and the fitted bodies, in the definition of the body model and of
-    the detector: PCP3D of actors 1 and 3 at alpha 0.5.
+    joints of `retriangulation`, the fitted bodies, in the definition of the body model and of the
+    detector, and what an export has by default: PCP3D of actors 1 and 3 at alpha 0.5.
     """
     data = options.data / "shelf_dev"
     cameras = list_cameras(data)
@@ -63,7 +72,7 @@ def score_runs(options: Namespace) -> Tables:
             match = write_case(data / "import", chosen, ALL_FRAMES, Path(temporary))
             rows.append([label, *scores(data, match, Path(temporary), *settings)])
         tell(str(rows[-1]))
-    columns = ["cameras", "joints", "bodies", "bodies as detected"]
+    columns = ["cameras", "joints", "bodies", "bodies as detected", "exported joints"]
     return {"pcp3d": Table("PCP3D", columns, rows, "%")}
 
 
@@ -73,11 +82,11 @@ def list_cameras(data: Path) -> tuple[str, ...]:
 
 
 def scores(data: Path, match: Path, folder: Path, *settings: str) -> list[float]:
-    """Return PCP3D of retriangulated joints and of bodies in both definitions [%]."""
+    """Return PCP3D of retriangulated joints, of bodies in both definitions, of the export [%]."""
     scorer, truth = load_module(data / "pcp.py"), np.load(data / "gt.npz")
     run_worldpose("run", match, "--project", folder / "project", *settings)
     run, values = open_run(str(folder / "project"), match.name), []
-    for stage, definition in SCORED[1:]:
+    for _, stage, definition in SCORED[1:]:
         tracks = joint_tracks(run, "clip", stage, definition)
         poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
         score, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf")
@@ -109,76 +118,144 @@ def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Pat
 
 @benchmark(
     "shelf_subsets",
-    "Shelf with few cameras and in short windows: each stage against its input",
+    "Shelf with few cameras and in short windows: joints, bodies, the export, identities",
     DATA,
-    option("--windows", type=int, nargs="+", default=[211, 121, 60, 30], help="lengths [frame]"),
+    option("--windows", type=int, nargs="+", default=[211], help="lengths of matches [frame]"),
     option("--first", type=int, help="first frame; that of the labels if not given"),
-    option("--cameras", type=int, nargs="+", default=[5, 4, 3, 2], help="numbers of cameras"),
+    option("--shown", type=int, default=421, help="frames from this one on are scored apart"),
+    option("--cameras", type=int, nargs="+", default=[5, 4, 3], help="numbers of cameras"),
+    option("--without", nargs="*", default=[], help="the subset without these alone"),
+    integer("iterations", 1),
+    option("--until", default="body_fitting"),
+    option("--keep", type=Path, help="folder whose results are not recomputed"),
 )
 def score_subsets(options: Namespace) -> Tables:
     """Every subset of cameras is a match, and so is every window of frames, in sequence.
 
-    Scored are joints of `triangulation` (T), `retriangulation` (R), and bodies in the definition of
-    the body model (B) and of the detector (D): PCP3D at alpha 0.5 and mean error. The second table
-    counts the cases in which a stage is worse than its input by more than 0.3 points or 1 mm.
+    Scored are joints of `triangulation` (T) and `retriangulation` (R), bodies in the definition of
+    the body model (B) and of the detector (D), and what an export has by default (E): PCP3D at
+    alpha 0.5 and mean error. `away` is the longest time for which an actor has nobody within
+    0.2 m. The further tables have the means and the worst over the subsets, and count the cases in
+    which a stage is worse than its input by more than 0.3 points or 1 mm.
     """
     data = options.data / "shelf_dev"
     scorer, truth = load_module(data / "pcp.py"), np.load(data / "gt.npz")
     every, last = list_cameras(data), int(truth["frames"][-1])
     first = options.first or int(truth["frames"][0])
     rows: list[list[Any]] = []
-    worse: dict[str, list[bool]] = {}
+    how = (options.until, options.iterations, {})
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+        folder = options.keep or Path(temporary)
         store = Store.open_or_new(str(folder / "project"))
         for length, number in itertools.product(options.windows, options.cameras):
             windows = [range(n, n + length) for n in range(first, last + 2 - length, length)]
             for frames, cameras in itertools.product(
                 windows, itertools.combinations(every, number)
             ):
-                shown = np.isin(truth["frames"], frames)
-                if not np.isfinite(truth["gt"][shown][:, [0, 2], 0, 0]).any():
+                rest = set(every) - set(cameras)
+                if options.without and rest != set(options.without):
                     continue
                 label = f"{' '.join(cameras)}, {frames.start} to {frames.stop - 1}"
                 try:
                     folder_of_case = write_case(data / "import", cameras, frames, folder)
-                    match, (keys,) = run_in_process(store, folder_of_case, STAGES[-1], 1, {})
+                    match, found = run_in_process(store, folder_of_case, *how)
                 except WorldposeError as error:
-                    rows.append([label, type(error).__name__, None, None])
+                    rows.append([label, type(error).__name__, *[None] * 6])
                     continue
-                marks: dict[str, tuple[float, float]] = {}
-                for stage in (each for each in STAGES if f"{each}/clip" in keys):
-                    marks |= score(scorer, truth, store, match, keys, stage)
-                rows += [[label, name, *pair] for name, pair in marks.items()]
-                for before, after in itertools.pairwise(("T", "R", "B")):
-                    if after in marks:
-                        lost = marks[before][0] - marks[after][0]
-                        risen = marks[after][1] - marks[before][1] if after == "R" else 0.0
-                        is_bad = lost > POINTS or risen > MILLIMETERS
-                        worse.setdefault(f"{before} to {after}", []).append(is_bad)
-                tell(f"{label} {marks}")
+                parts = [
+                    part
+                    for part in (
+                        range(frames.start, min(frames.stop, options.shown)),
+                        range(max(frames.start, options.shown), frames.stop),
+                    )
+                    if np.isfinite(
+                        truth["gt"][np.isin(truth["frames"], part)][:, [0, 2], 0, 0]
+                    ).any()
+                ]
+                for (turn, keys), part in itertools.product(enumerate(found, 1), parts):
+                    own = score(scorer, truth, open_keys(store, match, keys), part)
+                    said = f"{part.start} to {part.stop - 1}"
+                    rows += [
+                        [label, said, number, f"{letter}{turn}", *values]
+                        for letter, values in own.items()
+                    ]
+                tell(format_rows(rows, label))
+    return tabulate(rows)
+
+
+def format_rows(rows: list[list[Any]], label: str) -> str:
+    """Return the rows of a case in a line."""
+    own = [f"{r[1]} {r[3]} {r[4]:.2f} {r[5]:.1f} {r[6]} {r[7]}" for r in rows if r[0] == label]
+    return f"{label}: {'; '.join(own)}"
+
+
+def tabulate(rows: list[list[Any]]) -> Tables:
+    """Return all cases, their means and worst by number of cameras, and stages that lose."""
+    scored = [row for row in rows if len(row) == 8 and row[4] is not None]
+    summary, worse = list[list[Any]](), dict[str, list[bool]]()
+    for key in dict.fromkeys((row[2], row[1], row[3]) for row in scored):
+        own = np.array([row[4:] for row in scored if (row[2], row[1], row[3]) == key])
+        least, most = own.min(axis=0), own.max(axis=0)
+        mean = np.nanmean(own, axis=0)
+        summary.append([*key, mean[0], least[0], mean[1], most[1], int(own[:, 2].sum()), most[3]])
+    marks = {(row[0], row[1], row[3]): row[4:6] for row in scored}
+    for (label, part, name), (pcp, error) in marks.items():
+        before = {"R": "T", "B": "R", "E": "B"}.get(name[0])
+        if before is not None and (label, part, before + name[1:]) in marks:
+            given = marks[label, part, before + name[1:]]
+            lost, risen = given[0] - pcp, error - given[1] if name[0] != "B" else 0.0
+            worse.setdefault(f"{before} to {name}", []).append(lost > POINTS or risen > MILLIMETERS)
     counts = [[name, sum(cases), len(cases)] for name, cases in worse.items()]
+    values = ["PCP3D [%]", "error [mm]", "switches", "away [s]"]
+    means = ["PCP3D [%]", "least", "error [mm]", "most", "switches", "away [s]"]
     return {
-        "cases": Table("cases", ["case", "joints", "PCP3D [%]", "error [mm]"], rows),
+        "cases": Table("cases", ["case", "frames", "cameras", "joints", *values], rows),
+        "means": Table("means and worst", ["cameras", "frames", "joints", *means], summary),
         "worse": Table("worse than the input", ["step", "cases", "of"], counts),
     }
 
 
-def score(
-    scorer: Any, truth: Any, store: Store, match: str, keys: dict[str, str], stage: str
-) -> dict[str, tuple[float, float]]:
-    """Return PCP3D [%] and the mean error of matched people [mm], by letter."""
-    (unit,) = (name for name in keys if name.startswith(f"{stage}/"))
-    _, name = unit.split("/")
-    stored = store.open_result(match, stage, name, keys[unit])
-    frames, joints = stored["frame"].values, stored["joints"].values
-    by_letter = {LETTERS[stage]: joints}
-    if stage == "body_fitting":
-        by_letter["D"] = perceived_joints(joints, stored["joint_offsets"].values)
-    scores: dict[str, tuple[float, float]] = {}
-    for letter, places in by_letter.items():
-        poses = dict(zip(frames.tolist(), places, strict=True))
+def open_keys(store: Store, match: str, keys: dict[str, str]) -> Run:
+    """Return results that no run has recorded as those of one."""
+    fields: dict[str, Any] = {"failed": (), "blocked": (), "waiting": (), "body_folder": None}
+    record = RunRecord.model_construct(run_id="0001", match_id=match, results=keys, **fields)
+    return Run(store, record)
+
+
+def score(scorer: Any, truth: Any, run: Run, frames: range) -> dict[str, tuple[float, ...]]:
+    """Return PCP3D [%], mean error of matched people [mm], switches and `away` [s], by letter."""
+    scores: dict[str, tuple[float, ...]] = {}
+    for letter, stage, definition in SCORED:
+        if stage is not None and f"{stage}/clip" not in run:
+            continue
+        tracks = joint_tracks(run, "clip", stage, definition)
+        poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
         found, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf", frames=frames)
         error = found["mpjpe_mm_matched"]
-        scores[letter] = found["avg_pcp_actors_1_3"], np.nan if error is None else error
+        scores[letter] = (
+            found["avg_pcp_actors_1_3"],
+            np.nan if error is None else error,
+            *follow_actors(scorer, truth, poses, frames),
+        )
     return scores
+
+
+def follow_actors(
+    scorer: Any, truth: Any, poses: dict[int, Any], frames: range
+) -> tuple[int, float]:
+    """Return identity switches, and the longest time for which an actor has nobody [s]."""
+    switches, longest = 0, 0
+    for actor in (0, 2):
+        seen, gone = list[int](), 0
+        for row in np.flatnonzero(np.isin(truth["frames"], frames)):
+            place = truth["gt"][row, actor]
+            if not np.isfinite(place).all():
+                continue
+            pose = scorer.coco17_to_shelf14(poses.get(int(truth["frames"][row]), NOBODY), "shelf")
+            away = scorer.pose_distance(place, pose)
+            gone = gone + 1 if away.min(initial=np.inf) > AWAY_M else 0
+            longest = max(longest, gone)
+            if not gone:
+                seen.append(int(away.argmin()))
+        switches += sum(a != b for a, b in itertools.pairwise(seen))
+    return switches, longest / FPS

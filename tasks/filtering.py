@@ -30,7 +30,7 @@ from tasks.clip_inputs import (
 )
 from tasks.detection import footage_index, require_weights
 from tasks.unit import UnitInputs, unit_task
-from worldpose.body_fitting.evidence import perceived_joints
+from worldpose.body_fitting.evidence import perceived_joints, random_covariance
 from worldpose.compiled import map_in_threads
 from worldpose.detection.models import load_pose, load_score_map
 from worldpose.detection.pipeline import Place
@@ -44,7 +44,6 @@ from worldpose.filtering.judging import (
     TriangulatedDetections,
     judge_detections,
     learn_keypoint_spread,
-    perceived_covariance,
     view_bodies,
 )
 from worldpose.filtering.redetection import (
@@ -163,7 +162,7 @@ class _Bodies:
         return (
             joints[np.searchsorted(read, rows)],
             step,
-            perceived_covariance(covariance, self._common_bias),
+            random_covariance(covariance, self._common_bias),
         )
 
 

@@ -46,7 +46,7 @@ def export(
     out: Annotated[Path, typer.Option()],
     run: RunOption = "latest",
     stage: StageOption = None,
-    definition: Literal["body", "detector"] = "body",
+    definition: Literal["body", "detector"] = "detector",
     release: Annotated[str | None, typer.Option("--release", metavar="NAME")] = None,
     licence: Path | None = None,
     filled: Annotated[bool, typer.Option("--filled")] = False,
@@ -64,8 +64,8 @@ def export(
 
     Options:
         out: Output folder; with --format viewer also FILE.html.
-        definition: Joints of bodies where the body model has them, or where the detector sees
-            them.
+        definition: Joints where the detector sees them, but wrists and ankles where the body model
+            has them; or all where the model has them.
         release: Freeze the run under this name.
         licence: Text of the data licence, for a release or the files.
         filled: Interpolate and flag joints that are missing for a while.
@@ -78,8 +78,8 @@ def export(
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
-    changed = "--filled" if filled else "--definition detector"
-    if release is not None and (licence is None or filled or definition != "body"):
+    changed = "--filled" if filled else "--definition body"
+    if release is not None and (licence is None or filled or definition != "detector"):
         raise UsageError(
             "worldpose export --release",
             expected="--licence FILE, no --filled, no other --definition: joints as computed",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
+from data_contracts.conventions import COCO17
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
@@ -45,6 +46,9 @@ if TYPE_CHECKING:
 
 JointDefinition = Literal["body", "detector"]
 """Where a joint of a fitted body is: where the body model has it, or where the detector sees it."""
+LIMB_ENDS = [9, 10, 15, 16]
+"""Wrists and ankles in COCO-17, whose offset from body to detector nothing separates from the
+length of the limb."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
 ADJUSTED = "bundle_adjustment/cameras"
@@ -138,9 +142,11 @@ def joint_tracks(
     """Return the joints of one clip, from the best available or the given stage.
 
     People that a broadcast camera alone films have the joints of their bodies, or NaN; there are
-    none if the run ends with that camera. Triangulated
-    joints have the detector's definition always. If the first triangulation is the best available,
-    the frames that it skipped have the tracker's joints, without covariance.
+    none if the run ends with that camera. Triangulated joints have the detector's definition
+    always. The best joints in that definition are those of the bodies, at `LIMB_ENDS` where the
+    model has them, and triangulated ones without a body; `source` tells which. If the first
+    triangulation is the best available, the frames that it skipped have the tracker's joints,
+    without covariance.
 
     Raises:
         UsageError: the run has no such result.
@@ -172,6 +178,8 @@ def joint_tracks(
     fitted = stages[0] in BODY_STAGES and not on_plane
     seen = placed_joints(run, clip) if fitted else result
     joints, covariance = result["joints"].values, result["covariance"].values
+    if "joint_offsets" not in result:  # a monocular method's bodies have none
+        definition = "body"
     views = seen["views"].values.astype(np.int64)
     if best and stages[0] == "triangulation":
         joints, views = _with_tracked_joints(run, clip, joints, views)
@@ -179,12 +187,22 @@ def joint_tracks(
         joints = perceived_joints(joints, result["joint_offsets"].values)
     if fitted and definition == "detector":
         covariance = random_covariance(covariance, seen["common_bias"].values)
+    kind = 1 if stages[0] not in BODY_STAGES else 2 if definition == "detector" else 3
+    source = np.where(np.isfinite(joints[..., 0]), kind, 0)
+    if best and fitted and definition == "detector":
+        ends = np.isin(np.arange(len(COCO17)), LIMB_ENDS) & (source > 0)
+        alone = (source == 0) & np.isfinite(seen["joints"].values[..., 0])
+        for part, given, kind in ((ends, result, 3), (alone, seen, 1)):
+            joints = np.where(part[..., None], given["joints"].values, joints)
+            covariance = np.where(part[..., None, None], given["covariance"].values, covariance)
+            source[part] = kind
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
         joints=joints,
         covariance=covariance,
         views=views,
+        source=source,
         identity_certainty=_identity_certainty(
             run, clip, result["frame"].values, result["person"].values
         ),
@@ -333,7 +351,7 @@ class Origin:
     """Text of the data's licence; None = not stated."""
     surface: bool = False
     """Write also the surface of a body model that has terms of its own."""
-    definition: JointDefinition = "body"
+    definition: JointDefinition = "detector"
     """Definition of the joints of bodies."""
     footage: Footage | None = None
     """Videos to embed in viewer files; None = none."""

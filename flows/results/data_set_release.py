@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final, Literal
@@ -143,7 +144,7 @@ def _write_clip(
     public = root / "public" / split
     part = root / "hidden" if split == "test" else public
     model, poses, people = best_results.fitted_bodies(origin.run, clip)
-    tracks, spec = origin.tracks(clip), origin.spec
+    tracks, spec = replace(origin, definition="body").tracks(clip), origin.spec
     joints_file.write_poses(part / "poses" / f"{name}.npz", poses, model.name)
     joints_file.write_joints(part / f"{name}.joints.npz", tracks)
     manifests.write_frame_rates(part, {name: spec.fps})

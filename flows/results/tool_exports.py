@@ -95,6 +95,8 @@ def _joint_definition(origin: best_results.Origin, clip: str, stage: str) -> str
         owner = "detector sees" if origin.definition == "detector" else "model has"
         alone = ", from one camera by feet on the pitch and a monocular method's poses"
         how = alone if f"{best_results.PLANE}/{clip}" in origin.run else ""
+        if origin.definition == "detector" and origin.stage is None and not how:
+            how = ", but wrists and ankles where the model has them; triangulated without a body"
         return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them{how}"
     if stage == best_results.PLANE:
         return "none: people are placed on the pitch by their feet"

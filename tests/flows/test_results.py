@@ -16,6 +16,7 @@ from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.registering import open_match
 from flows.reports import viewer
 from flows.reports.people import body_tables
+from flows.results.best_results import LIMB_ENDS
 from worldpose import open_run
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
@@ -53,10 +54,14 @@ def test_truth_scored_against_itself_is_perfect_and_a_shift_is_its_length(tiny, 
 
 
 def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
-    succeed(*("export", TINY, "--format", "joints", "--out", tmp_path, "--project", tiny_run))
+    succeed(
+        *("export", TINY, "--format", "joints", "--definition", "body"),
+        *("--out", tmp_path, "--project", tiny_run),
+    )
     tracks = read_joints(tmp_path / "joints.npz")
     result = open_run(tiny_run, TINY)["body_fitting/clip"]
     np.testing.assert_array_equal(tracks.joints, result.joints.values)
+    assert set(np.unique(tracks.source)) <= {0, 3}
     np.testing.assert_array_equal(tracks.frames, np.arange(30))
     assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
 
@@ -73,24 +78,23 @@ def test_a_report_compares_bodies_with_joints_in_held_out_cameras(tiny_run):
         assert (row[-1] != "") == (certain > 0.0)
 
 
-def test_joints_of_bodies_are_exported_where_the_detector_sees_them_on_request(tiny_run, tmp_path):
-    succeed(
-        *("export", TINY, "--format", "joints", "--definition", "detector"),
-        *("--out", tmp_path, "--project", tiny_run),
-    )
+def test_joints_of_bodies_are_exported_where_the_detector_sees_them(tiny_run, tmp_path):
+    succeed(*("export", TINY, "--format", "joints", "--out", tmp_path, "--project", tiny_run))
     tracks = read_joints(tmp_path / "joints.npz")
     result = open_run(tiny_run, TINY)["body_fitting/clip"]
-    offsets = result["joint_offsets"].values
-    moved = np.linalg.norm(tracks.joints - result["joints"].values, axis=-1)
+    ends = np.isin(np.arange(17), LIMB_ENDS)
+    offsets = np.where(ends[:, None], 0.0, result["joint_offsets"].values)
+    from_body = np.where(tracks.source >= 2, 1.0, np.nan)[..., None]
+    moved = np.linalg.norm(from_body * (tracks.joints - result["joints"].values), axis=-1)
     assert np.abs(offsets).max() > 1e-3
     np.testing.assert_allclose(
-        np.nanmax(moved, axis=(0, 1)), np.linalg.norm(offsets, axis=-1), rtol=1e-6
+        np.nanmax(moved, axis=(0, 1)), np.linalg.norm(offsets, axis=-1), rtol=1e-6, atol=1e-12
     )
     # The offsets follow the detector, so its common bias is no error of these joints but for 1 cm.
     bias = open_run(tiny_run, TINY)["retriangulation/clip"]["common_bias"].values
-    less = result["covariance"].values - tracks.covariance
-    expected = np.maximum(bias**2 - 0.01**2, 0.0)
-    assert expected.min() > 0
+    less = from_body[..., None] * (result["covariance"].values - tracks.covariance)
+    expected = np.where(ends, 0.0, np.maximum(bias**2 - 0.01**2, 0.0))
+    assert expected[~ends].min() > 0
     np.testing.assert_allclose(
         np.nanmean(less, axis=(0, 1)), expected[:, None, None] * np.eye(3), atol=1e-12
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from common import load_module, run_in_process
-from shelf import score, write_case
+from shelf import open_keys, score, write_case
 
 from worldpose.store.store import Store
 
@@ -27,10 +27,8 @@ def test_adjustment_of_four_given_cameras_harms_no_joints(tmp_path):
     folder = write_case(SHELF / "import", CAMERAS, FRAMES, tmp_path)
     store = Store.create(tmp_path / "project")
     match, (keys,) = run_in_process(store, folder, "retriangulation", 1, {})
-    before, after = (
-        score(scorer, truth, store, match, keys, stage)[letter]
-        for stage, letter in (("triangulation", "T"), ("retriangulation", "R"))
-    )
+    scores = score(scorer, truth, open_keys(store, match, keys), FRAMES)
+    before, after = scores["T"], scores["R"]
     assert before[0] >= 95.0
     assert after[0] >= before[0] - 0.3
     assert after[1] <= before[1] + 1.0

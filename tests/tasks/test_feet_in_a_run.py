@@ -139,3 +139,27 @@ def test_joint_tracks_carry_them_in_both_definitions(run):
     )
     assert near < far + 1e-3
     assert (body.views == placed.extra.views).all()
+
+
+def test_best_joints_are_those_of_bodies_as_detected_and_tell_their_source(run):
+    results = Results(run[0])
+    best, seen, body, placed = (
+        joint_tracks(results, "clip", stage, definition)
+        for stage, definition in (
+            (None, "detector"),
+            ("body_fitting", "detector"),
+            ("body_fitting", "body"),
+            ("retriangulation", "detector"),
+        )
+    )
+    there = np.isfinite(seen.joints[..., 0])
+    ends = np.isin(np.arange(17), (9, 10, 15, 16))  # wrists and ankles
+    for source, tracks, where in (
+        (2, seen, there & ~ends),
+        (3, body, there & ends),
+        (1, placed, ~there & np.isfinite(placed.joints[..., 0])),
+    ):
+        np.testing.assert_array_equal(best.source == source, where)
+        np.testing.assert_array_equal(best.joints[where], tracks.joints[where])
+        np.testing.assert_array_equal(best.covariance[where], tracks.covariance[where])
+    assert ((best.source == 0) == np.isnan(best.joints[..., 0])).all()

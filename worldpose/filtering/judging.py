@@ -62,19 +62,6 @@ class BodyViews:
     """Image scale there [px/m]."""
 
 
-def perceived_covariance(covariance: Floats, common_bias: Floats) -> Floats:
-    """Return the covariance of the detector's joints of bodies (frames, persons, 17, 3, 3).
-
-    The offsets follow the detector's joints, so the common bias is no part of the covariance.
-
-    Args:
-        covariance: (frames, persons, 17, 3, 3) [m^2], of the bodies' joints.
-        common_bias: (17,) per axis, error that all views share [m]; included in `covariance`.
-    """
-    seen: Floats = covariance - common_bias[:, None, None] ** 2 * np.eye(3)
-    return seen
-
-
 def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyViews:
     """Return projections of bodies into all images.
 

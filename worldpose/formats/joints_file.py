@@ -25,6 +25,7 @@ MEMBERS: Final = {
     "joints": Member(("frames", "persons", JOINTS, 3), "float"),
     "covariance": Member(("frames", "persons", JOINTS, 3, 3), "float", required=False),
     "views": Member(("frames", "persons", JOINTS), "int", required=False),
+    "source": Member(("frames", "persons", JOINTS), "int", required=False),
     "identity_certainty": Member(("frames", "persons"), "float", required=False),
     "points": Member(("points",), "text", required=False),
     "extra_joints": Member(("frames", "persons", "points", 3), "float", required=False),
@@ -78,6 +79,10 @@ class JointTracks:
     identity_certainty: NDArray[np.float64] | None = None
     """(frames, persons) probability that this is the person of the id's first frame [1]; NaN where
     not stated, None if it is nowhere."""
+    source: NDArray[np.integer] | None = None
+    """(frames, persons, 17) where a joint comes from: 1 = the views, triangulated; 2 = the fitted
+    body, where the detector sees it; 3 = the fitted body, where the model has it; 0 = missing or
+    interpolated. None if unknown."""
 
     @property
     def markers(self) -> ExtraTracks:
@@ -121,6 +126,9 @@ class JointTracks:
         certainty, size = self.identity_certainty, (len(self.frames), len(self.person_ids))
         if certainty is not None and certainty.shape != size:
             raise wrong("identity_certainty", f"shape {size}", f"{certainty.shape}", "Correct it.")
+        if self.source is not None and self.source.shape != self.joints.shape[:-1]:
+            found = f"{self.source.shape}"
+            raise wrong("source", f"shape {self.joints.shape[:-1]}", found, "Correct it.")
         if certainty is not None and ((certainty < 0.0) | (certainty > 1.0)).any():
             raise wrong("identity_certainty", "0 to 1", f"{np.nanmax(certainty)}", "Correct it.")
         if np.any(np.diff(self.frames) <= 0):
@@ -169,6 +177,9 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
     joints = np.full((*shape, 3), np.nan)
     covariance = np.full((*shape, 3, 3), np.nan)
     views = np.zeros(shape, np.int64)
+    source = None if tracks.source is None else np.zeros((*shape[:2], JOINTS), np.int64)
+    if source is not None:
+        source[rows] = tracks.source
     joints[rows] = markers.joints
     if markers.covariance is not None:
         covariance[rows] = markers.covariance
@@ -202,6 +213,7 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
         joints[:, :, :JOINTS],
         covariance=None if stated is None else stated[:, :, :JOINTS],
         views=views[:, :, :JOINTS],
+        source=source,
         identity_certainty=certainty,
         extra=extra,
     )
@@ -212,7 +224,8 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
 
     Members: `frames` (frames,) int64, `person_ids` (persons,) int64, `joints` (frames, persons,
     17, 3) float64 [m, world], and where known `covariance` (frames, persons, 17, 3, 3) float64
-    [m^2], `views` (frames, persons, 17) uint8 and `identity_certainty` (frames, persons) float64.
+    [m^2], `views` and `source` (frames, persons, 17) uint8, and `identity_certainty` (frames,
+    persons) float64.
     Points besides COCO-17 are in `points`, their names as text, `extra_joints`,
     `extra_covariance` and `extra_views`.
     """
@@ -223,8 +236,9 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
     }
     if tracks.covariance is not None:
         arrays["covariance"] = tracks.covariance.astype(np.float64)
-    if tracks.views is not None:
-        arrays["views"] = tracks.views.astype(np.uint8)
+    for name, array in (("views", tracks.views), ("source", tracks.source)):
+        if array is not None:
+            arrays[name] = array.astype(np.uint8)
     if tracks.identity_certainty is not None:
         arrays["identity_certainty"] = tracks.identity_certainty.astype(np.float64)
     if tracks.extra is not None:

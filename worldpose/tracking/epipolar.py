@@ -10,7 +10,7 @@ from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17_BODY_BONES
 from worldpose.compiled import compile_kernel
 from worldpose.tracking.person import Sighting
-from worldpose.tracking.ray_matching import intersect_people, ray_affinity
+from worldpose.tracking.ray_matching import intersect_people, ray_affinity, rays_apart
 from worldpose.tracking.settings import TrackingSettings
 
 LIMBS = np.array(COCO17_BODY_BONES)
@@ -127,22 +127,9 @@ def pair_distances(
             reach = places[a, 2] + places[b, 2] + gate
             if math.hypot(places[a, 0] - places[b, 0], places[a, 1] - places[b, 1]) > reach:
                 continue
-            x, y = centers[b, 0] - centers[a, 0], centers[b, 1] - centers[a, 1]
-            z = centers[b, 2] - centers[a, 2]
-            total, sines, count = 0.0, 0.0, 0
-            for joint in range(joint_count):
-                px, py = directions[a, joint, 0], directions[a, joint, 1]
-                pz = directions[a, joint, 2]
-                qx, qy = directions[b, joint, 0], directions[b, joint, 1]
-                qz = directions[b, joint, 2]
-                nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-                sine = math.sqrt(nx * nx + ny * ny + nz * nz)
-                if sine > 0.0:
-                    total += abs(x * nx + y * ny + z * nz) / sine
-                    sines += sine
-                    count += 1
-                    if total > gate * joint_count:
-                        break
+            total, sines, count = rays_apart(
+                centers[b] - centers[a], directions[a], directions[b], gate * joint_count
+            )
             if count >= min_joints and sines >= min_sine * count and total <= gate * count:
                 distances[a, b] = total / count
     return distances

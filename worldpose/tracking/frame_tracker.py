@@ -29,10 +29,12 @@ from worldpose.tracking.pair_births import (
 )
 from worldpose.tracking.person import Person, Sighting, separations
 from worldpose.tracking.ray_matching import (
+    drop_lasting_strangers,
     intersect_people,
     match_greedily,
     match_optimally,
     ray_affinity,
+    view_distances,
 )
 from worldpose.tracking.settings import TrackingSettings
 
@@ -177,7 +179,9 @@ class FrameTracker:
         self.active.sort(key=lambda person: (not self._is_confirmed(person), person.number))
         confirmed = sum(map(self._is_confirmed, self.active))
         poses = np.array([person.pose for person in self.active])
-        doubt = [person.uncertainty(frame, self.fps, settings) for person in self.active]
+        doubt = np.stack(
+            [person.uncertainty(frame, self.fps, settings) for person in self.active], axis=1
+        )
         usual = np.maximum(
             settings.gate_factor * self.gates.usual[:, None],
             settings.gate_growth * np.array([person.misfit for person in self.active]),
@@ -200,6 +204,10 @@ class FrameTracker:
         distance = -np.take_along_axis(affinity, np.maximum(index, 0)[..., None], axis=2)[..., 0]
         distance[index < 0] = np.nan
         self.gates.learn(distance)
+        for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 1).tolist():
+            lone = int(index[:, n].argmax())
+            rays = directions[lone, index[lone, n]]
+            self.active[n].follow(frame, self.centers[lone], lone, rays, self.fps, settings)
         joints = intersect_people(
             self.centers,
             directions,
@@ -217,21 +225,27 @@ class FrameTracker:
         directions: Floats,
         affinity: Floats,
     ) -> None:
-        """Remove, from `index`, matches of two views whose rays are too far apart.
+        """Remove, from `index`, matches whose rays pass too far from those of the other views.
 
-        If a third view is lost, a neighbour's detection within the gate would drag the track away.
-        Of the two, the one nearer to the prediction stays.
+        Of two views, the one nearer to the prediction stays. After a crossing, the detection of a
+        neighbour can remain within the gate: its rays are apart for a while, in each frame by less
+        than tells in one frame (`drop_lasting_strangers`).
         """
+        apart = view_distances(self.centers, directions, index)
+        camera = np.arange(len(index))
+        noise = self.gates.pair_noise(camera[:, None], camera)
         for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 2).tolist():
             a, b = np.flatnonzero(index[:, n] >= 0)
-            i, j = index[a, n], index[b, n]
-            apart = ray_distance(
-                self.centers[b] - self.centers[a], directions[a, i], directions[b, j]
-            )
             # Largest distance of the rays of two views of one person, in standard deviations.
-            limit = 3.0 * float(self.gates.pair_noise(np.array([a]), np.array([b]))[0])
-            if apart > max(limit, self.settings.gate_growth * self.active[n].misfit):
+            limit = max(3.0 * noise[a, b], self.settings.gate_growth * self.active[n].misfit)
+            if not apart[n, a, b] <= limit:
+                i, j = index[a, n], index[b, n]
                 index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
+        gain = 1.0 - math.exp(-1.0 / (self.fps * self.settings.velocity_time_s))
+        for n, person in enumerate(self.active):
+            # The same for mean distances, and the motion between images half a frame apart.
+            limits = 2.5 * noise + 0.5 * np.linalg.norm(person.velocity) / self.fps
+            drop_lasting_strangers(apart[n] / limits, index[:, n], person.departure, gain)
 
     def _evidence(self, sighting: Sighting, pairs: Pairs | None) -> float:
         """Return a sighting's weight as evidence that its person exists [1].
@@ -270,7 +284,7 @@ class FrameTracker:
                 person = lost[back[place]]
                 self.lost.remove(person)
             else:
-                person = Person(self.born, group.joints, frame)
+                person = Person(self.born, group.joints, frame, len(self.centers))
                 self.born += 1
             numbers.append(person.number)
             ground = np.nanmean(group.joints[:, :2], axis=0)
@@ -326,8 +340,10 @@ class FrameTracker:
         """End or lose people unseen for too long; unconfirmed ones have a shorter limit."""
         settings = self.settings
         for person in list(self.active):
-            patience = settings.max_coast_s if self._is_confirmed(person) else settings.min_track_s
-            if (frame - person.last_fixed) / self.fps > patience:
+            patience, since = settings.min_track_s, person.last_fixed
+            if self._is_confirmed(person):
+                patience, since = settings.max_coast_s, person.last_followed(self.fps)
+            if (frame - since) / self.fps > patience:
                 self.active.remove(person)
                 back = settings.causal and self._is_confirmed(person)
                 (self.lost if back else self.ended).append(person)
@@ -335,15 +351,6 @@ class FrameTracker:
             if (frame - person.last_fixed) / self.fps > settings.max_lost_s:
                 self.lost.remove(person)
                 self.ended.append(person)
-
-
-def ray_distance(baseline: Floats, rays: Floats, others: Floats) -> float:
-    """Return the mean distance of two detections' rays (17, 3) [m]; infinite for no joint."""
-    normal = np.cross(rays, others)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        apart = np.abs(normal @ baseline) / np.linalg.norm(normal, axis=-1)
-    known = np.isfinite(apart)
-    return float(apart[known].mean()) if known.any() else math.inf
 
 
 def _views(index: NDArray[np.integer]) -> Integers:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, MutableMapping
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from typing import Final
 
 import numpy as np
@@ -100,6 +100,10 @@ class Sightings(MutableMapping[int, Sighting]):
         return len(self._place)
 
 
+LONE_S: Final = 1.0
+"""Time for which one camera alone can follow a person [s]: bodies fill gaps up to this."""
+
+
 @dataclass(eq=False)
 class Person:
     """The state of one track, updated frame by frame.
@@ -108,6 +112,9 @@ class Person:
         number: order of birth.
         pose: (17, 3) [m], world, at the current frame; NaN for joints never determined.
         last_fixed: last frame whose rays determined the position.
+        departure: (cameras,) recent mean distance of each view's rays from those of the other
+            views, over its limit [1].
+        followed: (cameras,) last frame in which this camera alone showed the person.
         velocity: (3,) [m/s], of the whole body.
         sightings: detections of the person, by frame.
         misfit: recent mean ray distance [m]: large where a body falls or jumps.
@@ -120,12 +127,18 @@ class Person:
     number: int
     pose: Floats
     last_fixed: int
+    cameras: InitVar[int]
+    departure: Floats = field(init=False)
+    followed: Integers = field(init=False)
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
     sightings: Sightings = field(default_factory=Sightings)
     misfit: float = 0.0
     fixed: int = 0
     evidence: float = 0.0
     shown_from: int = -1
+
+    def __post_init__(self, cameras: int) -> None:
+        self.departure, self.followed = np.zeros(cameras), np.full(cameras, -1)
 
     def advance(self, frame: int, fps: float, settings: TrackingSettings) -> None:
         """Predict the pose at `frame`, one frame later."""
@@ -162,13 +175,39 @@ class Person:
         if self.shown_from < 0 and self.evidence >= 1.0 - 1e-9:
             self.shown_from = frame
 
-    def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> float:
-        """Return the standard deviation of the predicted position at `frame` [m]."""
-        unseen = (frame - self.last_fixed) / fps
-        wander = settings.velocity_change_std_m_s * math.sqrt(unseen**3 / 3.0)
+    def last_followed(self, fps: float) -> int:
+        """Return the last frame that fixed the person, or in which one camera then followed."""
+        lone = min(int(self.followed.max()), self.last_fixed + round(LONE_S * fps))
+        return max(self.last_fixed, lone)
+
+    def follow(
+        self,
+        frame: int,
+        center: Floats,
+        camera: int,
+        rays: Floats,
+        fps: float,
+        settings: TrackingSettings,
+    ) -> None:
+        """Move the predicted pose across the rays (17, 3) of the only camera that sees it."""
+        away = self.pose - center
+        across = (away * rays).sum(axis=-1, keepdims=True) * rays - away
+        if np.isfinite(across).all(axis=-1).any():
+            shift = np.nanmedian(across, axis=0)
+            gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
+            self.pose, self.velocity = self.pose + shift, self.velocity + gain * fps * shift
+            self.followed[camera] = frame
+
+    def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> Floats:
+        """Return the standard deviation (cameras,) of the predicted position at `frame` [m].
+
+        A camera that followed the person alone knows the position across its rays.
+        """
+        unseen = (frame - np.maximum(self.followed, self.last_fixed)) / fps
+        wander = settings.velocity_change_std_m_s * np.sqrt(unseen**3 / 3.0)
         # The velocity estimate needs a few frames; before, a person may be running.
         known = 1.0 - math.exp(-self.fixed / (fps * settings.velocity_time_s))
-        return math.hypot(wander, (1.0 - known) * settings.rms_speed_m_s * unseen)
+        return np.hypot(wander, (1.0 - known) * settings.rms_speed_m_s * unseen)
 
     def absorb(self, other: Person, since: int) -> None:
         """Move the other's sightings from frame `since` on to this person."""

@@ -90,6 +90,99 @@ def distance(x: float, y: float, z: float, center: Floats, direction: Floats) ->
 
 
 @compile_kernel
+def rays_apart(
+    baseline: Floats, rays: Floats, others: Floats, most: float
+) -> tuple[float, float, int]:
+    """Return sums of distances [m] and of sines of two detections' rays, and their joints' number.
+
+    Args:
+        baseline: (3,) from the first camera to the second [m].
+        rays: (joints, 3) unit rays of the first; NaN where not seen.
+        others: (joints, 3) of the second.
+        most: sum of distances at which the rest does not count [m].
+    """
+    x, y, z = baseline
+    total, sines, count = 0.0, 0.0, 0
+    for joint in range(len(rays)):
+        px, py, pz = rays[joint]
+        qx, qy, qz = others[joint]
+        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        sine = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if sine > 0.0:  # also False for NaN
+            total += abs(x * nx + y * ny + z * nz) / sine
+            sines += sine
+            count += 1
+            if total > most:
+                break
+    return total, sines, count
+
+
+@compile_kernel
+def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floats:
+    """Return the mean distance of the rays of every two detections of each person.
+
+    Args:
+        centers: (cameras, 3) [m], world.
+        directions: (cameras, detections, joints, 3) unit rays, world; NaN where not seen.
+        index: (cameras, persons) index of the detection; -1 = not seen.
+
+    Returns:
+        (persons, cameras, cameras) [m]; infinite without a common joint.
+    """
+    cameras, persons = index.shape
+    apart = np.full((persons, cameras, cameras), np.inf)
+    for person in range(persons):
+        for a in range(cameras):
+            for b in range(a + 1, cameras):
+                i, j = index[a, person], index[b, person]
+                if i >= 0 and j >= 0:
+                    baseline = centers[b] - centers[a]
+                    total, _, count = rays_apart(
+                        baseline, directions[a, i], directions[b, j], math.inf
+                    )
+                    if count:
+                        apart[person, a, b] = apart[person, b, a] = total / count
+    return apart
+
+
+@compile_kernel
+def drop_lasting_strangers(apart: Floats, index: Integers, departure: Floats, gain: float) -> None:
+    """Remove a person's views whose rays are lastingly apart from those of the others.
+
+    The departure of view c is the running mean of the mean distance to the other views S,
+
+        r_c <- r_c + gain (mean_{j in S, j != c} apart_cj - r_c);
+
+    the worst view is left out of S as long as its departure exceeds 1. So the views that agree
+    decide; of the last two, the one that departed more before is left out.
+
+    Args:
+        apart: (cameras, cameras) distance of rays over its limit [1]; infinite = unknown.
+        index: (cameras,) detections; -1 = not seen. Written.
+        departure: (cameras,) [1]. Written.
+        gain: of the running mean [1].
+    """
+    matched, mean = index >= 0, departure.copy()
+    while True:
+        worst = -1
+        for c in range(len(index)):
+            if not matched[c]:
+                continue
+            total, count = 0.0, 0
+            for other in range(len(index)):
+                if other != c and index[other] >= 0 and apart[c, other] < math.inf:
+                    total, count = total + apart[c, other], count + 1
+            if count:
+                mean[c] = departure[c] + gain * (total / count - departure[c])
+                if index[c] >= 0 and mean[c] > (1.0 if worst < 0 else mean[worst]):
+                    worst = c
+        if worst < 0:
+            break
+        index[worst] = -1
+    departure[:] = mean
+
+
+@compile_kernel
 def match_greedily(affinity: Floats) -> Integers:
     """Return each person's detection in every camera, best pairs first.
 

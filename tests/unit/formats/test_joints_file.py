@@ -19,20 +19,21 @@ def tracks():
         joints=joints,
         covariance=rng.random((3, 2, 17, 3, 3)),
         views=rng.integers(0, 18, (3, 2, 17)),
+        source=rng.integers(0, 4, (3, 2, 17)),
     )
 
 
 def same(a, b):
-    for name in ("frames", "person_ids", "joints", "covariance", "views"):
+    for name in ("frames", "person_ids", "joints", "covariance", "views", "source"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_what_is_written_is_read(tmp_path, tracks):
     write_joints(tmp_path / "joints.npz", tracks)
     same(read_joints(tmp_path / "joints.npz"), tracks)
-    write_joints(tmp_path / "bare.npz", replace(tracks, covariance=None, views=None))
+    write_joints(tmp_path / "bare.npz", replace(tracks, covariance=None, views=None, source=None))
     bare = read_joints(tmp_path / "bare.npz")
-    assert (bare.covariance, bare.views) == (None, None)
+    assert (bare.covariance, bare.views, bare.source) == (None, None, None)
 
 
 def test_numpy_alone_reads_it_with_the_documented_types(tmp_path, tracks):
@@ -44,6 +45,7 @@ def test_numpy_alone_reads_it_with_the_documented_types(tmp_path, tracks):
             "joints": "<f8",
             "covariance": "<f8",
             "views": "|u1",
+            "source": "|u1",
         }
 
 

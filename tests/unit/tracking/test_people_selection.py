@@ -12,7 +12,7 @@ BODY = np.stack([np.zeros(17), np.zeros(17), np.linspace(0.0, 1.7, 17)], axis=1)
 
 def standing(x, y):
     """Return a person at a position [m], one or one per frame; NaN where rays give none."""
-    person = Person(0, BODY, FRAMES - 1)
+    person = Person(0, BODY, FRAMES - 1, CAMERAS)
     for frame in range(FRAMES):
         place = [np.broadcast_to(each, FRAMES)[frame] for each in (x, y)]
         joints = BODY + [*place, 0.0 if np.isfinite(place).all() else np.nan]
@@ -38,7 +38,7 @@ CAMERAS = 10
 
 def shadow_track(number, views, x, frames=range(FRAMES), joints=17):
     """Return a track at `x` [m], one or one per frame; joints from `joints` on are unknown."""
-    someone = Person(number, BODY, max(frames))
+    someone = Person(number, BODY, max(frames), CAMERAS)
     places = np.broadcast_to(x, FRAMES)
     for frame in frames:
         body = BODY + [places[frame], 0.0, 0.0]
@@ -77,7 +77,9 @@ def track(number, frames, x, y=0.0, views=CAMERAS):
     """Return a track over a time span [s] at a position [m], one or one per frame."""
     frames = range(*(round(FPS * second) for second in frames))
     x, y = np.broadcast_to(x, len(frames)), np.broadcast_to(y, len(frames))
-    someone = Person(number, BODY, frames[-1], fixed=len(frames), evidence=float(len(frames)))
+    someone = Person(
+        number, BODY, frames[-1], CAMERAS, fixed=len(frames), evidence=float(len(frames))
+    )
     index = np.where(np.arange(CAMERAS) < views, 0, -1)
     for n, frame in enumerate(frames):
         joints = BODY + [x[n], y[n], 0.0]

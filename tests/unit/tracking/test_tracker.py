@@ -173,6 +173,38 @@ def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, peo
     assert not together.any()
 
 
+def test_camera_that_shows_a_neighbour_for_a_while_is_left_out(ring, people, seen):
+    # Three cameras follow a person; then the third sees only a neighbour 0.5 m behind, whose rays
+    # pass the person within the gate.
+    camera = ring(3)
+    behind = -0.5 * camera.center[2, :2] / np.linalg.norm(camera.center[2, :2])
+    places = np.broadcast_to([[0.0, 0.0], behind], (60, 2, 2))
+    keypoints, confidence = seen(camera, people(places), noise=0.5)
+    keypoints[:, :2, 1] = np.nan
+    keypoints[:20, 2, 1] = np.nan
+    keypoints[20:, 2, 0] = np.nan
+    tracked = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
+    assert (tracked.detection_index[:, :2, 0] == 0).all()
+    assert (tracked.detection_index[:20, 2, 0] == 0).all()
+    assert (tracked.detection_index[40:, 2, 0] == -1).all()
+    # 1 px is 2 cm: two views place the mean of 17 joints to some millimetres.
+    away = tracked.joints[40:, 0].mean(axis=1) - people(places[40:])[:, 0].mean(axis=1)
+    assert np.linalg.norm(away, axis=-1).max() < 0.02
+
+
+def test_one_camera_alone_follows_a_person_through_a_turn(ring, people, seen):
+    # Walks to and fro at 1 m/s; from 0.5 to 1.2 s the first camera alone sees it.
+    time = np.arange(0, 2.0, 1 / FPS)
+    places = np.stack([0 * time, 0.5 * np.abs(2.0 * ((time + 0.2) % 1.0) - 1.0)], -1)[:, None]
+    keypoints, confidence = seen(ring(3), people(places))
+    keypoints[25:60, 1:] = np.nan
+    result = track_people(ring(3), detections(keypoints, confidence), FPS, SETTINGS)
+    assert result.report.births == 1
+    assert (result.detection_index[:, 0, 0] == 0).all()
+    assert np.isnan(result.joints[25:60]).all()
+    assert (result.detection_index[60:] == 0).all()
+
+
 @pytest.mark.parametrize(("agility", "births"), [(2.5, 2), (70.0, 1)])
 def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
     ring, people, seen, agility, births
