@@ -122,7 +122,7 @@ def learn_clip(
         known = detector.select_person(person)
         raw = triangulate_joints(cameras, alone, settings, camera_covariance, known)
         unswapped = undo_swaps(alone, raw.exchanged)
-        precision = raw.noise.precision(unswapped.confidence)
+        precision = raw.noise.precision(unswapped.confidence, unswapped.keypoints)
         return select_person(unswapped, precision, raw.offsets, raw.joints, person=0)
 
     intervals = choose_stretches(_have_views(detections, settings.min_views), fps)
@@ -356,8 +356,8 @@ class _Passes:
                     self._rig, points, self.shift, settings.noise, self._limit
                 )
             else:
-                self._noise[name] = NoiseModel.nominal(points.confidence.shape[-1])
-        precision = self._noise[name].precision(points.confidence)
+                self._noise[name] = NoiseModel.nominal(points.confidence.shape[-1], len(self._rig.cameras))
+        precision = self._noise[name].precision(points.confidence, points.keypoints)
         index = points.detection_index
         return Observations.of(self._rig, points.keypoints, precision, index, self.shift)
 
