@@ -7,6 +7,7 @@ from scipy.special import chdtri
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, JOINT_GROUPS
+from worldpose.body_fitting.evidence import body_axes
 from worldpose.errors import InputError
 from worldpose.evaluation.matching import (
     EvaluationSettings,
@@ -42,6 +43,15 @@ def _match(
     return found, covariance, counts
 
 
+def _subtract_offsets(error: Floats, axes: Floats, counts: Flags) -> Floats:
+    """Return errors (frames, persons, joints, 3) less the mean of each joint in a body's axes."""
+    counts = counts & np.isfinite(axes).all(axis=(-1, -2))[..., None]
+    axes = np.where(np.isfinite(axes), axes, 0.0)
+    own = np.where(counts[..., None], error @ axes, 0.0)
+    offset = own.sum(axis=(0, 1)) / np.maximum(counts.sum(axis=(0, 1)), 1)[:, None]
+    return error - np.einsum("fpab,jb->fpja", axes, offset)
+
+
 def group_errors(
     prediction: JointTracks, reference: JointTracks, settings: EvaluationSettings | None = None
 ) -> dict[str, tuple[float, int]]:
@@ -60,6 +70,8 @@ def region_counts(
     reference: JointTracks,
     level: float = 0.95,
     settings: EvaluationSettings | None = None,
+    *,
+    less_offset: bool = False,
 ) -> dict[str, tuple[int, int]]:
     """Return the number of joints inside their confidence region and in total, per group.
 
@@ -72,6 +84,8 @@ def region_counts(
         reference: true joints; with `views`, only joints seen by enough cameras count.
         level: stated probability, above 0 and below 1.
         settings: gate and views; the defaults if None.
+        less_offset: subtract the mean error of each joint in the axes of the body, since labels may
+            mean another point than the detector.
 
     Raises:
         InputError: the prediction has no covariance.
@@ -88,6 +102,8 @@ def region_counts(
     assert covariance is not None
     counts &= np.isfinite(covariance).all(axis=(-1, -2))
     error = np.where(counts[..., None], found - reference.joints, 0.0)
+    if less_offset:
+        error = _subtract_offsets(error, body_axes(found), counts)
     covariance = np.where(counts[..., None, None], covariance, np.eye(3))
     squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
     inside: Flags = np.asarray(counts & (squared <= chdtri(3, 1.0 - level)))

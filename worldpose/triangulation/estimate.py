@@ -363,7 +363,9 @@ class _Passes:
                     self._rig, points, self.shift, settings.noise, self._limit
                 )
             else:
-                self._noise[name] = NoiseModel.nominal(points.confidence.shape[-1], len(self._rig.cameras))
+                self._noise[name] = NoiseModel.nominal(
+                    points.confidence.shape[-1], len(self._rig.cameras)
+                )
         precision = self._noise[name].precision(points.confidence, points.keypoints)
         index = points.detection_index
         return Observations.of(self._rig, points.keypoints, precision, index, self.shift)

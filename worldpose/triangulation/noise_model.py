@@ -28,7 +28,6 @@ from worldpose.triangulation.residuals import (
 )
 from worldpose.triangulation.solve import find_consensus
 
-
 KINDS: Final = np.unique([name.split("_")[-1] for name in COCO17], return_inverse=True)[1]
 """Kind of each joint (17,): both sides are one kind."""
 REACH: Final = (0.5, 1.0, 1.7)
@@ -211,9 +210,7 @@ def learn_noise(
         free, chosen = freedom[used], [each[used] for each in classes]
         excess = np.maximum(squares[used] - known[used] * free, 0.0)
         for number, group in enumerate(chosen):
-            expected = math.prod(
-                table[each] for table, each in zip(tables, chosen, strict=True)
-            )
+            expected = math.prod(table[each] for table, each in zip(tables, chosen, strict=True))
             prior = PRIOR_FREEDOM[number]
             ratio = _variance_ratio(group, len(tables[number]), excess / expected, free, prior)
             tables[number] = tables[number] * ratio
