@@ -118,7 +118,7 @@ def _find_conditions(keypoints: AnyFloats, edges: Floats, found: NDArray[np.uint
             box[n, :2], box[n, 2:] = np.inf, -np.inf
             for j in range(joints):
                 x, y = keypoints[image, n, j]
-                if x - x == 0.0 and y - y == 0.0:
+                if math.isfinite(x) and math.isfinite(y):
                     box[n, 0], box[n, 2] = min(box[n, 0], x), max(box[n, 2], x)
                     box[n, 1], box[n, 3] = min(box[n, 1], y), max(box[n, 3], y)
         for n in range(people):
@@ -128,9 +128,9 @@ def _find_conditions(keypoints: AnyFloats, edges: Floats, found: NDArray[np.uint
             length = up[0] ** 2 + up[1] ** 2
             for j in range(joints):
                 x, y = at[j]
-                away = ((x - middle[0]) ** 2 + (y - middle[1]) ** 2) / length
+                away = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
                 for edge in edges:
-                    found[image, n, j] += away > edge * edge
+                    found[image, n, j] += away > edge * edge * length
                 for other in range(people):
                     inside = box[other, 0] < x < box[other, 2] and box[other, 1] < y
                     if inside and y < box[other, 3] and box[n, 3] < box[other, 3]:
