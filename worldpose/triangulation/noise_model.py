@@ -36,11 +36,6 @@ CONDITIONS: Final = 2 * (len(REACH) + 1)
 """Classes of a keypoint: limb positions, then the same behind a nearer person."""
 
 
-PRIOR_FREEDOM: Final = (60.0, 60.0, 600.0, 600.0)
-"""Degrees of freedom of 1 as a prior of the factors by confidence, joint, camera and condition: few
-observations change little, and errors of one camera or condition last."""
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
     """Noise of keypoints, learned from how the views of a recording disagree.
@@ -211,7 +206,9 @@ def learn_noise(
         excess = np.maximum(squares[used] - known[used] * free, 0.0)
         for number, group in enumerate(chosen):
             expected = math.prod(table[each] for table, each in zip(tables, chosen, strict=True))
-            prior = PRIOR_FREEDOM[number]
+            # Degrees of freedom of 1 as a prior: few observations change little. A person's error
+            # in one camera lasts, so that many frames count as few.
+            prior = 60.0 if number < 2 else 20.0 * len(index)
             ratio = _variance_ratio(group, len(tables[number]), excess / expected, free, prior)
             tables[number] = tables[number] * ratio
             if number == 0:
