@@ -45,11 +45,12 @@ def _match(
 
 def _subtract_offsets(error: Floats, axes: Floats, counts: Flags) -> Floats:
     """Return errors (frames, persons, joints, 3) less the mean of each joint in a body's axes."""
-    counts = counts & np.isfinite(axes).all(axis=(-1, -2))[..., None]
+    counts = counts & np.asarray(np.isfinite(axes).all(axis=(-1, -2)))[..., None]
     axes = np.where(np.isfinite(axes), axes, 0.0)
     own = np.where(counts[..., None], error @ axes, 0.0)
     offset = own.sum(axis=(0, 1)) / np.maximum(counts.sum(axis=(0, 1)), 1)[:, None]
-    return error - np.einsum("fpab,jb->fpja", axes, offset)
+    less: Floats = error - np.einsum("fpab,jb->fpja", axes, offset)
+    return less
 
 
 def group_errors(

@@ -141,7 +141,7 @@ def score_regions(options: Namespace) -> Tables:
             ("body_fitting", "bodies as detected", "regions_defined"),
         ):
             scored = [one[stage] for one in some if stage in one]
-            for level, end in (("95 %", ""), ("50 %", "_50")):
+            for level, end in (("95 %", ""), ("50 %", "_50")) if scored else ():
                 rows.append([f"{name}, {result}", level, *_ratios(scored, key + end)])
     columns = ["of", "region", *JOINT_GROUPS, "all"]
     return {"regions": Table("joints in stated regions", columns, rows, "%")}
@@ -242,7 +242,7 @@ def _ratios(scored: list[dict[str, Any]], name: str) -> list[float]:
     """Return the ratio of both numbers of each joint group, summed over matches, and of all."""
     sums = np.array([[one[name][group] for group in JOINT_GROUPS] for one in scored]).sum(axis=0)
     sums = np.append(sums, [sums.sum(axis=0)], axis=0)
-    ratios = sums[:, 0] / np.maximum(sums[:, 1], 1)
+    ratios = np.divide(sums[:, 0], sums[:, 1], out=np.full(len(sums), np.nan), where=sums[:, 1] > 0)
     found: list[float] = (100.0 * ratios if name.startswith("regions") else ratios).tolist()
     return found
 

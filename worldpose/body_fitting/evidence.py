@@ -71,8 +71,6 @@ def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
 def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """Return the covariance of joints without most of the bias that the shared offsets model.
 
-    It is that of joints where the detector sees them.
-
     Args:
         covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
         common_bias: (17,) per axis [m], included in `covariance`.

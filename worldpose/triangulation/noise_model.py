@@ -77,9 +77,7 @@ class NoiseModel:
     ) -> Floats:
         """Return the inverse of the factor (frames, cameras, detections, joints); 0 where missing.
 
-        Args:
-            confidence: (frames, cameras, detections, joints).
-            keypoints: (frames, cameras, detections, joints, 2) [px]; None = in no known condition.
+        Keypoints are (frames, cameras, detections, joints, 2) [px]; None = in no known condition.
         """
         precision = np.empty(confidence.shape)
         rows = np.ascontiguousarray(confidence).reshape(-1, len(self.joint))
@@ -96,10 +94,11 @@ def conditions(keypoints: AnyFloats) -> NDArray[np.uint8]:
     Hidden is a keypoint within the box of a person whose lowest keypoint is lower in the image: it
     stands nearer to the camera. Points besides COCO-17 have the first condition.
     """
-    found = np.zeros(keypoints.shape[:-1], np.uint8)
-    if found.shape[-1] == len(COCO17):
-        images = keypoints.reshape(-1, *keypoints.shape[-3:])
-        _find_conditions(images, np.array(REACH), found.reshape(images.shape[:-1]))
+    found: NDArray[np.uint8] = np.zeros(keypoints.shape[:-1], np.uint8)
+    people, joints = found.shape[-2:]
+    if joints == len(COCO17):
+        images = keypoints.reshape(-1, people, joints, 2), np.array(REACH)
+        _find_conditions(*images, found.reshape(-1, people, joints))
     return found
 
 

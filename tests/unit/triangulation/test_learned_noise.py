@@ -40,13 +40,14 @@ def test_keypoints_are_hidden_by_a_nearer_person_and_classed_by_their_distance_f
 
 def test_a_worse_camera_is_learned_from_residuals(ring):
     cameras = ring(7)
-    keypoints, confidence, index = detections(cameras, runner(120), noise=2.0)
-    exact, _, _ = detections(cameras, runner(120), noise=0.0)
+    joints = runner(20, persons=12)
+    keypoints, confidence, index = detections(cameras, joints, noise=2.0)
+    exact, _, _ = detections(cameras, joints, noise=0.0)
     keypoints[:, 2] += 2.0 * (keypoints[:, 2] - exact[:, 2])
     seen = KeypointDetections.from_keypoints(keypoints, confidence, index)
     model = learn_noise(Rig.from_cameras(cameras), seen, no_shift(), (2.0, 0.0), 1e3)
     rest = np.delete(model.camera, 2, axis=0).mean()
-    # Three times the noise; a prior of 600 degrees of freedom holds the ratio of variances back.
+    # Three times the noise; a prior of 20 degrees of freedom per frame holds the ratio back.
     assert 5.0 < model.camera[2].mean() / rest < 9.5
     precision = model.precision(confidence, keypoints)
     assert precision[:, 0].mean() > 5.0 * precision[:, 2].mean()
