@@ -34,7 +34,7 @@ from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
 from flows.results.best_results import (
     clip_positions,
-    clips_of,
+    find_clips,
     joint_tracks,
     open_results,
     static_cameras,
@@ -90,7 +90,7 @@ def write_report(
     run = open_results(store, match.match_id, run_id)
     source = reference or _own_reference(match)
     scores: Evaluation | None = None
-    if source is not None and len(clips_of(run.record)) == 1:
+    if source is not None and len(find_clips(run.record)) == 1:
         scores = score(match.match_id, source, store.url, run_id=run.record.run_id).evaluation
     _load_late_modules(run)
     with ThreadPoolExecutor(1) as painter:
@@ -171,7 +171,7 @@ def _write_videos(
 
         films.append(out.with_name(f"{out.stem}-{view}.mp4"))
         write_broadcast_video(run, match, view, films[-1])
-    for clip in clips_of(run.record):
+    for clip in find_clips(run.record):
         owner = camera or static_view(run, match, clip)
         if owner is not None:
             films.append(out.with_name(f"{out.stem}-{clip}-{owner}.mp4"))
@@ -182,7 +182,7 @@ def _write_videos(
 
 def _sections(store: Store, run: Run, match: Match, reference: str | None) -> list[Section]:
     """Return all sections of the report, in the order of a reader's questions."""
-    clips = clips_of(run.record)
+    clips = find_clips(run.record)
     filmed = clips if match.has_static_cameras else ()
     truth = None if reference is None else load_reference(reference)
     cameras = static_cameras(run, match.folder.spec)
@@ -205,7 +205,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             "too few cameras see the person; a body of such a person comes from the poses of a "
             "monocular method. Mixed: both, in different frames.",
         ),
-        counted_section(extent_of(run, match)),
+        *([counted_section(extent_of(run, match))] if clips else []),
         Section(
             "Detections",
             tuple(p for clip in filmed for p in detection_pictures(store, run, match, clip)),
@@ -214,7 +214,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         Section(
             "Static cameras",
             (
-                camera_table(run, match.folder.spec),
+                *([camera_table(run, match.folder.spec)] if match.has_static_cameras else []),
                 *(p for clip in filmed for p in health_picture(run, match, clip)),
                 *camera_pictures(store, run, match, cameras),
                 *paint_pictures(store, run, match, cameras),
@@ -252,7 +252,7 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
     from worldpose.reports.drawing import HIPS
 
     clips = {}
-    for clip in clips_of(run.record):
+    for clip in find_clips(run.record):
         places = joint_tracks(run, clip).joints[:, :, HIPS].mean(2)
         moving = broadcast_cameras(run, clip).values()
         kinds = [kind_of(each.focal.mean(-1), each.cam_from_world.rotation) for each in moving]
@@ -264,7 +264,7 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
 def _placed_extent(run: Run, match: Match) -> DataSetStatistics:
     """Count as `extent_of` does, with the people whom only their feet place."""
     clips = {}
-    for clip in clips_of(run.record):
+    for clip in find_clips(run.record):
         xy = clip_positions(run, clip).xy
         places = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1)
         clips[clip] = clip_statistics(places, match.folder.spec.fps)
@@ -273,6 +273,10 @@ def _placed_extent(run: Run, match: Match) -> DataSetStatistics:
 
 def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
     """Return the key metrics for the top of the report."""
+    static = (f"{len(match.folder.spec.static_cameras)}", "static cameras")
+    if not find_clips(run.record):
+        moving = broadcast_cameras(run).values()
+        return [static, (f"{sum(len(each.focal) for each in moving):,}", "broadcast frames")]
     found, placed = extent_of(run, match), _placed_extent(run, match)
     in_3d, people = (sum(clip.persons for clip in each.clips.values()) for each in (found, placed))
     clips = "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
@@ -280,7 +284,7 @@ def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[st
         (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {clips}"),
         (f"{people}", "people" if in_3d == people else f"people on the pitch, {in_3d} with joints"),
         (f"{found.poses:,}", "3D poses"),
-        (f"{len(match.folder.spec.static_cameras)}", "static cameras"),
+        static,
         (f"{1000.0 * placed.distance_km:,.0f} m", "run and walked by all"),
     ]
     if scores is not None and scores.mpjpe_mm is not None and np.isfinite(scores.mpjpe_mm):

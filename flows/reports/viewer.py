@@ -19,6 +19,7 @@ from flows.results.best_results import (
     bodies_unit,
     clip_positions,
     estimated_pitch,
+    find_clips,
     fitted_bodies,
     person_kinds,
     static_cameras,
@@ -52,7 +53,7 @@ def report_viewer(run: Run, match: Match) -> tuple[tuple[EmbeddedPage, ...], str
         The page, or nothing if there is nobody to show; and a sentence, empty if all is shown.
     """
     origin, spare, clips, all_frames = Origin(run, match.registration), REPORT_POSES, [], 0
-    for name in origin.clips:
+    for name in find_clips(run.record):
         clip = viewer_clip(origin, name, match.folder.pitch, None)
         all_frames += len(clip.frames)
         shown = clip.first_frames(spare // max(1, len(clip.people)))

@@ -21,6 +21,7 @@ from flows.results.broadcast_views import (
     broadcast_unit,
     broadcast_views,
     camera_in_frames,
+    clip_of,
 )
 from flows.review.identities import names_of
 from flows.stage import Match
@@ -54,6 +55,12 @@ def find_clips(record: RunRecord) -> tuple[str, ...]:
     """Return the clips for which a run has joints, or people on the pitch; empty without any."""
     units = [unit.partition("/") for unit in record.results]
     return tuple(sorted({unit for stage, _, unit in units if stage in (*JOINT_STAGES, PLANE)}))
+
+
+def all_clips(run: Run) -> tuple[str, ...]:
+    """Return the clips that have people or a calibrated moving camera."""
+    moving = (clip_of(run, view) for view in broadcast_views(run))
+    return tuple(sorted({*find_clips(run.record), *moving}))
 
 
 def clips_of(record: RunRecord) -> tuple[str, ...]:
@@ -130,7 +137,8 @@ def joint_tracks(
 ) -> JointTracks:
     """Return the joints of one clip, from the best available or the given stage.
 
-    People that a broadcast camera alone films have the joints of their bodies, or NaN. Triangulated
+    People that a broadcast camera alone films have the joints of their bodies, or NaN; there are
+    none if the run ends with that camera. Triangulated
     joints have the detector's definition always. If the first triangulation is the best available,
     the frames that it skipped have the tracker's joints, without covariance.
 
@@ -139,6 +147,9 @@ def joint_tracks(
     """
     stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
     on_plane = f"{PLANE}/{clip}" in run
+    if stage is None and not stages and not on_plane and (moving := broadcast_views(run, clip)):
+        frames = run[broadcast_unit(run, moving[0])]["frame"].values
+        return JointTracks(frames, np.zeros(0, np.int64), np.zeros((len(frames), 0, 17, 3)))
     if stage is None and on_plane and not (stages and run[f"{stages[0]}/{clip}"].sizes["person"]):
         tracked = run[f"{PLANE}/{clip}"]
         index = tracked["detection_index"].values

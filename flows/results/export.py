@@ -20,6 +20,7 @@ from data_contracts.triangulation import CameraChange
 from flows.results.best_results import (
     PLANE,
     Origin,
+    all_clips,
     bodies_unit,
     clip_positions,
     estimated_pitch,
@@ -137,13 +138,15 @@ def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
 def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz` (X3).
 
-    Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest error.
+    A clip without bodies has no poses. Other lenses than Brown's are fitted by it;
+    `lens_errors.json` states the largest error.
     """
-    for clip in origin.clips:
-        model, poses, _ = fitted_bodies(origin.run, clip)
-        path = out / "poses" / f"{clip}.npz"
-        write_poses(path, poses, model.name)
-        yield path
+    for clip in all_clips(origin.run):
+        if bodies_unit(origin.run, clip) in origin.run:
+            model, poses, _ = fitted_bodies(origin.run, clip)
+            path = out / "poses" / f"{clip}.npz"
+            write_poses(path, poses, model.name)
+            yield path
         moving = filmed_cameras(origin.run, clip) if broadcast_views(origin.run, clip) else {}
         for view, camera in moving.items():
             path = out / "cameras" / f"{view}.npz"
@@ -246,7 +249,7 @@ def export_tracks(origin: Origin, out: Path) -> Iterator[Path]:
 def export_slahmr_cameras(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `slahmr/cameras/<view>/shot-0/cameras.npz`, and the paper's settings."""
     yield _write_baseline_settings(out)
-    for clip in origin.clips:
+    for clip in all_clips(origin.run) or origin.clips:
         for view, camera in filmed_cameras(origin.run, clip).items():
             path = out / "slahmr" / "cameras" / view / "shot-0" / "cameras.npz"
             write_slahmr_cameras(path, camera)
@@ -373,7 +376,7 @@ def export(origin: Origin, forms: list[str], out: Path, *, overwrite: bool = Fal
             write_origins(written[-1], tracks, origins_of(tracks))
         if not COUNTED & set(forms):
             return written
-        rates = dict.fromkeys(origin.clips, origin.spec.fps)
+        rates = dict.fromkeys(all_clips(origin.run), origin.spec.fps)
         return [*written, write_frame_rates(place, rates)]
 
     match_id = origin.spec.match_id
@@ -410,7 +413,7 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
             todo="Export them into different folders.",
         )
     written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
-    on_plane = [clip for clip in origin.clips if f"{PLANE}/{clip}" in origin.run]
+    on_plane = [clip for clip in all_clips(origin.run) if f"{PLANE}/{clip}" in origin.run]
     if on_plane:
         kinds = {clip: person_kinds(origin.run, clip) for clip in on_plane}
         written.append(write_kinds(out, kinds))

@@ -42,6 +42,7 @@ def test_a_broadcast_camera_alone_gives_places_and_with_estimates_bodies(server,
     remove_static_cameras(match)
     given, aside = match / "estimates/clip.npz", tmp_path / "clip.npz"
     given.rename(aside)
+    check_camera_alone(match, project, tmp_path / "camera")
     answer = succeed("run", match, *project)
     assert "tracking: no units, as the match has no static cameras" in answer.err
     assert "warning" not in answer.err and answer.err.count("reservation") == 1
@@ -144,3 +145,19 @@ def remove_static_cameras(match):
     for camera in static:
         for file in match.rglob(f"{camera}.*"):
             file.unlink()
+
+
+def check_camera_alone(match, project, out):
+    """A run that ends with the camera has a report, and exports that need no people."""
+    succeed("run", match, *project, "--until", "broadcast_calibration")
+    made = (match, *project, "--run", 1)
+    forms = ("--format", "worldpose", "--format", "slahmr-cameras")
+    succeed("export", *made, *forms, "--out", out)
+    with np.load(out / "cameras/clip.npz") as arrays:
+        assert len(arrays["R"]) == 25
+    assert (out / "slahmr/cameras/clip/shot-0/cameras.npz").is_file()
+    succeed("report", *made, "--no-videos", "--out", out / "page.html")
+    assert "broadcast frames" in (out / "page.html").read_text()
+    refused = worldpose("export", *made, "--format", "joints", "--out", out / "joints")
+    assert refused.code == 1
+    assert "expected people, in 3D or on the pitch" in refused.err

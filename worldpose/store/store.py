@@ -315,6 +315,7 @@ class Store:
         finished, reserved, _ = run_files(self.blobs, match_id)
         names = sorted(finished, key=run_order)
         wanted = names[-1] if run_id == LATEST and names else run_id
+        wanted = wanted.zfill(4) if wanted.isdecimal() else wanted
         if wanted not in finished:
             pin = read_pin(self.blobs, match_id, run_id)
             wanted = run_id if pin is None else pin.run_id

@@ -11,6 +11,7 @@ The pitch looks the same after half a turn. The side on which the camera stands 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -35,7 +36,7 @@ from worldpose.static_calibration.from_paint.candidates import (
     project_markings,
     stand_on,
 )
-from worldpose.static_calibration.from_paint.paint import PaintMap, find_paint
+from worldpose.static_calibration.from_paint.paint import PaintMap, find_paint, restore_colors
 from worldpose.static_calibration.from_paint.ranking import (
     FINE,
     MIN_MARGIN,
@@ -187,6 +188,8 @@ def propose_camera(
 ) -> Proposal:
     """Return the camera that explains the paint of an image best.
 
+    If the image as it is has no clear one, the search is repeated with restored colors.
+
     Args:
         picture: (height, width, 3) RGB.
         pitch: the stadium's template.
@@ -204,10 +207,25 @@ def propose_camera(
     """
     height, width = picture.shape[:2]
     given = None if lens is None else Camera.from_lens(lens, (width, height))
-    paints = find_paint(picture, given, where)
-    found = propose_from_paint(paints, pitch, side=side, prior=prior, lens=given)
+
+    def search(shown: Image) -> Proposal | None:
+        paints = find_paint(shown, given, where)
+        return propose_from_paint(paints, pitch, side=side, prior=prior, lens=given)
+
+    found, refused = None, None
+    try:
+        found = search(picture)
+    except InputError as error:
+        if picture.ndim != 3:
+            raise
+        refused = error
+    if found is None or not found.is_clear:
+        with suppress(InputError):
+            again = search(restore_colors(picture))
+            if again is not None and (found is None or again.is_clear):
+                found = again
     if found is None:
-        raise InputError(
+        raise refused or InputError(
             where,
             expected="three straight markings, one across the others, or one and a circle",
             found="paint that fits no camera",
