@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import tell
-from registry import Table, Tables, benchmark, duration, integer, option
-from scipy.special import chdtri
+from common import load_module, tell
+from joint_regions import group_errors, region_counts
+from registry import DATA, Table, Tables, benchmark, duration, integer, option
+from shelf import ALL_FRAMES, SCORED, list_cameras, write_case
 
-from data_contracts.arrays import Flags, Floats, Integers
-from data_contracts.conventions import COCO17, JOINT_GROUPS
+from data_contracts.arrays import Integers
+from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.run import RunRecord
 from flows.match import task_of
 from flows.registering import find_match
@@ -35,13 +36,7 @@ from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog
 from flows.settings import selected_stages
 from flows.stage import Stage
-from worldpose.evaluation.matching import (
-    EvaluationSettings,
-    joint_distances,
-    match_people,
-    select_frames,
-    take_matched,
-)
+from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.ingest.footage import unit_frames
@@ -108,6 +103,74 @@ def score_matches(options: Namespace) -> Tables:
         tell(" ".join(map(str, list_match(row))))
     shown = [row for row in rows if not asked or any(p.items() <= row.items() for p in asked)]
     return report(shown)
+
+
+@benchmark(
+    "joint_regions",
+    "true joints and labels inside stated regions: Shelf, the second simulator and the first",
+    DATA,
+    integer("matches", 2, "of each source"),
+    duration(1.0),
+    integer("seed", 1, "of the first match of each source"),
+    option("--resume", type=Path, default=Path("joint_regions"), metavar="DIR"),
+)
+def score_regions(options: Namespace) -> Tables:
+    """DATA holds `shelf_dev`; matches are measured as by `second_world`, in DIR.
+
+    Share of joints in the stated regions of 95 % and of 50 %. Joints are those of `retriangulation`
+    and, in simulation, compared with what the detector takes for joints; bodies by the body model's
+    definition are compared with the true joints. Labels of Shelf count less a constant offset of
+    each joint, and as they are. Regions were chosen on its frames 300 to 420.
+    """
+    fixed = {"iterations": 1, "calibrated": False, "recordings": None, "limit": 3600.0}
+    shared = vars(options) | fixed | {"keep": False, "report": False}
+    rows: list[list[Any]] = score_labels(options.data / "shelf_dev")
+    for scenarios in (None, *(["penalty-box"], ["match"], ["hard"])):
+        score_matches(Namespace(**shared, scenarios=scenarios))
+        asked = plans(Namespace(**shared, scenarios=scenarios))
+        every = map(json.loads, (options.resume / "rows.jsonl").read_text().splitlines())
+        some = [
+            row["stages"][0]
+            for row in every
+            if row.get("stages") and any(plan.items() <= row.items() for plan in asked)
+        ]
+        name = scenarios[0] if scenarios else "second world"
+        for stage, result, key in (
+            ("retriangulation", "joints", "regions_defined"),
+            ("body_fitting", "bodies", "regions"),
+            ("body_fitting", "bodies as detected", "regions_defined"),
+        ):
+            scored = [one[stage] for one in some if stage in one]
+            for level, end in (("95 %", ""), ("50 %", "_50")) if scored else ():
+                rows.append([f"{name}, {result}", level, *_ratios(scored, key + end)])
+    columns = ["of", "region", *JOINT_GROUPS, "all"]
+    return {"regions": Table("joints in stated regions", columns, rows, "%")}
+
+
+def score_labels(data: Path) -> list[list[Any]]:
+    """Return rows of the table of `score_regions` for Shelf."""
+    truth, rows = np.load(data / "gt.npz"), []
+    labels = np.full((*truth["gt"].shape[:2], 17, 3), np.nan)
+    places = load_module(data / "pcp.py").COCO_FOR_SHELF
+    labels[:, :, places] = truth["gt"][:, :, : len(places)]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, project = Path(temporary), Path(temporary) / "project"
+        match = write_case(data / "import", list_cameras(data), ALL_FRAMES, folder)
+        run_in_process(project, match, 1)
+        run = open_run(str(project), match.name)
+        for (first, last), (stage, definition), less in product(
+            ((300, 420), (421, 510)), [scored[1:] for scored in SCORED[1:4]], (True, False)
+        ):
+            there = (truth["frames"] >= first) & (truth["frames"] <= last)
+            known = JointTracks(truth["frames"][there], np.arange(4), labels[there])
+            tracks = joint_tracks(run, "clip", stage, definition)
+            name = "joints" if stage == "retriangulation" else f"bodies by the {definition}"
+            title = f"Shelf {first} to {last}, {name}{', less offset' if less else ''}"
+            for level in (0.95, 0.5):
+                counts = region_counts(tracks, known, level, less_offset=less)
+                values = _ratios([{"regions": counts}], "regions")
+                rows.append([title, f"{100 * level:.0f} %", *values])
+    return rows
 
 
 def list_match(row: dict[str, Any]) -> list[Any]:
@@ -179,7 +242,7 @@ def _ratios(scored: list[dict[str, Any]], name: str) -> list[float]:
     """Return the ratio of both numbers of each joint group, summed over matches, and of all."""
     sums = np.array([[one[name][group] for group in JOINT_GROUPS] for one in scored]).sum(axis=0)
     sums = np.append(sums, [sums.sum(axis=0)], axis=0)
-    ratios = sums[:, 0] / np.maximum(sums[:, 1], 1)
+    ratios = np.divide(sums[:, 0], sums[:, 1], out=np.full(len(sums), np.nan), where=sums[:, 1] > 0)
     found: list[float] = (100.0 * ratios if name.startswith("regions") else ratios).tolist()
     return found
 
@@ -246,7 +309,9 @@ def score_stage(run: Run, stage: str, reference: Path, fps: float) -> dict[str, 
     defined = read_joints(reference / "defined_joints.npz")
     return found | {
         "regions": region_counts(tracks, truth),
+        "regions_50": region_counts(tracks, truth, 0.5),
         "regions_defined": region_counts(seen, defined),
+        "regions_defined_50": region_counts(seen, defined, 0.5),
         "errors_mm": group_errors(tracks, truth),
         "errors_defined_mm": group_errors(seen, defined),
     }
@@ -350,60 +415,3 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
         if not answer.exists():
             return plan | {"state": "crash", "failures": [f"exit code {process.exitcode}"]}
         return dict(json.loads(answer.read_text()))
-
-
-def group_joints(group: str) -> list[int]:
-    """Return the indices of a group's joints in COCO-17."""
-    parts = JOINT_GROUPS[group]
-    return [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]
-
-
-def _match(prediction: JointTracks, reference: JointTracks) -> tuple[Floats, Floats | None, Flags]:
-    """Return matched joints, their covariance, and which of them count, as the true people."""
-    settings = EvaluationSettings()
-    joints = select_frames(prediction.joints, prediction.frames, reference.frames)
-    match = match_people(joint_distances(joints, reference.joints), settings.match_gate_m)
-    covariance = None
-    if prediction.covariance is not None:
-        stated = select_frames(prediction.covariance, prediction.frames, reference.frames)
-        flat = take_matched(stated.reshape(*stated.shape[:3], 9), match)
-        covariance = flat.reshape(*flat.shape[:3], 3, 3)
-    found = take_matched(joints, match)
-    counts: Flags = np.asarray(np.isfinite(found - reference.joints).all(axis=-1))
-    if reference.views is not None:
-        counts &= reference.views >= settings.min_views
-    return found, covariance, counts
-
-
-def _by_group(values: Floats | Flags, counts: Flags) -> dict[str, tuple[Any, int]]:
-    """Return the sum of values of joints (frames, persons, 17), and their number, per group."""
-    groups = {name: group_joints(name) for name in JOINT_GROUPS}
-    return {
-        name: (values[..., some].sum().item(), int(counts[..., some].sum()))
-        for name, some in groups.items()
-    }
-
-
-def group_errors(prediction: JointTracks, reference: JointTracks) -> dict[str, tuple[float, int]]:
-    """Return the sum of distances [mm] and the number of joints per group."""
-    found, _, counts = _match(prediction, reference)
-    away = np.linalg.norm(found - reference.joints, axis=-1)
-    return _by_group(np.where(counts, 1e3 * away, 0.0), counts)
-
-
-def region_counts(
-    prediction: JointTracks, reference: JointTracks, level: float = 0.95
-) -> dict[str, tuple[int, int]]:
-    """Return the number of joints inside their confidence region and in total, per group.
-
-    A region is the ellipsoid of the stated covariance that contains the true joint with probability
-    `level` for normal errors: d^T C^-1 d is below the quantile of the chi-square distribution with
-    three degrees of freedom. People are matched per frame as for the other metrics.
-    """
-    found, covariance, counts = _match(prediction, reference)
-    assert covariance is not None  # joints of a run have one
-    counts &= np.isfinite(covariance).all(axis=(-1, -2))
-    error = np.where(counts[..., None], found - reference.joints, 0.0)
-    covariance = np.where(counts[..., None, None], covariance, np.eye(3))
-    squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
-    return _by_group(np.asarray(counts & (squared <= chdtri(3, 1.0 - level))), counts)

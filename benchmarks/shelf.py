@@ -143,7 +143,6 @@ def score_subsets(options: Namespace) -> Tables:
     every, last = list_cameras(data), int(truth["frames"][-1])
     first = options.first or int(truth["frames"][0])
     rows: list[list[Any]] = []
-    how = (options.until, options.iterations, {})
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.keep or Path(temporary)
         store = Store.open_or_new(str(folder / "project"))
@@ -158,7 +157,9 @@ def score_subsets(options: Namespace) -> Tables:
                 label = f"{' '.join(cameras)}, {frames.start} to {frames.stop - 1}"
                 try:
                     folder_of_case = write_case(data / "import", cameras, frames, folder)
-                    match, found = run_in_process(store, folder_of_case, *how)
+                    match, found = run_in_process(
+                        store, folder_of_case, options.until, options.iterations, {}
+                    )
                 except WorldposeError as error:
                     rows.append([label, type(error).__name__, *[None] * 6])
                     continue

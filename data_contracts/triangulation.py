@@ -96,7 +96,7 @@ _ARRAYS = array_layouts(
         whole person
     common_bias (joint) float64 [m]:
         standard deviation per axis of the error that all views of a joint share;
-        `covariance` contains it
+        `covariance` contains it, and more where views miss the joint
     views (*frame, person, joint) uint8 [1], missing 0:
         number of inlier cameras
     spread (*frame, person, joint) float32 [rad], missing nan:

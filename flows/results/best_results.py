@@ -28,7 +28,7 @@ from flows.review.identities import names_of
 from flows.stage import Match
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.body_fitting.evidence import perceived_joints, random_covariance
+from worldpose.body_fitting.evidence import perceived_joints
 from worldpose.body_fitting.extra_points import perceived_points
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
@@ -185,8 +185,6 @@ def joint_tracks(
         joints, views = _with_tracked_joints(run, clip, joints, views)
     if stages[0] in BODY_STAGES and definition == "detector":
         joints = perceived_joints(joints, result["joint_offsets"].values)
-    if fitted and definition == "detector":
-        covariance = random_covariance(covariance, seen["common_bias"].values)
     kind = 1 if stages[0] not in BODY_STAGES else 2 if definition == "detector" else 3
     source = np.where(np.isfinite(joints[..., 0]), kind, 0)
     if best and fitted and definition == "detector":

@@ -71,8 +71,6 @@ def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
 def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """Return the covariance of joints without most of the bias that the shared offsets model.
 
-    It is that of joints where the detector sees them.
-
     Args:
         covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
         common_bias: (17,) per axis [m], included in `covariance`.
@@ -103,7 +101,7 @@ class PersonEvidence:
             joints: (frames, points, 3) [m], world; NaN where missing.
             covariance: (frames, points, 3, 3) [m^2], as triangulation states it.
             fps: [1/s].
-            settings: scale and correlation time of the noise.
+            settings: correlation time of the noise.
         """
         own = self.of(joints, covariance, fps, settings)
         return PersonEvidence(
@@ -126,15 +124,13 @@ class PersonEvidence:
             joints: (frames, 17, 3) [m], world; or other points.
             covariance: (frames, 17, 3, 3) [m^2], as triangulation states it.
             fps: [1/s].
-            settings: scale and correlation time of the noise.
+            settings: correlation time of the noise.
         """
         seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
         stated = np.where(seen[..., None, None], covariance, np.eye(3))
-        relative = JOINT_SPREAD if joints.shape[1] == len(JOINT_SPREAD) else np.ones(1)
-        spread = settings.noise_scale**2 * relative[:, None, None] ** 2 * stated
-        spread = spread + settings.min_joint_std_m**2 * np.eye(3)
+        spread = stated + settings.min_joint_std_m**2 * np.eye(3)
         # Correlated frames count as one observation.
-        spread *= 1.0 + settings.noise_time_s * fps
+        spread *= settings.repeated(fps)
         information = invert_symmetric(spread) * seen[..., None, None]
         return cls(np.where(seen[..., None], joints, np.nan), information)
 
@@ -156,7 +152,7 @@ class PersonEvidence:
         joints, information = self.joints.copy(), self.information.copy()
         seen = np.asarray(np.isfinite(points).all(-1))
         spread = (settings.ray_std_m * JOINT_SPREAD) ** 2 + settings.min_joint_std_m**2
-        spread *= 1.0 + settings.noise_time_s * fps
+        spread *= settings.repeated(fps)
         information[rows] += np.where(seen[..., None, None], across / spread[:, None, None], 0.0)
         # From the point on the line towards the known joint; a lone line has no force along
         # itself.

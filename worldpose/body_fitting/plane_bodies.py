@@ -337,7 +337,7 @@ class _Clip:
         variance = np.where(seen, variance, 1.0)
         if shorten:
             points = shorten_limbs(points, across * variance[..., None, None])
-        variance *= 1.0 + settings.noise_time_s * fps
+        variance *= settings.repeated(fps)
         by_ray = np.where(seen[..., None, None], across / variance[..., None, None], 0.0)
 
         sight, place = self._sight(person, rows)

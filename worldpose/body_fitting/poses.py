@@ -175,7 +175,10 @@ def pose_covariance(
 ) -> tuple[Floats, Floats]:
     """Return a solved track's points (frames, points, 3) [m] and their covariance.
 
-    The covariance (frames, points, 3, 3) [m^2] is that of the poses.
+    The covariance (frames, points, 3, 3) [m^2] is that of the poses. Errors last for about
+    `noise_time_s`, so that a frame of the track has that much less weight. Where a point moves too
+    freely to gain from other frames, its own frame alone determines it, with all its weight: the
+    smaller of both covariances is that of a point.
 
     Args:
         objective: that of the track, with its standing ankles.
@@ -183,8 +186,14 @@ def pose_covariance(
         offsets: (17, 3) [m], the detector's offsets.
     """
     equations = damp_motion(objective).equations(pose, offsets, bordered=False)
-    inverse = factor(equations.blocks).inverse_blocks()
-    return equations.points.keypoints, propagate(equations.points.pose, inverse)
+    body = equations.points
+    random = propagate(body.pose, factor(equations.blocks).inverse_blocks())
+    alone = replace(objective, acceleration=np.inf, contacts=None)
+    blocks = alone.equations(pose, offsets, bordered=False).blocks
+    blocks *= objective.settings.repeated(objective.fps)
+    single = propagate(body.pose, factor(blocks).inverse_blocks())
+    smaller = np.einsum("tpii->tp", single) < np.einsum("tpii->tp", random)
+    return body.keypoints, np.where(smaller[..., None, None], single, random)
 
 
 def factor(blocks: Floats) -> BandedFactor:

@@ -23,9 +23,6 @@ class BodyFittingSettings(Record):
     body_model: str = OPEN_BODY
     """Body model to fit: the open body, open-neutral/3 with narrower hip joints, or one installed
     with `worldpose body install`."""
-    noise_scale: float = Field(default=1.3, ge=1e-6, le=1000)
-    """Standard deviation of the joints over the stated one [1]: triangulation includes the noise of
-    a detector, but no error of occluded joints or wrong views."""
     noise_time_s: float = Field(default=0.1, ge=0, le=10)
     """Correlation time of a detector's error [s]: frames within it count as one observation,
     otherwise a slow error would pass for motion."""
@@ -93,6 +90,10 @@ class BodyFittingSettings(Record):
     """Gauss-Newton steps for the poses of every frame [1]; feet stand from the third on."""
     max_filled_gap_s: float = Field(default=1.0, ge=0, le=100)
     """Gaps up to this are filled by motion [s]; in longer ones a person is missing."""
+
+    def repeated(self, fps: float) -> float:
+        """Return the number of frames of a clip that count as one observation [1]."""
+        return 1.0 + self.noise_time_s * fps
 
     def pose_weight(self, fps: float) -> float:
         """Return the weight of the pose prior in each frame of a clip [1].

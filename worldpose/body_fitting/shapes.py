@@ -17,7 +17,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.body_fitting.bones import Shape, fit_shape, measure_bones, shorten_limbs
-from worldpose.body_fitting.evidence import JOINT_SPREAD, MIRRORED_OFFSETS, PersonEvidence
+from worldpose.body_fitting.evidence import MIRRORED_OFFSETS, PersonEvidence
 from worldpose.body_fitting.pose_space import interpolate_gaps, start_poses
 from worldpose.body_fitting.poses import PoseSolver, factor
 from worldpose.body_fitting.residuals import (
@@ -183,9 +183,8 @@ def _sample_piece(
     settings, model = solver.settings, solver.chained.model
     stride = max(1, int(fps / settings.shape_rate_hz))
     rate = fps / stride
-    scale = (settings.noise_scale * JOINT_SPREAD[:, None, None]) ** 2
     joints, covariance = (np.concatenate(column) for column in zip(*intervals, strict=True))
-    bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
+    bones = measure_bones(joints, covariance, settings.repeated(fps))
     betas = fit_shape(model, bones).betas
     sampled = [(some[::stride], sure[::stride]) for some, sure in intervals]
     seen = [
@@ -196,7 +195,7 @@ def _sample_piece(
     if not seen:
         return None
     joints, covariance = (np.concatenate(column) for column in zip(*seen, strict=True))
-    joints = shorten_limbs(joints, scale * covariance)
+    joints = shorten_limbs(joints, covariance)
     starts = np.cumsum([len(some) for some, _ in seen])[:-1].tolist()
     parts = [interpolate_gaps(part) for part in np.split(joints, starts)]
     if all(np.isfinite(part).all() for part in parts):

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Flags, Floats
+from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import map_in_threads
@@ -33,7 +34,12 @@ from worldpose.triangulation.limb_lengths import (
     repair_limb_lengths,
     undo_swaps,
 )
-from worldpose.triangulation.noise_model import BY_JOINT, NoiseModel, learn_common_bias, learn_noise
+from worldpose.triangulation.noise_model import (
+    NoiseModel,
+    learn_common_bias,
+    learn_noise,
+    shared_variance,
+)
 from worldpose.triangulation.person_offsets import (
     estimate_midhip_shift,
     estimate_offsets,
@@ -122,7 +128,7 @@ def learn_clip(
         known = detector.select_person(person)
         raw = triangulate_joints(cameras, alone, settings, camera_covariance, known)
         unswapped = undo_swaps(alone, raw.exchanged)
-        precision = raw.noise.precision(unswapped.confidence)
+        precision = raw.noise.precision(unswapped.confidence, unswapped.keypoints)
         return select_person(unswapped, precision, raw.offsets, raw.joints, person=0)
 
     intervals = choose_stretches(_have_views(detections, settings.min_views), fps)
@@ -242,11 +248,12 @@ def triangulate_joints(
     passes = _Passes(cameras, detections, settings, camera_covariance, model)
     learned, solved = passes.run(), passes.solved
     bias = learned.common_bias
+    index, shift = detections.detection_index, passes.shift
     lasting = np.broadcast_to(
         passes.offset_covariance + bias[:, None, None] ** 2 * np.eye(3), solved.covariance.shape
     )
-    covariance = solved.covariance + lasting
-    index, shift = detections.detection_index, passes.shift
+    hidden = shared_variance(bias, solved.views, (index >= 0).sum(axis=1)) - bias**2
+    covariance = solved.covariance + lasting + hidden[..., None, None] * np.eye(3)
     found = Triangulation(
         joints=solved.joints,
         covariance=covariance,
@@ -356,8 +363,10 @@ class _Passes:
                     self._rig, points, self.shift, settings.noise, self._limit
                 )
             else:
-                self._noise[name] = NoiseModel.nominal(points.confidence.shape[-1])
-        precision = self._noise[name].precision(points.confidence)
+                self._noise[name] = NoiseModel.nominal(
+                    points.confidence.shape[-1], len(self._rig.cameras)
+                )
+        precision = self._noise[name].precision(points.confidence, points.keypoints)
         index = points.detection_index
         return Observations.of(self._rig, points.keypoints, precision, index, self.shift)
 
@@ -396,12 +405,11 @@ class _Passes:
         settings, solved = self._settings, self.solved
         if self._known is not None:
             return self._known.common_bias
-        count = self._detections.confidence.shape[-1]
-        if not (settings.learn_noise and count == len(BY_JOINT)):
-            return np.full(count, settings.common_bias_m)
-        covariance = solved.covariance + self.offset_covariance
-        usual = learn_common_bias(solved.joints, covariance, settings.common_bias_m)
-        return np.asarray(BY_JOINT * usual)
+        count, bias = self._detections.confidence.shape[-1], settings.common_bias_m
+        if settings.learn_noise and count == len(COCO17):
+            covariance = solved.covariance + self.offset_covariance
+            bias = learn_common_bias(solved.joints, covariance, bias)
+        return np.full(count, bias)
 
 
 def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:

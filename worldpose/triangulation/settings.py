@@ -29,12 +29,13 @@ class TriangulationSettings(Record):
     learn_noise: bool = True
     """Learn the factors from residuals between the clip's views; False uses the stated noise, with
     a variance proportional to the inverse confidence."""
-    common_bias_m: float = Field(default=0.024, ge=0, le=1)
+    common_bias_m: float = Field(default=0.018, ge=0, le=1)
     """Usual standard deviation per axis of the error that all views of a joint share [m]: a
-    detector's labels mean another point than the joint's centre. No residual shows it; it is added
-    to the covariance. With `learn_noise` every joint has a factor (`noise_model.BY_JOINT`), and the
-    proportions of a clip's people determine the size of the bias. Joints of real people are 27 mm
-    per axis from hand-made labels (Shelf); 10 of these are noise of the views."""
+    detector's labels mean another point than the joint's centre, and that depends on the pose. No
+    residual shows it; it is added to the covariance, and more of it where views miss the joint
+    (`noise_model.shared_variance`). With `learn_noise` the proportions of a clip's people determine
+    its size. Joints of real people are 22 mm per axis from hand-made labels and a constant offset
+    for each joint (Shelf, frames 300 to 420); 10 of these are noise of the views."""
     max_deviation: float = Field(default=3.5, ge=1e-6, le=1e6)
     """Observations farther than this from the joint, in standard deviations, are rejected [1]: 0.2
     % of correct ones (chi-square, two degrees of freedom). It is also the limit for left-right

@@ -171,7 +171,7 @@ def smooth_joints(
     """
     rig = Rig.from_cameras(cameras)
     detections = undo_swaps(detections, raw.exchanged)
-    precision = raw.noise.precision(detections.confidence)
+    precision = raw.noise.precision(detections.confidence, detections.keypoints)
     joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
     if motion is None:
         chosen = choose_stretches(np.asarray(raw.views.any(axis=-1)), fps)

@@ -47,7 +47,7 @@ def test_what_a_detector_always_gets_wrong_is_found():
     fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     moved = np.abs(offsets).max(axis=-1) > 0.0
     # A head is rigid, so that pose explains nothing of it, and shape and the prior but a part.
-    np.testing.assert_allclose(fit.offsets[moved], offsets[moved], atol=0.02)
+    np.testing.assert_allclose(fit.offsets[moved], offsets[moved], atol=0.025)
 
 
 def test_gaps_are_filled_marked_and_less_sure():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from second_world import region_counts
+from joint_regions import region_counts
 
 from worldpose.formats.joints_file import JointTracks
 
