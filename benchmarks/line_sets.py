@@ -111,8 +111,7 @@ def score_line_sets(options: Namespace) -> Tables:
     scorer, rows, overlaps = load_scorer(options.data), [], []
     for name, (_, size) in SETS.items():
         lines = load_lines(options.data, name, options.half, options.every)
-        fitted = {key: fit(drawn, size, BROADCAST) for key, drawn in lines.items()}
-        fits = {key: each for key, each in fitted.items() if each is not None}
+        fits = fit_all(lines, size)
         scores = {
             key: jaccards(scorer, lines[key], each.estimate.camera, size)
             for key, each in fits.items()
@@ -139,14 +138,8 @@ def score_key_frames(options: Namespace) -> Tables:
 
     Every line set is the only key frame of its clip, whose camera depends on the drawn lines alone.
     """
-    # Of the half that settings were not tuned on.
-    lines = dict(list(load_lines(options.data, "wc14", 1, 1).items())[:30])
-    scorer, found = load_scorer(options.data), dict[str, Camera]()
-    for name, drawn in lines.items():
-        key = KeyFrame(frame=0, markings=soccernet_markings(drawn, SIZE))
-        with suppress(WorldposeError):
-            keys = calibrate_keys(PITCH, [key], SIZE, {}, BroadcastCalibrationSettings(), name)
-            found[name] = keys.camera.camera[0]
+    lines, scorer = key_frame_lines(options.data), load_scorer(options.data)
+    found = cameras_of_key_frames(lines)
     hits = [jaccards(scorer, lines[name], each, SIZE) for name, each in found.items()]
     centers = np.array([each.center for each in found.values()])
     away, height = np.hypot(centers[:, 0], centers[:, 1]), centers[:, 2]
@@ -155,6 +148,22 @@ def score_key_frames(options: Namespace) -> Tables:
     columns = ["cameras", "of", "nearest [m]", "farthest [m]", "lowest [m]", "highest [m]"]
     columns += [f"JaC@{pixels} [%]" for pixels in PIXELS]
     return {"cameras": Table("cameras of single key frames", columns, [row])}
+
+
+def key_frame_lines(folder: Path) -> dict[str, Lines]:
+    """Return 30 line sets, of the half that settings were not tuned on."""
+    return dict(list(load_lines(folder, "wc14", 1, 1).items())[:30])
+
+
+def cameras_of_key_frames(lines: Mapping[str, Lines]) -> dict[str, Camera]:
+    """Return the camera of each line set as the only key frame of a clip, if there is one."""
+    found: dict[str, Camera] = {}
+    for name, drawn in lines.items():
+        key = KeyFrame(frame=0, markings=soccernet_markings(drawn, SIZE))
+        with suppress(WorldposeError):
+            keys = calibrate_keys(PITCH, [key], SIZE, {}, BroadcastCalibrationSettings(), name)
+            found[name] = keys.camera.camera[0]
+    return found
 
 
 def soccernet_markings(
@@ -193,6 +202,12 @@ def fit(lines: Lines, size: Size, settings: StaticCalibrationSettings) -> Static
         return calibrate_camera(PITCH, soccernet_markings(lines, size), size, settings=settings)
     except InputError:
         return None
+
+
+def fit_all(lines: Mapping[str, Lines], size: Size) -> dict[str, StaticCalibration]:
+    """Return the cameras of all images that are not refused."""
+    fits = {key: fit(drawn, size, BROADCAST) for key, drawn in lines.items()}
+    return {key: each for key, each in fits.items() if each is not None}
 
 
 def as_json(camera: Camera) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from line_sets import SIZE, cameras, jaccards, line_sets, load_scorer
+from line_sets import SIZE, cameras_of_key_frames, jaccards, key_frame_lines, load_scorer
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 
@@ -18,9 +18,9 @@ pytestmark = pytest.mark.skipif(
 
 
 def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand():
-    lines = line_sets(DATA)
-    found = cameras(lines)
-    assert None not in found.values()
+    lines = key_frame_lines(DATA)
+    found = cameras_of_key_frames(lines)
+    assert len(found) == len(lines)
     centers = np.array([camera.center for camera in found.values()])
     away = np.hypot(centers[:, 0], centers[:, 1])
     # Where main cameras stand; seen: 63 to 95 m, and 13 to 19 m high.
