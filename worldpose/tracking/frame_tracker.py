@@ -50,6 +50,8 @@ class FrameTracker:
         takeovers: frames in which a track may have passed to another person.
         merged: number of tracks that duplicated another's person.
         detections: number of detections with enough joints to be matched.
+        departure: (cameras,) recent distance of a camera's rays from those of the others for most
+            people, over its limit [1].
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class FrameTracker:
         self.near_since: dict[tuple[int, int], int] = {}
         self.born = self.merged = self.detections = 0
         self.gates = CameraGates(len(self.centers))
+        self.departure = np.zeros(len(self.centers))
         self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
 
     @property
@@ -229,7 +232,7 @@ class FrameTracker:
 
         Of two views, the one nearer to the prediction stays. After a crossing, the detection of a
         neighbour can remain within the gate: its rays are apart for a while, in each frame by less
-        than tells in one frame (`drop_lasting_strangers`).
+        than tells in one frame (`drop_lasting_strangers`). A camera that moved keeps its people.
         """
         apart = view_distances(self.centers, directions, index)
         camera = np.arange(len(index))
@@ -242,10 +245,24 @@ class FrameTracker:
                 i, j = index[a, n], index[b, n]
                 index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
         gain = 1.0 - math.exp(-1.0 / (self.fps * self.settings.velocity_time_s))
+        # The same for mean distances, and the motion between images half a frame apart.
+        speed = np.array([np.linalg.norm(person.velocity) for person in self.active])
+        shares = apart / (2.5 * noise + 0.5 * speed[:, None, None] / self.fps)
+        moved = self._find_moved(shares, gain)
+        shares[:, moved] = shares[:, :, moved] = math.inf
         for n, person in enumerate(self.active):
-            # The same for mean distances, and the motion between images half a frame apart.
-            limits = 2.5 * noise + 0.5 * np.linalg.norm(person.velocity) / self.fps
-            drop_lasting_strangers(apart[n] / limits, index[:, n], person.departure, gain)
+            drop_lasting_strangers(shares[n], index[:, n], person.departure, gain)
+
+    def _find_moved(self, shares: Floats, gain: float) -> Flags:
+        """Return the cameras (cameras,) that depart for most people: they moved.
+
+        `shares` (persons, cameras, cameras) are distances of rays over their limits, infinite if
+        unknown; `gain` is that of the running mean of the people's lower median.
+        """
+        by_person = _lower_median(shares)
+        middle, many = _lower_median(by_person.T), np.isfinite(by_person).sum(axis=0) > 1
+        self.departure[many] += gain * (middle - self.departure)[many]
+        return np.asarray(self.departure > 0.5)  # a tenth without a fault
 
     def _evidence(self, sighting: Sighting, pairs: Pairs | None) -> float:
         """Return a sighting's weight as evidence that its person exists [1].
@@ -383,3 +400,9 @@ def _pose_distances(poses: list[Floats], people: list[Person]) -> Floats:
     if not poses or not people:
         return np.empty((len(poses), len(people)))
     return separations(np.array(poses), np.array([person.pose for person in people]))
+
+
+def _lower_median(values: Floats) -> Floats:
+    """Return the lower median of the finite values in each row (..., n); infinite if none is."""
+    last = np.maximum(np.isfinite(values).sum(axis=-1, keepdims=True) - 1, 0)
+    return np.asarray(np.take_along_axis(np.sort(values, axis=-1), last // 2, axis=-1)[..., 0])
