@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Amount, Count, Name, ProcessId, Record, Share
+from data_contracts.records import CONTRACT_VERSION, Amount, Count, Name, Number, ProcessId, Record, Share
 from data_contracts.run import RunRecord
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]
@@ -163,7 +163,7 @@ class Question(Record):
     rejected: bool = False
     since: datetime | None = None
     """Time of the request."""
-    excess: float = 0.0
+    excess: Number = 0.0
     """Relative excess of the worst metric over its limit [1]."""
 
 
@@ -215,7 +215,7 @@ class MatchSummary(Record):
     """Damaged entries of its journal."""
     settings: dict[str, dict[str, JsonValue]] = {}
     """Settings of its next run that layers state, by stage."""
-    poses: tuple[tuple[datetime, float], ...] = ()
+    poses: tuple[tuple[datetime, Amount], ...] = ()
     """End and number of fitted bodies of each run."""
     is_settled: bool = False
     """Whether `worldpose reprocess` without options has nothing to do."""

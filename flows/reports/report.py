@@ -29,12 +29,13 @@ from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
 from flows.results.best_results import (
     clip_positions,
+    clips_of,
     find_clips,
     joint_tracks,
     open_results,
     static_cameras,
 )
-from flows.results.broadcast_views import broadcast_cameras, broadcast_views
+from flows.results.broadcast_views import BROADCAST, broadcast_cameras, broadcast_views
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
@@ -78,6 +79,8 @@ def write_report(
         _check_film(match, camera)
     match = match.at_hand()
     run = open_results(store, match.match_id, run_id)
+    if not any(unit.startswith(("static_calibration/", BROADCAST)) for unit in run):
+        clips_of(run.record)  # without cameras, there have to be people
     source = reference or _own_reference(match)
     scores: Evaluation | None = None
     if source is not None and len(find_clips(run.record)) == 1:

@@ -209,11 +209,10 @@ def learn_noise(
             # in one camera lasts, so that many frames count as few.
             prior = 60.0 if number < 2 else 20.0 * len(index)
             ratio = _variance_ratio(group, len(tables[number]), excess / expected, free, prior)
-            tables[number] = tables[number] * ratio
-            if number == 0:
-                # Perfect agreement of views does not imply certainty, and the factor must not rise
-                # with confidence.
-                tables[0] = np.minimum.accumulate(np.maximum(tables[0], 0.01))
+            # Perfect agreement of views does not imply certainty.
+            tables[number] = np.maximum(tables[number] * ratio, 0.01 if number == 0 else 0.05)
+            if number == 0:  # the factor must not rise with confidence
+                tables[0] = np.minimum.accumulate(tables[0])
         camera = tables[2].reshape(count, alike)[:, kinds]
         model = NoiseModel(tables[1], np.exp(knots), 1.0 / tables[0], camera, tables[3])
     return model
