@@ -80,7 +80,7 @@ def read_layer(store: Store, name: str) -> Layer:
         InputError: the file is not a mapping of names to plain values, or states an invalid value
             that is not of a stage.
     """
-    path = _path(name)
+    path = layer_path(name)
     file = f"{store.url}/{path}"
     data = store.blobs.read(path)
     if data is None:
@@ -112,7 +112,7 @@ def project_layers(store: Store) -> tuple[Layer, ...]:
 
 def list_venues(store: Store) -> tuple[str, ...]:
     """Return the names of the venues with a layer, sorted."""
-    top = _path(f"{VENUES}/x").rpartition("/")[0]
+    top = layer_path(f"{VENUES}/x").rpartition("/")[0]
     paths = (entry.path.rpartition("/")[2] for entry in store.blobs.entries(top))
     return tuple(sorted(path.removesuffix(".yaml") for path in paths if path.endswith(".yaml")))
 
@@ -120,12 +120,12 @@ def list_venues(store: Store) -> tuple[str, ...]:
 def write_layer(store: Store, name: str, values: Mapping[str, Any]) -> None:
     """Write all values of a layer; without values its file is removed, unless it is a venue's."""
     if not values and not name.startswith(VENUES):
-        store.blobs.delete(_path(name))
+        store.blobs.delete(layer_path(name))
         return
     plain = json.loads(json.dumps(values, sort_keys=True))  # an object twice would be an alias
     text = yaml.safe_dump(plain, allow_unicode=True)
     about = "# worldpose writes this file, without comments: see worldpose settings --help.\n"
-    store.blobs.put(_path(name), (about + text).encode())
+    store.blobs.put(layer_path(name), (about + text).encode())
 
 
 def merge_general(layers: Iterable[Layer]) -> RunSettings:
@@ -178,7 +178,8 @@ def pitch_of(store: Store, registration: Registration) -> PitchSpec | None:
     return read_pitch(folder, spec)
 
 
-def _path(name: str) -> str:
+def layer_path(name: str) -> str:
+    """Return the path of a layer in the store."""
     kind, slash, last = name.partition("/")
     return f"settings/{kind}{slash}{checked_name(last) if slash else ''}.yaml"
 

@@ -20,12 +20,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import JsonValue
+
 from data_contracts.match import Registration
 from data_contracts.operations import MatchSummary, Question, UnitSummary
 from data_contracts.review import ReviewRecord, ReviewRequest
 from data_contracts.run import RunRecord
 from flows.gates import GATES
-from flows.layers import read_layers
+from flows.layers import PROJECT, VENUES, layer_path, match_layer, read_layer, read_layers
 from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
 from flows.registering import open_for_review
@@ -37,6 +39,7 @@ from flows.run_record import latest_run, runs_at_work
 from flows.run_status import run_status
 from flows.settings import resolve
 from flows.stage import Match
+from worldpose.body.body_file import body_folder
 from worldpose.errors import InputError, StoreError, WorldposeError
 from worldpose.review.journal import last_decision, read_journal, requests_by_id
 from worldpose.store.blobs import changed_at
@@ -50,6 +53,8 @@ PAGE: Final = 50
 """Matches of a page."""
 TURN_SECONDS: Final = 10.0
 """Between two looks at changes outside the project, unless there are too many matches."""
+GLANCE_SECONDS: Final = 5.0
+"""For so long, open pages with a list of matches share what was read."""
 TICK_NS: Final = 20_000_000
 """Two changes within a clock tick of the file system have the same time [ns]."""
 TURN_SHARE: Final = 0.2
@@ -105,6 +110,7 @@ class Overview:
     _heads: dict[str, MatchSummary] = field(default_factory=dict)
     _marks: dict[str, tuple[int, ...]] = field(default_factory=dict)
     _read_at: dict[str, float] = field(default_factory=dict)
+    _recent: dict[str, tuple[float, MatchSummary]] = field(default_factory=dict)
     _at_work: set[str] = field(default_factory=set)
 
     def look(self, budget: float = math.inf) -> list[MatchSummary]:
@@ -137,6 +143,17 @@ class Overview:
         """Return the whole summary of a match, as it is now."""
         return self._read(match_id, self._marks.get(match_id, ()))
 
+    def glance(self, match_id: str) -> MatchSummary:
+        """Return the whole summary of a match, as it was `GLANCE_SECONDS` ago or later."""
+        now, kept = time.monotonic(), self._recent.get(match_id)
+        if kept and kept[0] == self._read_at.get(match_id) and now - kept[0] < GLANCE_SECONDS:
+            return kept[1]
+        found = self.read(match_id)
+        recent = {name: it for name, it in self._recent.items() if now - it[0] < GLANCE_SECONDS}
+        # Replaced, not changed: other threads read it.
+        self._recent = {**recent, match_id: (self._read_at[match_id], found)}
+        return found
+
     def _list(self) -> dict[str, tuple[int, ...]]:
         """Return each match with the times of changes of its registration, runs and journal."""
         names = self.store.matches()
@@ -146,8 +163,10 @@ class Overview:
 
     def _read(self, name: str, mark: tuple[int, ...]) -> MatchSummary:
         self._at_work.add(name)
-        found = read_summary(self.store, name)
-        self._at_work.discard(name)
+        try:
+            found = read_summary(self.store, name)
+        finally:
+            self._at_work.discard(name)
         slim: dict[str, Any] = {"stages": {}, "units": {}, "watched": (), "settings": {}}
         self._heads[name], self._read_at[name] = found.model_copy(update=slim), time.monotonic()
         self._marks[name] = mark  # last: without it the head is not used
@@ -217,14 +236,29 @@ def _files_of(registration: Registration) -> Iterator[str]:
 
 
 def _settings_of(store: Store, registration: Registration) -> Iterator[str]:
-    """Yield the files of the layers of settings, and the files and folders that these name."""
-    for layer in read_layers(store, registration.spec):
-        if layer.is_stored:
-            yield layer.file.removeprefix(f"{store.url}/")
-        for value in layer.values.values():
-            named = value.partition(":")[2] or value if isinstance(value, str) else ""
-            if named and Path(named).expanduser().exists():
-                yield str(Path(named).expanduser().resolve())
+    """Yield the files of the layers of settings, and the files and folders that these can name.
+
+    A file that is absent or cannot be parsed is among them: it can be added or corrected.
+    """
+    spec = registration.spec
+    own = match_layer(spec.match_id)
+    yield from (layer_path(PROJECT), layer_path(own), str(body_folder()))
+    venue = read_layer(store, own).values.get("venue", spec.venue)
+    if venue is not None:
+        yield layer_path(f"{VENUES}/{venue}")
+    for layer in read_layers(store, spec):
+        yield from _paths_in(list(layer.values.values()))
+
+
+def _paths_in(value: JsonValue) -> Iterator[str]:
+    """Yield the paths that a value, or each of a list, can name: `/net.onnx`, `onnx:/net.onnx`."""
+    if isinstance(value, list):
+        for each in value:
+            yield from _paths_in(each)
+    elif isinstance(value, str) and value and "\0" not in value:
+        path = value if value.startswith(("/", "~")) else value.partition(":")[2] or value
+        # Of a path's `expanduser`, an unknown user is an error.
+        yield str(Path(os.path.expanduser(path)).absolute())  # noqa: PTH111
 
 
 def _basis(store: Store, summary: MatchSummary) -> tuple[str, int]:

@@ -274,7 +274,7 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             todo=LIST,
         ) from None
     for name, value in given.items():
-        if _count_truths(getattr(settings, name)) != _count_truths(value):  # read as 1 or 0
+        if _count_truths(value) > _count_truths(getattr(settings, name)):  # read as 1 or 0
             raise UsageError(
                 f"--set {stage.name}.{name}",
                 expected="a number" if isinstance(value, bool) else "numbers",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -121,9 +120,12 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     """Return one match's status; what cannot be read is its problem, and hides no other match."""
     found, pins, unfinished = read_summary(store, match_id), {}, list[str]()
     latest, problem = found.latest, found.problem or (found.words == UNREADABLE and found.why)
-    with suppress(OSError, WorldposeError):  # the problem says it
-        pins = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)}
+    said = problem
+    try:
         unfinished = [run.run_id for run in store.unfinished_runs(match_id)]
+        pins = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)}
+    except (OSError, WorldposeError) as error:
+        said = said or str(error)
     return {
         "match": match_id,
         "run": None if latest is None else latest.run_id,
@@ -140,7 +142,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "settings": found.settings,
         "unfinished_runs": unfinished,
         "pins": pins,
-        "problem": problem or None,
+        "problem": said or None,
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from threading import Lock
@@ -149,14 +149,21 @@ class AlertDispatcher:
         self._held: dict[str, list[Alert]] = {}
         self._lock, self._writing = Lock(), Lock()
 
-    def hold(self, alerts: Iterable[Alert], source: str = "") -> None:
-        """Replace the alerts of a source, and add the day's digest of those that last."""
+    def hold(self, alerts: Iterable[Alert], source: str = "", unread: Container[str] = ()) -> None:
+        """Replace the alerts of a source, and add the day's digest of those that last.
+
+        The former alerts of `unread` matches last: nothing says that they are over.
+        """
         with self._lock:
             self._held[source] = list(alerts)
             today, before = f"{datetime.now(UTC):%Y-%m-%d}", self._told
             # Before the first look after a restart, nothing says that former alerts are over.
             former = frozenset[str]() if "" in self._held else self._former & before.keys()
-            told = {key: before[key] for key in former}
+            told = {
+                key: each
+                for key, each in before.items()
+                if key in former or each.get("match") in unread
+            }
             for alert in (each for held in self._held.values() for each in held):
                 known = before.get(alert.key)
                 if known is None:

@@ -47,10 +47,10 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/api/status")
     def status(page: int = 1) -> dict[str, Any]:
         found = overview.look(BUDGET_SECONDS)
-        rows = _rows(context, overview, found, page)
+        rows = _rows(context, overview, found, min(max(page, 1), _pages(found)))
         return {
             "matches": [_as_json(each) for each in rows],
-            "pages": -(-len(found) // PAGE),
+            "pages": _pages(found),
             "arrivals": [each.model_dump(mode="json") for each in _arrivals(context)],
         }
 
@@ -62,6 +62,7 @@ def routes(context: PageContext) -> APIRouter:
         found = overview.look(BUDGET_SECONDS)
         names = [each.match_id for each in found]
         page = 1 + names.index(match) // PAGE if match in names else page
+        page = min(max(page, 1), _pages(found))
         running = context.continuing.running()
         kept = kept_alerts(served_state(context.store.url)).values()
         alerts = [each for each in kept if each["alert"] != "digest"]
@@ -73,7 +74,7 @@ def routes(context: PageContext) -> APIRouter:
             opened=match,
             alerts=alerts,
             counts=Counter(StatusRow(it, _running(it, running)).kind for it in found),
-            place=(page, -(-len(found) // PAGE)),
+            place=(page, _pages(found)),
         )
         rest = BackgroundTask(overview.look, REST_SECONDS) if is_late(found) else None
         return HTMLResponse(text, background=rest)
@@ -131,13 +132,17 @@ def _running(match: MatchSummary, running: Container[str]) -> Mapping[str, Any] 
     return {"state": "running"} if match.match_id in running else None
 
 
+def _pages(found: Sequence[MatchSummary]) -> int:
+    return max(1, -(-len(found) // PAGE))
+
+
 def _rows(
     context: PageContext, overview: Overview, found: Sequence[MatchSummary], page: int
 ) -> list[StatusRow]:
     """Return the matches of a page with their units, and their runs at work and at Prefect."""
     links = context.continuing.links()
     rows = []
-    for match in found[PAGE * max(page - 1, 0) : PAGE * max(page, 1)]:
+    for match in found[PAGE * (page - 1) : PAGE * page]:
         name = match.match_id
         whole = match if match.is_unseen else overview.read(name)
         rows.append(StatusRow(whole, context.continuing.state(name), links.get(name, "")))

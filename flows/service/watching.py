@@ -34,6 +34,8 @@ RECOVERY_SECONDS: Final = 10.0
 """Between two checks for lost runs, and for runs without progress."""
 LOOK_SECONDS: Final = 2.0
 """Time of one look at matches for alerts, after which metrics have their turn."""
+READING_SECONDS: Final = 60.0
+"""Time of looks until alerts are sent, even if some matches are not read yet."""
 DELIVERY_SECONDS: Final = 2.0
 """Between two checks of a channel for outstanding alerts."""
 KEPT: Final = timedelta(days=1)
@@ -142,12 +144,14 @@ def _hold_alerts(
     queue = queue_of(plan.project)
 
     def hold() -> None:
-        while is_late(matches := overview.look(LOOK_SECONDS)):
+        end = time.monotonic() + READING_SECONDS
+        while is_late(matches := overview.look(LOOK_SECONDS)) and time.monotonic() < end:
             STEPS["looking for alerts"] = time.monotonic()  # it makes progress
             time.sleep(0.1)
         arrivals = plan.state_folder.arrivals().values()
         found = alerts_now(plan, matches, arrivals, queue.runs())
-        dispatcher.hold([*found, *liveness.alerts])
+        unread = {each.match_id for each in matches if each.is_unseen}
+        dispatcher.hold([*found, *liveness.alerts], unread=unread)
 
     return hold
 

@@ -103,7 +103,7 @@ def _choose(
     shown = (each[3] for each in sought[PAGE * (page - 1) : PAGE * page])
     return {
         "matches": [
-            _glance(context, each if each.is_unseen else overview.read(each.match_id))
+            _glance(context, each if each.is_unseen else overview.glance(each.match_id))
             for each in shown
         ],
         "total": len(found),

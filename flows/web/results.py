@@ -27,6 +27,7 @@ from flows.results.best_results import (
     find_clips,
     joint_tracks,
     open_results,
+    static_cameras,
     tracked_people,
 )
 from flows.results.comparison import SubjectChange, compare_runs
@@ -44,6 +45,8 @@ from worldpose.store.store import Run, Store
 BINARY: Final = "application/octet-stream"
 BROADCAST_FORMATS: Final = ("challenge", "challenge-2025", "tracks", "slahmr-cameras")
 """Formats of a calibrated broadcast camera."""
+CAMERA_FORMATS: Final = ("worldpose", "slahmr-cameras")
+"""Export formats that hold cameras without people."""
 POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
 """Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
@@ -222,7 +225,10 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     lacking = {clip: why_without_joints(run, clip) for clip in clips}
     is_3d = not clips or None in lacking.values()
     formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
-    if not any(name.startswith("broadcast_calibration/") for name in record.results):
+    has_moving = any(name.startswith("broadcast_calibration/") for name in record.results)
+    if not clips and (has_moving or static_cameras(run, match.folder.spec)):
+        formats = CAMERA_FORMATS
+    if not has_moving:
         formats = tuple(form for form in formats if form not in BROADCAST_FORMATS)
     return {
         "run": record.run_id,

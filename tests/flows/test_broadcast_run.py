@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import succeed, worldpose
+from page_client import log_in, served
 
 import worldpose as library
 from worldpose.video.files import VideoReader
@@ -158,6 +159,9 @@ def check_camera_alone(match, project, out):
     assert (out / "slahmr/cameras/clip/shot-0/cameras.npz").is_file()
     succeed("report", *made, "--no-videos", "--out", out / "page.html")
     assert "broadcast frames" in (out / "page.html").read_text()
+    name = library.read_match(match).spec.match_id
+    found = log_in(served(project[1]), "Ada").get(f"/api/matches/{name}/results").json()
+    assert found["formats"] == ["worldpose", "slahmr-cameras"]
     refused = worldpose("export", *made, "--format", "joints", "--out", out / "joints")
     assert refused.code == 1
     assert "expected people, in 3D or on the pitch" in refused.err

@@ -207,3 +207,18 @@ def test_pages_have_the_units_of_the_status_command_after_a_correction(ada, proj
         assert ada.get("/api/matches").json()["matches"][0]["state"] == found
         (status,) = ada.get("/api/status").json()["matches"]
         assert status["now"] == found["words"]
+
+
+def test_a_run_of_cameras_alone_offers_them(ada, project_copy):
+    store = Store.open(project_copy)
+    run = store.run(TINY)
+    kept = {name: key for name, key in run.results.items() if "calibration/" in name}
+    store.blobs.delete(f"runs/{TINY}/0001.json")
+    store.finish_run(run.model_copy(update={"run_id": store.reserve_run(TINY), "results": kept}))
+    found = ada.get(f"{MATCH}/results").json()
+    assert (found["clips"], found["formats"]) == ([], ["worldpose"])
+    answer = ada.get(f"{MATCH}/results/exports/worldpose")
+    assert answer.status_code == 200, answer.text
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert "cameras/cam00.npz" in archive.namelist()
+    assert ada.get(f"{MATCH}/results/report").status_code == 200

@@ -44,6 +44,16 @@ def test_a_pinned_run_has_a_name_and_stays(command, project_copy):
     assert store.runs(TINY) == ("0002",)
 
 
+def test_status_names_a_damaged_pin(command, project_copy):
+    assert command("pin", TINY, "gold", "--who", "Ada").exit_code == 0
+    file = project_copy / "pins" / TINY / "gold.json"
+    file.write_bytes(file.read_bytes()[:20])
+    (row,) = json.loads(command("status", "--json").stdout)["matches"]
+    assert f"pins/{TINY}/gold.json" in row["problem"]
+    assert row["now"] == "ready"  # its results can still be used
+    assert f"pins/{TINY}/gold.json" in command("status").stdout.replace("\n", "")
+
+
 @pytest.mark.parametrize("name", ["0007", "latest", "a/b", ""])
 def test_a_name_that_is_none_is_refused(command, name):
     with pytest.raises(InputError, match="name of"):

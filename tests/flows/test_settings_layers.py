@@ -405,3 +405,5 @@ def test_true_and_numbers_stay_what_they_are():
     stage, _, field = name.partition(".")
     assert parse_overrides([f"{name}=false"]) == {stage: {field: False}}
     assert parse_overrides(["detection.stride=2"]) == {"detection": {"stride": 2}}
+    for text in ("true", "yes", "0"):  # what pydantic reads as a boolean
+        assert parse_overrides([f"triangulation.learn_noise={text}"])

@@ -5,6 +5,7 @@ import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
 from threading import Thread
+from types import SimpleNamespace
 
 import apprise
 import pytest
@@ -13,6 +14,7 @@ from run_records import run_record
 
 from data_contracts.operations import Arrival, MatchSummary, Question, QueuedRun
 from data_contracts.usability import Usability
+from flows.service import watching
 from flows.service.alerts import (
     LONGEST_PAUSE,
     MAX_SINGLE,
@@ -388,3 +390,18 @@ def test_alerts_of_two_sources_do_not_end_each_other(tmp_path):
     dispatcher.hold([], source="steps")
     assert set(kept_alerts(StateFolder(tmp_path))) == {"0"}
     assert MAX_SINGLE > 5
+
+
+def test_alerts_are_sent_though_some_matches_are_never_read(plan, tmp_path, monkeypatch):
+    match = MatchSummary(match_id="m", is_unseen=True)
+    state = StateFolder(tmp_path)
+    former = Alert("quality/m/weak", "quality", "m is weak", match_id="m")
+    over = Alert("quality/n/weak", "quality", "n is weak", match_id="n")
+    AlertDispatcher(state, []).hold([former, over])
+    monkeypatch.setattr(watching, "READING_SECONDS", 0.0)
+    looks = SimpleNamespace(look=lambda budget: [match])
+    stalled = Alert("run_stalled/1", "run_stalled", "a run makes no progress")
+    dispatcher = AlertDispatcher(state, [])
+    watching._hold_alerts(plan, looks, dispatcher, SimpleNamespace(alerts=[stalled]))()
+    # Nothing says that the alert of the unread match is over.
+    assert set(kept_alerts(state)) == {"quality/m/weak", "run_stalled/1"}

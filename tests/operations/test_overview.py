@@ -16,10 +16,11 @@ from run_records import run_record
 from data_contracts.review import NamedTrack, ReviewDecision, ReviewRequest
 from data_contracts.run import WaitingUnit
 from flows import overview
-from flows.layers import write_layer
+from flows.layers import layer_path, write_layer
 from flows.overview import PAGE, Overview, make_summary, read_summary
 from flows.registering import open_match
 from flows.review.corrections import keep_edits
+from worldpose.body import body_file
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.registration import register_match
 from worldpose.store.paths import ResultId, summary_path
@@ -188,6 +189,79 @@ def test_a_summary_is_used_until_something_changes_that_it_was_made_from(
     overview.code_digest.cache_clear()
 
 
+BROKEN = {
+    "project": b"detection.stride: [",
+    f"matches/{TINY}": b"- 1",
+    "venues/hall": b"pitch: 3",
+}
+
+
+@pytest.mark.parametrize("layer", BROKEN)
+def test_a_broken_layer_of_settings_can_be_corrected(store, layer):
+    if layer.startswith("venues"):
+        write_layer(store, f"matches/{TINY}", {"venue": "hall"})
+    store.blobs.put(layer_path(layer), BROKEN[layer])
+    assert layer in read_summary(store, TINY).problem
+    write_layer(store, layer, {})
+    assert read_summary(store, TINY).problem == ""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda file: {"detection.detector": f"onnx:{file}"},
+        lambda file: {"detection.detector": ["embedded", f"onnx:{file}"]},
+        lambda file: {"body_folder": str(file)},
+    ],
+)
+def test_files_that_settings_name_are_watched_even_if_they_are_absent(store, settings, tmp_path):
+    file = tmp_path / "named"
+    write_layer(store, "project", settings(file))
+    first = make_summary(store, TINY)
+    assert str(file) in first.watched
+    assert read_summary(store, TINY) == first
+    file.mkdir()
+    assert read_summary(store, TINY).made_from != first.made_from
+
+
+def test_the_default_body_folder_is_watched(store, monkeypatch, tmp_path):
+    monkeypatch.delenv("WORLDPOSE_BODY_FOLDER", raising=False)
+    monkeypatch.setattr(body_file, "BODY_FOLDER", tmp_path / "bodies")
+    assert str(tmp_path / "bodies") in make_summary(store, TINY).watched
+
+
+def test_a_text_that_is_no_path_is_no_error():
+    assert list(overview._paths_in(["", "a\0b", 3, None, "~nobody-of-this-name/x"])) == [
+        str(Path("~nobody-of-this-name/x").absolute())
+    ]
+
+
+def test_a_match_is_read_again_after_a_look_that_failed(store, monkeypatch):
+    looked = Overview(store)
+    with monkeypatch.context() as patch:
+        patch.setattr(overview, "read_summary", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            looked.look()
+    (match,) = looked.look()
+    assert match.words == "ready"
+
+
+def test_pages_that_are_open_at_once_share_what_was_read(store, monkeypatch):
+    asked, reads = Overview(store), []
+    real = overview.read_summary
+    monkeypatch.setattr(overview, "read_summary", lambda *it: reads.append(it) or real(*it))
+    asked.look()
+    assert [asked.glance(TINY).words for _ in range(3)] == ["ready"] * 3
+    assert len(reads) == 2  # of the look, and of the first page
+    correct(store)
+    asked.look()
+    assert asked.glance(TINY).corrections == 1
+    monkeypatch.setattr(overview, "GLANCE_SECONDS", 0.0)
+    before = len(reads)
+    asked.glance(TINY)
+    assert len(reads) == before + 1
+
+
 def test_a_summary_that_is_damaged_or_of_another_match_is_made_again(store):
     first = make_summary(store, TINY)
     path = store.blobs.root / summary_path(TINY)
@@ -242,4 +316,6 @@ def test_lists_have_pages_of_fifty_and_the_server_searches(project_copy):
     assert ada.get(MATCH).json()["state"]["words"] == "ready"
     assert ada.get("/status").text.count("/#/match/") == PAGE
     assert ada.get("/status", params={"page": 2}).text.count("/#/match/") == 1
-    assert len(ada.get("/api/status", params={"page": 2}).json()["matches"]) == 1
+    for page, count in ((2, 1), (9, 1), (0, PAGE), (-3, PAGE)):
+        assert len(ada.get("/api/status", params={"page": page}).json()["matches"]) == count
+    assert "page 2 of 2" in ada.get("/status", params={"page": 9}).text

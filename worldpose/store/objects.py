@@ -144,7 +144,7 @@ class ObjectBlobs:
         """See `Blobs`. Few listings: of the first folders if there are many paths."""
         is_many = len(paths) > LISTINGS
         parts = [path.split("/") for path in paths]
-        ends = [1 if is_many or (len(p) == 2 and p[1].endswith(".json")) else 2 for p in parts]
+        ends = [1 if is_many or (len(p) == 2 and "." in p[1]) else 2 for p in parts]
         tops = ["/".join(p[:end]) for p, end in zip(parts, ends, strict=True)]
         below: dict[str, list[str]] = {path: [] for path in paths}
         for top in set(tops):

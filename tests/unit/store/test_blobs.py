@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from obstore.store import MemoryStore
 
 from worldpose.errors import StoreError
 from worldpose.store import objects
@@ -70,3 +71,18 @@ def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
     monkeypatch.setattr(objects.obstore, "get", broken)
     with pytest.raises(StoreError, match="Check the bucket"):
         blobs.download("a/b", tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", ["settings/project.yaml", "matches/m.json"])
+def test_a_file_below_a_folder_of_object_storage_has_a_mark(name: str) -> None:
+    blobs = objects.ObjectBlobs("bucket", "")
+    vars(blobs)["_s3"] = MemoryStore()
+    folder = name.partition("/")[0]
+    assert blobs.marks([name, folder]) == [0, 0]
+    blobs.put(name, b"1")
+    before = blobs.marks([name, folder])
+    assert 0 not in before
+    blobs.put(name, b"22")
+    after = blobs.marks([name, folder])
+    assert 0 not in after and before[0] != after[0]
+    assert blobs.marks([name] * (objects.LISTINGS + 1))[0] == after[0]
