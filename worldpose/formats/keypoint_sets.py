@@ -276,6 +276,8 @@ class Changes(NamedTuple):
     """Entries without a known joint, which are no people."""
     empty: int = 0
     """Empty files of frames."""
+    pointless: int = 0
+    """Annotations of a data set that have no points, such as of the ball."""
 
 
 class PeopleFile(NamedTuple):

@@ -116,6 +116,7 @@ def camera_of(place: Path) -> str:
 _CHANGES: Final = {
     "clamped": "confidences above 1, which count as 1",
     "nobody": "entries without a known joint, which count as no person",
+    "pointless": "annotations without keypoints, such as of the ball, which count as no person",
     "empty": "empty files, which count as frames without people",
 }
 
