@@ -227,10 +227,6 @@ def import_lenses(
                 found="one",
                 todo="Remove it there first.",
             )
-    from worldpose.geometry.cameras import Camera  # late: it loads the kernels
-
-    for name, lens in lenses.items():
-        Camera.from_lens(lens).require_rays(f"{files[0]}: {name}")
     with whole_file(target) as draft:
         write_lens_toml(draft, {**known, **lenses})
     return lenses
