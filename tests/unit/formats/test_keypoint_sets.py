@@ -215,6 +215,13 @@ def test_many_people_of_no_known_order_are_refused(tmp_path):
         (["f3_1700000000480.png", "f12_1700000000840.png"], [3, 12]),  # times are no frames
         (["2_0.5_3.JSON", "2_0.5_12.JSON"], [3, 12]),
         (["a_1.jpg", "b_1.jpg", "c.jpg"], [1, 1]),
+        # One frame of several clips, or cameras: the callers refuse equal numbers.
+        (["clip1_5.png", "clip2_5.png"], [5, 5]),
+        (["1_5.png", "2_5.png"], [5, 5]),
+        (["clip1_5.png", "clip2_9.png"], [5, 9]),
+        (["cam1_000012_480.png", "cam1_000013_520.png"], [12, 13]),  # a time [ms]
+        (["12_480_7.png", "13_520_7.png"], [12, 13]),
+        (["cam000012.png", "cam000013.png"], [12, 13]),
     ],
 )
 def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
