@@ -56,6 +56,7 @@ def calibrate(
     from flows.results.outputs import claim_file, require_new
     from worldpose.formats.files import whole_file
     from worldpose.formats.lens_files import write_lens_toml
+    from worldpose.geometry.cameras import Camera
     from worldpose.reports.drawing import draw_lens_fits, require_plot
     from worldpose.static_calibration.boards import Board, calibrate_lens
 
@@ -76,6 +77,7 @@ def calibrate(
     for name, place in _cameras(boards, camera).items():
         views, size, files[name] = _find_boards(name, place, board, every)
         fits[name] = calibrate_lens(name, views, size)
+        Camera.from_lens(fits[name].lens).require_rays(str(place))
     with whole_file(out) as draft:
         write_lens_toml(draft, {name: fit.lens for name, fit in fits.items()})
     if plot is not None:

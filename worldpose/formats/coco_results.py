@@ -66,10 +66,13 @@ def read_coco_results(path: Path) -> PeopleFile:
     keep = ("images", "categories", "meta_info")
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
     entries = plain_entries(str(path), items)
-    batches = [
-        _read_batch(path, _with_points(results) if items.is_mapping else results, first)
-        for first, results in _batches(path, entries)
-    ]
+    batches, pointless = [], 0
+    for first, given in _batches(path, entries):
+        results = given
+        if items.is_mapping:
+            results, without = _with_points(given)
+            pointless += without
+        batches.append(_read_batch(path, results, first))
     if not items.has_list:
         raise InputError(
             str(path),
@@ -80,6 +83,13 @@ def read_coco_results(path: Path) -> PeopleFile:
         )
     found = _join(path, batches)
     points = found.points
+    if pointless and pointless == len(points):
+        raise InputError(
+            f"{path}: annotations",
+            expected="keypoints of people",
+            found=f"{pointless} annotations without keypoints",
+            todo="Export the poses, not the boxes alone.",
+        )
     if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
@@ -93,7 +103,8 @@ def read_coco_results(path: Path) -> PeopleFile:
     points, changed = clean_points(order.select(points))
     frames = _frames(path, found.images, items.kept.get("images"))
     people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, _limit(path))
-    return PeopleFile(people, order.name, changed._replace(nobody=nobody))
+    changed = changed._replace(nobody=nobody - pointless, pointless=pointless)
+    return PeopleFile(people, order.name, changed)
 
 
 def _limit(path: Path) -> int:
@@ -111,8 +122,15 @@ class _Results(NamedTuple):
 
 
 def _join(path: Path, batches: Sequence[_Results]) -> _Results:
-    """Return all results, which must have the same points."""
-    sizes = sorted({batch.points.shape[1] for batch in batches})
+    """Return all results, which must have the same points; a batch without any takes theirs."""
+    sizes = sorted({batch.points.shape[1] for batch in batches if batch.points.any()})
+    if sizes:
+        batches = [
+            batch
+            if batch.points.any()
+            else batch._replace(points=np.zeros((len(batch.images), sizes[0], 3), np.float32))
+            for batch in batches
+        ]
     if len(sizes) > 1:
         raise _wrong(str(path), "the same points of all people", f"{sizes[0]} and {sizes[1]}")
     if not batches:
@@ -138,11 +156,12 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
         yield index + 1 - len(batch), batch
 
 
-def _with_points(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return annotations of a data set, those without points, such as of the ball, as nobody."""
+def _with_points(results: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int]:
+    """Return annotations of a data set, those without points as nobody, and their number."""
     sizes = [len(given) for each in results if isinstance(given := each.get("keypoints"), list)]
-    nobody = {"keypoints": [0.0] * max(sizes, default=51), "bbox": None, "box": None}
-    return [each if each.get("keypoints") else {**each, **nobody} for each in results]
+    nobody = {"keypoints": [0.0] * (max(sizes, default=0) or 51), "bbox": None, "box": None}
+    filled = [each if each.get("keypoints") else {**each, **nobody} for each in results]
+    return filled, sum(not each.get("keypoints") for each in results)
 
 
 def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:

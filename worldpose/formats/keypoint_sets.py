@@ -35,27 +35,35 @@ COORDINATE_LIMIT: Final = 1e6
 
 
 _NUMBER: Final = re.compile(r"[A-Za-z]*(\d{1,18})")
+_SOURCE: Final = re.compile(r"(cam|camera|clip|view)\d", re.IGNORECASE)
 
 
 def frame_numbers(names: Iterable[str]) -> dict[str, int]:
     """Return the frame in each name of a picture or its file; those without a number are left out.
 
-    It is the last number that differs from name to name and can be a frame: of `000012_cam1.png`
-    and `frame12_1700000000480.png` it is 12. A part that mixes letters and digits, such as 1080p or
-    a digest, is no number; `frame12` is 12. Roboflow puts a digest after the name:
-    `frame_12_jpg.rf.3fa9`. The numbers of names without such a place are their last ones.
+    It is the number that differs from name to name and can be a frame: of `000012_cam1.png` and
+    `frame12_1700000000480.png` it is 12. Of several such, it is the one with the smallest steps.
+    A part that mixes letters and digits, such as 1080p or a digest, is no number; `frame12` is 12.
+    The number of a camera or clip, as in `cam1`, counts in names without another. Roboflow puts a
+    digest after the name: `frame_12_jpg.rf.3fa9`.
+
+    The numbers of names without such a place are their last ones. So they are if the last one is
+    the same in all names and a single other one differs: that may be the camera's or the clip's.
     """
     found: dict[str, list[int]] = {}
     for name in set(names):
         stem = PureWindowsPath(name).stem.partition(".rf.")[0]
-        parts = map(_NUMBER.fullmatch, re.split(r"[^A-Za-z0-9]+", stem))
-        if numbers := [int(part[1]) for part in parts if part]:
-            found[name] = numbers
-    for place in range(1, min(map(len, found.values()), default=0) + 1):
-        values = {numbers[-place] for numbers in found.values()}
-        if len(values) == len(found) and max(values) <= FRAME_LIMIT:
-            return {name: numbers[-place] for name, numbers in found.items()}
-    return {name: numbers[-1] for name, numbers in found.items()}
+        parts = [p for p in map(_NUMBER.fullmatch, re.split(r"[^A-Za-z0-9]+", stem)) if p]
+        if numbers := [p for p in parts if not _SOURCE.match(p[0])] or parts:
+            found[name] = [int(p[1]) for p in numbers]
+    count = min(map(len, found.values()), default=0)
+    values = {place: {each[-place] for each in found.values()} for place in range(1, count + 1)}
+    differing = [place for place, there in values.items() if len(there) > 1]
+    distinct = [p for p in values if len(values[p]) == len(found) and max(values[p]) <= FRAME_LIMIT]
+    chosen = min(distinct, key=lambda p: max(values[p]) - min(values[p]), default=1)
+    if 1 not in differing and len(differing) == 1:
+        chosen = 1
+    return {name: numbers[-chosen] for name, numbers in found.items()}
 
 
 class PointOrder(NamedTuple):
@@ -276,6 +284,8 @@ class Changes(NamedTuple):
     """Entries without a known joint, which are no people."""
     empty: int = 0
     """Empty files of frames."""
+    pointless: int = 0
+    """Annotations of a data set that have no points, such as of the ball."""
 
 
 class PeopleFile(NamedTuple):

@@ -69,7 +69,8 @@ def read_lenses(
 
     Raises:
         InputError: a file is unreadable, of another kind, without matrix or distortion; the pixels
-            are not square; the image sizes do not fit; a camera is unknown or not named.
+            are not square; the lens folds within the image; the image sizes do not fit; a camera is
+            unknown or not named.
     """
     first = files[0]
     if first.suffix.lower() == ".toml":
@@ -374,7 +375,7 @@ def _lens(
         "distortion_std": _deviation(where, table, "distortion_std", 1.0, distortion_std),
     }
     try:
-        return LensCalibration(
+        lens = LensCalibration(
             id=name,
             image_size=size,
             focal_px=focal,
@@ -389,6 +390,10 @@ def _lens(
         raise calibration_error(
             f"{where}.{entry}", str(first["msg"]), str(first["input"])
         ) from error
+    from worldpose.geometry.cameras import Camera  # late: it loads the kernels
+
+    Camera.from_lens(lens).require_rays(where)
+    return lens
 
 
 def _deviation(

@@ -116,6 +116,7 @@ def camera_of(place: Path) -> str:
 _CHANGES: Final = {
     "clamped": "confidences above 1, which count as 1",
     "nobody": "entries without a known joint, which count as no person",
+    "pointless": "annotations without keypoints, such as of the ball, which count as no person",
     "empty": "empty files, which count as frames without people",
 }
 
@@ -226,10 +227,6 @@ def import_lenses(
                 found="one",
                 todo="Remove it there first.",
             )
-    from worldpose.geometry.cameras import Camera  # late: it loads the kernels
-
-    for name, lens in lenses.items():
-        Camera.from_lens(lens).require_rays(f"{files[0]}: {name}")
     with whole_file(target) as draft:
         write_lens_toml(draft, {**known, **lenses})
     return lenses

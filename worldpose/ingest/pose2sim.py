@@ -130,19 +130,36 @@ def import_pose2sim(
     people = {name: found.people for name, found in read.items()}
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
-    spec = build_spec(
-        out, match_id, rate, {name: sizes[name] for name in names}, (first, stop), videos=videos
-    )
     for name, files in poses.items():
         people[name] = on_frames(files, people[name], [(first, stop - first)])
-
     if place is not None:
         cameras, notes[:0] = place(calibration or project, cameras, people, rate)
+    _require_video_sizes(folder, cameras, indices)
+    sizes |= {name: camera.image_size for name, camera in cameras.items()}
+    sizes = {name: sizes[name] for name in names}
+    spec = build_spec(out, match_id, rate, sizes, (first, stop), videos=videos)
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
-    sizes = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
     return spec, notes + describe_outside(people, sizes) + _describe_poses(folder, read)
+
+
+def _require_video_sizes(
+    folder: Path, cameras: Mapping[str, CameraCalibration], indices: Mapping[str, FrameIndex]
+) -> None:
+    """Raise InputError if the 2D poses in a folder make a camera another size than its video's."""
+    for name, camera in cameras.items():
+        if name in indices and camera.image_size != indices[name].size:
+            raise InputError(
+                str(folder),
+                expected="2D poses in the pixels of the videos, {} x {} in {}".format(
+                    *indices[name].size, name
+                ),
+                found="people on whom the cameras agree in images of {} x {} px alone".format(
+                    *camera.image_size
+                ),
+                todo="Give the videos in which the poses were estimated, or estimate them again.",
+            )
 
 
 def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:

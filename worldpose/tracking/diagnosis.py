@@ -284,12 +284,9 @@ def _count_joints(detections: KeypointDetections[ClipArray]) -> Integers:
     """Return the number of joints of each detection (frames, cameras, detections)."""
     keypoints, confidence = detections.keypoints, detections.confidence
     rows = [
-        np.count_nonzero(
-            (confidence[start : start + WINDOW] > 0.0)
-            & np.isfinite(keypoints[start : start + WINDOW][..., 0]),
-            axis=-1,
-        )
+        np.count_nonzero((confidence[part] > 0.0) & np.isfinite(keypoints[part][..., 0]), axis=-1)
         for start in range(0, confidence.shape[0], WINDOW)
+        for part in [slice(start, start + WINDOW)]
     ]
     return np.concatenate(rows) if rows else np.zeros(confidence.shape[:3], dtype=np.int64)
 

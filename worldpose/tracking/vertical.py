@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats
 
@@ -71,3 +72,28 @@ def name_axis(axis: Floats) -> str:
     if abs(axis[largest]) >= SAME_AXIS:
         return ("-" if axis[largest] < 0.0 else "") + "xyz"[largest]
     return ",".join(f"{value:.3f}" for value in axis)
+
+
+def snap_to_axis(up: Floats) -> Floats:
+    """Return the world's own axis near a unit vector (3,): it is more accurate than people."""
+    largest = int(np.abs(up).argmax())
+    exact = np.sign(up[largest]) * np.eye(3)[largest]
+    return np.asarray(exact if up @ exact >= SAME_AXIS else up)
+
+
+def describe_turn(up: Floats) -> str:
+    """Return the axis that is turned to z, with the rotation."""
+    turn = Rotation.from_matrix(turn_to_z(up)).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    return f"{name_axis(up)}, turned by {np.degrees(angle):.1f} degrees about " + (
+        name_axis(turn / angle) if angle > 0.0 else "z"
+    )
+
+
+def turn_to_z(up: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) that brings a unit vector to z; about x if it is -z."""
+    if up[2] < -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = up
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from data_contracts.arrays import Floats
 from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
@@ -40,7 +41,7 @@ def read_otherwise(
     detections: KeypointDetections,
     agree: Callable[[Camera], bool],
 ) -> tuple[Mapping[str, CameraCalibration], list[str]]:
-    """Return cameras for images of another size if people in them agree then, and what was done.
+    """Return cameras for images of another size if people agree at it alone, and what was done.
 
     Args:
         calibration: the file, for messages.
@@ -65,17 +66,37 @@ def read_otherwise(
                 found="poses by which no two cameras agree on their people",
                 todo=f"They agree if {why}.",
             )
-    known = detections.keypoints[np.isfinite(detections.confidence)]
+    reach = _reach(detections)
+    found = {}
     for scale in _SCALES:
-        sizes = {n: np.rint(scale * np.array(c.image_size)) for n, c in cameras.items()}
-        if not len(known) or (known.max(axis=0) > np.min([*sizes.values()], axis=0)).any():
+        sizes = [np.rint(scale * np.array(camera.image_size)) for camera in cameras.values()]
+        if (reach > sizes).any():
             continue
         resized = {
-            name: scaled(camera, scale, (int(sizes[name][0]), int(sizes[name][1])))
-            for name, camera in cameras.items()
+            name: scaled(camera, scale, (int(size[0]), int(size[1])))
+            for (name, camera), size in zip(cameras.items(), sizes, strict=True)
         }
         if agree(stack(resized)):
-            shown = " x ".join(str(length) for length in next(iter(resized.values())).image_size)
-            said = f"the calibration is scaled by {scale:.5f}, to images of {shown} px: the people "
-            return resized, [said + "of the 2D poses agree at this size alone"]
-    return cameras, []
+            found[scale] = resized
+    if len(found) != 1:
+        scales = " and ".join(f"{scale:.5f}" for scale in found)
+        said = f"warning: no two cameras agree on their people, but do if scaled by {scales}: give "
+        return cameras, [said + "a calibration of the 2D poses' images"] if found else []
+    ((scale, resized),) = found.items()
+    shown = dict.fromkeys("{} x {}".format(*camera.image_size) for camera in resized.values())
+    said = f"the calibration is scaled by {scale:.5f}, to images of {' and '.join(shown)} px: "
+    return resized, [said + "of the usual ratios of image sizes, this alone fits the 2D poses"]
+
+
+def _reach(detections: KeypointDetections) -> Floats:
+    """Return how far right and down keypoints are in each camera (cameras, 2) [px]; 0 = none.
+
+    Detectors guess some keypoints beyond the border.
+    """
+    inside = 0.98  # share of keypoints within the image [1]
+    reach = np.zeros((detections.keypoints.shape[1], 2))
+    for camera in range(len(reach)):
+        known = np.isfinite(detections.confidence[:, camera])
+        if known.any():
+            reach[camera] = np.quantile(detections.keypoints[:, camera][known], inside, axis=0)
+    return reach

@@ -11,7 +11,6 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import CameraCalibration
@@ -27,10 +26,12 @@ from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.tracking.vertical import (
     ALIGNED,
-    SAME_AXIS,
     Vertical,
+    describe_turn,
     find_vertical,
     name_axis,
+    snap_to_axis,
+    turn_to_z,
 )
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
 from worldpose.triangulation.other_readings import read_otherwise
@@ -396,10 +397,9 @@ def place_cameras(
     scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
     up, turned, doubt = _find_up(batch, people, stated.up)
     notes = [*told, doubt] if doubt else told
-    if people is not None and (size := doubt_statures(scale * people.statures)):
-        notes.append(f"warning: {size}")
-    if people is not None and (sides := doubt_sides(people)):
-        notes.append(f"warning: {sides}")
+    if people is not None:
+        doubts = doubt_statures(scale * people.statures), doubt_sides(people)
+        notes += [f"warning: {each}" for each in doubts if each]
     if scale == 1.0 and not turned:
         return dict(cameras), [*([f"{calibration}: {unit}"] if unit else []), *notes]
     height = float(scale * people.ground @ up) if turned and people is not None else 0.0
@@ -409,7 +409,7 @@ def place_cameras(
     else:
         turned += f"; people walk at {height:+.2f} m, which is z = 0 now"
     done = "; ".join(each for each in (unit, turned) if each)
-    motion = Similarity(np.array(scale), _turn_to_z(up), np.array([0.0, 0.0, -height]))
+    motion = Similarity(np.array(scale), turn_to_z(up), np.array([0.0, 0.0, -height]))
     pose = move_cameras(motion, batch).cam_from_world
     poses = zip(pose.rotation.tolist(), pose.translation.tolist(), strict=True)
     placed = {
@@ -483,7 +483,7 @@ def _find_up(
         if vertical is not None and vertical.axis @ stated < ALIGNED:
             doubt = f"warning: {vertical.describe(f'{name_axis(stated)} as stated')}"
         same = stated @ z > 1.0 - 1e-12
-        return stated, "" if same else f"up is {_describe_turn(stated)}, as stated", doubt
+        return stated, "" if same else f"up is {describe_turn(stated)}, as stated", doubt
     # Bodies lean, and ground slopes: both must tell that z is not up.
     if people is None or vertical is None or max(vertical.axis[2], people.up[2]) > LEVEL:
         return z, "", ""
@@ -492,27 +492,6 @@ def _find_up(
             doubt = f"warning: {vertical.describe()}, but the cameras stand along z: if these "
             doubt += f"people do not lie, --up {name_axis(people.up)} turns the world"
         return z, "", doubt
-    largest = int(np.abs(people.up).argmax())
-    # The world's own axes are more accurate than people.
-    exact = np.sign(people.up[largest]) * np.eye(3)[largest]
-    up = exact if people.up @ exact >= SAME_AXIS else people.up
+    up = snap_to_axis(people.up)
     told = f"{vertical.share:.0%} of {vertical.poses} poses stand along it"
-    return up, f"up is {_describe_turn(up)}, by people: {told}", ""
-
-
-def _describe_turn(up: Floats) -> str:
-    """Return the axis that is turned to z, with the rotation."""
-    turn = Rotation.from_matrix(_turn_to_z(up)).as_rotvec()
-    angle = float(np.linalg.norm(turn))
-    return f"{name_axis(up)}, turned by {np.degrees(angle):.1f} degrees about " + (
-        name_axis(turn / angle) if angle > 0.0 else "z"
-    )
-
-
-def _turn_to_z(up: Floats) -> Floats:
-    """Return the smallest rotation (3, 3) that brings a unit vector to z; about x if it is -z."""
-    if up[2] < -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, z = up
-    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
+    return up, f"up is {describe_turn(up)}, by people: {told}", ""

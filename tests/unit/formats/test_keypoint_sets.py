@@ -8,10 +8,12 @@ import pytest
 from data_contracts.conventions import COCO17, FEET
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
+from worldpose.formats import coco_results
 from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
 from worldpose.formats.keypoint_sets import frame_numbers, order_by_names
+from worldpose.ingest.importing import describe_changes
 
 # A standing person in pixels, 400 px tall, of which each set has some points.
 BODY = {
@@ -213,6 +215,13 @@ def test_many_people_of_no_known_order_are_refused(tmp_path):
         (["f3_1700000000480.png", "f12_1700000000840.png"], [3, 12]),  # times are no frames
         (["2_0.5_3.JSON", "2_0.5_12.JSON"], [3, 12]),
         (["a_1.jpg", "b_1.jpg", "c.jpg"], [1, 1]),
+        # One frame of several clips, or cameras: the callers refuse equal numbers.
+        (["clip1_5.png", "clip2_5.png"], [5, 5]),
+        (["1_5.png", "2_5.png"], [5, 5]),
+        (["clip1_5.png", "clip2_9.png"], [5, 9]),
+        (["cam1_000012_480.png", "cam1_000013_520.png"], [12, 13]),  # a time [ms]
+        (["12_480_7.png", "13_520_7.png"], [12, 13]),
+        (["cam000012.png", "cam000013.png"], [12, 13]),
     ],
 )
 def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
@@ -233,10 +242,26 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
     path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}])
     content = json.loads(path.read_text())
     nan = {"image_id": 3, "keypoints": [float("nan")] * 51, "score": float("nan")}
-    content["annotations"] += [{"image_id": 3, "bbox": [1, 2, 3, 4]}, nan]
+    ball = {"image_id": 3, "bbox": [1, 2, 3, 4]}
+    content["annotations"] += [ball, nan]
     path.write_text(json.dumps(content))
     found = read_coco_results(path)
-    assert (found.people.score.shape, found.changes.nobody) == ((1, 1), 2)
+    assert (found.people.score.shape, found.changes) == ((1, 1), (17, 1, 0, 1))
+    assert "annotations without keypoints, such as of the ball" in str(
+        describe_changes({"a": found})
+    )
+    path.write_text(json.dumps(content | {"annotations": [ball, {**ball, "keypoints": []}]}))
+    with pytest.raises(InputError, match="expected keypoints of people, found 2 annotations"):
+        read_coco_results(path)
+
+
+def test_annotations_without_points_take_the_set_of_the_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(coco_results, "BATCH", 2)
+    path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}], BODY_25B)
+    content = json.loads(path.read_text())
+    balls = [{"image_id": 3, "bbox": [1, 2, 3, 4]}] * 2
+    path.write_text(json.dumps(content | {"annotations": balls + content["annotations"]}))
+    assert_body(read_coco_results(path).people)
 
 
 def test_points_may_be_lists_of_three(tmp_path):
@@ -274,7 +299,7 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     (folder / "cam_000000000002_keypoints.json").write_text("")
     (folder / "cam_000000000003_keypoints.json").write_text(json.dumps({"people": [lame]}))
     found = read_openpose_folder(folder)
-    assert found.changes == (17, 1, 1)
+    assert found.changes == (17, 1, 1, 0)
     assert found.people.confidence[1, 0].max() == 1.0
     people = np.isfinite(found.people.score).sum(axis=1)
     np.testing.assert_array_equal(people, [1, 1, 0, 1])
@@ -282,5 +307,5 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     same = [{"image_id": 1, **{"keypoints": one["pose_keypoints_2d"]}} for one in (sure, nobody)]
     (tmp_path / "a.json").write_text(json.dumps(same))
     listed = read_coco_results(tmp_path / "a.json")
-    assert listed.changes == (17, 1, 0)
+    assert listed.changes == (17, 1, 0, 0)
     np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])

@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_unit import scaled
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, Similarity
+from worldpose.triangulation.other_readings import read_otherwise
 from worldpose.triangulation.world import (
     People,
     StatedWorld,
@@ -145,6 +147,33 @@ def test_a_calibration_of_larger_images_is_scaled_to_those_of_the_people(ring, p
         assert found[name].image_size == camera.image_size
         np.testing.assert_allclose(found[name].focal_px, camera.focal_px)
         np.testing.assert_allclose(found[name].principal_point_px, camera.principal_point_px)
+
+
+@pytest.mark.parametrize("also", [1.0 / 3.0, 0.5])
+def test_cameras_of_different_sizes_are_scaled_if_people_agree_at_one_size(ring, also):
+    true = records(ring(2))
+    size = np.array(true["c0"].image_size)
+    focal = true["c0"].focal_px[0]
+    true["c1"] = scaled(true["c1"], 0.5, tuple((size // 2).tolist()))
+    large = {n: scaled(c, 3.0, tuple(3 * s for s in c.image_size)) for n, c in true.items()}
+    # People all over the larger image, and one joint of 17 x 20 beyond its border.
+    points = np.random.default_rng(3).uniform(0.0, 1.0, (20, 2, 1, 17, 2)) * size
+    points[:, 1] /= 2.0
+    points[0, 0, 0, 0] = size + 40.0
+    seen = KeypointDetections.from_keypoints(points, np.ones(points.shape[:-1]))
+    wanted = 3.0 * focal * np.array([1.0 / 3.0, also])
+
+    def agree(batch):
+        return bool(np.isclose(batch.focal[0, 0], wanted).any())
+
+    found, notes = read_otherwise(CALIBRATION, large, seen, agree)
+    if also == 0.5:
+        assert found == large
+        assert "but do if scaled by 0.33333 and 0.50000" in notes[0]
+    else:
+        assert [found[name].image_size for name in true] == [c.image_size for c in true.values()]
+        both = " and ".join("{} x {}".format(*c.image_size) for c in true.values())
+        assert f"scaled by 0.33333, to images of {both} px: of the usual ratios" in notes[0]
 
 
 def test_exchanged_sides_are_told(ring, people, seen):
