@@ -19,7 +19,8 @@ from registry import OUT, Table, Tables, benchmark, option
 import worldpose
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from flows.results.best_results import joint_tracks, static_cameras
+from flows.results.best_results import joint_tracks
+from flows.results.run_cameras import static_cameras
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.geometry.cameras import Camera

@@ -7,7 +7,16 @@ from typing import Literal
 
 from pydantic import JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Amount, Count, Name, Number, ProcessId, Record, Share
+from data_contracts.records import (
+    CONTRACT_VERSION,
+    Amount,
+    Count,
+    Name,
+    Number,
+    ProcessId,
+    Record,
+    Share,
+)
 from data_contracts.run import RunRecord
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]

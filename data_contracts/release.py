@@ -73,6 +73,8 @@ class ReleaseManifest(Record):
     formats: tuple[str, ...]
     stage: str | None = None
     """Requested stage of the joints; None = the best available."""
+    definition: Literal["body", "detector"] = "detector"
+    """Definition of the joints of bodies, that of the detector in older releases."""
     fps: FramesPerSecond
     """[1/s]"""
     clips: dict[str, ReleasedClip]

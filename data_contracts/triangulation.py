@@ -113,7 +113,7 @@ _ARRAYS = array_layouts(
     smoothed (*frame, person, joint, coordinate) float64 [m], missing nan:
         joints smoothed over the whole track, world
     smoothed_covariance (*frame, person, joint, coordinate, coordinate_) float64 [m^2], missing nan:
-        covariance of `smoothed`; it grows inside gaps
+        covariance of `smoothed`, from the same errors as `covariance`; it grows inside gaps
     filled (*frame, person, joint) bool [1]:
         `smoothed` is present and `joints` is missing
     clock_late (camera) float64 [frame], missing nan:

@@ -60,7 +60,8 @@ def evaluate(
 
     Options:
         prediction: A joints file, a folder with joints.npz and cameras/, a match of the
-            project, or a challenge submission. With a data set, a folder of the same layout; may
+            project, or a challenge submission. Joints of a match are those of the body model, as by
+            `worldpose export --definition body`. With a data set, a folder of the same layout; may
             be given more than once, as NAME=FOLDER, for one table.
         reference: A joints file, a folder with joints.npz, cameras/ or both, a .c3d or .trc, or a
             .csv of positions of a provider (a table of kloppy); true poses in the layout of a

@@ -46,7 +46,7 @@ def export(
     out: Annotated[Path, typer.Option()],
     run: RunOption = "latest",
     stage: StageOption = None,
-    definition: Literal["body", "detector"] = "detector",
+    definition: Literal["body", "detector"] | None = None,
     release: Annotated[str | None, typer.Option("--release", metavar="NAME")] = None,
     licence: Path | None = None,
     filled: Annotated[bool, typer.Option("--filled")] = False,
@@ -65,7 +65,7 @@ def export(
     Options:
         out: Output folder; with --format viewer also FILE.html.
         definition: Joints where the detector sees them, but wrists and ankles where the body model
-            has them; or all where the model has them.
+            has them (by default); or all where the model has them (always in a release).
         release: Freeze the run under this name.
         licence: Text of the data licence, for a release or the files.
         filled: Interpolate and flag joints that are missing for a while.
@@ -78,11 +78,11 @@ def export(
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
-    changed = "--filled" if filled else "--definition body"
-    if release is not None and (licence is None or filled or definition != "detector"):
+    changed = "--filled" if filled else "--definition detector"
+    if release is not None and (licence is None or filled or definition == "detector"):
         raise UsageError(
             "worldpose export --release",
-            expected="--licence FILE, no --filled, no other --definition: joints as computed",
+            expected="--licence FILE, no --filled, no --definition detector: joints as computed",
             found="no licence" if licence is None else changed,
             todo="Give the text of the data licence, or export without --release.",
         )
@@ -107,7 +107,7 @@ def export(
         stage,
         filled=filled,
         surface=surface,
-        definition=definition,
+        definition=definition or "detector",
         footage=Footage(store, open_match(store, name)) if video else None,
         licence=None if licence is None else read_licence(licence),
     )

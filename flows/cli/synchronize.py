@@ -15,8 +15,8 @@ from flows.cli import console
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
 from flows.cli.options import WorkersOption
 from flows.registering import find_match
-from flows.results.best_results import static_cameras
 from flows.results.outputs import claim_file
+from flows.results.run_cameras import static_cameras
 from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
 from flows.stage import Match

@@ -12,7 +12,7 @@ from data_contracts.arrays import Floats, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.reports.match_pictures import shown_pitch
 from flows.results.best_results import body_tracks, clip_title, joint_tracks
-from flows.results.broadcast_views import broadcast_cameras, broadcast_unit, clip_of
+from flows.results.run_cameras import broadcast_cameras, broadcast_unit, clip_of
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration.given_camera import GivenCamera

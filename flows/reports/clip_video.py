@@ -15,8 +15,8 @@ from flows.reports.broadcast import (
     write_broadcast_video,
 )
 from flows.reports.match_pictures import frame_pictures, shown_pitch
-from flows.results.best_results import body_tracks, joint_tracks, placed_joints, static_cameras
-from flows.results.broadcast_views import broadcast_views
+from flows.results.best_results import body_tracks, joint_tracks, placed_joints
+from flows.results.run_cameras import broadcast_views, static_cameras
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.videos import overlay_frames

@@ -9,13 +9,8 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
 from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
-from flows.results.best_results import (
-    body_tracks,
-    clip_title,
-    joint_tracks,
-    placed_joints,
-    static_cameras,
-)
+from flows.results.best_results import body_tracks, clip_title, joint_tracks, placed_joints
+from flows.results.run_cameras import static_cameras
 from flows.stage import Match
 from flows.stages.filtering import seen_in
 from worldpose.dataset.contents import sample_evenly

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_contracts.arrays import Image, Integers
 from data_contracts.pitch import PitchSpec
-from flows.results.best_results import estimated_pitch
+from flows.results.run_cameras import estimated_pitch
 from flows.stage import Match
 from worldpose.ingest.footage import read_still, unit_frames
 from worldpose.store.store import Run, Store

@@ -8,13 +8,8 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.conventions import COCO17, JOINT_GROUPS
-from flows.results.best_results import (
-    ADJUSTED,
-    bodies_unit,
-    clip_positions,
-    clip_title,
-    person_kinds,
-)
+from flows.results.best_results import bodies_unit, clip_positions, clip_title, person_kinds
+from flows.results.run_cameras import ADJUSTED
 from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number, format_scaled

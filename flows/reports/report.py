@@ -33,10 +33,9 @@ from flows.results.best_results import (
     find_clips,
     joint_tracks,
     open_results,
-    static_cameras,
 )
-from flows.results.broadcast_views import BROADCAST, broadcast_cameras, broadcast_views
 from flows.results.evaluation import load_reference, score
+from flows.results.run_cameras import BROADCAST, broadcast_cameras, broadcast_views, static_cameras
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of, most_moving
@@ -246,7 +245,7 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
 
     clips = {}
     for clip in find_clips(run.record):
-        places = joint_tracks(run, clip).joints[:, :, HIPS].mean(2)
+        places = joint_tracks(run, clip, definition="detector").joints[:, :, HIPS].mean(2)
         moving = broadcast_cameras(run, clip).values()
         kinds = [kind_of(each.focal.mean(-1), each.cam_from_world.rotation) for each in moving]
         kind = most_moving(kinds) if kinds else "S"

@@ -18,13 +18,11 @@ from flows.results.best_results import (
     Origin,
     bodies_unit,
     clip_positions,
-    estimated_pitch,
     find_clips,
     fitted_bodies,
     person_kinds,
-    static_cameras,
 )
-from flows.results.broadcast_views import moving_cameras
+from flows.results.run_cameras import estimated_pitch, moving_cameras, static_cameras
 from flows.results.tool_exports import describe_clip
 from flows.stage import Match
 from worldpose.body.model import BodyModel, BodyParameters

@@ -17,12 +17,13 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Join, Track
 from flows.layers import pitch_of
-from flows.results.broadcast_views import (
+from flows.results.run_cameras import (
     BROADCAST,
     broadcast_unit,
     broadcast_views,
     camera_in_frames,
     clip_of,
+    static_cameras,
 )
 from flows.review.identities import names_of
 from flows.stage import Match
@@ -33,8 +34,7 @@ from worldpose.body_fitting.extra_points import perceived_points
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions
-from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.static_calibration.venue import Venue, join_cameras
+from worldpose.geometry.cameras import Camera
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store, open_run
 from worldpose.tracking.joins import identity_certainty
@@ -51,7 +51,6 @@ LIMB_ENDS = [9, 10, 15, 16]
 length of the limb."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
-ADJUSTED = "bundle_adjustment/cameras"
 MID_HIP = [11, 12]  # of COCO-17
 
 
@@ -175,8 +174,8 @@ def joint_tracks(
             todo="Run the match to the end first.",
         )
     result = _stage_joints(run, clip, stages[0])
-    fitted = stages[0] in BODY_STAGES and not on_plane
-    seen = placed_joints(run, clip) if fitted else result
+    fitted = stages[0] in BODY_STAGES
+    seen = placed_joints(run, clip) if fitted and not on_plane else result
     joints, covariance = result["joints"].values, result["covariance"].values
     if "joint_offsets" not in result:  # a monocular method's bodies have none
         definition = "body"
@@ -268,9 +267,11 @@ def person_kinds(run: Run, clip: str) -> dict[int, str]:
 def clip_positions(run: Run, clip: str) -> Positions:
     """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet.
 
+    The joints are those of an export by default.
     Bodies of people that a broadcast camera alone films stand where their feet do: kind plane.
     """
-    tracks, (tracking, known) = joint_tracks(run, clip), tracked_people(run, clip)
+    tracks = joint_tracks(run, clip, definition="detector")
+    tracking, known = tracked_people(run, clip)
     person = tracking["person"].values.astype(np.int64)
     xy = np.full((len(tracks.frames), len(person), 2), np.nan)
     covariance = np.full((*xy.shape, 2), np.nan)
@@ -472,59 +473,3 @@ def placed_joints(run: Run, clip: str) -> xr.Dataset:
         found=", ".join(run) or "an empty run",
         todo="Run the match to the end first.",
     )
-
-
-def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[str, Camera]:
-    """Return the static cameras of a run by id; if it has joints, all that it did not leave out.
-
-    They are those with which `stage` computed joints, or the best available.
-    """
-    if ADJUSTED in run and stage != "triangulation":
-        adjusted = run[ADJUSTED]
-        cameras = camera_from_arrays(adjusted.data_vars)
-        return {str(name): cameras[c] for c, name in enumerate(adjusted["camera"].values)}
-    venue, camera_ids = _join_calibrated(run, spec)
-    if venue is None:
-        return {}
-    return {camera_id: venue.cameras[index] for index, camera_id in enumerate(camera_ids)}
-
-
-def _join_calibrated(run: Run, spec: MatchSpec) -> tuple[Venue | None, list[str]]:
-    """Return the calibrated static cameras that a run did not leave out, and their ids."""
-    found = {
-        camera.id: run[unit].data_vars
-        for camera in spec.static_cameras
-        if camera.id not in run.record.left_out
-        and (unit := f"static_calibration/{camera.id}") in run
-    }
-    return (join_cameras(list(found.values())) if found else None), list(found)
-
-
-def estimated_pitch(
-    run: Run, pitch: PitchSpec | None, spec: MatchSpec, clip: str | None = None
-) -> PitchSpec | None:
-    """Return the pitch with the surface that a run estimated, for drawing; None without a pitch.
-
-    The pitch is that of the clip's (or the view's) broadcast camera that knows it best, if one
-    estimated it; otherwise crown and end fall are those that the static cameras show together.
-    """
-    if pitch is None:
-        return None
-    views = [] if clip is None else broadcast_views(run, clip)
-    stated = (run[f"{BROADCAST}{view}"].attrs["pitch"] for view in views)
-    if estimated := [each for each in stated if each is not None]:
-        found = min(estimated, key=lambda each: sum(each["std_m"]))
-        names = ("length", "width", "crown", "end_fall", "points")
-        sizes = {name: found[name] for name in names if name in found}
-        given = pitch.model_dump(mode="json") | sizes
-        return PitchSpec.model_validate(given | {"any_size": True})
-    if ADJUSTED in run:
-        surface = run[ADJUSTED].attrs["surface"]
-    else:
-        venue, _ = _join_calibrated(run, spec)
-        shown = None if venue is None else venue.surface
-        surface = None if shown is None else shown.shape.tolist()
-    if surface is None:
-        return pitch
-    # Not validated: an estimated crown may be slightly negative.
-    return pitch.model_copy(update={"crown": surface[0], "end_fall": surface[1]})

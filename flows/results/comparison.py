@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.run import BODY_STAGES, RunRecord
 from flows.registering import find_registration
-from flows.results.best_results import bodies_unit, static_cameras
+from flows.results.best_results import bodies_unit
+from flows.results.run_cameras import static_cameras
 from worldpose.geometry.cameras import Camera
 from worldpose.store.store import Run, Store
 

@@ -10,14 +10,8 @@ from data_contracts.evaluation import Evaluation
 from data_contracts.match import MatchSpec
 from data_contracts.run import JOINT_STAGES
 from flows.registering import find_match
-from flows.results.best_results import (
-    clips_of,
-    describe_later_run,
-    joint_tracks,
-    open_results,
-    static_cameras,
-)
-from flows.results.broadcast_views import broadcast_cameras
+from flows.results.best_results import clips_of, describe_later_run, joint_tracks, open_results
+from flows.results.run_cameras import broadcast_cameras, static_cameras
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (

@@ -18,8 +18,8 @@ from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from data_contracts.triangulation import CameraChange
 from flows.results import best_results
-from flows.results.broadcast_views import broadcast_views, moving_cameras
 from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
+from flows.results.run_cameras import broadcast_views, estimated_pitch, moving_cameras
 from flows.results.tool_exports import TOOL_EXPORTS
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
@@ -73,10 +73,8 @@ def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         )
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        placed, frames = (
-            best_results.placed_joints(origin.run, clip),
-            tracks.frames.astype(np.int64),
-        )
+        placed = best_results.placed_joints(origin.run, clip)
+        frames = tracks.frames.astype(np.int64)
         inliers = placed["inliers"]
         changes = [CameraChange.model_validate(each) for each in placed.attrs["changes"]]
         for camera_id, camera in origin.static_cameras.items():
@@ -90,9 +88,7 @@ def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
                     move_on,
                     frame=frames,
                     camera=camera,
-                    changes=[
-                        each for each in changes if each.camera == camera_id and each.kind == "view"
-                    ],
+                    changes=[c for c in changes if (c.camera, c.kind) == (camera_id, "view")],
                 ),
             )
             path = (out if len(origin.clips) == 1 else out / clip) / f"{camera_id}.json"
@@ -103,20 +99,20 @@ def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz` (X3).
 
-    A clip without bodies has no poses. Other lenses than Brown's are fitted by it;
+    A clip without people has cameras alone. Other lenses than Brown's are fitted by it;
     `lens_errors.json` states the largest error.
+
+    Raises:
+        InputError: a clip has people and no bodies.
     """
     for clip in best_results.all_clips(origin.run):
-        if best_results.bodies_unit(origin.run, clip) in origin.run:
+        if clip in best_results.find_clips(origin.run.record):
             model, poses, _ = best_results.fitted_bodies(origin.run, clip)
             path = out / "poses" / f"{clip}.npz"
             write_poses(path, poses, model.name)
             yield path
-        moving = (
-            best_results.filmed_cameras(origin.run, clip)
-            if broadcast_views(origin.run, clip)
-            else {}
-        )
+        filmed = broadcast_views(origin.run, clip)
+        moving = best_results.filmed_cameras(origin.run, clip) if filmed else {}
         for view, camera in moving.items():
             path = out / "cameras" / f"{view}.npz"
             write_moving_camera(path, camera)
@@ -247,7 +243,7 @@ def export_recording(origin: best_results.Origin, out: Path) -> Iterator[Path]:
             tracks,
             origin.spec.fps,
             cameras=origin.static_cameras | moving,
-            pitch=best_results.estimated_pitch(origin.run, origin.pitch, origin.spec, clip),
+            pitch=estimated_pitch(origin.run, origin.pitch, origin.spec, clip),
         )
         yield path
 
@@ -386,13 +382,9 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
             todo="Export them into different folders.",
         )
     written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
-    on_plane = [
-        clip
-        for clip in best_results.all_clips(origin.run)
-        if f"{best_results.PLANE}/{clip}" in origin.run
-    ]
-    if on_plane:
-        kinds = {clip: best_results.person_kinds(origin.run, clip) for clip in on_plane}
+    clips, plane = best_results.find_clips(origin.run.record), best_results.PLANE
+    on_plane = [clip for clip in clips if f"{plane}/{clip}" in origin.run]
+    if kinds := {clip: best_results.person_kinds(origin.run, clip) for clip in on_plane}:
         written.append(manifests.write_kinds(out, kinds))
     return written
 
@@ -431,7 +423,8 @@ def release(
     """
     if out.suffix == VIEWER_SUFFIX:
         raise _file_for_folder(out, forms)
-    origin = replace(origin, licence=licence)
+    # As the poses next to them.
+    origin = replace(origin, licence=licence, definition="body")
     record, spec = origin.run.record, origin.spec
     frozen = manifests.read_manifest(out)
     ours = {
@@ -440,6 +433,7 @@ def release(
         "run_id": record.run_id,
         "formats": tuple(dict.fromkeys(forms)),
         "stage": origin.stage,
+        "definition": origin.definition,
         "licence": licence,
         "results": record.results,
     }
@@ -481,19 +475,14 @@ def _write_release(
         )
     bodies = [best_results.bodies_unit(origin.run, clip) for clip in origin.clips]
     models = {origin.run[unit].attrs["body_model"] for unit in bodies if unit in origin.run}
-    pictures = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
+    sizes = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
+    pictures = {name: sizes[name] for name in origin.static_cameras}
+    views = [each for each in spec.broadcast_views.items() if each[1].clip.id in clips]
     manifest = ReleaseManifest(
         **ours,
         fps=spec.fps,
         clips=clips,
-        pictures={
-            **{camera: pictures[camera] for camera in origin.static_cameras},
-            **{
-                name: pictures[view.camera.id]
-                for name, view in spec.broadcast_views.items()
-                if view.clip.id in clips
-            },
-        },
+        pictures=pictures | {name: sizes[view.camera.id] for name, view in views},
         pitch=spec.pitch != NO_PITCH,
         body_model=models.pop() if len(models) == 1 else None,
         usability=record.usability,

@@ -14,7 +14,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.run import BODY_STAGES, JOINT_STAGES
 from flows.results import best_results
-from flows.results.broadcast_views import moving_cameras
+from flows.results.run_cameras import estimated_pitch, moving_cameras
 from worldpose.errors import UsageError
 from worldpose.formats import motion_capture
 from worldpose.formats.c3d_file import write_c3d
@@ -91,12 +91,15 @@ def _keypoint_source(run: Run) -> str:
 
 def _joint_definition(origin: best_results.Origin, clip: str, stage: str) -> str:
     if stage in BODY_STAGES:
-        model = origin.run[f"{stage}/{clip}"].attrs["body_model"]
-        owner = "detector sees" if origin.definition == "detector" else "model has"
-        alone = ", from one camera by feet on the pitch and a monocular method's poses"
-        how = alone if f"{best_results.PLANE}/{clip}" in origin.run else ""
-        if origin.definition == "detector" and origin.stage is None and not how:
-            how = ", but wrists and ankles where the model has them; triangulated without a body"
+        fits = origin.run[f"{stage}/{clip}"]
+        moved = origin.definition == "detector" and "joint_offsets" in fits
+        best = moved and origin.stage is None
+        how = ", but wrists and ankles where the model has them" if best else ""
+        if f"{best_results.PLANE}/{clip}" in origin.run:
+            how += ", from one camera by feet on the pitch and a monocular method's poses"
+        elif best:
+            how += "; triangulated without a body"
+        owner, model = "detector sees" if moved else "model has", fits.attrs["body_model"]
         return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them{how}"
     if stage == best_results.PLANE:
         return "none: people are placed on the pitch by their feet"
@@ -184,7 +187,7 @@ def export_scenes(
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings
 
-    pitch = best_results.estimated_pitch(origin.run, origin.pitch, origin.spec)
+    pitch = estimated_pitch(origin.run, origin.pitch, origin.spec)
     for clip in origin.clips:
         model, poses, persons = best_results.fitted_bodies(origin.run, clip)
         frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values

@@ -19,7 +19,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import DetectionIndex, Frame, Name, Record
 from data_contracts.review import MovedKeypoint
 from flows.reports.match_pictures import frame_picture
-from flows.results.best_results import static_cameras
+from flows.results.run_cameras import static_cameras
 from flows.review.corrections import keep_edits
 from flows.review.detections import accept, detections_now, left_to_look_at
 from flows.review.identities import identities_now

@@ -22,7 +22,8 @@ from flows.reports.clip_video import clip_view
 from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.match_pictures import frame_pictures
 from flows.reports.people import adjustment_tables, body_tables
-from flows.results.best_results import ADJUSTED, placed_joints, static_cameras
+from flows.results.best_results import placed_joints
+from flows.results.run_cameras import ADJUSTED, static_cameras
 from flows.stage import Match
 from flows.stages.detection import seen_by
 from flows.web.app_context import PageContext

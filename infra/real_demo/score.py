@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 import worldpose
 from data_contracts.conventions import COCO17_BONES
-from flows.results.best_results import bodies_unit, joint_tracks, placed_joints, static_cameras
+from flows.results.best_results import bodies_unit, joint_tracks, placed_joints
+from flows.results.run_cameras import static_cameras
 from worldpose.ingest.match_folder import read_match
 from worldpose.video.files import VideoReader, write_video
 

@@ -100,6 +100,16 @@ def test_a_later_format_that_fails_leaves_the_earlier_ones_out(match_folder, tmp
     assert after == before
 
 
+@pytest.mark.parametrize("left", ["triangulation", "broadcast_tracking"])
+def test_people_without_bodies_are_no_cameras_alone(match_folder, tmp_path, left):
+    kept = ("tracking__A_1", "broadcast_calibration__A_1")
+    results = {name: data for name, data in whole().items() if name in kept}
+    results[f"{left}__A_1"] = whole()["triangulation__A_1"]
+    with pytest.raises(InputError, match="results of body_fitting/A_1"):
+        export(origin(match_folder, **results), ["worldpose"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_export_is_repeated_into_its_folder_and_joined_by_others(match_folder, tmp_path):
     run = origin(match_folder, **tracked())
     first = export(run, ["joints"], tmp_path / "out")

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from data_contracts.pitch import PitchSpec
-from flows.results.best_results import estimated_pitch
+from flows.results.run_cameras import estimated_pitch
 from worldpose.pitch.template import PitchTemplate
 
 GIVEN = PitchSpec(crown=0.2)

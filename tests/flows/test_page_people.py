@@ -7,7 +7,7 @@ from page_client import MATCH
 
 from data_contracts.conventions import COCO17
 from flows.registering import open_match
-from flows.results.best_results import static_cameras
+from flows.results.run_cameras import static_cameras
 from flows.run_plan import plan_run
 from tasks.ingest import ingest
 from worldpose.store.store import Store, open_run

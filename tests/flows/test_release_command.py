@@ -8,6 +8,7 @@ import pytest
 from command_line import TINY, succeed, worldpose
 
 from worldpose.errors import InputError
+from worldpose.formats.joints_file import read_joints
 from worldpose.store.garbage import plan_gc
 from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
@@ -43,6 +44,9 @@ def test_a_release_names_its_run_files_and_licence(released):
     manifest = json.loads((released / "manifest.json").read_text())
     assert manifest["release"] == "first"
     assert manifest["licence"] == "For tests alone."
+    assert manifest["definition"] == "body"
+    tracks = read_joints(released / "joints.npz")
+    assert {3} <= set(np.unique(tracks.source)) <= {0, 3}
     assert manifest["usability"]["verdict"] == "usable"
     assert manifest["body_model"] == "open-neutral/2"
     assert "body_fitting/clip" in manifest["results"]

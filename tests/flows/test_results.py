@@ -61,7 +61,7 @@ def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
     tracks = read_joints(tmp_path / "joints.npz")
     result = open_run(tiny_run, TINY)["body_fitting/clip"]
     np.testing.assert_array_equal(tracks.joints, result.joints.values)
-    assert set(np.unique(tracks.source)) <= {0, 3}
+    assert {3} <= set(np.unique(tracks.source)) <= {0, 3}
     np.testing.assert_array_equal(tracks.frames, np.arange(30))
     assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
 

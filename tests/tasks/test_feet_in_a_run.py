@@ -11,7 +11,7 @@ from data_contracts.conventions import FEET
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
-from flows.results.best_results import joint_tracks
+from flows.results.best_results import LIMB_ENDS, clip_positions, joint_tracks
 from flows.run_plan import plan_run
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
@@ -143,6 +143,9 @@ def test_joint_tracks_carry_them_in_both_definitions(run):
 
 def test_best_joints_are_those_of_bodies_as_detected_and_tell_their_source(run):
     results = Results(run[0])
+    fitted = results["body_fitting/clip"].copy(deep=True)
+    fitted["joints"][:5, 0] = np.nan  # a person without a body there
+    results["body_fitting/clip"] = fitted
     best, seen, body, placed = (
         joint_tracks(results, "clip", stage, definition)
         for stage, definition in (
@@ -159,7 +162,26 @@ def test_best_joints_are_those_of_bodies_as_detected_and_tell_their_source(run):
         (3, body, there & ends),
         (1, placed, ~there & np.isfinite(placed.joints[..., 0])),
     ):
+        assert where.any()
         np.testing.assert_array_equal(best.source == source, where)
         np.testing.assert_array_equal(best.joints[where], tracks.joints[where])
         np.testing.assert_array_equal(best.covariance[where], tracks.covariance[where])
     assert ((best.source == 0) == np.isnan(best.joints[..., 0])).all()
+    places = clip_positions(results, "clip")
+    column = np.searchsorted(places.person, best.person_ids)
+    hips = best.joints[:, :, 11:13, :2].mean(axis=2)
+    found = np.isfinite(hips)
+    assert found[:5, 0].all()
+    np.testing.assert_array_equal(places.xy[:, column][found], hips[found])
+
+
+def test_bodies_of_people_whom_one_camera_films_have_the_model_s_wrists_and_ankles(run):
+    views = run[0]["retriangulation/clip"]["views"]
+    fitted = run[0]["body_fitting/clip"].drop_vars("extra_joints").assign(views=views)
+    results = Results({"body_fitting/clip": fitted})
+    results["broadcast_tracking/clip"] = run[0]["tracking/clip"]
+    tracks = joint_tracks(results, "clip", definition="detector")
+    model = fitted["joints"].values[:, :, LIMB_ENDS]
+    np.testing.assert_array_equal(tracks.joints[:, :, LIMB_ENDS], model)
+    assert 3 in tracks.source[:, :, LIMB_ENDS]
+    assert 3 not in np.delete(tracks.source, LIMB_ENDS, axis=2)

@@ -179,7 +179,7 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
     settings, detections = clip.triangulation, clip.detections
     if settings.learn_noise and len(frames):
         noise = triangulate_joints(clip.cameras, detections[frames], settings).noise
-        precision = noise.precision(detections.confidence)
+        precision = noise.precision(detections.confidence, detections.keypoints)
     else:
         precision = np.where(detections.confidence > 0.0, detections.confidence, 0.0)
     max_precision = max(float(precision.max(initial=0.0)), 1e-12)

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
-from data_contracts.arrays import Flags, Image
+from data_contracts.arrays import Flags
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.release import DataSetManifest, ReleaseManifest
 from data_contracts.run import StoredFile
@@ -155,7 +156,7 @@ ORIGINS: Final = ("absent", "automatic", "filled", "corrected")
 """Meanings of the origin codes."""
 
 
-def origins_of(tracks: JointTracks, corrected: Flags | None = None) -> Image:
+def origins_of(tracks: JointTracks, corrected: Flags | None = None) -> NDArray[np.uint8]:
     """Return the origin of joints (frames, persons, 17), indices of `ORIGINS`.
 
     A joint without a contributing camera was filled in, from motion or from the rest of the body.
@@ -171,7 +172,7 @@ def origins_of(tracks: JointTracks, corrected: Flags | None = None) -> Image:
     return origin
 
 
-def write_origins(path: Path, tracks: JointTracks, origin: Image) -> None:
+def write_origins(path: Path, tracks: JointTracks, origin: NDArray[np.uint8]) -> None:
     """Write origins/<clip>.npz: `frames`, `person_ids`, `origin`, and the meanings of its codes."""
     write_archive(
         path,

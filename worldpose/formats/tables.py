@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, find_runs
+from data_contracts.conventions import COCO17
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
@@ -128,7 +129,8 @@ def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> 
     Heels and toes follow the 17 joints of a person where the clip has them.
 
     Columns: frame, time_s (frame / fps), person, kind (of the person), joint, x_m, y_m, z_m
-    (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera does).
+    (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera does),
+    source (as in `JointTracks`; 0 at heels and toes).
 
     Args:
         tracks: the joints.
@@ -155,6 +157,9 @@ def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> 
     }
     if markers.views is not None:
         columns |= {"views": markers.views[there], "filled": markers.views[there] == 0}
+    if tracks.source is not None:
+        further = len(markers.points) - len(COCO17)
+        columns["source"] = np.pad(tracks.source, ((0, 0), (0, 0), (0, further)))[there]
     return pd.DataFrame(columns)
 
 

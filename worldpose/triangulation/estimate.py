@@ -249,11 +249,10 @@ def triangulate_joints(
     learned, solved = passes.run(), passes.solved
     bias = learned.common_bias
     index, shift = detections.detection_index, passes.shift
-    lasting = np.broadcast_to(
-        passes.offset_covariance + bias[:, None, None] ** 2 * np.eye(3), solved.covariance.shape
-    )
-    hidden = shared_variance(bias, solved.views, (index >= 0).sum(axis=1)) - bias**2
-    covariance = solved.covariance + lasting + hidden[..., None, None] * np.eye(3)
+    seen = (index >= 0).sum(axis=1)
+    bias_variance = shared_variance(bias, solved.views, seen)[..., None, None]
+    lasting = passes.offset_covariance + bias_variance * np.eye(3)
+    covariance = solved.covariance + lasting
     found = Triangulation(
         joints=solved.joints,
         covariance=covariance,
@@ -263,7 +262,8 @@ def triangulate_joints(
         inliers=solved.inliers,
         exchanged=passes.exchanged,
         offsets=shift[..., :2] if len(shift) else np.zeros((*index.shape, 2)),
-        calibration_covariance=lasting,
+        lasting_covariance=lasting,
+        bias_variance=bias_variance[..., 0, 0],
         common_bias=bias,
         noise=learned.last_noise,
         agreement=count_agreement(solved, covariance, index, passes.exchanged, passes.misplaced),
@@ -271,13 +271,15 @@ def triangulate_joints(
     if passes.extra is None:
         return found
     # Calibration moves all points of a person together, as it does the joints.
-    shared = np.nan_to_num(found.shared_covariance) + settings.common_bias_m**2 * np.eye(3)
+    shared, points = np.nan_to_num(found.shared_covariance), passes.extra
+    usual = np.full(len(detections.points), settings.common_bias_m)
+    bias_variance = shared_variance(usual, points.views, seen)[..., None, None]
     extra = ExtraJoints(
         detections.points,
-        passes.extra.joints,
-        passes.extra.covariance + shared[:, :, None],
-        passes.extra.views,
-        np.full(len(detections.points), settings.common_bias_m),
+        points.joints,
+        points.covariance + shared[:, :, None] + bias_variance * np.eye(3),
+        points.views,
+        usual,
     )
     return replace(found, extra=extra)
 
@@ -455,7 +457,7 @@ def _add_margins(
         here,
         joints=join("joints"),
         covariance=join("covariance"),
-        calibration_covariance=join("calibration_covariance"),
+        lasting_covariance=join("lasting_covariance"),
         exchanged=join("exchanged"),
         offsets=join("offsets"),
     )

@@ -91,8 +91,8 @@ class NoiseModel:
 def conditions(keypoints: AnyFloats) -> NDArray[np.uint8]:
     """Return the condition of each keypoint (frames, cameras, detections, joints), see `REACH`.
 
-    Hidden is a keypoint within the box of a person whose lowest keypoint is lower in the image: it
-    stands nearer to the camera. Points besides COCO-17 have the first condition.
+    Occluded is a keypoint within the box of a person whose lowest keypoint is lower in the image:
+    that person stands nearer to the camera. Points besides COCO-17 have the first condition.
     """
     found: NDArray[np.uint8] = np.zeros(keypoints.shape[:-1], np.uint8)
     people, joints = found.shape[-2:]
@@ -205,8 +205,8 @@ def learn_noise(
         excess = np.maximum(squares[used] - known[used] * free, 0.0)
         for number, group in enumerate(chosen):
             expected = math.prod(table[each] for table, each in zip(tables, chosen, strict=True))
-            # Degrees of freedom of 1 as a prior: few observations change little. A person's error
-            # in one camera lasts, so that many frames count as few.
+            # Prior degrees of freedom with ratio 1: few observations change little. A person's
+            # error in one camera lasts, so that many frames count as few.
             prior = 60.0 if number < 2 else 20.0 * len(index)
             ratio = _variance_ratio(group, len(tables[number]), excess / expected, free, prior)
             # Perfect agreement of views does not imply certainty.
@@ -295,7 +295,7 @@ def _precision(
 
 OCCLUDED: Final = 2.0
 """Growth of the error that all views share with the share of a person's views that miss the joint
-[1]: what hides a joint from some views misleads the others. Without a constant offset, joints of
+[1]: what occludes a joint in some views misleads the others. Without a constant offset, joints of
 real people (Shelf, frames 300 to 420) are 20 mm per axis from labels where all views agree, 25 mm
 without one of them, 37 mm without two, and the residuals are the same."""
 

@@ -30,7 +30,8 @@ FRAME_ARRAYS = (
     "inliers",
     "exchanged",
     "offsets",
-    "calibration_covariance",
+    "lasting_covariance",
+    "bias_variance",
 )
 """Attributes of `Triangulation` with a dimension of frames."""
 
@@ -117,9 +118,11 @@ class Triangulation:
             `EXCHANGED_PARTS`, already corrected.
         offsets: (frames, cameras, persons, 2) [px], offset of the person in the image from the
             reprojection of all cameras' joints; 0 where unknown.
-        calibration_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that
-            more frames do not reduce: offsets and the common bias.
-        common_bias: (17,) per axis, error that all views share [m]; included in `covariance`.
+        lasting_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that more
+            frames do not reduce: offsets by calibration and `bias_variance`.
+        bias_variance: (frames, persons, 17) [m^2] per axis, of the error that all views share
+            (`noise_model.shared_variance`).
+        common_bias: (17,) per axis, error that all views share [m] where all agree.
         noise: noise model of the detector.
         agreement: counts and histograms behind `report`.
         extra: points besides COCO-17, which influence none of the above; None without any.
@@ -133,7 +136,8 @@ class Triangulation:
     inliers: NDArray[np.bool_]
     exchanged: NDArray[np.bool_]
     offsets: Floats
-    calibration_covariance: Floats
+    lasting_covariance: Floats
+    bias_variance: Floats
     common_bias: Floats
     noise: NoiseModel
     agreement: Agreement
@@ -146,7 +150,7 @@ class Triangulation:
         It is that of calibration, mean over the joints; NaN for a person without any.
         """
         found = np.asarray(np.isfinite(self.joints).all(-1))
-        own = self.calibration_covariance - self.common_bias[:, None, None] ** 2 * np.eye(3)
+        own = self.lasting_covariance - self.bias_variance[..., None, None] * np.eye(3)
         count = found.sum(-1)[..., None, None]
         total = np.where(found[..., None, None], own, 0.0).sum(axis=2)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -198,7 +198,7 @@ def smooth_joints(
                 good = np.isfinite(x).all() and np.isfinite(c).all()
                 joints[part, person, joint] = x if good else given[part]
                 covariance[part, person, joint] = (
-                    c + _nearest(raw.calibration_covariance[part, person, joint], given[part])
+                    c + _nearest(raw.lasting_covariance[part, person, joint], given[part])
                     if good
                     else raw.covariance[part, person, joint]
                 )

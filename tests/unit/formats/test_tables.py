@@ -23,7 +23,11 @@ def tracks():
     covariance = np.zeros((4, 2, 17, 3, 3)) + np.diag([1e-4, 4e-4, 9e-4])
     views = np.full((4, 2, 17), 3)
     views[2, 0, 4] = 0
-    return JointTracks(np.arange(100, 104), np.array([4, 9]), joints, covariance, views)
+    source = np.full(views.shape, 2)
+    source[:, :, 9] = 3
+    return JointTracks(
+        np.arange(100, 104), np.array([4, 9]), joints, covariance, views, source=source
+    )
 
 
 def walker(speed=2.0, stride_s=0.9, seconds=5.0):
@@ -48,6 +52,8 @@ def check_joints(table, tracks, atol):
     assert row.time_s.item() == pytest.approx(2.04)
     assert (row.views.item(), row.filled.item(), row.kind.item()) == (0, True, "triangulated")
     assert table.filled.sum() == 1
+    assert ((table.source == 3) == (table.joint == "left_wrist")).all()
+    assert set(table.source) == {2, 3}
     assert set(table[table.person == 9].kind) == {"mixed"}
     assert not ((table.frame == 101) & (table.person == 9)).any()
 

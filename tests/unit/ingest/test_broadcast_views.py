@@ -8,7 +8,7 @@ import yaml
 from pydantic import ValidationError
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.results import broadcast_views
+from flows.results import run_cameras
 from worldpose.errors import InputError
 from worldpose.ingest.clock import ImageClock, rows_at
 from worldpose.ingest.footage import footage_size, image_clock, unit_frames
@@ -152,8 +152,8 @@ def test_an_image_between_match_frames_is_drawn_with_the_nearest_that_has_a_came
 
 
 def test_a_static_camera_may_be_named_broadcast(monkeypatch):
-    monkeypatch.setattr(broadcast_views, "broadcast_views", lambda run, clip: ["goal"])
-    monkeypatch.setattr(broadcast_views, "camera_in_frames", lambda run, view, frames: view)
-    find = partial(broadcast_views.moving_cameras, None, "goal", np.arange(3))
+    monkeypatch.setattr(run_cameras, "broadcast_views", lambda run, clip: ["goal"])
+    monkeypatch.setattr(run_cameras, "camera_in_frames", lambda run, view, frames: view)
+    find = partial(run_cameras.moving_cameras, None, "goal", np.arange(3))
     assert find(["cam1"]) == {"broadcast": "goal"}
     assert find(["cam1", "broadcast"]) == {"goal": "goal"}

@@ -6,6 +6,7 @@ import pytest
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
+from worldpose.triangulation.noise_model import shared_variance
 from worldpose.triangulation.settings import TriangulationSettings
 
 NOISE = 2.0
@@ -49,7 +50,9 @@ def test_points_are_found_within_their_noise(clip):
     away = found.joints - truth
     # 30 m away at 1500 px, 2 px are 40 mm across one ray; six views leave half of that.
     assert 0.01 < np.sqrt((away**2).mean()) < 0.03
-    random = found.covariance - found.common_bias[0] ** 2 * np.eye(3)
+    seen = (with_feet.detection_index >= 0).sum(axis=1)
+    bias = shared_variance(found.common_bias, found.views, seen)
+    random = found.covariance - bias[..., None, None] * np.eye(3)
     square = np.einsum("fpka,fpkab,fpkb->fpk", away, np.linalg.inv(random), away)
     assert 2.4 < square.mean() < 3.6  # chi-square of three degrees of freedom
     assert (found.views >= 5).mean() > 0.95
