@@ -27,12 +27,12 @@ from flows.results.best_results import (
     find_clips,
     joint_tracks,
     open_results,
-    static_cameras,
     tracked_people,
 )
 from flows.results.comparison import SubjectChange, compare_runs
 from flows.results.export import export
 from flows.results.outputs import OWNERS
+from flows.results.run_cameras import static_cameras
 from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
