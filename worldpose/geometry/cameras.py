@@ -385,12 +385,13 @@ class Camera:
         return float(np.isnan(self.normalize(self.image_grid())[:, 0]).mean())
 
     def require_rays(self, where: str) -> None:
-        """Raise InputError if a single camera's lens folds well within the image.
+        """Raise InputError if a single camera's lens folds in the middle of the image.
 
         There two directions have one pixel, or a pixel has none: no lens does so, but a polynomial
         does, far from the points to which it was fitted.
         """
-        most = 0.1  # share of the image without rays: the corners of many calibrations [1]
+        # Share of the image without rays: a third is usual where boards stayed in the middle [1].
+        most = 0.5
         if (share := self.blind_share()) > most:
             raise InputError(
                 f"{where}: distortion",

@@ -207,8 +207,8 @@ def test_an_impossible_lens_is_refused(changes, said, tmp_path):
 
 
 def test_a_lens_that_folds_is_refused_wherever_it_is_read(tmp_path):
-    # r (1 - 0.9 r^2) grows up to r = 0.61; the image's corner is at 0.79.
-    text = write_toml(tmp_path)[0].read_text().replace("-0.31, 0.12", "-0.9, 0.0")
+    # r (1 - 3 r^2) grows up to r = 0.33, to 0.22; the image's corner is at 0.79.
+    text = write_toml(tmp_path)[0].read_text().replace("-0.31, 0.12", "-3.0, 0.0")
     (tmp_path / "lenses.toml").write_text(text)
     with pytest.raises(InputError, match=r"lenses\.toml: .*distortion: expected a lens whose"):
         read_lens_toml(tmp_path / "lenses.toml", SIZES)
