@@ -196,7 +196,7 @@ class MatchSummary(Record):
     why: str = ""
     """Reason of the state, in sentences."""
     todo: str = ""
-    """What a person can do."""
+    """Remedy, in sentences."""
     seconds: Amount | None = None
     """Expected time of the next run [s]; None if it computes nothing or is unknown."""
     units: dict[str, tuple[str, ...]] = {}

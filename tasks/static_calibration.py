@@ -52,11 +52,13 @@ def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
     """
     if inputs.sources["calibration"] is not None:
         given = CameraCalibration.model_validate(inputs.sources["calibration"])
+        camera = Camera.from_calibration(given)
         result.write(
             STATIC_CALIBRATION,
-            arrays=camera_arrays(Camera.from_calibration(given)),
+            arrays=camera_arrays(camera),
             attributes=given_attributes(inputs.unit),
         )
+        result.warnings += [said] if (said := camera.describe_fold(inputs.unit)) else []
         return
     try:
         calibration = _calibrate(inputs)

@@ -143,14 +143,15 @@ def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> st
 
 
 def _first_picture(match: Match) -> NDArray[np.uint8] | None:
-    """Return the image of the first static camera that has one; None if there is none."""
+    """Return the first image of a static camera, else of a moving one; None if there is none."""
     folder = match.folder
-    for camera in folder.spec.static_cameras:
+    for owner in (*(each.id for each in folder.spec.static_cameras), *folder.spec.broadcast_views):
         try:
-            if camera.id in folder.stills:
-                return read_still(folder.stills[camera.id], (camera.width, camera.height))
-            if camera.id in folder.videos:
-                with open_video(folder.videos[camera.id]) as video:
+            if owner in folder.stills:
+                camera = folder.spec.camera(owner)
+                return read_still(folder.stills[owner], (camera.width, camera.height))
+            if owner in folder.videos:
+                with open_video(folder.videos[owner]) as video:
                     return video.frame(0)
         except (OSError, WorldposeError):
             continue  # the page of the match shows the error

@@ -160,7 +160,9 @@ def check_camera_alone(match, project, out):
     succeed("report", *made, "--no-videos", "--out", out / "page.html")
     assert "broadcast frames" in (out / "page.html").read_text()
     name = library.read_match(match).spec.match_id
-    found = log_in(served(project[1]), "Ada").get(f"/api/matches/{name}/results").json()
+    ada = log_in(served(project[1]), "Ada")
+    assert ada.get(f"/api/matches/{name}/thumbnail").headers["content-type"] == "image/jpeg"
+    found = ada.get(f"/api/matches/{name}/results").json()
     assert found["formats"] == ["worldpose", "slahmr-cameras"]
     refused = worldpose("export", *made, "--format", "joints", "--out", out / "joints")
     assert refused.code == 1

@@ -1,7 +1,10 @@
 """A task computes what its key stands for, or refuses."""
 
 import json
+import math
+import re
 import shutil
+import tomllib
 
 import numpy as np
 import pytest
@@ -58,6 +61,23 @@ def test_an_edit_after_planning_does_not_reach_the_result(planned, tmp_path):
     planned_translation = unit.recipe.sources["calibration"]["translation"]
     assert stored["translation"].values.tolist() == pytest.approx(planned_translation)
     assert stored.attrs["origin"] == "given"
+
+
+def test_a_run_tells_of_a_given_lens_that_folds_at_the_corners(planned, tmp_path):
+    store, match, _ = planned
+    calibration = tmp_path / "match" / "calibration.toml"
+    (given, *_) = tomllib.loads(calibration.read_text()).values()
+    corner = math.hypot(*given["size"]) / 2 / given["matrix"][0][0]
+    # r (1 + k1 r^2) grows up to r = 1 / sqrt(-3 k1), to two thirds of that: 0.9 of the corner.
+    folds = f"distortions = [{-((2 / (3 * 0.9 * corner)) ** 2) / 3}, 0, 0, 0, 0]"
+    text = re.sub(r"distortions = \[.*\]", folds, calibration.read_text(), count=1)
+    calibration.write_text(text)
+    match, _ = register(store, tmp_path / "match")
+    unit = next(u for u in plan_run(store, match, {}) if u.recipe.stage == "static_calibration")
+    static_calibration.fn(unit.work(store.url, match, "0001"))
+    written = store.manifest(match.match_id, "static_calibration", unit.recipe.unit, unit.key)
+    (said,) = written.warnings
+    assert said.startswith(f"{unit.recipe.unit}: the lens folds within the image")
 
 
 def test_an_imported_lens_is_the_prior_of_its_camera_and_of_no_other(clicked, tmp_path):

@@ -186,7 +186,7 @@ class Camera:
         Raises:
             InputError: a focal length or the image size is not positive, the rotation is not
                 orthonormal with determinant 1 within what six decimals allow, or the lens folds
-                within the image (`require_rays`).
+                in the middle of the image (`require_rays`).
         """
         where = f"camera {calibration.id}" if where is None else where
         if min(*calibration.focal_px, *calibration.image_size) <= 0:
@@ -383,6 +383,12 @@ class Camera:
         if not np.isfinite(self.numbers[21]) or self.lens_model == LensModel.FISHEYE:
             return 0.0
         return float(np.isnan(self.normalize(self.image_grid())[:, 0]).mean())
+
+    def describe_fold(self, where: str) -> str:
+        """Return a warning of a single camera whose lens folds within the image, else nothing."""
+        share = self.blind_share()
+        said = f"{where}: the lens folds within the image, {share:.1%} of which shows nothing"
+        return said if share > 0.0 else ""
 
     def require_rays(self, where: str) -> None:
         """Raise InputError if a single camera's lens folds in the middle of the image.

@@ -146,7 +146,7 @@ def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floa
 
 
 @compile_kernel
-def drop_lasting_strangers(apart: Floats, index: Integers, departure: Floats, gain: float) -> None:
+def drop_inconsistent_views(apart: Floats, index: Integers, departure: Floats, gain: float) -> None:
     """Remove a person's views whose rays are lastingly apart from those of the others.
 
     The departure of view c is the running mean of the mean distance to the other views S,

@@ -458,6 +458,7 @@ def _add_margins(
         joints=join("joints"),
         covariance=join("covariance"),
         lasting_covariance=join("lasting_covariance"),
+        bias_variance=join("bias_variance"),
         exchanged=join("exchanged"),
         offsets=join("offsets"),
     )

@@ -34,7 +34,7 @@ from worldpose.tracking.vertical import (
     turn_to_z,
 )
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
-from worldpose.triangulation.other_readings import read_otherwise
+from worldpose.triangulation.reinterpretation import reinterpret_calibration
 
 Placed: TypeAlias = tuple[dict[str, CameraCalibration], list[str]]
 LEVEL: Final = float(np.cos(np.radians(10.0)))
@@ -377,15 +377,15 @@ def place_cameras(
     )
     people = None
     told = [
-        f"warning: {name}: the lens folds within the image, {share:.1%} of which shows nothing"
+        f"warning: {fold}"
         for n, name in enumerate(cameras)
-        if (share := batch[n].blind_share()) > 0.0
+        if (fold := batch[n].describe_fold(name))
     ]
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
         people = find_people(batch, stacked, fps)
         if people is None:
-            cameras, said = read_otherwise(
+            cameras, said = reinterpret_calibration(
                 calibration,
                 cameras,
                 stacked,

@@ -12,7 +12,7 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_unit import scaled
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, Similarity
-from worldpose.triangulation.other_readings import read_otherwise
+from worldpose.triangulation.reinterpretation import reinterpret_calibration
 from worldpose.triangulation.world import (
     People,
     StatedWorld,
@@ -166,7 +166,7 @@ def test_cameras_of_different_sizes_are_scaled_if_people_agree_at_one_size(ring,
     def agree(batch):
         return bool(np.isclose(batch.focal[0, 0], wanted).any())
 
-    found, notes = read_otherwise(CALIBRATION, large, seen, agree)
+    found, notes = reinterpret_calibration(CALIBRATION, large, seen, agree)
     if also == 0.5:
         assert found == large
         assert "but do if scaled by 0.33333 and 0.50000" in notes[0]

@@ -35,7 +35,7 @@ _SCALES: Final = (1 / 4, 1 / 3, 3 / 8, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 8
 """Ratios of usual image sizes."""
 
 
-def read_otherwise(
+def reinterpret_calibration(
     calibration: Path,
     cameras: Mapping[str, CameraCalibration],
     detections: KeypointDetections,
