@@ -15,7 +15,6 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +41,6 @@ from worldpose.body_fitting.results import BodyFit, ClipEvidence, EvidenceSource
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shapes import Shapes, fit_shapes, spread_intervals
 from worldpose.compiled import map_in_threads
-
-WINDOW_FRAMES: Final = 3000
-"""Frames that are solved together: a person's equations take 60 KB per frame."""
 
 
 def fit_bodies(
@@ -295,7 +291,9 @@ def split_windows(
     """Yield frames that are solved together, and those of them that are kept."""
     # Motion ties a pose to those within some tenths of a second.
     margin = math.ceil(max(3.0, 2.0 * settings.max_filled_gap_s) * fps)
-    size = max(WINDOW_FRAMES, 2 * margin)
+    # Frames that are solved together: a person's equations take 60 KB per frame.
+    window_frames = 3000
+    size = max(window_frames, 2 * margin)
     starts = range(0, frames, size) if frames > size + margin else (0,)
     for start in starts:
         stop = start + size if len(starts) > 1 and start + size < frames else frames

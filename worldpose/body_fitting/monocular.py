@@ -29,12 +29,6 @@ from worldpose.formats.files import require_file
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
-WHOLE: Final = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
-"""Names of all 24 rotations in one array."""
-ROOT: Final = ("global_orient", "pred_global_orient")
-REST: Final = ("body_pose", "pred_body_pose")
-"""Names of the pelvis' rotation and of the 23 others."""
-
 
 @dataclass(frozen=True, eq=False)
 class MonocularEstimates:
@@ -77,15 +71,20 @@ def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> Monocula
     Raises:
         InputError: arrays are missing or have wrong shapes; the error names `where`.
     """
-    whole = _first_present(arrays, WHOLE)
+    # Names of all 24 rotations in one array.
+    names_of_all = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
+    whole = _first_present(arrays, names_of_all)
+    names_of_root = ("global_orient", "pred_global_orient")
+    # Names of the pelvis' rotation and of the 23 others.
+    names_of_rest = ("body_pose", "pred_body_pose")
     if whole is None:
-        root, rest = _first_present(arrays, ROOT), _first_present(arrays, REST)
+        root, rest = _first_present(arrays, names_of_root), _first_present(arrays, names_of_rest)
         if root is None or rest is None:
-            expected = f"{' or '.join(WHOLE)}; or {ROOT[0]} and {REST[0]}"
+            expected = f"{' or '.join(names_of_all)}; or {names_of_root[0]} and {names_of_rest[0]}"
             raise _format_error(where, expected, ", ".join(arrays) or "nothing")
         parts = [
-            _rotation_matrices(root, where, ROOT[0], 1),
-            _rotation_matrices(rest, where, REST[0], JOINTS - 1),
+            _rotation_matrices(root, where, names_of_root[0], 1),
+            _rotation_matrices(rest, where, names_of_rest[0], JOINTS - 1),
         ]
         if len(parts[0]) != len(parts[1]):
             raise _format_error(

@@ -151,10 +151,6 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
 
 
 SUBMISSIONS = ("submission.zip", "submission.npz")
-_FRAMES = 200
-"""Maximum number of frames, with all people, posed per chunk."""
-ONLY = "clip"
-"""Name of the one clip of a data set without clip names."""
 
 
 def list_clips(folder: Path) -> tuple[str, ...]:
@@ -168,8 +164,10 @@ def list_clips(folder: Path) -> tuple[str, ...]:
     for name in SUBMISSIONS:
         if (folder / name).is_file():
             names |= set(submission_clips(folder / name))
+    # Name of the one clip of a data set without clip names.
+    only_clip = "clip"
     if not names and (folder / "joints.npz").is_file():
-        names = {ONLY}
+        names = {only_clip}
     if not names:
         raise InputError(
             str(folder),
@@ -343,8 +341,10 @@ def _points(model: BodyModel, poses: BodyParameters) -> Floats:
     keypoints = fold_keypoints(model, BODY25)
     persons, frames = poses.batch_shape
     points = np.empty((frames, persons, len(BODY25), 3))
-    for start in range(0, frames, _FRAMES):
-        part = slice(start, min(start + _FRAMES, frames))
+    # Maximum number of frames, with all people, posed per chunk.
+    max_frames = 200
+    for start in range(0, frames, max_frames):
+        part = slice(start, min(start + max_frames, frames))
         points[part] = keypoints(poses[:, part]).swapaxes(0, 1)
     return points
 

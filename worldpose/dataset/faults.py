@@ -296,11 +296,14 @@ def compare_view(source: PointSource, view: View) -> Agreement | None:
 def agreement_findings(found: Iterable[Agreement]) -> Iterator[Finding]:
     """Yield findings, one per fault of a source, with the cameras that show it."""
     named: dict[tuple[str, str, str], list[Agreement]] = {}
+    unexplained = (
+        "the projected 3D points differ from the 2D points, and no known convention explains it"
+    )
     for one in found:
         if one.fault is not SOUND:
             named.setdefault((one.source, one.fault.name, one.fault.says), []).append(one)
         elif one.median_px > LIMITS.max_error * one.height_px:
-            named.setdefault((one.source, "reprojection", _UNEXPLAINED), []).append(one)
+            named.setdefault((one.source, "reprojection", unexplained), []).append(one)
     for (source, name, says), group in named.items():
         yield Finding(
             fault=name,
@@ -312,11 +315,6 @@ def agreement_findings(found: Iterable[Agreement]) -> Iterator[Finding]:
                 "explained_median_px": _capped_median([one.explained_px for one in group]),
             },
         )
-
-
-_UNEXPLAINED = (
-    "the projected 3D points differ from the 2D points, and no known convention explains it"
-)
 
 
 def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
@@ -392,8 +390,6 @@ def _capped_median(values: list[float]) -> float:
 
 _POINTS: Final = 8
 """Minimum number of points of a body: their mean has a third of the error of each."""
-_BODIES: Final = 1500
-"""Maximum number of sampled bodies."""
 
 
 def find_frame_offset(source: PointSource, view: View) -> Fault | None:
@@ -407,7 +403,9 @@ def find_frame_offset(source: PointSource, view: View) -> Fault | None:
     frame, person = np.nonzero(known[: len(points)])
     if not len(frame):
         return None
-    picked = sample_evenly(len(frame), _BODIES)
+    # Maximum number of sampled bodies.
+    max_bodies = 1500
+    picked = sample_evenly(len(frame), max_bodies)
     frame, person = frame[picked], person[picked]
 
     def error(fault: Fault) -> float:

@@ -304,10 +304,6 @@ def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     return CELL * torch.stack([x, y], dim=1) + 0.5 * (CELL - 1), mass
 
 
-MIN_MASS: Final = 0.01
-"""Candidate positions of less probability are dropped, except the likeliest of a joint [1]."""
-
-
 def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return candidate positions of each joint, finer than cells, the likeliest first.
 
@@ -320,7 +316,7 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Returns:
         Positions (batch, joints, count, 2) [px of the crop], and the probability around each
-        (batch, joints, count); 0 where a map has fewer peaks with a probability of `MIN_MASS`.
+        (batch, joints, count); 0 where a map has fewer peaks with a probability of `min_mass`.
     """
     shape, (rows, columns) = maps.shape[:2], maps.shape[2:]
     chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, rows, columns)
@@ -328,7 +324,9 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     blocks = chance.view(-1, rows // 4, 4, columns)
     high = _largest([blocks[:, :, k] for k in range(4)]).unflatten(2, (-1, 4))
     high = _largest([high[..., k] for k in range(4)])
-    least = high.amax(dim=(1, 2), keepdim=True).clamp(max=MIN_MASS / 25.0)
+    # Candidate positions of less probability are dropped, except the likeliest of a joint [1].
+    min_mass = 0.01
+    least = high.amax(dim=(1, 2), keepdim=True).clamp(max=min_mass / 25.0)
     index, row, column = torch.nonzero(high >= least, as_tuple=True)
     step = torch.arange(-3, 4, device=maps.device)
     best = _around(chance, (index, 4 * row, 4 * column), step[3:]).flatten(1).max(dim=1)

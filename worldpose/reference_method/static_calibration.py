@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
 
 import cv2
 import numpy as np
@@ -19,9 +18,6 @@ from worldpose.reference_method.cameras import K1_K2, TensorCameras
 from worldpose.reference_method.reprojection import Views, adjust
 from worldpose.static_calibration.initialization import camera_from_homography, plane_from_image
 from worldpose.static_calibration.report import StaticCalibration
-
-NEAR_PX: Final = 15
-"""Edges farther than this from the projected markings are "uninteresting lines" [px]."""
 
 
 def camera_from_plane(points: Floats, image: Floats, image_size: tuple[int, int]) -> Camera:
@@ -88,8 +84,10 @@ def distance_map(picture: Image, camera: Camera, points: Floats) -> NDArray[np.f
     near = np.zeros_like(grey)
     pixels = camera.project(points)
     inside = ((pixels >= 0.0) & (pixels <= camera.image_size - 1.0)).all(axis=-1)
+    # Edges farther than this from the projected markings are "uninteresting lines" [px].
+    near_px = 15
     for x, y in np.rint(pixels[inside]).astype(int).tolist():
-        cv2.circle(near, (x, y), NEAR_PX, 255, -1)
+        cv2.circle(near, (x, y), near_px, 255, -1)
     away = cv2.distanceTransform(255 - cv2.bitwise_and(edges, near), cv2.DIST_L2, 5)
     return np.asarray(away, dtype=np.float32)
 

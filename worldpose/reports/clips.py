@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -111,10 +111,6 @@ def _frame(points: Floats, margin: float) -> tuple[Floats, Floats]:
     return middle - half, middle + half
 
 
-VIEW_LENGTH_M: Final = 130.0
-"""Length of a drawn field of view [m]: a little more than a pitch's length."""
-
-
 def plot_camera_view(
     camera: Camera,
     title: str,
@@ -192,7 +188,7 @@ def plot_stadium(
 
 
 def visible_ground(camera: Camera) -> Floats:
-    """Return corners (n, 2) [m] of the ground in a camera's field of view, to `VIEW_LENGTH_M`.
+    """Return corners (n, 2) [m] of the ground in a camera's field of view, to `view_length_m`.
 
     The ground is the plane z = 0, world.
     """
@@ -204,19 +200,15 @@ def visible_ground(camera: Camera) -> Floats:
     directions = camera.unproject(border).directions
     directions = directions[np.isfinite(directions[:, 0])]
     flat = np.linalg.norm(directions[:, :2], axis=-1)
+    # Length of a drawn field of view [m]: a little more than a pitch's length.
+    view_length_m = 130.0
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -camera.center[2] / directions[:, 2] * flat
         # Rays that go up never meet the ground: clip them to the drawn length.
         distance = np.where(
-            (directions[:, 2] < 0.0) & (distance < VIEW_LENGTH_M), distance, VIEW_LENGTH_M
+            (directions[:, 2] < 0.0) & (distance < view_length_m), distance, view_length_m
         )
         return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])
-
-
-USED: Final = PALETTE[5]
-LEFT_OUT: Final = PALETTE[1]
-FLOOR: Final = "#f6f6f6"
-"""Colour of the ground without a pitch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,10 +258,14 @@ def plot_detections(
     if part is None:
         titles[0] += f": {int(there.sum())}"
         titles[1] += f": {int(found.sum())} people"
-    ground = GRASS if pitch is not None else FLOOR
+    # Colour of the ground without a pitch.
+    floor = "#f6f6f6"
+    ground = GRASS if pitch is not None else floor
     figure, (before, after) = picture_panels(titles, corner, side, still=still, ground=ground)
+    used = PALETTE[5]
+    left_out = PALETTE[1]
     for number in np.flatnonzero(there):
-        color = USED if number in detections.used else LEFT_OUT
+        color = used if number in detections.used else left_out
         _box(before, boxes[number], color)
         draw_skeleton(before, detections.keypoints[number], color)
     draw_markings(after, camera, pitch, LINE if still is None else TEMPLATE)

@@ -67,8 +67,6 @@ def digest(data: bytes | memoryview) -> str:
 
 R = TypeVar("R", bound=Record)
 
-_OTHER_FIELDS: Final = {"extra_forbidden": "the unknown field", "missing": "no field"}
-"""pydantic's error types of records with other fields, and what they found."""
 _SEAL: Final = re.compile(rb'\{"checksum":"([0-9a-f]{64})",')
 """Start of a document with no key before `checksum`."""
 
@@ -123,13 +121,15 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
         )
     if "checksum" in kind.model_fields:
         fields["checksum"] = checksum
+    # pydantic's error types of records with other fields, and what they found.
+    other_fields = {"extra_forbidden": "the unknown field", "missing": "no field"}
     try:
         return kind.model_validate_json(json.dumps(fields))
     except ValidationError as error:
         found = {
-            f"{_OTHER_FIELDS[each['type']]} {'.'.join(map(str, each['loc']))}"
+            f"{other_fields[each['type']]} {'.'.join(map(str, each['loc']))}"
             for each in error.errors()
-            if each["type"] in _OTHER_FIELDS
+            if each["type"] in other_fields
         }
         if len(found) == error.error_count():
             raise InputError(

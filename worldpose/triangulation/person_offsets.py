@@ -35,8 +35,6 @@ from worldpose.triangulation.residuals import (
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solve import SolvedJoints, solve_joints, take_step
 
-RADIAL = [0, 1, 4]
-"""k1, k2, k3 among the five coefficients."""
 HIPS = [COCO17.index("left_hip"), COCO17.index("right_hip")]
 
 
@@ -82,6 +80,8 @@ def stated_errors(
     pose = cameras.cam_from_world
     shape = (len(joints), len(cameras.focal), joints.shape[1])
     variance, scale = np.zeros(shape), np.zeros(shape)
+    # k1, k2, k3 among the five coefficients.
+    radial = [0, 1, 4]
     for camera in range(shape[1]):
         depth = places @ pose.rotation[camera, 2] + pose.translation[camera, 2]
         # A missing camera sees no person.
@@ -93,7 +93,7 @@ def stated_errors(
             continue
         seen = cameras[camera].project_with_jacobians(places[before])
         by_focal = (seen.d_intrinsics[..., :2] * cameras.focal[camera]).sum(-1, keepdims=True)
-        steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., RADIAL])
+        steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., radial])
         jacobian = np.concatenate(steps, axis=-1)
         spread = ((jacobian @ camera_covariance[camera]) * jacobian).sum(axis=(-2, -1)) / 2.0
         variance[:, camera][before] = np.where(np.isfinite(spread), spread, 0.0)

@@ -109,9 +109,6 @@ betas are not used here."""
 Place = Literal["transl", "pelvis", "mid_hip"]
 """Reference point of a position: `transl` is added to SMPL's joints; the others are points."""
 
-_CHUNK: Final = 4096
-"""Bodies posed per chunk: 50 MB."""
-
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
@@ -173,8 +170,10 @@ def pose_track(
     names = (*COCO17, "mid_hip")
     keypoints = fold_keypoints(model, names)
     points = np.empty((count, len(names), 3))
-    for start in range(0, count, _CHUNK):
-        part = slice(start, start + _CHUNK)
+    # Bodies posed per chunk: 50 MB.
+    chunk_bodies = 4096
+    for start in range(0, count, chunk_bodies):
+        part = slice(start, start + chunk_bodies)
         points[part] = keypoints(
             BodyParameters(betas[part], track.global_orient[part], pose[part], shift[part])
         )

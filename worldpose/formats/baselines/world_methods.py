@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -267,7 +266,6 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     return merge_people("shared", people, {"shape": used})
 
 
-_ARRAYS: Final = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
 _Piece = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -329,8 +327,9 @@ def _read_run(
     if not files:
         raise format_error(info.parent / phase, "<clip>_<iteration>_world_results.npz", "none")
     arrays = read_npz(files[-1], FILE_BYTES)
-    if not {*_ARRAYS} <= {*arrays}:
-        raise format_error(files[-1], f"the arrays {', '.join(_ARRAYS)}", ", ".join(arrays))
+    array_names = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
+    if not {*array_names} <= {*arrays}:
+        raise format_error(files[-1], f"the arrays {', '.join(array_names)}", ", ".join(arrays))
     where = str(files[-1])
     place = Part(f"{where}: trans", arrays["trans"]).floats(None, None, 3)
     count, length = place.shape[:2]

@@ -144,8 +144,6 @@ _EASE: Final = np.array(
     [0.5, 0.45, 0.45, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0, 1.25, 1.25, 1.3, 1.3, 1.05, 1.05, 1.15, 1.15]
 )
 """Error of each joint relative to the average one [1]."""
-_PARTS: Final = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
-"""Joints that are swapped left to right together."""
 
 _STICKMAN: Final = (
     np.array(
@@ -348,7 +346,9 @@ def _swap_sides(
 ) -> Floats:
     """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
     swapped = keypoints.copy()
-    for part in (*_PARTS, tuple(range(17))):
+    # Joints that are swapped left to right together.
+    parts = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
+    for part in (*parts, tuple(range(17))):
         on = _draw_bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
         more = _draw_bursts(profile.swapped, 0.2, view.size.shape, fps, rng)
         on |= more & (np.cos(view.azimuth) < 0.0)
