@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_HIPS
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel
@@ -49,8 +49,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.plane.kalman import CORRELATION_S as PLACE_CORRELATION_S
 
-HIPS: Final = (11, 12)
-"""Hips in COCO-17; the place on the pitch is below their middle."""
 PIXEL_STD: Final = 1.0
 """Standard deviation of a keypoint in the image [px], in addition to `ray_std_m`."""
 MIN_KEYPOINTS: Final = 6
@@ -259,7 +257,7 @@ class _Clip:
             pose, _ = free.search(track, start, shapes.offsets)
             joints = self.solver.chained.place(pose.parameters())
             center = evidence.camera.center[own.span]
-            hips = joints[:, HIPS, :2].mean(axis=1)
+            hips = joints[:, COCO17_HIPS, :2].mean(axis=1)
             sight = hips - center[:, :2]
             distance = np.linalg.norm(sight, axis=-1)
             sight /= distance[:, None]
@@ -349,17 +347,17 @@ class _Clip:
         weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + PLACE_CORRELATION_S * fps)) * known
         by_place = np.zeros_like(by_ray)
         outer = np.nan_to_num(sight[:, :, None] * sight[:, None])
-        by_place[:, HIPS] = (weight[:, None, None] * outer)[:, None]
+        by_place[:, COCO17_HIPS] = (weight[:, None, None] * outer)[:, None]
         joints = np.where(seen[..., None], points, np.nan)
-        hips = joints[:, HIPS]
+        hips = joints[:, COCO17_HIPS]
         target = np.broadcast_to(place[:, None], hips.shape)
         hips = np.where(np.isfinite(hips), hips, target)
         information = by_ray + by_place
         moved = np.linalg.solve(
-            information[:, HIPS] + MIN_INFORMATION * np.eye(3),
-            by_place[:, HIPS] @ np.nan_to_num(target - hips)[..., None],
+            information[:, COCO17_HIPS] + MIN_INFORMATION * np.eye(3),
+            by_place[:, COCO17_HIPS] @ np.nan_to_num(target - hips)[..., None],
         )[..., 0]
-        joints[:, HIPS] = hips + moved
+        joints[:, COCO17_HIPS] = hips + moved
         information[~np.isfinite(joints).all(axis=-1)] = 0.0
         return PersonEvidence(joints, information)
 
@@ -429,7 +427,7 @@ def stand_on_ground(solver: PoseSolver, pose: Pose, place: Floats) -> Pose:
     model = solver.chained.model
     pose = replace(pose, transl=np.zeros_like(pose.transl))
     joints = solver.chained.place(pose.parameters())
-    xy = place - joints[:, HIPS, :2].mean(axis=1)
+    xy = place - joints[:, COCO17_HIPS, :2].mean(axis=1)
     feet = joints[:, ANKLES, :2] + xy[:, None]
     floor = solver.ground(feet[..., 0], feet[..., 1]) + ankle_height(model, pose.betas)
     up = (floor - joints[:, ANKLES, 2]).max(axis=1)

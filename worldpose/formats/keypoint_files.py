@@ -42,12 +42,10 @@ from worldpose.formats.keypoint_sets import (
     PeopleFile,
 )
 
-_JOINTS: Final = len(COCO17)
-
 _MEMBERS: Final = {
     "frame": Member(("frames",), "int", dtype="<i8"),
-    "keypoints": Member(("frames", "detections", _JOINTS, 2), "float", dtype="<f4"),
-    "confidence": Member(("frames", "detections", _JOINTS), "float", dtype="<f4"),
+    "keypoints": Member(("frames", "detections", len(COCO17), 2), "float", dtype="<f4"),
+    "confidence": Member(("frames", "detections", len(COCO17)), "float", dtype="<f4"),
     "boxes": Member(("frames", "detections", 4), "float", dtype="<f4"),
     "score": Member(("frames", "detections"), "float", dtype="<f4"),
     "point": Member(("points",), "text", required=False),

@@ -13,13 +13,13 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Image
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import crowded_part
 from worldpose.reports.drawing import (
     GRASS,
-    HIPS,
     INK,
     LINE,
     PALE,
@@ -98,7 +98,7 @@ def plot_paths(
 
 def _ground(tracks: JointTracks) -> Floats:
     """Return mid-hips on the ground (frames, persons, 2) [m]."""
-    middle: Floats = tracks.joints[..., HIPS, :2].mean(axis=-2)
+    middle: Floats = tracks.joints[..., COCO17_HIPS, :2].mean(axis=-2)
     return middle
 
 
@@ -144,7 +144,7 @@ def plot_stadium(
     Shading shows the ground in each single camera's field of view, on and near the pitch if there
     is one: the more cameras see a place, the darker it is.
     """
-    hips = tracks.joints[0][:, HIPS, :2].mean(axis=1)
+    hips = tracks.joints[0][:, COCO17_HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
         places.append(pitch_corners(pitch))
@@ -188,7 +188,7 @@ def plot_stadium(
 
 
 def visible_ground(camera: Camera) -> Floats:
-    """Return corners (n, 2) [m] of the ground in a camera's field of view, to `view_length_m`.
+    """Return corners (n, 2) [m] of the ground in a camera's field of view, to 130 m.
 
     The ground is the plane z = 0, world.
     """

@@ -51,8 +51,6 @@ TEMPLATE: Final = "#ffd54a"
 HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 WIDTH: Final = 1540
 """Width of a figure [px]."""
-HIPS: Final = (11, 12)
-"""Indices of the hips in COCO-17; their middle is a person's position from above."""
 _kept: ContextVar[dict[bytes, Figure] | None] = ContextVar("kept", default=None)
 
 

@@ -24,8 +24,6 @@ from worldpose.tracking.person import Person
 from worldpose.tracking.plane.feet import PIXEL_SHARE, PIXEL_STD
 from worldpose.tracking.settings import TrackingSettings
 
-JOINTS = len(COCO17)
-
 
 class TrackingReport(Record):
     """Summary of a tracking run."""
@@ -240,7 +238,7 @@ def _build_result(
     cameras = len(tracker.centers)
     index = np.full((frames, cameras, len(chains)), -1, dtype=np.int16)
     distance = np.full(index.shape, np.nan, dtype=np.float32)
-    joints = np.full((frames, len(chains), JOINTS, 3), np.nan, dtype=np.float32)
+    joints = np.full((frames, len(chains), len(COCO17), 3), np.nan, dtype=np.float32)
     tracks = []
     for n, chain in enumerate(chains):
         for person in chain:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import camera_model
@@ -34,8 +34,6 @@ from worldpose.triangulation.residuals import (
 )
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solve import SolvedJoints, solve_joints, take_step
-
-HIPS = [COCO17.index("left_hip"), COCO17.index("right_hip")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +182,9 @@ def estimate_midhip_shift(
         (frames, cameras, persons, 3) [px].
     """
     index = detections.detection_index
-    middle = detections.keypoints[..., HIPS, :].mean(axis=-2, keepdims=True, dtype=np.float64)
-    sure = detections.confidence[..., HIPS].min(axis=-1, keepdims=True)
+    hips = detections.keypoints[..., COCO17_HIPS, :]
+    middle = hips.mean(axis=-2, keepdims=True, dtype=np.float64)
+    sure = detections.confidence[..., COCO17_HIPS].min(axis=-1, keepdims=True)
     precision = NoiseModel.nominal(1).precision(sure)
     observed = Observations.of(rig, middle, precision, index)
     joints = solve_joints(observed, settings).joints[:, :, 0]

@@ -13,6 +13,7 @@ from typing import Final, Literal
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
 from worldpose.body.occlusions import facing_axes
 from worldpose.simulation.foreign.rigs import View
@@ -138,8 +139,6 @@ PROFILES: Final = {
 
 _PARENT: Final = (5, 0, 0, 1, 2, 6, 5, 5, 6, 7, 8, 12, 11, 11, 12, 13, 14)
 """Parent joint of the limb that leads to each joint."""
-_OTHER: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
-"""The same joint on the other side."""
 _EASE: Final = np.array(
     [0.5, 0.45, 0.45, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0, 1.25, 1.25, 1.3, 1.3, 1.05, 1.05, 1.15, 1.15]
 )
@@ -182,7 +181,7 @@ def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detecto
     """Return a detector of this profile; left and right are mirror images."""
     definition = profile.definition * rng.standard_normal((17, 3))
     height_bias = profile.height_bias * rng.standard_normal(17)
-    for joint, mirror in enumerate(_OTHER):
+    for joint, mirror in enumerate(COCO17_FLIP):
         if mirror < joint:
             definition[joint] = definition[mirror] * [1.0, -1.0, 1.0]
             height_bias[joint] = height_bias[mirror]
@@ -324,7 +323,7 @@ def _misplace_joints(
     kind = rng.integers(3, size=len(frame))
     hider = view.hider[frame, person, joint]
     kind = np.where((hider >= 0) & (rng.random(len(frame)) < 0.7), 3, kind)
-    parents, others = np.array(_PARENT), np.array(_OTHER)
+    parents, others = np.array(_PARENT), np.array(COCO17_FLIP)
     share = rng.uniform(0.3, 0.9, len(frame))[:, None]
     here = keypoints[frame, person, joint]
     parent = keypoints[frame, person, parents[joint]]
@@ -354,7 +353,7 @@ def _swap_sides(
         on |= more & (np.cos(view.azimuth) < 0.0)
         frame, person = np.nonzero(on)
         joints = np.array(part)
-        mirror = np.array(_OTHER)[joints]
+        mirror = np.array(COCO17_FLIP)[joints]
         swapped[frame[:, None], person[:, None], joints] = keypoints[
             frame[:, None], person[:, None], mirror
         ]

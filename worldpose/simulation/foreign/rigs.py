@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
+from data_contracts.conventions import COCO17_TORSO
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
-from worldpose.body.occlusions import CAPSULES, TRUNK, facing_axes, find_hiders, is_covered
+from worldpose.body.occlusions import CAPSULES, facing_axes, find_hiders, is_covered
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import fold_radius
 from worldpose.geometry.rigid import Rigid
@@ -262,7 +263,7 @@ def view_people(
     if pillar is not None:
         with np.errstate(invalid="ignore"):
             inside &= (pixels[..., 0] < pillar[0]) | (pixels[..., 0] > pillar[1])
-    trunk = joints[:, :, TRUNK].mean(axis=2)
+    trunk = joints[:, :, COCO17_TORSO].mean(axis=2)
     depth = camera.camera.cam_from_world.apply(trunk)[..., 2]
     size = float(camera.camera.focal.mean()) / np.where(depth > 0.1, depth, np.nan) * statures
     away = camera.camera.center - trunk
