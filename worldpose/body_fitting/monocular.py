@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
 from worldpose.body.model import JOINTS
-from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps
+from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps, nearest_known
 from worldpose.errors import InputError
 from worldpose.formats.archives import read_npz
 from worldpose.formats.files import require_file
@@ -415,3 +415,30 @@ def monocular_priors(
         orient, bend, left = carry_errors(orient, bend, off, used, CORRELATION_S * fps)
         guided[person] = MonocularPrior(orient, bend, used, precision, correlated_frames, left)
     return guided
+
+
+def smooth_poses(
+    poses: MonocularPoses,
+    person: int,
+    at: NDArray[np.int64],
+    frames: NDArray[np.int64],
+    reach: float,
+) -> tuple[Floats, Floats]:
+    """Return robust means of a person's orientations (frames, 3) and angles (frames, 30) [rad]."""
+    orient = np.empty((len(frames), 3, 3))
+    angles = np.empty((len(frames), SIZE))
+    width = np.maximum(reach, np.abs(frames - nearest_known(at, frames)))
+    first = np.searchsorted(at, frames - width)
+    last = np.searchsorted(at, frames + width, side="right")
+    for row in range(len(frames)):
+        near = at[first[row] : last[row]]
+        turns = poses.orient[near, person]
+        weight = np.ones(len(near))
+        for _ in range(3):
+            u, _, vt = np.linalg.svd(np.einsum("n,nab->ab", weight, turns))
+            u[:, -1] *= np.linalg.det(u @ vt)
+            mean = u @ vt
+            off = np.linalg.norm(Rigid(turns @ mean.T, np.zeros(3)).rotvec, axis=-1)
+            weight = 1.0 / (1.0 + (off / PRIOR_SPREAD) ** 2)
+        orient[row], angles[row] = mean, np.median(poses.angles[near, person], axis=0)
+    return Rigid(orient, np.zeros(3)).rotvec, angles

@@ -11,7 +11,7 @@ from data_contracts.pin import Pin
 from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store.blobs import Entry, verify_published
+from worldpose.store.blobs import Entry
 from worldpose.store.documents import read_checksum, unseal
 from worldpose.store.paths import (
     DAMAGED,
@@ -24,7 +24,7 @@ from worldpose.store.paths import (
 )
 from worldpose.store.runs import is_run_file
 from worldpose.store.store import Store
-from worldpose.store.writer import content_digest
+from worldpose.store.writer import content_digest, verify_published
 
 Progress = Callable[[int, int], None]
 """Called with the number of verified bytes, and the total."""
