@@ -59,7 +59,7 @@ class PointSource:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """One camera and its 2D points of people."""
 
     name: str
@@ -97,7 +97,7 @@ class ShippedClip:
     name: str
     fps: float
     sources: tuple[PointSource, ...]
-    views: tuple[View, ...]
+    views: tuple[CameraView, ...]
     pitch: bool = True
     """Whether the ground is z = 0; otherwise the world frame is that of the camera calibration."""
     findings: tuple[Finding, ...] = field(default=())
@@ -209,7 +209,7 @@ def read_clip(
     for name, camera in rows.items():
         file = coco / f"{name}.json"
         pixels = read_coco(file, ids, frames) if file.is_file() else None
-        views.append(View(name, camera, pixels, COCO17))
+        views.append(CameraView(name, camera, pixels, COCO17))
     given = None
     if (folder / "boxes.npz").is_file() or any((folder / "boxes").glob("*.npy")):
         given = read_challenge(folder, clip).get(clip)
@@ -220,7 +220,7 @@ def read_clip(
             pixels = np.where(gone[..., None, None], np.nan, given.skel_2d)
             skeleton = BODY25 if pixels.shape[2] == len(BODY25) else CHALLENGE15
             views = [
-                View(view.name, view.rows, pixels, skeleton) if view.name == clip else view
+                CameraView(view.name, view.rows, pixels, skeleton) if view.name == clip else view
                 for view in views
             ]
             sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])

@@ -9,7 +9,13 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.release import Finding
-from worldpose.dataset.contents import PointSource, View, convention, implausible, sample_evenly
+from worldpose.dataset.contents import (
+    CameraView,
+    PointSource,
+    convention,
+    implausible,
+    sample_evenly,
+)
 from worldpose.dataset.faults import (
     LATEST,
     LIMITS,
@@ -277,7 +283,7 @@ def is_blind(source: PointSource, rows: CameraRows) -> bool:
 
 
 def visibility_findings(
-    source: PointSource, views: Sequence[View]
+    source: PointSource, views: Sequence[CameraView]
 ) -> Iterator[tuple[Finding, Fault | None]]:
     """Yield findings on cameras that show too few people, and the fault that explains each.
 
@@ -309,7 +315,7 @@ def visibility_findings(
 
 
 def _make_finding(
-    views: Sequence[View], which: Flags, fault: Fault | None, share: Floats
+    views: Sequence[CameraView], which: Flags, fault: Fault | None, share: Floats
 ) -> Finding:
     where = tuple(f"cameras/{view.name}" for view, ours in zip(views, which, strict=True) if ours)
     figures = {"explained_share_seen": float(share[which].min())}
@@ -320,7 +326,7 @@ def _make_finding(
     return Finding(fault="sees_nobody", kind="damage", where=where, says=says, figures=figures)
 
 
-def turning_findings(source: PointSource, view: View) -> Iterator[Finding]:
+def turning_findings(source: PointSource, view: CameraView) -> Iterator[Finding]:
     """Yield the frame offset that explains a source and a camera's 2D, independent of its poses."""
     posed = np.isfinite(view.rows.rotation).all((-1, -2))
     shared = view.shared_points(source)

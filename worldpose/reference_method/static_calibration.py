@@ -15,7 +15,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.reference_method.cameras import K1_K2, TensorCameras
-from worldpose.reference_method.reprojection import Views, adjust
+from worldpose.reference_method.reprojection import Views, minimize_reprojection
 from worldpose.static_calibration.initialization import camera_from_homography, plane_from_image
 from worldpose.static_calibration.report import StaticCalibration
 
@@ -65,7 +65,9 @@ def refine_on_points(start: Camera, points: Floats, image: Floats) -> Camera:
     cameras, every = TensorCameras.of(Camera.stack([start])), torch.arange(len(points))
     seen = Views(every, torch.zeros_like(every), torch.tensor(image))
     still = torch.zeros(len(points), dtype=torch.bool)
-    return adjust(cameras, torch.tensor(points), seen, still, K1_K2).cameras.camera()[0]
+    return minimize_reprojection(
+        cameras, torch.tensor(points), seen, still, K1_K2
+    ).cameras.camera()[0]
 
 
 def distance_map(picture: Image, camera: Camera, points: Floats) -> NDArray[np.float32]:

@@ -276,7 +276,7 @@ def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SceneView:
     """A static camera before an empty stadium.
 
     Attributes:
@@ -294,17 +294,17 @@ class View:
 
 def open_view(
     camera: Camera, pitch: PitchTemplate, seed: int, settings: RenderingSettings | None = None
-) -> View:
+) -> SceneView:
     """Return a static camera's view of a stadium, about a second for 1920 x 1080.
 
     The seed is that of the stadium's look, the same for all its cameras, and of the sensor's noise.
     """
     venue = build_venue(pitch, seed, settings or RenderingSettings())
-    return View(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
+    return SceneView(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
 
 
 def render_frame(
-    view: View, cast: Cast, opened: Surfaces, closed: Surfaces | None = None, *, frame: int = 0
+    view: SceneView, cast: Cast, opened: Surfaces, closed: Surfaces | None = None, *, frame: int = 0
 ) -> RenderedFrame:
     """Return one image of people; the same arguments give the same bytes.
 

@@ -17,7 +17,7 @@ from worldpose.reference_method import body_fitting, broadcast_calibration  # no
 from worldpose.reference_method.cameras import K1_K2, TensorCameras  # noqa: E402
 from worldpose.reference_method.reprojection import (  # noqa: E402
     Views,
-    adjust,
+    minimize_reprojection,
     reprojection_error,
     triangulate,
     triangulate_about_mid_hip,
@@ -177,7 +177,9 @@ def test_adjustment_finds_the_cameras_of_exact_markings_and_people(cameras, with
     moving = torch.arange(len(points)) >= len(marks)
     start = torch.tensor(points + 0.05 * moving.numpy()[:, None])
     assert reprojection_error(tensors.with_values(tensors.values + off), start, seen) > 1e3
-    found = adjust(tensors.with_values(tensors.values + off), start, seen, moving, K1_K2)
+    found = minimize_reprojection(
+        tensors.with_values(tensors.values + off), start, seen, moving, K1_K2
+    )
     assert found.cost < 1e-6
     np.testing.assert_allclose(found.points, points, atol=1e-4)
     np.testing.assert_allclose(found.cameras.camera().center, cameras.center, atol=1e-3)

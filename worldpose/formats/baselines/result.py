@@ -126,7 +126,7 @@ class MethodResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class MethodTrack:
     """Bodies of one person in some frames."""
 
     frames: NDArray[np.int64]
@@ -144,7 +144,7 @@ class Track:
 
 
 def pose_track(
-    track: Track, model: BodyModel, shape: Shape, place: Place = "transl"
+    track: MethodTrack, model: BodyModel, shape: Shape, place: Place = "transl"
 ) -> tuple[Floats, str]:
     """Return the joints (frames, 17, 3) [m] of one person, and the source of its shape.
 

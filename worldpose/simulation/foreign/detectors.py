@@ -16,7 +16,7 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
 from worldpose.body.occlusions import facing_axes
-from worldpose.simulation.foreign.rigs import View
+from worldpose.simulation.foreign.rigs import ForeignView
 from worldpose.simulation.reference import Report, list_detections
 
 
@@ -213,7 +213,7 @@ def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floa
 
 def detect_people(
     detector: Detector,
-    view: View,
+    view: ForeignView,
     defined: Floats,
     image_size: Integers,
     fps: float,
@@ -302,7 +302,7 @@ def _draw_errors(
     return np.asarray(own)
 
 
-def _bias(detector: Detector, view: View, size: Floats) -> Floats:
+def _bias(detector: Detector, view: ForeignView, size: Floats) -> Floats:
     """Return the bias (frames, persons, 17, 2) [px] by azimuth and elevation of the camera."""
     azimuth = view.azimuth
     waves = [np.cos(azimuth), np.sin(azimuth), np.cos(3.0 * azimuth), np.sin(3.0 * azimuth)]
@@ -312,7 +312,11 @@ def _bias(detector: Detector, view: View, size: Floats) -> Floats:
 
 
 def _misplace_joints(
-    profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
+    profile: DetectorProfile,
+    keypoints: Floats,
+    view: ForeignView,
+    fps: float,
+    rng: np.random.Generator,
 ) -> tuple[Floats, Flags]:
     """Return keypoints with gross errors in bursts, and their flags."""
     shape = keypoints.shape[:3]
@@ -341,7 +345,11 @@ def _misplace_joints(
 
 
 def _swap_sides(
-    profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
+    profile: DetectorProfile,
+    keypoints: Floats,
+    view: ForeignView,
+    fps: float,
+    rng: np.random.Generator,
 ) -> Floats:
     """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
     swapped = keypoints.copy()
@@ -365,7 +373,7 @@ def _merge_people(
     keypoints: Floats,
     there: Flags,
     found: Flags,
-    view: View,
+    view: ForeignView,
     fps: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Flags, Flags]:

@@ -225,7 +225,7 @@ def _look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ForeignView:
     """People in one camera's image.
 
     Attributes:
@@ -252,7 +252,7 @@ class View:
 
 def view_people(
     camera: RigCamera, joints: Floats, statures: Floats, pillar: tuple[float, float] | None
-) -> View:
+) -> ForeignView:
     """Return positions of people in the image and their occlusions.
 
     `joints` (frames, persons, 17, 3) [m], world; `statures` (persons,) [m]; `pillar` is the left
@@ -269,7 +269,7 @@ def view_people(
     away = camera.camera.center - trunk
     forward, left = facing_axes(joints)
     level = np.linalg.norm(away[..., :2], axis=-1)
-    return View(
+    return ForeignView(
         inside=inside,
         hider=find_hiders(pixels, depth, size),
         behind_self=_is_behind_trunk(camera, joints, pixels, depth, size),
