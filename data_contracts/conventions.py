@@ -64,6 +64,9 @@ COCO17_BODY_BONES = (
 COCO17_LIMBS = ((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16))
 """Upper and lower ends of upper arms, forearms, thighs and shanks, left before right."""
 
+COCO17_RIGID_BONES = (*COCO17_LIMBS, (5, 6), (11, 12))
+"""Bones whose length no pose changes: the limbs, and the lines between shoulders and hips."""
+
 COCO17_TORSO = (5, 6, 11, 12)
 """Left and right shoulder, left and right hip."""
 

@@ -51,10 +51,6 @@ OPENCAP_NAME: Final = "cameraIntrinsicsExtrinsics"
 OPENCAP_KEYS: Final = Keys("imageSize", "intrinsicMat", "distortion", "rotation", "translation")
 
 
-LYING: Final = np.diag([1.0, -1.0, -1.0])
-"""(3, 3) from a board on the ground, whose z points into it."""
-
-
 Sizes: TypeAlias = Mapping[str, tuple[int, int]]
 """Width and height [px] by camera."""
 
@@ -234,8 +230,10 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     from_standing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
     # (3, 3) from a board whose y points up.
     from_turned = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    # (3, 3) from a board on the ground, whose z points into it.
+    from_lying = np.diag([1.0, -1.0, -1.0])
     cosine, axes = max(
-        ((down[1], from_standing), (-down[1], from_turned), (down[2], LYING)),
+        ((down[1], from_standing), (-down[1], from_turned), (down[2], from_lying)),
         key=lambda place: float(place[0]),
     )
     if not cosine >= upright:

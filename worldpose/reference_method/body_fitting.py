@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,15 +11,10 @@ from torch import Tensor
 from torch.func import jacrev
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17_HIPS, COCO17_TORSO
+from data_contracts.conventions import COCO17_HIPS, COCO17_RIGID_BONES, COCO17_TORSO
 from worldpose.body.differentiable import DifferentiableBody
 from worldpose.geometry.rigid import Rigid, align
 from worldpose.reference_method.cameras import TensorCameras
-
-BONES: Final = (
-    *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),
-)
-"""Bones of COCO-17 whose length no pose changes."""
 
 
 class Omega(NamedTuple):
@@ -57,7 +52,7 @@ def fit_shape(body: DifferentiableBody, joints: Floats) -> Floats:
         body: with the keypoints of COCO-17.
         joints: (frames, 17, 3) P [m]; NaN where missing.
     """
-    first, second = np.array(BONES).T
+    first, second = np.array(COCO17_RIGID_BONES).T
 
     def lengths(betas: Tensor) -> Tensor:
         still = (betas.new_zeros(size) for size in (3, 69, 3))

@@ -7,6 +7,7 @@ torch = pytest.importorskip("torch")
 
 from camera_builders import look_at_camera  # noqa: E402
 
+from data_contracts.conventions import COCO17_RIGID_BONES
 from worldpose.body.body_file import find_body  # noqa: E402
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
 from worldpose.body.keypoints import SKELETONS, fold_keypoints  # noqa: E402
@@ -191,7 +192,7 @@ def test_shape_by_bone_lengths_is_that_of_an_exact_body_whatever_a_few_frames_sa
     betas = torch.tensor(body_fitting.fit_shape(body, joints))
     still = torch.zeros(75, dtype=torch.float64).split((3, 69, 3))
     found, true = (body.keypoints(b, *still) for b in (betas, moving_person(body).betas))
-    for first, second in body_fitting.BONES:
+    for first, second in COCO17_RIGID_BONES:
         lengths = [torch.linalg.vector_norm(k[first] - k[second]) for k in (found, true)]
         np.testing.assert_allclose(*lengths, atol=0.002)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,6 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pickles import read_pickle
-
-Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Rotation of world points to axes with y down, the ground orientation of SLAHMR."""
 
 
 def write_tracks(path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
@@ -80,7 +77,9 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
         )
     pose = camera.cam_from_world
     transforms = np.tile(np.eye(4), (len(camera.focal), 1, 1))
-    transforms[:, :3, :3] = pose.rotation @ Y_DOWN.T
+    # Rotation of world points to axes with y down, the ground orientation of SLAHMR.
+    y_down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    transforms[:, :3, :3] = pose.rotation @ y_down.T
     transforms[:, :3, 3] = pose.translation
     width, height = camera.image_size.reshape(-1, 2)[0]
     write_archive(
