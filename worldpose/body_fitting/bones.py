@@ -52,10 +52,7 @@ def measure_bones(joints: Floats, covariance: Floats, correlated_frames: float) 
         covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
         correlated_frames: frames with correlated errors, which count as one.
     """
-    lengths, variances = (
-        np.full(len(COCO17_RIGID_BONES), np.nan),
-        np.full(len(COCO17_RIGID_BONES), np.inf),
-    )
+    lengths, variances = (np.full(len(COCO17_RIGID_BONES), value) for value in (np.nan, np.inf))
     for index, (a, b) in enumerate(COCO17_RIGID_BONES):
         bone = joints[:, b] - joints[:, a]
         error = covariance[:, a] + covariance[:, b]
@@ -112,9 +109,7 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
 
     The prior of betas is normal with variance 1; without bones they are 0 with covariance 1.
     """
-    ends = np.array(
-        [[JOINT_OF_POINT[COCO17[joint]] for joint in bone] for bone in COCO17_RIGID_BONES]
-    )
+    ends = np.array([JOINT_OF_POINT[name] for name in COCO17])[np.array(COCO17_RIGID_BONES)]
     template = model.joint_template[ends[:, 1]] - model.joint_template[ends[:, 0]]
     directions = model.joint_directions[ends[:, 1]] - model.joint_directions[ends[:, 0]]
     seen = np.isfinite(bones.length)

@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 
 from camera_builders import look_at_camera  # noqa: E402
 
-from data_contracts.conventions import COCO17_RIGID_BONES
+from data_contracts.conventions import COCO17_RIGID_BONES  # noqa: E402
 from worldpose.body.body_file import find_body  # noqa: E402
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
 from worldpose.body.keypoints import SKELETONS, fold_keypoints  # noqa: E402
