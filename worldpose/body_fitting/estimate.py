@@ -42,6 +42,9 @@ from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shapes import Shapes, fit_shapes, spread_intervals
 from worldpose.compiled import map_in_threads
 
+WINDOW_FRAMES = 3000
+"""Frames that are solved together: a person's equations take 60 KB per frame."""
+
 
 def fit_bodies(
     model: BodyModel,
@@ -291,9 +294,7 @@ def split_windows(
     """Yield frames that are solved together, and those of them that are kept."""
     # Motion ties a pose to those within some tenths of a second.
     margin = math.ceil(max(3.0, 2.0 * settings.max_filled_gap_s) * fps)
-    # Frames that are solved together: a person's equations take 60 KB per frame.
-    window_frames = 3000
-    size = max(window_frames, 2 * margin)
+    size = max(WINDOW_FRAMES, 2 * margin)
     starts = range(0, frames, size) if frames > size + margin else (0,)
     for start in starts:
         stop = start + size if len(starts) > 1 and start + size < frames else frames

@@ -39,6 +39,9 @@ from worldpose.formats.keypoint_sets import (
 )
 from worldpose.formats.pose_forms import plain_entries
 
+BATCH = 4096
+"""Results per batch of Python objects."""
+
 _COUNT_TODO: Final = "Export all points, and 0, 0, 0 where one is missing."
 _NUMBER_TODO: Final = (
     "Number the images from 0 in the order of the video, in image_id or file_name."
@@ -140,15 +143,13 @@ def _join(path: Path, batches: Sequence[_Results]) -> _Results:
 def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
     """Yield batches of results, each with the index of its first result in the file."""
     batch: list[dict[str, Any]] = []
-    # Results per batch of Python objects.
-    batch_size = 4096
     for index, result in enumerate(items):
         if type(result) is not dict:
             expected = "a mapping with image_id and keypoints"
             raise _result_error(path, index, "", expected, _shorten(result))
         batch.append(result)
-        if len(batch) == batch_size:
-            yield index + 1 - batch_size, batch
+        if len(batch) == BATCH:
+            yield index + 1 - BATCH, batch
             batch = []
     if batch:
         yield index + 1 - len(batch), batch

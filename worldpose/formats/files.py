@@ -23,6 +23,15 @@ import yaml
 
 from worldpose.errors import InputError, say_failure
 
+ENTRY_LENGTH = 1 << 20
+"""Maximum characters of one entry; a person's keypoints have under a thousand."""
+
+CHUNK = 1 << 20
+"""Bytes per read."""
+
+EVENTS = 100_000
+"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
@@ -209,8 +218,6 @@ class _Loader(yaml.SafeLoader):
 def _load_yaml(text: str) -> Any:  # noqa: ANN401
     # Events arrive one by one, so that the check rejects a bomb before construction.
     depth = 0
-    # Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000.
-    max_events = 100_000
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
         if isinstance(event, yaml.AliasEvent):
             raise yaml.YAMLError(f"an alias (*), which is not allowed {event.start_mark}")
@@ -218,8 +225,8 @@ def _load_yaml(text: str) -> Any:  # noqa: ANN401
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        if count > max_events:
-            raise yaml.YAMLError(f"more than {max_events} entries")
+        if count > EVENTS:
+            raise yaml.YAMLError(f"more than {EVENTS} entries")
         if depth > NESTING:
             raise yaml.YAMLError(f"more than {NESTING} levels {event.start_mark}")
     return yaml.load(text, Loader=_Loader)
@@ -416,8 +423,6 @@ class _Text:
     def value(self) -> Any:  # noqa: ANN401
         """Return the next value."""
         self.ahead()
-        # Maximum characters of one entry; a person's keypoints have under a thousand.
-        max_length = 1 << 20
         while True:
             try:
                 value, end = _DECODER.raw_decode(self._buffer, self._place)
@@ -429,8 +434,8 @@ class _Text:
                 if self._is_whole or self._buffer[end : end + 1] in (*_SPACE, *",:]}"):
                     self._place = end
                     return value
-            if len(self._buffer) - self._place > max_length:
-                raise self.error(f"an entry that is wrong or longer than {max_length} characters")
+            if len(self._buffer) - self._place > ENTRY_LENGTH:
+                raise self.error(f"an entry that is wrong or longer than {ENTRY_LENGTH} characters")
             self._fill()
 
     def error(self, message: str, place: int | None = None) -> json.JSONDecodeError:
@@ -440,9 +445,7 @@ class _Text:
         return error
 
     def _fill(self) -> None:
-        # Bytes per read.
-        chunk_bytes = 1 << 20
-        data = self._file.read(chunk_bytes)
+        data = self._file.read(CHUNK)
         self._is_whole = not data
         self._before += self._place
         self._buffer = self._buffer[self._place :] + self._decode(data, not data)

@@ -40,6 +40,9 @@ from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
 
+MAX_FILE_BYTES = 400_000_000
+"""Largest file; browsers refuse texts of 512 MB, and this is more than ten minutes of a match."""
+
 JOINT_UNIT: Final = 1e-4
 """Resolution of the joints of people without a body, relative to one of them [m]."""
 SURFACE_UNIT: Final = 1e-4
@@ -317,12 +320,10 @@ def _parts(clip: ViewerClip, video: Path | None) -> Iterator[tuple[str, bytes]]:
 
 
 def _require_size(path: Path, size: int) -> None:
-    # Largest file; browsers refuse texts of 512 MB, and this is more than ten minutes of a match.
-    max_bytes = 400_000_000
-    if size > max_bytes:
+    if size > MAX_FILE_BYTES:
         raise InputError(
             str(path),
-            expected=f"at most {max_bytes / 1e6:g} MB, which browsers open",
+            expected=f"at most {MAX_FILE_BYTES / 1e6:g} MB, which browsers open",
             found="more",
             todo="Cut the match into shorter clips, export a folder with a file per clip, or leave "
             "out --video.",
