@@ -36,9 +36,8 @@ from data_contracts.conventions import CONVENTIONS
 from data_contracts.run import ResultManifest, StoredFile
 from worldpose.errors import InputError, InternalError
 from worldpose.store.blobs import Blobs, LocalBlobs
-from worldpose.store.documents import canonical_json
+from worldpose.store.documents import canonical_json, corruption_error, read_published
 from worldpose.store.paths import ResultId
-from worldpose.store.writer import corruption_error, read_published
 
 Arrays = Mapping[str, NDArray[Any]]
 

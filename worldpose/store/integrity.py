@@ -12,7 +12,7 @@ from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry
-from worldpose.store.documents import read_checksum, unseal
+from worldpose.store.documents import read_checksum, unseal, verify_published
 from worldpose.store.paths import (
     DAMAGED,
     MANIFEST,
@@ -24,7 +24,7 @@ from worldpose.store.paths import (
 )
 from worldpose.store.runs import is_run_file
 from worldpose.store.store import Store
-from worldpose.store.writer import content_digest, verify_published
+from worldpose.store.writer import content_digest
 
 Progress = Callable[[int, int], None]
 """Called with the number of verified bytes, and the total."""

@@ -29,7 +29,7 @@ from worldpose.errors import (
     StoreError,
 )
 from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point
-from worldpose.store.documents import seal, unseal
+from worldpose.store.documents import seal, unseal, verify_published
 from worldpose.store.paths import (
     MANIFEST,
     PROJECT,
@@ -41,7 +41,7 @@ from worldpose.store.paths import (
 )
 from worldpose.store.recipes import STORE_FORMAT, recipe_key
 from worldpose.store.runs import LATEST, read_document, read_pin, run_files, run_order
-from worldpose.store.writer import ResultWriter, verify_published
+from worldpose.store.writer import ResultWriter
 
 if TYPE_CHECKING:
     import xarray as xr

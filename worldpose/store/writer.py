@@ -1,4 +1,4 @@
-"""Writer of one result before its publication, and verified reads of what is published."""
+"""Writer of one result before its publication."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from data_contracts.arrays import GroupLayout
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest, StoredFile
 from data_contracts.work import Work
-from worldpose.errors import CorruptionError, InternalError, StoreError
-from worldpose.store.blobs import Blobs, pass_commit_point, storage_errors
+from worldpose.errors import InternalError, StoreError
+from worldpose.store.blobs import pass_commit_point, storage_errors
 from worldpose.store.documents import canonical_json, digest, record_checksum
-from worldpose.store.paths import ResultId
 
 if TYPE_CHECKING:
     from worldpose.store.groups import Arrays
@@ -142,48 +141,3 @@ def stored_files(folder: Path) -> tuple[StoredFile, ...]:
 def content_digest(files: tuple[StoredFile, ...]) -> str:
     """Return a digest that is equal for all valid computations of one key."""
     return digest(canonical_json([file.model_dump(mode="json") for file in files]))
-
-
-def read_published(blobs: Blobs, result: ResultId, file: StoredFile) -> bytes:
-    """Return the bytes of one file after verifying that they are the published ones.
-
-    Raises:
-        CorruptionError: the file is missing or its bytes have changed.
-    """
-    path = f"{result.path}/{file.path}"
-    data = blobs.read(path)
-    there = None if data is None else (len(data), digest(data))
-    _require_published(blobs, path, file, there)
-    assert data is not None
-    return data
-
-
-def _require_published(
-    blobs: Blobs, path: str, file: StoredFile, there: tuple[int, str] | None
-) -> None:
-    """Raise CorruptionError unless size and SHA-256 of the bytes there are the published ones."""
-    if there is None:
-        raise corruption_error(blobs, path, "the file is missing")
-    size, sha256 = there
-    if size != file.size:
-        raise corruption_error(blobs, path, f"the file has {size} bytes, not {file.size}")
-    if sha256 != file.sha256:
-        raise corruption_error(blobs, path, "its SHA-256 differs from the one in the manifest")
-
-
-def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
-    """Verify that the bytes of one file are the published ones, without holding them in memory.
-
-    Raises:
-        CorruptionError: as `read_published`.
-    """
-    path = f"{result.path}/{file.path}"
-    _require_published(blobs, path, file, blobs.digest(path))
-
-
-def corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
-    """Return the error of a published file that is not as it was."""
-    return CorruptionError(
-        f"{blobs.url}/{path} has changed since its publication: {found}. Run "
-        "`worldpose verify --repair` to find and repair all damage."
-    )
