@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
+from data_contracts.conventions import COCO17_TORSO
 from worldpose.geometry.cameras import Camera
 
 Capsules = tuple[tuple[int, int, float], ...]
@@ -17,7 +18,6 @@ CAPSULES: Final[Capsules] = (
     *((11, 13, 0.045), (12, 14, 0.045), (13, 15, 0.03), (14, 16, 0.03), (3, 4, 0.055)),
 )
 """Joint pairs of body parts, and their half widths [stature]."""
-TRUNK: Final = (5, 6, 11, 12)
 
 
 def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
@@ -84,7 +84,7 @@ def visible_joints(joints: Floats, camera: Camera) -> tuple[Floats, Flags]:
     stature = 1.8  # mean height of a person [m]
     frames, persons, count, _ = joints.shape
     pixels = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
-    trunk = joints[:, :, TRUNK].mean(axis=2)
+    trunk = joints[:, :, COCO17_TORSO].mean(axis=2)
     depth = np.linalg.norm(trunk - camera.center[..., None, :], axis=-1)
     size = stature * camera.focal.mean(axis=-1)[..., None] / depth
     within = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)

@@ -228,8 +228,6 @@ def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
 
 BVH_DECIMALS: Final = 6
 """Decimals of all numbers: a hundredth of a micrometre, and angles that move a hand by as much."""
-_LOCKED: Final = 1e-7
-"""Cosine of the middle angle below which the outer two have the same axis (gimbal lock) [1]."""
 
 
 def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float) -> None:
@@ -314,7 +312,9 @@ def _numbers(vector: Floats) -> str:
 def zxy_angles(rotation: Floats) -> Floats:
     """Return angles (..., 3) [rad] with rotation = Rz(first) Rx(second) Ry(third)."""
     cosine = np.hypot(rotation[..., 2, 0], rotation[..., 2, 2])
-    locked = cosine < _LOCKED
+    # Cosine of the middle angle below which the outer two have the same axis (gimbal lock) [1].
+    locked_cosine = 1e-7
+    locked = cosine < locked_cosine
     about_z = np.where(
         locked,
         np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]),
@@ -324,15 +324,8 @@ def zxy_angles(rotation: Floats) -> Floats:
     return np.stack([about_z, np.arctan2(rotation[..., 2, 1], cosine), about_y], axis=-1)
 
 
-OPENSIM_AXES: Final = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-"""Rotation from the axes of the body model in T-pose (x left, y up, z forward) to those of
-OpenSim's bodies (x forward, y up, z right)."""
-LOWERED: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Rotation of the right arm from hanging, OpenSim's zero, to the T-pose: -90 degrees about x."""
 MIRROR: Final = np.diag([1.0, 1.0, -1.0])
 """Reflection in the body's sagittal plane: a left limb's angles are those of its mirror image."""
-MID_HIP_M: Final = np.array([-0.056276, -0.07849, 0.0])
-"""Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes."""
 OPENSIM_COORDINATES: Final = (
     *("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz"),
     *("hip_flexion_r", "hip_adduction_r", "hip_rotation_r", "knee_angle_r", "ankle_angle_r"),
@@ -360,10 +353,13 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
     out. The pelvis's place is such that the middle of the hips of the unscaled model is that of the
     body.
     """
-    rest = (model.joint_template + model.joint_directions @ poses.betas[0]) @ OPENSIM_AXES.T
+    # Rotation from the axes of the body model in T-pose (x left, y up, z forward) to those of
+    # OpenSim's bodies (x forward, y up, z right).
+    opensim_axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    rest = (model.joint_template + model.joint_directions @ poses.betas[0]) @ opensim_axes.T
     turns = model.articulate(poses).local_rotations
-    relative = OPENSIM_AXES @ turns @ OPENSIM_AXES.T
-    pelvis = Y_UP @ Rigid.from_rotvec(poses.global_orient, np.zeros(3)).rotation @ OPENSIM_AXES.T
+    relative = opensim_axes @ turns @ opensim_axes.T
+    pelvis = Y_UP @ Rigid.from_rotvec(poses.global_orient, np.zeros(3)).rotation @ opensim_axes.T
 
     def turn(*names: str) -> Floats:
         """Return the rotation of a chain of joints, from the first's parent to the last."""
@@ -373,11 +369,15 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
         return whole
 
     hips = model.joints(poses)[:, [_JOINT["left_hip"], _JOINT["right_hip"]]].mean(axis=1)
-    place = hips @ Y_UP.T - pelvis @ MID_HIP_M
+    # Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes.
+    mid_hip_m = np.array([-0.056276, -0.07849, 0.0])
+    place = hips @ Y_UP.T - pelvis @ mid_hip_m
     columns = {}
+    # Rotation of the right arm from hanging, OpenSim's zero, to the T-pose: -90 degrees about x.
+    lowered = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for side, mirror in (("right", np.eye(3)), ("left", MIRROR)):
-        arm = mirror @ turn(f"{side}_collar", f"{side}_shoulder") @ mirror @ LOWERED
-        elbow = LOWERED.T @ mirror @ turn(f"{side}_elbow") @ mirror @ LOWERED
+        arm = mirror @ turn(f"{side}_collar", f"{side}_shoulder") @ mirror @ lowered
+        elbow = lowered.T @ mirror @ turn(f"{side}_elbow") @ mirror @ lowered
         hip, knee, ankle = (
             mirror @ turn(f"{side}_{name}") @ mirror for name in ("hip", "knee", "ankle")
         )
