@@ -45,15 +45,3 @@ def test_perfect_boxes_score_one_and_the_crowd_does_not_count_on_the_pitch(label
     assert everywhere["precision"] < 1.0
     on_pitch = stills.score_boxes(*stills.keep_pitch(found, labels, outlines), 0.4)
     assert on_pitch == {"recall": 1.0, "precision": 1.0, "ap50": 1.0}
-
-
-def test_a_second_box_and_a_shifted_box_are_false(labels):
-    still = next(each for each in labels if each.path.name == "off2.jpg")
-    box = still.boxes[~still.ignored][0]
-    width = box[2] - box[0]
-    shifted = box + [width, 0.0, width, 0.0]
-    scores, right = stills.judge_boxes(
-        People(np.stack([box, box + 1.0, shifted]), np.array([0.9, 0.8, 0.7])), still
-    )
-    assert scores.tolist() == [0.9, 0.8, 0.7]
-    assert right.tolist() == [True, False, False]

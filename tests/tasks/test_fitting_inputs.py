@@ -1,7 +1,5 @@
 """Images of the broadcast camera as input of body fitting: clock offsets."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,7 +8,7 @@ from camera_builders import look_at_camera
 from tasks import refitting
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
-from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.clock import ImageClock
 
@@ -24,43 +22,6 @@ def runner(frame):
     """Joints (frames, 1, 17, 3) of a person who moves 0.7 m per frame, diagonally away."""
     body = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], -1)
     return (body + (frame - 5.5)[:, None, None] * [0.5, 0.5, 0.0])[:, None]
-
-
-@pytest.mark.parametrize(("feed_offset", "late"), [("report", -0.25), ("correct", 1.25)])
-def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_offset, late):
-    arrays = camera_arrays(beside(3))
-    seen = xr.Dataset(
-        {"keypoints": (("frame", "detection", "joint", "axis"), np.zeros((3, 1, 17, 2)))},
-        coords={"frame": [100, 101, 102]},
-    )
-    found = xr.Dataset(
-        {
-            name: ([f"{name}_{axis}" for axis in range(values.ndim)], values)
-            for name, values in {**arrays, "reprojection_error": np.array([1.0, 2.5, 2.0])}.items()
-        },
-        attrs={"feed_offset": {"frames": 1.5}},
-    )
-    results = {"broadcast_calibration/clip": found, "ingest/clip": seen}
-    calibrated = SimpleNamespace(recipe=SimpleNamespace(settings={"feed_offset": feed_offset}))
-    inputs = SimpleNamespace(
-        unit="clip",
-        sources={
-            "offset_frames": 4,
-            "broadcast_offset_frames": 104.25,
-            "seen_in_broadcast": "ingest/clip",
-            "estimates": None,
-        },
-        frames=np.arange(100, 103),
-        open=results.__getitem__,
-        open_first=lambda pooled, calibrated: results[calibrated],
-        made_from=lambda name: calibrated,
-    )
-    pictures = refitting._BroadcastView.open(inputs, "clip", {"joints": None})
-    # Match frame 100 is at 104.25 of the video: its image 104 was taken a quarter earlier. The
-    # feed was measured to show what static cameras show one and a half frames on.
-    assert (pictures.clock.late + pictures.late).tolist() == [late] * 3
-    assert pictures.clock.number.tolist() == [104, 105, 106]
-    assert np.isfinite(pictures.camera.focal).all(axis=-1).tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("late", [1.0, -2.0])

@@ -22,11 +22,6 @@ def load():
 '''
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "new" / "sources.json"
-
-
 def test_a_source_has_its_imports_and_names_of_data() -> None:
     parsed = parse_source(SOURCE)
     assert parsed.imports == [

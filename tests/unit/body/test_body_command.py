@@ -34,10 +34,3 @@ def test_body_install_says_where_the_body_is(file, tmp_path):
     assert find_body("smpl-female", folder).name == "smpl-female"
     named = CliRunner().invoke(app, [*command, "--name", "mine", "--json"])
     assert json.loads(named.stdout) == {"body_model": "mine", "file": str(folder / "mine.npz")}
-
-
-def test_body_install_keeps_bodies_in_the_users_folder(file, tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert CliRunner().invoke(app, ["body", "install", str(file)]).exit_code == 0
-    kept = tmp_path / "home" / ".local" / "share" / "worldpose" / "bodies" / "smpl-female.npz"
-    assert kept.is_file()

@@ -66,11 +66,3 @@ def test_a_vertex_of_a_model_of_another_size_is_refused(open_body):
 def test_a_regressor_that_is_no_mean_is_refused(open_body, joints, vertices):
     with pytest.raises(InputError, match="keypoint regressor"):
         fold_regressor(open_body, joints, vertices)
-
-
-def test_a_missing_person_is_nan_and_the_others_are_not(open_body, people):
-    transl = people.transl.copy()
-    transl[1] = np.nan
-    keypoints = fold_keypoints(open_body, SKELETONS["coco17"])(replace(people, transl=transl))
-    assert np.isnan(keypoints[1]).all()
-    assert np.isfinite(np.delete(keypoints, 1, axis=0)).all()

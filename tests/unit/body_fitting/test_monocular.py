@@ -87,13 +87,6 @@ def test_files_that_lack_something_are_refused_with_its_name(tmp_path, change, s
     assert str(path) in str(told.value)
 
 
-def test_pickled_objects_are_not_loaded(tmp_path):
-    path = tmp_path / "estimates.npz"
-    np.savez(path, poses=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match="Python objects, which are never loaded"):
-        read_monocular(path)
-
-
 EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)
 
 

@@ -7,7 +7,6 @@ import pytest
 import turning_clip as clip
 
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
-from worldpose.broadcast_calibration.evidence import PLAYER
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.residuals import linearize
 from worldpose.broadcast_calibration.settings import BroadcastPrior
@@ -52,24 +51,3 @@ def test_the_gradient_is_the_slope_of_the_cost():
     )
     # Differences of a cost of 1e3 known to 1e-13, over 2e-8; the slope is 1e5.
     assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)
-
-
-@pytest.mark.parametrize("term", ["field", "player", "flow"])
-def test_a_weight_multiplies_its_own_term_alone(term):
-    rng = np.random.default_rng(5)
-    true = clip.moving(6)
-    points = clip.ground_points(true, rng, each=8)
-    some = rng.random(len(points)) < 0.4
-    points = replace(points, kind=np.where(some, PLAYER, points.kind))
-    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
-    camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), np.zeros(5))
-
-    def cost(weight):
-        weights = TermWeights()._replace(**{term: weight})
-        problem = ClipProblem(
-            points, clip.followed_points(true, np.random.default_rng(6)), prior, weights
-        )
-        return linearize(camera, np.zeros((0, 3)), problem).cost
-
-    assert cost(1.0) > cost(0.0)
-    assert cost(3.0) - cost(0.0) == pytest.approx(3.0 * (cost(1.0) - cost(0.0)))

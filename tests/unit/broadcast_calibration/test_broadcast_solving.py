@@ -9,12 +9,10 @@ from scipy.optimize import least_squares
 
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
-from worldpose.broadcast_calibration.pitch_errors import PitchErrors
-from worldpose.broadcast_calibration.priors import build_prior, lens_walk
-from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings, BroadcastPrior
+from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import solve
 from worldpose.errors import DegenerateError
-from worldpose.pitch.template import PitchTemplate
 
 SMOOTH = np.array([np.inf] * 3 + [1e-4])
 
@@ -83,30 +81,3 @@ def test_a_frame_with_neither_evidence_nor_prior_is_named_as_undetermined():
     prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
     with pytest.raises(DegenerateError, match="neither evidence nor prior"):
         solve(true, ClipProblem(PointEvidence.none(), FlowEvidence.none(), prior), 5)
-
-
-def test_the_distortion_changes_with_the_zoom_alone():
-    rng = np.random.default_rng(8)
-    true = clip.moving(12)
-    still = replace(true, focal=np.full(12, true.focal[0]))
-    prior = build_prior(BroadcastPrior(), still.focal, still.image_size)
-    lens = np.repeat(prior.distortion[:1], 12, axis=0)
-    still = replace(still, distortion=lens)
-    zoomed = replace(still, focal=still.focal * np.exp(np.linspace(0.0, 1.0, 12)))
-    for one, walk in ((still, 1e-3), (zoomed, np.sqrt(1.0 / 11.0))):
-        np.testing.assert_allclose(lens_walk(one.focal) * np.sqrt(12), walk, rtol=1e-3)
-    free = problem_of(still, rng, noise=1.0)
-    held = solve(still, replace(free, lens_walk=lens_walk(still.focal)), 30).camera
-    loose = solve(still, free, 30).camera
-    assert np.ptp(held.distortion, axis=0).max() < 0.01 * np.ptp(loose.distortion, axis=0).max()
-
-
-def test_markings_stay_within_their_spread_and_the_shown_spread_is_told():
-    errors = PitchErrors.of(PitchTemplate.standard(), BroadcastCalibrationSettings())
-    point, sure = np.arange(4), np.zeros((4, 3))
-    far = errors.learn_paint(np.full((4, 3), 10.0), sure, point)
-    # (6 + 12 * 10^2) / (6 + 12) squared deviations of 0.03 m.
-    assert far.shown_m == pytest.approx(0.03 * np.sqrt(67.0))
-    assert far.paint_m == 0.03
-    near = errors.learn_paint(np.zeros((4, 3)), sure, point)
-    assert near.paint_m == pytest.approx(0.03 * np.sqrt(1.0 / 3.0))

@@ -10,11 +10,9 @@ import pytest
 import xarray as xr
 from faulty_data_sets import FPS, PERSONS, edit, transpose_rotation
 from run_records import StubRun
-from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.cli.app import app
 from flows.results.best_results import Origin
 from flows.results.data_set_release import (
     ASSETS,
@@ -344,16 +342,6 @@ def test_a_planted_fault_is_found(written, tmp_path, name):
     assert (fault, where) in {(each.fault, place) for each in found for place in each.where}, found
 
 
-def test_the_command_checks_a_data_set(written, tmp_path):
-    check = ("release", "--check", str(written / "set"), "--hidden", str(written / "truth"))
-    assert "no findings" in CliRunner().invoke(app, check).stdout
-    folder = shutil.copytree(written / "set", tmp_path / "set")
-    (folder / BOXES).unlink()
-    answer = CliRunner().invoke(app, ("release", "--check", str(folder), "--json"))
-    assert answer.exit_code == 1
-    assert "missing_files" in {each["fault"] for each in json.loads(answer.stdout)["findings"]}
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -399,17 +387,3 @@ def test_a_video_that_changed_since_its_registration_is_not_copied(origins, tmp_
     changed = [(Origin(origin.run, registration), "train")]
     with pytest.raises(InputError, match="Register it again and run: worldpose ingest"):
         write_data_set(store, changed, tmp_path / "set", "third", LICENCES, footage="copy")
-
-
-def test_the_command_names_clips_without_people(origins, tmp_path, monkeypatch):
-    store, ((origin, _), *_) = origins
-    some = {unit: found for unit, found in origin.run.items() if unit.endswith("/A")}
-    run = StubRun(some, store, match_id="ann-1")
-    monkeypatch.setattr("flows.registering.find_registration", lambda *_: origin.registration)
-    monkeypatch.setattr("flows.results.best_results.open_results", lambda *_: run)
-    (tmp_path / "TERMS.txt").write_text("For tests alone.")
-    asked = ["release", "ann-1/1", "--name=fourth", f"--project={store.url}"]
-    places = [f"--out={tmp_path}/set", f"--licence={tmp_path}/TERMS.txt"]
-    answer = CliRunner().invoke(app, [*asked, *places])
-    assert answer.exit_code == 0, answer.exception
-    assert "run 0001 of ann-1 has no people in B: not in the data set" in answer.stderr

@@ -2,9 +2,7 @@
 
 import io
 import itertools
-import json
 import math
-import re
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from flows.cli.app import app
-from flows.results.dataset import check, count
+from flows.results.dataset import count
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import write_frame_rates
 from worldpose.dataset.statistics import clip_statistics
@@ -85,28 +83,6 @@ def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
     assert [found.clips[f"C_{n}"].camera for n in range(3)] == ["S", "M", "M+Z"]
     picture = imread(io.BytesIO(plot_statistics(found)))
     assert picture.shape[:2] == (462, 1540)
-
-
-def test_the_command_counts_as_the_library_does(tmp_path):
-    places = made(np.random.default_rng(2), 50, 4)
-    bodies = BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), places.astype(np.float64))
-    write_poses(tmp_path / "poses" / "C.npz", bodies, "open-neutral/2")
-    picture = tmp_path / "lengths.png"
-    page = tmp_path / "page.html"
-    asked = ["statistics", str(tmp_path), "--fps", "25", "--picture", str(picture), "--json"]
-    asked += ["--page", str(page)]
-    answer = CliRunner().invoke(app, asked)
-    assert answer.exit_code == 0
-    found = count([tmp_path], fps=25.0)
-    assert json.loads(answer.stdout) == found.model_dump(mode="json")
-    assert imread(picture).shape[:2] == (462, 1540)
-    text = page.read_text()
-    assert f"<b>{found.poses:,}</b><span>3D poses</span>" in text
-    assert text.count('src="data:image/') == 1
-    # These people lie about in the air.
-    faults = re.findall('<td class="bad">([a-z_]+)</td>', text)
-    assert faults == [finding.fault for finding in check(tmp_path, fps=25.0).findings]
-    assert faults
 
 
 def test_a_gap_adds_no_way_and_heights_do_not_count():

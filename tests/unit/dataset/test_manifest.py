@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from data_contracts.release import ReleasedClip, ReleaseManifest
 from data_contracts.usability import Usability
@@ -67,11 +66,6 @@ def test_a_changed_and_a_lost_file_are_noticed(tmp_path):
     assert changed_files(tmp_path, manifest.files) == ["poses/A_1.npz"]
     (tmp_path / "joints.npz").unlink()
     assert changed_files(tmp_path, manifest.files) == ["joints.npz", "poses/A_1.npz"]
-
-
-def test_a_release_needs_a_licence(tmp_path):
-    with pytest.raises(ValidationError):
-        manifest_of(tmp_path, licence="")
 
 
 def test_a_folder_without_a_manifest_has_none_and_another_contract_is_refused(tmp_path):

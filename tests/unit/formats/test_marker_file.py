@@ -43,11 +43,3 @@ def test_joints_come_back_in_millimetres_with_y_up(tracks, tmp_path):
     back = np.stack([markers[..., 0], -markers[..., 2], markers[..., 1]], axis=-1) / 1000.0
     # Written to a micrometre.
     np.testing.assert_allclose(back, expected, atol=5.1e-7)
-
-
-def test_missing_joints_are_empty_cells(tracks, tmp_path):
-    write_markers(tmp_path / "p.trc", tracks, 1, 50.0)
-    rows = (tmp_path / "p.trc").read_text().split("\n")[6:-1]
-    assert rows[2].split("\t")[2 + 15 : 2 + 18] == ["", "", ""]
-    assert rows[3].split("\t")[2:] == [""] * 51
-    assert "nan" not in (tmp_path / "p.trc").read_text()

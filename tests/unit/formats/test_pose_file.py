@@ -39,18 +39,6 @@ def test_poses_come_back_in_single_precision(poses, tmp_path):
         }
 
 
-def test_the_plural_names_of_the_releases_note_are_read(poses, tmp_path):
-    write_poses(tmp_path / "clip.npz", poses, "open-neutral/2")
-    with np.load(tmp_path / "clip.npz") as file:
-        arrays = dict(file)
-    plural = {"global_orient": "global_orients", "body_pose": "body_poses"}
-    del arrays["body_model"]  # the release knows one
-    np.savez(tmp_path / "note.npz", **{plural.get(k, k): v for k, v in arrays.items()})
-    noted, body_model = read_poses(tmp_path / "note.npz")
-    assert body_model is None
-    np.testing.assert_array_equal(noted.body_pose, read_poses(tmp_path / "clip.npz")[0].body_pose)
-
-
 def test_a_file_without_an_array_is_refused(tmp_path):
     np.savez(tmp_path / "half.npz", betas=np.zeros((1, 10)))
     with pytest.raises(InputError, match=r"half\.npz"):

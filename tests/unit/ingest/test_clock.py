@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from data_contracts.match import CameraSpec, MatchSpec
+from data_contracts.match import CameraSpec
 from worldpose.ingest.clock import camera_frames, remaining_offset, simplest_offset
 from worldpose.ingest.footage import UnitFrames
-from worldpose.ingest.validation import validate_record
 
 FRAME = np.arange(8)
 
@@ -66,11 +65,3 @@ def test_an_offset_that_cannot_be_read_is_refused(offset, kind, told):
 )
 def test_offsets_are_written_as_simply_as_they_are(frame, exact, written):
     assert simplest_offset(np.array(frame), np.array(exact)) == written
-
-
-def test_pairs_are_read_from_match_yaml(tmp_path):
-    camera = {"id": "a", "width": 9, "height": 9, "offset_frames": [[61, 0], [62, -4.0]]}
-    clip = {"id": "clip", "frame_count": 3}
-    spec = {"contract": 1, "match_id": "m", "fps": 25, "cameras": [camera], "clips": [clip]}
-    read = validate_record(MatchSpec, spec, "match.yaml")
-    assert read.cameras[0].offset_frames == ((61, 0.0), (62, -4.0))

@@ -103,23 +103,6 @@ def test_every_form_gives_the_same_clicks(tmp_path, write):
     assert len(drawn) == len(lines)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        {"image": "https://store/east.png?signature=a.b/c&expires=1"},
-        {"image": "/data/local-files/?d=stills/east.png"},
-        {"project": "a match", "image": "east.png"},
-    ],
-)
-def test_an_image_is_named_in_an_address_and_beside_other_texts(tmp_path, data):
-    file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
-    tasks = json.loads(file.read_text())
-    tasks[0]["data"] = data
-    file.write_text(json.dumps(tasks))
-    import_clicks(file, match(tmp_path / "m"))
-    assert clicked(tmp_path / "m")[0].keys() == CLICKS.keys()
-
-
 @pytest.mark.parametrize("angle", [0, 90, 180, 270])
 @pytest.mark.parametrize("kind", ["polygonlabels", "vectorlabels"])
 def test_a_picture_that_the_annotator_turned_is_turned_back(tmp_path, angle, kind):
@@ -172,16 +155,6 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
     points, _ = clicked(tmp_path / "m")
     for name, pixel in CLICKS.items():
         np.testing.assert_allclose(points[name], pixel, atol=1e-9)
-
-
-@pytest.mark.parametrize("spell", [str.upper, "{} ".format, lambda name: name.replace("_", " ")])
-def test_labels_are_known_in_any_case_and_with_spaces(tmp_path, spell):
-    clicks = [(spell(name), pixel) for name, pixel in CLICKS.items()]
-    lines = [(spell("touch_line_near"), LINE)]
-    import_clicks(cvat(tmp_path / "clicks", clicks, lines), match(tmp_path / "m"))
-    points, (drawn,) = clicked(tmp_path / "m")
-    assert points.keys() == CLICKS.keys()
-    assert drawn.name == "touch_line_near"
 
 
 def test_lines_of_soccernet_are_clicks_in_its_json_and_by_its_names(tmp_path):
@@ -274,18 +247,6 @@ def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, 
     pitch = json.loads((folder / "pitch.json").read_text())
     assert pitch["points"]["at_5.50_34.00"] == [5.5, 34.0, -0.2]  # the crown falls to the line
     assert read_pitch(folder, read_spec(folder)).points.keys() == report.own_points.keys()
-
-
-def test_images_of_a_clip_become_key_frames(tmp_path):
-    folder = match(tmp_path / "m")
-    file = cvat(tmp_path / "c.xml", CLICKS.items(), name="frame_000084.png")
-    text = file.read_text().replace("</annotations>", "")
-    other = cvat(tmp_path / "d.xml", CLICKS.items(), name="frame_000009.png").read_text()
-    file.write_text(text + other.replace("<annotations>", ""))
-    report = import_clicks(file, folder, "goal")
-    assert report.clicks == {"goal": 4}
-    written = json.loads((folder / report.files[0]).read_text())
-    assert [each["frame"] for each in written["key_frames"]] == [9, 84]
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,9 @@
 import hashlib
 import os
-import time
 
 import pytest
-import yaml
 
 from worldpose.errors import InputError
-from worldpose.ingest import registration
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.registration import register_match
 
@@ -80,21 +77,6 @@ def test_identity_is_of_videos_detections_and_pitch(folder, name, same):
     assert (after.files != before.files) is (name in registered)
 
 
-def test_a_folder_of_images_is_registered_image_by_image(folder):
-    (folder / "images").mkdir()
-    for i in range(3):
-        (folder / "images" / f"{i}.png").write_bytes(bytes([i]))
-    content = yaml.safe_load((folder / "match.yaml").read_text())
-    content["cameras"][1]["video"] = "images"
-    (folder / "match.yaml").write_text(yaml.safe_dump(content))
-    paths = [file.path for file in register(folder).files]
-    assert [path for path in paths if path.startswith("images")] == [
-        "images/0.png",
-        "images/1.png",
-        "images/2.png",
-    ]
-
-
 def test_unchanged_files_are_not_read_again(folder, monkeypatch):
     first = register(folder)
 
@@ -123,32 +105,3 @@ def test_a_file_that_changes_while_it_is_read_is_refused(folder, monkeypatch):
     monkeypatch.setattr(hashlib, "file_digest", grow)
     with pytest.raises(InputError, match="still being written"):
         register(folder)
-
-
-@pytest.mark.parametrize("hidden", ["videos/cam1.mp4", "pitch.json"])
-def test_a_time_in_the_future_does_not_skip_the_second_look(folder, monkeypatch, hidden):
-    # A camera's clock may run ahead: its file must not hide that another one is being written.
-    video = folder / "videos" / "cam1.mp4"
-    video.write_bytes(b"the first half")
-    ahead = time.time() + 3600.0
-    os.utime(folder / hidden, (ahead, ahead))
-    waits = []
-
-    def write_more(seconds):
-        waits.append(seconds)
-        video.write_bytes(b"the first half and the second")
-
-    monkeypatch.setattr(time, "sleep", write_more)
-    with pytest.raises(InputError, match="still being written"):
-        register(folder)
-    assert len(waits) == 1
-    assert 0 < waits[0] <= registration.SETTLE_SECONDS
-
-
-def test_a_file_that_vanishes_is_refused(folder, monkeypatch):
-    match = read_match(folder)
-    (folder / "videos" / "cam1.mp4").unlink()
-    (folder / "videos" / "cam1.mp4").symlink_to("nowhere")
-    monkeypatch.setattr(registration, "_files_under", lambda folder, root: ["videos/cam1.mp4"])
-    with pytest.raises(InputError, match="a readable file"):
-        register_match(match, None)

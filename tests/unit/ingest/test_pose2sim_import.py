@@ -11,7 +11,6 @@ from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
-from worldpose.formats.calibration_unit import scaled
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import read_match
@@ -100,26 +99,6 @@ def test_a_resized_video_scales_the_calibration(trial, tmp_path):
     assert "cam02.mp4: 544 x 960 px, calibrated are 1088 x 1920: the calibration is scaled" in str(
         notes
     )
-
-
-def halve(calibration, cameras, people, fps):
-    """Place cameras whose people agree in images of half the size."""
-    return {name: scaled(each, 0.5, (544, 960)) for name, each in cameras.items()}, ["halved"]
-
-
-def test_the_match_has_the_size_to_which_people_scale_the_calibration(trial, tmp_path):
-    spec, notes = import_pose2sim(trial, tmp_path / "m", place=halve)
-    assert [(each.width, each.height) for each in spec.cameras] == [(544, 960)] * 2
-    assert read_match(tmp_path / "m").spec == spec
-    assert notes[0] == "halved"
-    assert "keypoints are outside of the images" in str(notes), "judged at the new size"
-
-
-def test_people_do_not_scale_a_calibration_away_from_its_videos(trial, tmp_path):
-    film(trial, (1088, 1920))
-    with pytest.raises(InputError, match=r"pose: .* 1088 x 1920 in cam01, found .* 544 x 960 px"):
-        import_pose2sim(trial, tmp_path / "m", place=halve)
-    assert not (tmp_path / "m").exists()
 
 
 XCP = """<Cameras><Camera DEVICEID="{}" ISDV="1" SENSOR_SIZE="1088 1920"><KeyFrames>

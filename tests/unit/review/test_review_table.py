@@ -50,18 +50,3 @@ def test_verdicts_corrections_and_what_was_taken_back_are_told_in_order():
     assert table.rows[0] == ("2026-01-02 03:04 UTC", "Ada", "rejected", "tracking/clip", "swapped")
     assert "corner_left_near in cam00" in table.rows[1][3]
     assert table.rows[2][3] == table.rows[1][3]
-
-
-def test_first_clicks_of_a_person_in_a_camera_are_one_row():
-    def click(camera, marking, who="Bob"):
-        edit = MovedPoint(camera=camera, marking=marking, xy=(1.0, 2.0))
-        return MOVED.model_copy(update={"edit": edit, "who": who, "based_on": {}})
-
-    clicks = [click("cam00", "a"), click("cam01", "a"), click("cam00", "b"), click("cam00", "b")]
-    (table,) = said(*clicks, MOVED, click("cam00", "a", "Ada"))
-    assert [row[1:4] for row in table.rows] == [
-        ("Bob", "clicked", "2 markings in cam00"),
-        ("Bob", "clicked", "1 marking in cam01"),
-        ("Bob", "corrected", table.rows[2][3]),
-        ("Ada", "clicked", "1 marking in cam00"),
-    ]

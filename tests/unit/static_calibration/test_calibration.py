@@ -111,23 +111,3 @@ def test_a_wrong_click_is_found_and_no_other():
     # A click whose place nothing else tells, such as a lone far corner, cannot be judged.
     assert found >= 11
     assert others <= 1
-
-
-def test_the_expected_ground_error_is_that_of_repeated_clicks():
-    camera, _ = people.seat(4)
-    seen = people.visible(camera)
-    rng = np.random.default_rng(0)
-    place = PITCH.positions([next(iter(seen))])
-    errors, expected = [], []
-    for _ in range(40):
-        noisy = {name: xy + rng.standard_normal(2) for name, xy in seen.items()}
-        result = of(people.points(noisy))
-        errors.append(people.ground_errors(result.estimate.camera, camera, place)[0])
-        known = result.report.ground_error
-        row = np.argmin(np.abs(known.y - place[0, 1]))
-        column = np.argmin(np.abs(known.x - place[0, 0]))
-        expected.append(known.expected[row, column])
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    # 40 draws of two dimensions tell an rms to 1 / sqrt(2 x 80) = 8 %; the prior is wider than
-    # the truth lies off the grid, up to 1.4 m from the nearest grid place.
-    assert rms == pytest.approx(np.median(expected), rel=0.3)

@@ -9,14 +9,12 @@ from clicking_people import paint_of, pinhole
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration.from_paint.paint import restore_colors
 from worldpose.static_calibration.from_paint.proposal import (
     calibrate_proposal,
     calibrate_without_clicks,
     propose_camera,
     propose_from_paint,
 )
-from worldpose.static_calibration.paint_share import paint_share
 
 PITCH = PitchTemplate.standard()
 SIZE = (1280, 720)
@@ -66,15 +64,6 @@ def test_a_purple_cast_hides_no_pitch():
     assert np.median(misplaced(found.estimate.camera, camera())) < 0.05
 
 
-def test_restored_paint_is_white_and_grass_is_not():
-    dull = np.full((40, 40, 3), (60, 70, 55), np.uint8)
-    dull[10:12] = dull[30:32] = (160, 130, 170)
-    restored = restore_colors(dull)
-    # The darkest channel counts as 0.7 * 55 = 38.5, paint as 245.
-    assert restored[10, 0].tolist() == [245, 245, 245]
-    assert restored[0, 0].tolist() == [43, 84, 31]
-
-
 def test_a_proposal_whose_markings_are_not_in_the_image_is_refused(proposal):
     other = still((-20.0, -64.0, 19.0))
     with pytest.raises(InputError, match=r"lines where the proposed camera projects.*Click four"):
@@ -118,13 +107,3 @@ def test_lines_that_many_cameras_explain_are_not_clear():
 def test_an_image_without_a_green_pitch_is_refused(picture, message):
     with pytest.raises(InputError, match=message):
         propose_camera(picture, PITCH, side="near")
-
-
-def test_markings_lie_on_paint_for_the_right_camera_alone():
-    share = paint_share(still(), camera(), PITCH)
-    assert share is not None
-    assert share > 0.9
-    other = paint_share(still(), camera((10.0, -55.0, 15.0), (-25.0, 4.0, 0.0)), PITCH)
-    assert other is not None
-    assert other < 0.4
-    assert paint_share(still(), camera(aim=(-24.0, -160.0, 0.0)), PITCH) is None

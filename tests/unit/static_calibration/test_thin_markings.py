@@ -1,18 +1,10 @@
 """Paint thinner than the search for lines admits, and half turns of what was found."""
 
-import json
-
 import cv2
 import numpy as np
-import pytest
-from clicking_people import pinhole
 
-from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
-from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.from_paint.proposal import MarkingSupport, Proposal
 from worldpose.static_calibration.from_paint.thin_paint import trace_marking
 
-PITCH = PitchTemplate.standard()
 SIZE = (1920, 400)
 
 
@@ -58,24 +50,3 @@ def test_thin_paint_beside_its_projection_is_traced_despite_letters():
     expected = np.interp(found[:, 0], *true_places().T)
     assert np.abs(np.median(found[:, 1] - expected)) < 0.15
     assert np.quantile(np.abs(found[:, 1] - expected), 0.95) < 1.0
-
-
-@pytest.fixture
-def proposal():
-    camera = pinhole((-24.0, -60.0, 22.0), (-33.0, -2.0, 0.0), 1300.0, k1=-0.05, roll=0.01)
-    drawn = []
-    for name in ("penalty_area_left_near", "halfway_line", "center_circle", "penalty_arc_left"):
-        pixels = camera.project(PITCH.marking_points(name, 2.0))
-        pixels = pixels[((pixels > 0.0) & (pixels < [1279.0, 719.0])).all(axis=1)]
-        drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
-    markings = (MarkingSupport("penalty_area_left_near", 200.0, 0.9),)
-    return Proposal(camera, ClickedMarkings(drawn=tuple(drawn)), markings, 90.0, 40.0, 0.9, 0.5)
-
-
-def test_a_stored_proposal_is_read_back(proposal):
-    stored = json.loads(json.dumps(proposal.attributes()))
-    read = Proposal.from_attributes(proposal.camera, stored)
-    assert read.drawn == proposal.drawn
-    assert read.markings == proposal.markings
-    assert (read.score, read.margin, read.found, read.explained) == (90.0, 40.0, 0.9, 0.5)
-    assert read.is_clear

@@ -8,8 +8,6 @@ from store_samples import (
     place,
     publish,
     run_once,
-    sample_arrays,
-    sample_coordinates,
     sample_recipe,
 )
 
@@ -55,25 +53,6 @@ def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
     collect(store, plan)
     assert store.results() == ()
     assert store.unfinished_runs("final") == ()
-
-
-def test_nothing_is_taken_from_a_result_that_is_being_written(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder_store.reserve_run("final")
-    written = []
-
-    def collected(*given: Any) -> Any:
-        written.append(given)
-        collect(folder_store, plan_gc(folder_store, older_than=NOW))
-        return array_parts(*given)
-
-    monkeypatch.setattr(groups, "array_parts", collected)
-    publish(folder_store)
-    # Once when its values are checked, and once when it is written.
-    assert len(written) == 2 * (len(sample_arrays()) + len(sample_coordinates()))
-    data = folder_store.open_result(*place(), verify=True)
-    assert (data["views"].values == 0).all()
 
 
 def test_result_of_which_something_was_removed_is_not_published(

@@ -63,13 +63,6 @@ def test_seven_tenths_of_the_time_decide(near, left):
     assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, way)) == left
 
 
-def person(number, first, last, evidence):
-    nothing = Sighting(np.empty(0, int), np.empty(0), np.empty((0, 3)))
-    someone = Person(number, np.empty((0, 3)), last, evidence=evidence)
-    someone.sightings.update({first: nothing, last: nothing})
-    return someone
-
-
 FPS, PITCH = 50.0, (20.0, 20.0)
 
 

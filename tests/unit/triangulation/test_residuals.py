@@ -67,14 +67,3 @@ def test_leverages_of_all_views_sum_to_three(views):
         write_leverages(tile, depth, (10.0, 0.0), buffers.state[0])
     # Three unknowns; the matrix is that before a last step of under a micrometre.
     assert buffers.tiles["leverage"][:, 0].sum() == pytest.approx(3.0, rel=1e-6)
-
-
-def test_lane_without_observations_leaves_the_others_alone(ring):
-    camera = ring(4)
-    rig, buffers = buffers_of(camera, camera.project(POINT[None])[:, 0])
-    for name in ("a", "b", "precision"):
-        buffers.tiles[name][..., 5] = 0.0
-    find_consensus(rig, NOISE, 12.0, buffers)
-    points = buffers.state["point"][0]
-    assert np.isnan(points[:, 5]).all()
-    np.testing.assert_allclose(np.delete(points, 5, axis=1).T - POINT, 0.0, atol=1e-9)

@@ -130,21 +130,6 @@ def test_a_file_that_was_cut_off_is_said(tmp_path, ending, words):
     assert words in note and "copied" in note
 
 
-def test_a_file_that_grows_during_the_import_is_refused(tmp_path, monkeypatch):
-    folder = tmp_path / "videos"
-    film(folder, ("a", "b"))
-
-    def grow(*_, **__):
-        with (folder / "a.MP4").open("ab") as file:
-            file.write(b"more")
-        return []
-
-    monkeypatch.setattr("worldpose.ingest.importing.describe_videos", grow)
-    with pytest.raises(InputError, match="still being written"):
-        import_videos(None, folder, tmp_path / "m")
-    assert not (tmp_path / "m").exists()
-
-
 def test_two_videos_of_one_camera_are_refused(tmp_path):
     film(tmp_path / "videos", ("a", "b"))
     (tmp_path / "videos" / "a.mov").write_bytes(b"")
