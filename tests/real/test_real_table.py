@@ -7,7 +7,6 @@ import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 REAL = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
@@ -42,19 +41,6 @@ def test_bad_data_is_one_clear_error(table, tmp_path):
     (tmp_path / "mvor" / "openpose_kps.json").write_text("[]")
     failure, _ = table(tmp_path)
     assert failure.startswith("error: mvor: KeyError")
-
-
-def test_pairs_of_feet_are_mutual_nearest_neighbours_at_the_offset(table):
-    first = np.array([[[0.0, 0.0], [30.0, 5.0]]] * 5)
-    first[:, 0, 0] = np.arange(5)  # one person runs 1 m per frame
-    second = first[:, [0, 0, 1]].copy()
-    second[:, 1] += [0.0, 1.5]  # a second box of the runner is farther away
-    second[:, 2] += [0.0, 2.5]  # beyond the largest distance
-    second[:, :2, 0] -= 0.5  # the second clock is half a frame late
-    pairs = table.module.pair_feet(first, second, 0.5)
-    assert len(pairs) == 4
-    np.testing.assert_allclose(pairs, 0.0, atol=1e-12)
-    np.testing.assert_allclose(table.module.pair_feet(first, second, 0.0), 0.5)
 
 
 @pytest.mark.slow

@@ -4,12 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from worldpose.sources import (
-    _read_module,
-    _source_cache,
-    code_version,
-    parse_source,
-)
+from worldpose.sources import _read_module, _source_cache, code_version, parse_source
 
 SOURCE = b'''
 """Docstring."""

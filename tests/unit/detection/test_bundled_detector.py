@@ -3,10 +3,7 @@
 import numpy as np
 from camera_builders import look_at_camera
 
-from worldpose.detection.enlargement import (
-    expect_parts,
-    find_small,
-)
+from worldpose.detection.enlargement import expect_parts, find_small
 from worldpose.detection.interfaces import People
 from worldpose.pitch.template import PitchTemplate
 

@@ -8,11 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from worldpose.geometry.cameras import Camera
-from worldpose.reports.drawing import (
-    figure_data,
-    note_undrawn_distortion,
-    write_figure,
-)
+from worldpose.reports.drawing import figure_data, note_undrawn_distortion, write_figure
 
 
 @pytest.fixture

@@ -9,12 +9,7 @@ from run_records import AT, run_record
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.run import UnitFailure
-from worldpose.reports.html_page import (
-    CaptionedImage,
-    EmbeddedPage,
-    LinkedFile,
-    Section,
-)
+from worldpose.reports.html_page import CaptionedImage, EmbeddedPage, LinkedFile, Section
 from worldpose.reports.run_report import CAMERA_MEANINGS, MEANINGS, report_page, score_rows
 
 PNG = base64.b64decode(

@@ -32,3 +32,36 @@ def test_the_folder_is_a_match_with_clicks_detections_and_a_surveyed_pitch(match
         people, _ = read_unit(read, name)
         np.testing.assert_array_equal(people.keypoints, observations.keypoints)
     assert read.clicked == {name: clicks.markings for name, clicks in scene.clicks.items()}
+
+
+SHORT = 0.4
+
+
+def short(name, **changes):
+    return SCENARIOS[name].model_copy(update={"duration": SHORT, **changes})
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_scenario_makes_a_match(name, tmp_path):
+    scenario = short(name)
+    spec = simulate_match(
+        *(scenario, 2, tmp_path / name),
+        MatchOptions(duration=SHORT, cameras=4, stills=False, video=False),
+    )
+    read = read_match(tmp_path / name)
+    assert read.spec == spec
+    frames = round(SHORT * scenario.fps)
+    for camera in spec.static_cameras:
+        people, calibration = read_unit(read, camera.id)
+        assert (calibration is not None) == (name == "hard")
+        assert len(people.frame) == frames
+        clicks = read.clicked[camera.id]
+        assert len(clicks.points) + len(clicks.drawn) > 1
+    assert len(read.spec.broadcast_views) == len(scenario.broadcast)
+    for view in read.spec.broadcast_views:
+        people, calibration = read_unit(read, view)
+        assert calibration is None
+        assert len(people.frame) == frames
+        assert np.isfinite(people.score).sum(axis=1).mean() > 1.0
+        camera = np.load(tmp_path / name / "reference" / "cameras" / f"{view}.npz")
+        assert camera["K"].shape == camera["R"].shape == (frames, 3, 3)

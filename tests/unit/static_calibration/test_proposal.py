@@ -15,6 +15,7 @@ from worldpose.static_calibration.from_paint.proposal import (
     propose_camera,
     propose_from_paint,
 )
+from worldpose.static_calibration.paint_share import paint_share
 
 PITCH = PitchTemplate.standard()
 SIZE = (1280, 720)
@@ -107,3 +108,13 @@ def test_lines_that_many_cameras_explain_are_not_clear():
 def test_an_image_without_a_green_pitch_is_refused(picture, message):
     with pytest.raises(InputError, match=message):
         propose_camera(picture, PITCH, side="near")
+
+
+def test_markings_lie_on_paint_for_the_right_camera_alone():
+    share = paint_share(still(), camera(), PITCH)
+    assert share is not None
+    assert share > 0.9
+    other = paint_share(still(), camera((10.0, -55.0, 15.0), (-25.0, 4.0, 0.0)), PITCH)
+    assert other is not None
+    assert other < 0.4
+    assert paint_share(still(), camera(aim=(-24.0, -160.0, 0.0)), PITCH) is None

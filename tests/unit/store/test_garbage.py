@@ -4,12 +4,7 @@ from datetime import timedelta
 from typing import Any
 
 import pytest
-from store_samples import (
-    place,
-    publish,
-    run_once,
-    sample_recipe,
-)
+from store_samples import place, publish, run_once, sample_recipe
 
 from worldpose.errors import StoreError
 from worldpose.store import groups
@@ -68,20 +63,6 @@ def test_result_of_which_something_was_removed_is_not_published(
         publish(folder_store)
     assert not folder_store.has(*place())
     assert folder_store.blobs.staged_entries() == []
-
-
-def test_forgotten_runs_go_with_what_only_they_reach(folder_store: Store) -> None:
-    for unit in ("one", "two", "three"):
-        run_once(folder_store, sample_recipe("shared"), sample_recipe(unit))
-    plan = plan_gc(folder_store, older_than=NOW, forget=["final/0001"])
-    assert [item.path for item in plan.garbage] == [
-        "runs/final/0001.json",
-        ResultId(*place(sample_recipe("one"))).path,
-    ]
-    collect(folder_store, plan_gc(folder_store, older_than=NOW, keep_last=1))
-    assert folder_store.runs("final") == ("0003",)
-    assert {result.unit for result in folder_store.results()} == {"shared", "three"}
-    assert verify(folder_store) == ()
 
 
 @pytest.mark.parametrize("damaged", ["run", "manifest", "pin", "reservation"])

@@ -53,10 +53,7 @@ def test_equal_arrays_give_equal_files(tmp_path: Path) -> None:
         ({"inliers": np.zeros((40, 4), bool)}, "dimension person: expected size 3"),
         ({"joints": np.full((40, 3, 3), np.inf)}, r"joints\[0, 0, 0\]: expected finite numbers or"),
         ({"height": np.array(np.nan, np.float32)}, r"height\[\]: expected finite numbers only"),
-        (
-            {"detection_index": np.full((40, 2), -2, np.int16)},
-            "or -1 for missing, found -2; 80",
-        ),
+        ({"detection_index": np.full((40, 2), -2, np.int16)}, "or -1 for missing, found -2; 80"),
         ({"unplanned": np.zeros(3)}, "unknown: unplanned"),
     ],
 )
@@ -87,8 +84,7 @@ def test_attribute_that_breaks_the_layout_is_refused(
 
 @settings(max_examples=15)
 @given(
-    st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]),
-    st.data(),
+    st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]), st.data()
 )
 def test_any_array_of_any_shape_comes_back(dtype: Any, data: st.DataObject) -> None:
     import tempfile

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 from store_samples import (
     ATTRIBUTES,
     LAYOUT,
@@ -156,39 +155,6 @@ def test_run_gives_its_results_by_unit(store: Store) -> None:
     assert "tracking/late" in repr(run)
 
 
-def test_the_best_bodies_are_labelled_and_become_a_table(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_once(folder_store)
-    run = worldpose.open_run(folder_store.url, "final")
-    with pytest.raises(InputError, match=r"body_fitting or refitting, found none of any clip"):
-        run.bodies("clip")
-    stored = xr.Dataset(
-        {
-            "betas": (("person", "shape_component"), np.zeros((2, 10))),
-            "body_pose": (("frame", "person", "rotation_23"), np.arange(414.0).reshape(3, 2, 69)),
-            "transl": (("frame", "person", "coordinate"), np.arange(18.0).reshape(3, 2, 3)),
-        },
-        coords={"frame": [5, 6, 7], "person": [3, 8], "coordinate": ["x", "y", "z"]},
-    )
-    names = ("body_fitting/clip", "refitting/clip", "triangulation/other")
-    results = {"results": dict.fromkeys(names, "k")}
-    monkeypatch.setattr(run, "record", run.record.model_copy(update=results))
-    monkeypatch.setattr(
-        Store, "open_result", lambda _, match, stage, *__: stored.assign_attrs(stage=stage)
-    )
-    bodies = run.bodies("clip")
-    assert bodies.stage == "refitting"
-    assert run.joints("other").stage == "triangulation"
-    knee = bodies.body_pose.sel(rotation_23="left_knee_x", person=8, frame=6)
-    assert knee.item() == stored.body_pose.values[1, 1, 9]  # the fourth joint below the pelvis
-    assert bodies.shape_component.values.tolist() == list(range(10))
-    table = bodies.transl.to_dataframe()
-    assert table.loc[(7, 8, "z"), "transl"] == 17.0
-    with pytest.raises(InputError, match=r"found results of clip\. Name one"):
-        run.bodies("second")
-
-
 def write_sample(writer: ResultWriter) -> None:
     writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
 
@@ -266,3 +232,32 @@ def test_lost_or_changed_chunk_is_corruption_and_never_a_fill_value(store: Store
     np.testing.assert_array_equal(
         store.open_result(*place()).joints[16:24], sample_arrays()["joints"][16:24]
     )
+
+
+BAD = ["", "/", "/etc/passwd", "..", "a/../b", "a/..", "./a", "a//b", "a/", "a\0b", "a\nb", "a\\b"]
+
+
+def test_path_that_could_leave_the_project_is_refused_by_every_method(
+    store: Store, tmp_path: Path
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    blobs = store.blobs
+    for path in BAD:
+        for call in (
+            lambda path=path: blobs.read(path),
+            lambda path=path: blobs.exists(path),
+            lambda path=path: blobs.put(path, b"x"),
+            lambda path=path: blobs.put_new(path, b"x"),
+            lambda path=path: blobs.delete(path),
+            lambda path=path: blobs.delete_tree(path, "manifest.json"),
+            lambda path=path: blobs.entries(path),
+        ):
+            with pytest.raises(InputError, match="path inside a project"):
+                call()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("key", ["", "0" * 31, "0" * 33, "G" * 32, "A" * 32, "../" + "0" * 29])
+def test_key_that_is_no_key_is_refused(key: str) -> None:
+    with pytest.raises(InputError, match="32 lower-case"):
+        ResultId("final", "tracking", "clip", key)

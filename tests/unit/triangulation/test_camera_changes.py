@@ -13,11 +13,7 @@ from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.changes import find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.camera_changes import (
-    correct_views,
-    explain_changes,
-    triangulate_views,
-)
+from worldpose.triangulation.camera_changes import correct_views, explain_changes, triangulate_views
 from worldpose.triangulation.clock_courses import add_slow_drifts, trace_clocks
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
