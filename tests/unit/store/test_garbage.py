@@ -34,7 +34,8 @@ def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) ->
     assert verify(store) == ()
 
 
-def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
+def test_match_with_a_run_at_work_is_left_alone(folder_store: Store) -> None:
+    store = folder_store
     publish(store)
     other = sample_recipe(match_id="semi")
     publish(store, other)
@@ -89,8 +90,9 @@ def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(
 
 
 def test_interrupted_collection_is_finished_by_the_next(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    folder_store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    store = folder_store
     run_once(store, sample_recipe("one"), sample_recipe("two"))
     run_once(store, sample_recipe("three"))
 

@@ -18,7 +18,8 @@ from worldpose.store.runs import list_pins, may_be_running, pin_run, unpin_run
 from worldpose.store.store import Store, open_run
 
 
-def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
+def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store: Store) -> None:
+    store = folder_store
     run_once(store)
     assert store.reserve_run("final") == "0002"
     assert store.run("final").run_id == "0001"

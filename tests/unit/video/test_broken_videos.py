@@ -50,14 +50,6 @@ def numbers_read(path, start=0, stop=None):
         ]
 
 
-def test_a_dropped_picture_leaves_its_frame_empty_and_shifts_none(tmp_path):
-    shown = np.delete(np.arange(30), [11, 12])
-    index = index_video(encode(tmp_path / "dropped.mkv", 40 * shown))
-    expected = np.full(30, -1)
-    expected[shown] = np.arange(28)
-    assert index.on_clock(25.0, "dropped").tolist() == expected.tolist()
-
-
 @pytest.mark.parametrize(
     ("matrix", "said"),
     [
