@@ -10,24 +10,11 @@ from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.tracking import (
     Followed,
     chain,
-    follow,
     modified_z_scores,
     turn,
 )
 from worldpose.broadcast_calibration.uncertainty import pool_centers
 from worldpose.ingest.clock import ImageClock, rows_at
-
-
-def test_a_shifted_picture_is_followed_by_its_shift():
-    # Structure at the size of a tracking window.
-    coarse = np.random.default_rng(1).uniform(0.0, 255.0, (40, 60))
-    picture = np.kron(coarse, np.ones((8, 8))).astype(np.uint8)
-    moved = np.roll(picture, (-2, 3), axis=(0, 1))
-    (pair,) = follow([picture, moved], None, 200)
-    assert len(pair.start) > 60
-    # Whole pixels: what is left is the tracker's tolerance.
-    assert np.abs(pair.end - pair.start - [3.0, -2.0]).max() < 0.05
-    assert pair.inlier_share > 0.9
 
 
 def pairs_of(camera, rng):

@@ -4,14 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_builders import plain_camera
 from joint_regions import region_counts
 from people_samples import crowd, person, score, tracks
 
-from worldpose.evaluation.matching import joint_boxes, joint_distances, match_people, merge_tracks
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry.rigid import Rigid
 
 # Sums of a few hundred rounded distances of some metres: 1e-9 mm is a thousand times their error.
 MM = 1e-9
@@ -118,39 +115,6 @@ def test_an_empty_prediction_and_an_empty_truth_have_no_error():
     assert score(truth, nobody).false_persons_per_frame == 3.0
     no_frames = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
     assert score(truth, no_frames).model_dump(exclude_none=True) == {"persons": 0, "frames": 0}
-
-
-ONE = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-"""A person of two joints 1 m apart."""
-
-
-def match_frame(predicted, true, gate):
-    return match_people(joint_distances(predicted[None], true[None]), gate)[0].tolist()
-
-
-def test_nobody_matches_nothing_and_distance_is_over_common_joints_only():
-    assert match_frame(ONE[:0], ONE, 1.0) == [-1]
-    assert match_frame(ONE, ONE[:0], 1.0) == []
-    half = ONE + [0.4, 0.0, 0.0]
-    half[0, 1] = np.nan
-    assert match_frame(half, ONE, 0.5) == [0]
-    assert match_frame(half, ONE, 0.3) == [-1]
-
-
-def test_split_tracks_are_merged_and_the_nearer_of_two_counts():
-    pairs = np.array([[0], [0], [1], [1]])
-    cost = np.array([[[0.1, np.inf]], [[0.1, np.inf]], [[0.3, 0.2]], [[np.inf, 0.2]]])
-    assert merge_tracks(pairs, cost).tolist() == [[0], [0], [1], [1]]
-    cost[2, 0] = [0.1, 0.2]
-    assert merge_tracks(pairs, cost).tolist() == [[0], [0], [0], [1]]
-
-
-def test_boxes_go_around_the_joints_in_front_of_the_camera():
-    camera = plain_camera(100.0, (50.0, 50.0), Rigid.identity(), (100, 100))
-    one = [[1.0, 2.0, 10.0], [-1.0, 0.0, 10.0], [0.0, 0.0, -5.0]]
-    boxes = joint_boxes(np.array([[one, [[np.nan] * 3] * 3]]), camera)
-    assert boxes[0, 0].tolist() == [40.0, 50.0, 60.0, 70.0]
-    assert np.isnan(boxes[0, 1]).all()
 
 
 def people(frames=60, persons=4):
