@@ -20,7 +20,8 @@ def test_an_unforeseen_exception_is_called_a_bug_and_names_its_line():
         broken()
     error = InternalError.wrap("tracking/clip", caught.value)
     assert str(error).startswith("tracking/clip: internal error KeyError at ")
-    assert "test_errors.py:11 in broken: 'click'" in str(error)
+    line = broken.__code__.co_firstlineno + 1
+    assert f"test_errors.py:{line} in broken: 'click'" in str(error)
     assert "This is a bug in worldpose, not in your data" in str(error)
 
 

@@ -28,7 +28,7 @@ def view(rng, tilt=0.6, noise=0.1, far=0.7):
 def test_a_lens_is_found_within_its_stated_uncertainty():
     rng = np.random.default_rng(3)
     off = []
-    for _ in range(12):
+    for _ in range(8):
         fit = calibrate_lens("cam", [view(rng) for _ in range(10)], SIZE)
         lens = fit.lens
         off += [(lens.focal_px - 900.0) / lens.focal_std_px]
