@@ -9,7 +9,9 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.noise_model import (
+    CONDITIONS,
     OCCLUDED,
+    conditions,
     learn_noise,
     shared_variance,
 )
@@ -81,3 +83,25 @@ def test_noise_is_not_taken_for_an_exchange(ring):
     arrays = detections(ring(5), runner(40), 6.0)
     found = triangulate_joints(ring(5), as_detections(*arrays), SETTINGS)
     assert found.exchanged.any(axis=-1).mean() < 0.01
+
+
+def standing(x: float, bottom: float, height: float) -> np.ndarray:
+    """Keypoints (17, 2) [px] of an upright person whose trunk is a third of the height."""
+    up = {"shoulder": 0.8, "hip": 0.8 - 1 / 3, "knee": 0.25, "ankle": 0.0, "elbow": 0.65}
+    rows = [up.get(name.split("_")[-1], 0.9) for name in COCO17]
+    side = [0.05 * (("left" in name) - ("right" in name)) for name in COCO17]
+    return np.stack([x + height * np.array(side), bottom - height * np.array(rows)], axis=-1)
+
+
+def test_keypoints_are_hidden_by_a_nearer_person_and_classed_by_their_distance_from_the_trunk():
+    far, near = standing(300.0, 400.0, 120.0), standing(302.0, 450.0, 180.0)
+    apart = standing(700.0, 400.0, 120.0)
+    found = conditions(np.stack([far, near, apart])[None, None])[0, 0]
+    alone = found[2]
+    # The trunk's middle is at 0.633 of the height, its length a third: ankles are 1.9 away.
+    assert alone[COCO17.index("left_ankle")] == 3
+    assert alone[COCO17.index("left_knee")] == 2
+    assert alone[COCO17.index("left_elbow")] == 0
+    np.testing.assert_array_equal(found[1], alone)
+    inside = (np.abs(far[:, 0] - 302.0) < 9.0) & (far[:, 1] > near[:, 1].min())
+    np.testing.assert_array_equal(found[0], alone + CONDITIONS // 2 * inside)
