@@ -14,7 +14,6 @@ from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
-from flows.run_record import RunLog
 from tasks.ingest import ingest
 from tasks.static_calibration import static_calibration
 from tasks.unit import unit_task
@@ -185,31 +184,6 @@ def test_a_worker_with_other_code_refuses(planned, part, name):
 def test_what_may_pass_is_tried_again(failure, retried):
     task = unit_task(lambda inputs, result: None)
     assert task.retry_condition_fn(task, None, Failed(data=failure)) is retried
-
-
-def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
-    store, match, first = planned
-    failed = f"static_calibration/{first.recipe.unit}"
-    log = RunLog.begin(store, match, METHOD, {})
-    for stage in METHOD:
-        for unit in log.plan.plan_stage(stage):
-            if unit.name != failed:
-                task_of(stage).fn(unit.work(store.url, match, log.run_id))
-            log.finish_unit(unit, RuntimeError("x") if unit.name == failed else None)
-    record = log.close()
-    assert record.state == "failed"
-    assert [failure.unit for failure in record.failed] == [failed]
-    assert record.blocked == (
-        "body_fitting/clip",
-        "bundle_adjustment/cameras",
-        "camera_consistency/clip",
-        "filtering/clip",
-        "retriangulation/clip",
-        "tracking/clip",
-        "triangulation/clip",
-    )
-    # The other cameras have their results: only what needs all of them waits.
-    assert len(record.executed) == len(plan_run(store, match, {})) - 8
 
 
 @pytest.mark.parametrize(

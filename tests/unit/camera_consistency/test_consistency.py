@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
@@ -10,7 +9,7 @@ from camera_builders import look_at_camera
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import check_consistency
-from worldpose.camera_consistency.hypotheses import lens_hypotheses, tangential_shift
+from worldpose.camera_consistency.hypotheses import lens_hypotheses
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
@@ -151,23 +150,6 @@ def test_a_wrong_world_is_no_fault_of_its_cameras(change):
     assert (result.faults, result.strangers) == ((), ())
 
 
-def test_a_group_of_cameras_that_shows_other_people_is_no_fault():
-    world, far = walkers(), [60.0, 0.0, 0.0]
-    halls = (
-        rig()[:3],
-        [
-            posed(
-                c,
-                c.cam_from_world.rotation,
-                c.cam_from_world.translation - c.cam_from_world.rotation @ far,
-            )
-            for c in rig()[:3]
-        ],
-    )
-    keypoints = np.concatenate([seen(halls[0], world), seen(halls[1], walkers(seed=5) + far)], 1)
-    assert check([*halls[0], *halls[1]], keypoints, pitch=None).faults == ()
-
-
 @pytest.mark.parametrize(
     ("frames", "kind", "value"),
     # The other camera shows frames 9 earlier, or 50 frames per second stated as 25.
@@ -226,17 +208,3 @@ def test_four_coefficients_of_a_fisheye_read_as_browns_are_a_hypothesis():
     np.testing.assert_array_equal(found.camera.numbers, true.numbers)
     orders = [each for each in lens_hypotheses(true) if "order" in each.detail]
     assert not orders  # the order of a fisheye's coefficients is not in doubt
-
-
-def test_the_tangential_shift_is_that_of_a_corner_in_opencv():
-    camera = looking((5, -42, 9), (22, 2, 1), 1200.0)
-    corners = np.array([(0, 0), (1919, 0), (0, 1079), (1919, 1079)]) - camera.principal_point
-    rays = np.column_stack([corners / camera.focal, np.ones(4)])
-    matrix = np.diag([*camera.focal, 1.0])
-    moved = [
-        cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, lens)[0][:, 0]
-        for lens in (np.zeros(5), np.array([0.0, 0.0, 0.003, -0.002, 0.0]))
-    ]
-    expected = np.linalg.norm(moved[1] - moved[0], axis=1).max() / 1919
-    found = tangential_shift(camera, np.array([-0.3, 0.1, 0.003, -0.002, 0.02]))
-    assert found == pytest.approx(expected, rel=1e-9)

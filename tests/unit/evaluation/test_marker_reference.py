@@ -9,7 +9,6 @@ from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.evaluation.marker_reference import (
     align_reference,
-    c3d_labels,
     map_marker_names,
     marker_joints,
     read_marker_map,
@@ -74,21 +73,6 @@ def test_c3d_gives_the_points_that_were_written(tmp_path, markers):
     joints[3, 0, 5] = markers[3, 0, 5]
     # Single precision millimetres at 40 m.
     np.testing.assert_allclose(joints, markers, atol=1e-5)
-
-
-def test_labels_beyond_255_and_a_missing_unit_are_told(tmp_path, markers):
-    write_c3d(tmp_path / "a.c3d", markers[:3])
-    content = (tmp_path / "a.c3d").read_bytes()
-    (tmp_path / "b.c3d").write_bytes(content.replace(b"UNITS", b"UNITZ"))
-    with pytest.raises(InputError, match=r"b.c3d: POINT:UNITS: expected the unit of length"):
-        read_markers(tmp_path / "b.c3d")
-
-    class Part:
-        def __init__(self, names):
-            self.string_array = names
-
-    parts = {"POINT:LABELS": Part(["a ", "b"]), "POINT:LABELS2": Part(["c"])}
-    assert c3d_labels(parts) == ("a", "b", "c")
 
 
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):

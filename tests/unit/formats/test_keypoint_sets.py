@@ -8,7 +8,6 @@ import pytest
 from data_contracts.conventions import COCO17, FEET
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
-from worldpose.formats import coco_results
 from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
@@ -253,29 +252,6 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
     path.write_text(json.dumps(content | {"annotations": [ball, {**ball, "keypoints": []}]}))
     with pytest.raises(InputError, match="expected keypoints of people, found 2 annotations"):
         read_coco_results(path)
-
-
-def test_annotations_without_points_take_the_set_of_the_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(coco_results, "BATCH", 2)
-    path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}], BODY_25B)
-    content = json.loads(path.read_text())
-    balls = [{"image_id": 3, "bbox": [1, 2, 3, 4]}] * 2
-    path.write_text(json.dumps(content | {"annotations": balls + content["annotations"]}))
-    assert_body(read_coco_results(path).people)
-
-
-def test_points_may_be_lists_of_three(tmp_path):
-    nested = np.reshape(points(COCO17), (17, 3)).tolist()
-    (tmp_path / "a.json").write_text(json.dumps([{"image_id": 4, "keypoints": nested}]))
-    assert_body(read_coco_results(tmp_path / "a.json").people)
-
-
-@pytest.mark.parametrize(
-    "name", ["12.png", "a/frame000012.PNG", "cam2_0012_1080p.jpg", "f_12_jpg.rf.3fa9b7.jpg"]
-)
-def test_the_frame_is_the_last_number_and_no_part_of_a_word(tmp_path, name):
-    found = read_coco_results(data_set(tmp_path / "a.json", [{"id": 7, "file_name": name}]))
-    assert (found.kind, found.people.frame.tolist()) == ("COCO-17", [12])
 
 
 def test_alphapose_numbers_its_images_by_their_names(tmp_path):

@@ -1,8 +1,6 @@
 """Calibrations of other programs: known cameras written in each form, and bad files of each."""
 
 import json
-import os
-import pickle
 import re
 from pathlib import Path
 
@@ -220,18 +218,6 @@ def test_an_optitrack_camera_looks_where_a_real_one_looks(tmp_path):
     assert np.all((pixel > 0) & (pixel < SIZE))
 
 
-def test_a_pickle_runs_nothing(tmp_path):
-    class Attack:
-        def __reduce__(self):
-            return (os.mkdir, (str(tmp_path / "ran"),))
-
-    path = tmp_path / "Cam0.pickle"
-    path.write_bytes(pickle.dumps({"rotation": Attack()}))
-    with pytest.raises(InputError, match=r"mkdir, which is not allowed. .*Nothing in this file"):
-        read_calibration(path)
-    assert not (tmp_path / "ran").exists()
-
-
 def test_unknown_files_and_empty_folders_name_all_forms(tmp_path):
     (tmp_path / "old.cal").write_bytes(b"\x00\x01")
     for path, found, todo in (
@@ -399,18 +385,3 @@ def test_an_empty_or_binary_file_is_refused_once(tmp_path, form, content, capfd)
         read_calibration(path)
     assert str(spoilt) in str(refused.value)
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_the_documents_and_the_help_name_every_form():
-    root = Path(__file__).parents[3]
-    page = (root / "docs/reference/formats.md").read_text().partition("## Calibrations")[2]
-    table = [
-        line.split("|")[1:3] for line in page.partition("\n## ")[0].splitlines() if "|" in line
-    ]
-    assert [name.strip() for name, _ in table[2:]] == [form.name for form in FORMS]
-    for (_, files), form in zip(table[2:], FORMS, strict=True):
-        assert form.endings[0] in files
-    source = (root / "flows/cli/matches.py").read_text()
-    for form in FORMS:
-        for program in form.name.split(", "):
-            assert program in source
