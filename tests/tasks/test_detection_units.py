@@ -225,3 +225,29 @@ def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, m
     np.testing.assert_array_equal(found[..., 1], np.where(np.isnan(expected), np.nan, [10.0, 20.0]))
     manifest = store.manifest("filmed", "detection", "right.early", after["detection/right.early"])
     assert manifest.figures["empty_share"] == 0.5
+
+
+def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    names = [stage.name for stage in METHOD]
+    results = computed(store, match, names.index("detection"))
+    plan = RunPlan(store, match, {}, results=results)
+    planned = plan.plan_stage(METHOD[names.index("detection")])
+    monkeypatch.setattr(tasks.detection, "weights_of", lambda settings: {"embedded": "another"})
+    with pytest.raises(InputError, match="planned with"):
+        task_of(METHOD[names.index("detection")]).fn(planned[0].work(store.url, match, "0001"))
+
+
+@pytest.mark.parametrize(("tall", "told"), [(20.0, False), (900.0, True)])
+def test_people_too_large_for_the_bundled_detector_are_told(
+    filmed, tmp_path, reading, monkeypatch, tall, told
+):
+    boxes = np.array([[0.0, 0.0, 8.0, tall]])
+    detect = staticmethod(lambda pictures: [People(boxes, np.array([0.9])) for _ in pictures])
+    monkeypatch.setattr(Reading, "detect", detect)
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+    warnings = store.manifest("filmed", "detection", "left.late", results["detection/left.late"])
+    assert any("people of 28 to 160 px" in text for text in warnings.warnings) == told

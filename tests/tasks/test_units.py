@@ -14,6 +14,7 @@ from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
+from flows.run_record import RunLog
 from tasks.ingest import ingest
 from tasks.static_calibration import static_calibration
 from tasks.unit import unit_task
@@ -206,3 +207,28 @@ def test_a_bug_in_a_unit_is_not_blamed_on_the_match(planned, monkeypatch, raised
         unit_task(compute).fn(unit.work(store.url, match, "0001"))
     assert unit.name in str(caught.value)
     assert told in str(caught.value)
+
+
+def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
+    store, match, first = planned
+    failed = f"static_calibration/{first.recipe.unit}"
+    log = RunLog.begin(store, match, METHOD, {})
+    for stage in METHOD:
+        for unit in log.plan.plan_stage(stage):
+            if unit.name != failed:
+                task_of(stage).fn(unit.work(store.url, match, log.run_id))
+            log.finish_unit(unit, RuntimeError("x") if unit.name == failed else None)
+    record = log.close()
+    assert record.state == "failed"
+    assert [failure.unit for failure in record.failed] == [failed]
+    assert record.blocked == (
+        "body_fitting/clip",
+        "bundle_adjustment/cameras",
+        "camera_consistency/clip",
+        "filtering/clip",
+        "retriangulation/clip",
+        "tracking/clip",
+        "triangulation/clip",
+    )
+    # The other cameras have their results: only what needs all of them waits.
+    assert len(record.executed) == len(plan_run(store, match, {})) - 8

@@ -171,3 +171,11 @@ def test_an_impossible_lens_is_refused(changes, said, tmp_path):
     np.savez(tmp_path / "lens.npz", **{"mtx": MATRIX, "dist": DISTORTION, **changes})
     with pytest.raises(InputError, match=said):
         read_lenses([tmp_path / "lens.npz"], "left", SIZES)
+
+
+def test_a_lens_that_folds_is_refused_wherever_it_is_read(tmp_path):
+    # r (1 - 3 r^2) grows up to r = 0.33, to 0.22; the image's corner is at 0.79.
+    text = write_toml(tmp_path)[0].read_text().replace("-0.31, 0.12", "-3.0, 0.0")
+    (tmp_path / "lenses.toml").write_text(text)
+    with pytest.raises(InputError, match=r"lenses\.toml: .*distortion: expected a lens whose"):
+        read_lens_toml(tmp_path / "lenses.toml", SIZES)

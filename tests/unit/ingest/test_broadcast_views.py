@@ -134,3 +134,9 @@ def test_several_broadcast_cameras_need_static_ones(two):
     (two / "detections" / "goal.npz").rename(two / "detections" / "goal.main.npz")
     with pytest.raises(InputError, match=r"clip goal: broadcast.*one broadcast camera.*tight"):
         read_match(two)
+
+
+def test_an_offset_of_the_match_rate_is_rounded_and_its_rest_is_lateness():
+    spec = match("main", 12.25)
+    assert unit_frames(spec, "goal").offset == -88
+    assert image_clock(spec, "goal").late.tolist() == [-0.25] * 6

@@ -1,6 +1,8 @@
 """Clicked markings and stills: read back as written, or refused by file and entry."""
 
 import json
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -169,3 +171,22 @@ def test_frames_out_of_order_or_twice_are_refused(write, frames):
 def test_a_wrong_entry_is_named(write, markings, place):
     with pytest.raises(InputError, match=place):
         write(KeyFrames(key_frames=(KeyFrame(frame=3, markings=markings),)))
+
+
+def test_a_small_file_that_declares_a_huge_still_is_refused_unread(tmp_path):
+    """A PNG of 60,000 x 60,000 pixels takes 254 bytes, and would take 10.8 GB of memory."""
+    path = tmp_path / "cam.png"
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(60_000))), (b"IEND", b"")]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+    )
+    assert path.stat().st_size < 300
+    with pytest.raises(
+        InputError, match=r"cam.png.*at most .* pixels, found .* bytes that are none"
+    ):
+        read_still(path, (1920, 1080))

@@ -4,6 +4,7 @@ import unicodedata
 
 import numpy as np
 import pytest
+from calibration_writers import write_easymocap
 
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
@@ -185,3 +186,25 @@ def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):
         "the clip has 7 frames; videos end earlier: two after 3",
         "the clip ends after 7 frames, the last that two videos show; one has 9",
     ]
+
+
+def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
+    tmp_path, make_camera
+):
+    names = ["one", "two", "three"]
+    cameras = read_calibration(calibrate(tmp_path, make_camera, names))
+    folder = tmp_path / "easymocap"
+    folder.mkdir()
+    write_easymocap(folder, list(cameras.values()))
+    lens, pose = folder / "intri.yml", folder / "extri.yml"
+    lens.write_text("".join(re.findall(r"^(?![WH]_).*\n", lens.read_text(), re.MULTILINE)))
+    pose.write_text(
+        re.sub(r"(R|Rot|T)_three: .*?(?=^\S|\Z)", "", pose.read_text(), flags=re.M | re.S)
+    )
+    with pytest.raises(InputError, match="the image size of camera one"):
+        read_calibration(folder)
+    for name in names:
+        film(tmp_path / "videos" / f"{name}.mp4")
+    spec, notes = import_videos(folder, tmp_path / "videos", tmp_path / "m")
+    assert [(camera.id, camera.width) for camera in spec.cameras] == [("one", 64), ("two", 64)]
+    assert notes == ["camera three is left out: it has no pose"]

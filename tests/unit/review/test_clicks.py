@@ -3,6 +3,7 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
@@ -20,6 +21,9 @@ from data_contracts.review import (
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import replay_corrections
+from worldpose.review.journal import append, read_journal
+from worldpose.store.blobs import Entry
+from worldpose.store.store import Store
 
 CORNER, MARK, LINE = "corner_left_near", "penalty_mark_left", "touch_line_near"
 
@@ -153,3 +157,60 @@ def test_key_frames_of_a_clip_are_corrected_picked_and_dropped(folder):
     assert points(picked[1].markings) == {CORNER: (190.0, 90.0)}
     gone = moved(None, (150.0, 60.0), camera="clip", frame=3)
     assert replay_corrections(folder, made(gone)).folder.key_frames == {}
+
+
+class MemoryBlobs:
+    """The journal's storage interface, in memory."""
+
+    url = "memory"
+
+    def __init__(self):
+        self.files = {}
+
+    def entries(self, prefix):
+        paths = sorted(path for path in self.files if path.startswith(f"{prefix}/"))
+        return [Entry(path, len(self.files[path]), datetime.now(UTC)) for path in paths]
+
+    def read(self, path):
+        return self.files.get(path)
+
+    def put_new(self, path, data):
+        return self.files.setdefault(path, data) is data
+
+
+def interleave(folder, rng):
+    """Two editors of one point, in any order of looking and saving; what each was told."""
+    store = Store(MemoryBlobs())
+    seen, wanted = {}, {}
+    acknowledged, count = [], 0
+    for editor in rng.integers(0, 2, 10).tolist():
+        if editor not in seen:
+            journal = read_journal(store, "m")
+            state = replay_corrections(folder, journal.standing.values()).folder
+            seen[editor] = journal
+            wanted[editor] = MovedPoint(
+                camera="a",
+                marking=CORNER,
+                was=points(state.clicked["a"])[CORNER],
+                xy=(float(count), 1.0),
+            )
+            count += 1
+        else:
+            correction = made(wanted[editor])[0].model_copy(update={"id": f"c{count}"})
+            count += 1
+            if append(store, seen.pop(editor), [correction]) is not None:
+                acknowledged.append(correction)
+    kept = tuple(read_journal(store, "m").standing.values())
+    replay = replay_corrections(folder, kept)
+    assert list(kept) == acknowledged, "an acknowledged edit is lost or doubled"
+    assert replay.stale == (), "an edit overwrote another person's unseen edit"
+    last = acknowledged[-1].edit.xy if acknowledged else (1.0, 2.0)
+    assert points(replay.folder.clicked["a"])[CORNER] == last
+    return len(acknowledged), count
+
+
+def test_two_editors_at_once_lose_and_overwrite_nothing(folder):
+    rng = np.random.default_rng(5)
+    saved = np.array([interleave(folder, rng) for _ in range(100)])
+    # Both outcomes have to come about for the test to say anything.
+    assert saved[:, 0].min() < saved[:, 0].max() <= 5

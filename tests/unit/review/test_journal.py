@@ -7,7 +7,7 @@ from multiprocessing import get_context
 import pytest
 
 from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest
-from worldpose.errors import CorruptionError
+from worldpose.errors import CorruptionError, StoreError
 from worldpose.review.journal import append, last_decision, read_journal, requests_by_id, say
 from worldpose.store.integrity import verify
 from worldpose.store.store import Store
@@ -147,3 +147,16 @@ def test_the_last_verdict_on_the_same_bytes_counts(store):
     records = tuple(read_journal(store, "m").records)
     assert last_decision(records, "tracking/clip", one).verdict == "approve"
     assert list(requests_by_id(records)) == ["q1", "q2"]
+
+
+def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch):
+    say(store, "m", lambda _: [correction("a")])
+
+    def fail(_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("worldpose.store.blobs.os.fsync", fail)
+        with pytest.raises(StoreError, match="No space left"):
+            say(store, "m", lambda _: [correction("b")])
+    assert said(read_journal(store, "m")) == ["a"]

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from obstore.store import MemoryStore
 from store_samples import place, run_once
 
 from worldpose.errors import StoreError
 from worldpose.store import blobs as folder_module
+from worldpose.store import objects
 from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
@@ -135,3 +137,41 @@ def test_a_disk_that_syncs_no_folders_is_fine(
     store = Store.create(tmp_path / "project")
     run_once(store)
     assert verify(store) == ()
+
+
+def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pieces = [b"ab", b"cd"]
+
+    class Answer:
+        def stream(self) -> Iterator[bytes]:
+            return iter(pieces)
+
+    monkeypatch.setattr(objects.obstore, "get", lambda *_: Answer())
+    blobs = objects.ObjectBlobs.at("s3://bucket/project")
+    (tmp_path / "there").write_bytes(b"")
+    with pytest.raises(FileExistsError, match="there"):
+        blobs.download("a/b", tmp_path / "there")
+    blobs.download("a/b", tmp_path / "new")
+    assert (tmp_path / "new").read_bytes() == b"abcd"
+
+    def broken(*_: object) -> None:
+        raise OSError("connection reset")
+
+    monkeypatch.setattr(objects.obstore, "get", broken)
+    with pytest.raises(StoreError, match="Check the bucket"):
+        blobs.download("a/b", tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", ["settings/project.yaml", "matches/m.json"])
+def test_a_file_below_a_folder_of_object_storage_has_a_mark(name: str) -> None:
+    blobs = objects.ObjectBlobs("bucket", "")
+    vars(blobs)["_s3"] = MemoryStore()
+    assert blobs.marks([name]) == [0]
+    blobs.put(name, b"1")
+    (before,) = blobs.marks([name])
+    blobs.put(name, b"22")
+    (after,) = blobs.marks([name])
+    assert 0 not in (before, after) and before != after
+    assert blobs.marks([name] * (objects.LISTINGS + 1))[0] == after

@@ -157,3 +157,37 @@ def test_one_camera_alone_follows_a_person_through_a_turn(ring, people, seen):
     assert (result.detection_index[:, 0, 0] == 0).all()
     assert np.isnan(result.joints[25:60]).all()
     assert (result.detection_index[60:] == 0).all()
+
+
+def test_camera_that_shows_a_neighbour_for_a_while_is_left_out(ring, people, seen):
+    # Three cameras follow a person; then the third sees only a neighbour 0.5 m behind, whose rays
+    # pass the person within the gate.
+    camera = ring(3)
+    behind = -0.5 * camera.center[2, :2] / np.linalg.norm(camera.center[2, :2])
+    places = np.broadcast_to([[0.0, 0.0], behind], (60, 2, 2))
+    keypoints, confidence = seen(camera, people(places), noise=0.5)
+    keypoints[:, :2, 1] = np.nan
+    keypoints[:20, 2, 1] = np.nan
+    keypoints[20:, 2, 0] = np.nan
+    tracked = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
+    assert (tracked.detection_index[:, :2, 0] == 0).all()
+    assert (tracked.detection_index[:20, 2, 0] == 0).all()
+    assert (tracked.detection_index[40:, 2, 0] == -1).all()
+    # 1 px is 2 cm: two views place the mean of 17 joints to some millimetres.
+    away = tracked.joints[40:, 0].mean(axis=1) - people(places[40:])[:, 0].mean(axis=1)
+    assert np.linalg.norm(away, axis=-1).max() < 0.02
+
+
+def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
+    # From running at 6 m/s to lying still within 0.3 s, in a low camera rig.
+    time = np.arange(0.0, 2.0, 1 / FPS)
+    slowed = np.clip(time - 1.0, 0.0, 0.3)
+    along = 6.0 * np.minimum(time, 1.0) + 6.0 * slowed - 10.0 * slowed**2
+    joints = people(np.stack([along, 0 * along], -1)[:, None])
+    tilt = np.clip((time - 1.0) / 0.3, 0.0, 1.0)[:, None] * np.pi / 2
+    height = joints[:, 0, :, 2].copy()
+    joints[:, 0, :, 0] += np.sin(tilt) * height
+    joints[:, 0, :, 2] = np.cos(tilt) * height + 0.1
+    result = track_people(ring(4), detections(*seen(ring(4), joints)), FPS, SETTINGS)
+    assert owners(result) == [0]
+    assert (result.detection_index >= 0).all()

@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_unit import scaled
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, Similarity
+from worldpose.triangulation.reinterpretation import reinterpret_calibration
 from worldpose.triangulation.world import (
     People,
     StatedWorld,
@@ -210,3 +212,45 @@ def test_statures_that_no_adults_have(statures, said):
 def test_options_that_state_nothing(unit, up):
     with pytest.raises(UsageError, match=f"found {unit} and {up}"):
         read_stated_world(unit, up)
+
+
+def test_a_lens_that_folds_in_the_middle_is_refused_and_at_the_corners_told(ring):
+    def given(k1):
+        return records(replace(ring(4), distortion=np.tile([k1, *[0.0] * 7], (4, 1))))
+
+    # r (1 + k1 r^2) grows up to r = 1 / sqrt(-3 k1), where it is two thirds of that.
+    corner = float(np.hypot(*(ring(4)[0].image_size / 2)) / ring(4)[0].focal[0])
+    with pytest.raises(InputError, match=r"c0: distortion: expected a lens whose image radii grow"):
+        place_cameras(
+            CALIBRATION, given(-((2.0 / (3.0 * 0.5 * corner)) ** 2) / 3.0), {}, FPS, NOTHING
+        )
+    folds = given(-((2.0 / (3.0 * 0.98 * corner)) ** 2) / 3.0)
+    _, (_, warning, *_) = place_cameras(CALIBRATION, folds, {}, FPS, NOTHING)
+    assert "c0: the lens folds within the image" in warning
+
+
+@pytest.mark.parametrize("also", [1.0 / 3.0, 0.5])
+def test_cameras_of_different_sizes_are_scaled_if_people_agree_at_one_size(ring, also):
+    true = records(ring(2))
+    size = np.array(true["c0"].image_size)
+    focal = true["c0"].focal_px[0]
+    true["c1"] = scaled(true["c1"], 0.5, tuple((size // 2).tolist()))
+    large = {n: scaled(c, 3.0, tuple(3 * s for s in c.image_size)) for n, c in true.items()}
+    # People all over the larger image, and one joint of 17 x 20 beyond its border.
+    points = np.random.default_rng(3).uniform(0.0, 1.0, (20, 2, 1, 17, 2)) * size
+    points[:, 1] /= 2.0
+    points[0, 0, 0, 0] = size + 40.0
+    seen = KeypointDetections.from_keypoints(points, np.ones(points.shape[:-1]))
+    wanted = 3.0 * focal * np.array([1.0 / 3.0, also])
+
+    def agree(batch):
+        return bool(np.isclose(batch.focal[0, 0], wanted).any())
+
+    found, notes = reinterpret_calibration(CALIBRATION, large, seen, agree)
+    if also == 0.5:
+        assert found == large
+        assert "but do if scaled by 0.33333 and 0.50000" in notes[0]
+    else:
+        assert [found[name].image_size for name in true] == [c.image_size for c in true.values()]
+        both = " and ".join("{} x {}".format(*c.image_size) for c in true.values())
+        assert f"scaled by 0.33333, to images of {both} px: of the usual ratios" in notes[0]

@@ -235,3 +235,17 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     shift = corrected - pixels
     np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
     assert not shift[:, 0].any()
+
+
+def test_cameras_that_all_sway_agree_with_nobody(cameras):
+    def misfit(size):
+        people = view(cameras, lambda pixels, *_: pixels)
+        phase = np.arange(FRAMES)[:, None] / FRAMES * 2.0 * np.pi + np.arange(4)
+        sway = size * np.stack([np.sin(phase), np.cos(1.3 * phase)], axis=-1)
+        people = replace(people, keypoints=people.keypoints + sway[:, :, None, None])
+        health = CameraHealth.empty(FRAMES, 4, people.detection_index.shape[2], FPS)
+        health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
+        return np.median(health.misfit)
+
+    assert misfit(0.0) < 1.0
+    assert misfit(30.0) > 3.0
