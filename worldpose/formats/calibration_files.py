@@ -261,7 +261,7 @@ def read_calibration_toml(
     cameras = []
     for where, name, given in tables:
         table = _with_size(given, sizes.get(camera_id(name)))
-        if "matrix" in table and not {"rotation", "translation"} & table.keys():
+        if _has_lens_alone(table):
             raise InputError(
                 f"{where}.rotation",
                 expected="the pose of the camera, rotation and translation",
@@ -282,11 +282,15 @@ def _with_size(table: Mapping[str, Any], size: tuple[int, int] | None) -> Mappin
     return {**table, "size": list(size)} if near else table
 
 
+def _has_lens_alone(table: Mapping[str, Any]) -> bool:
+    pose = [table.get(key) for key in ("rotation", "translation")]
+    return "matrix" in table and all(each in (None, "null", "None", "", []) for each in pose)
+
+
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
     """Return whether a camera has a lens but no pose, an empty one, or one with NaN."""
-    pose = [table.get(key) for key in ("rotation", "translation")]
-    empty = all(value in (None, "null", "None", "", []) for value in pose)
-    return "matrix" in table and (empty or "nan" in repr(pose))
+    pose = repr([table.get(key) for key in ("rotation", "translation")])
+    return _has_lens_alone(table) or ("matrix" in table and "nan" in pose)
 
 
 def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:

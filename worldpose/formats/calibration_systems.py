@@ -119,7 +119,8 @@ def _read_qualisys(
         if element.get("active", "1") != "0"
     ]
     has_video = any("video" in element.get("model", "").lower() for _, element in active)
-    lacks = [_qualisys_lack(element, has_video) for _, element in active]
+    has_fov = any(element.find("fov_video") is not None for _, element in active)
+    lacks = [_qualisys_lack(element, has_video, has_fov) for _, element in active]
     if left_out is not None and not all(lacks):
         for (where, element), why in zip(active, lacks, strict=True):
             if why:
@@ -129,12 +130,12 @@ def _read_qualisys(
     return index_by_name(path, cameras)
 
 
-def _qualisys_lack(element: ET.Element, has_video: bool) -> str:
+def _qualisys_lack(element: ET.Element, has_video: bool, has_fov: bool) -> str:
     """Return why a camera makes no calibrated video; empty if it does."""
     model = element.get("model", "")
     if has_video and "video" not in model.lower():
         return f"it records markers ({model})"
-    if element.find("fov_video") is None:
+    if has_fov and element.find("fov_video") is None:
         return "it makes no video (no fov_video)"
     place = element.find("transform")
     axes = [] if place is None else [place.get(f"r{i}{j}", "") for i in "123" for j in "123"]
@@ -149,19 +150,31 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
     `<transform>`: x y z is the camera centre C [mm]; r11..r33 is A, row by row, whose rows are the
     camera's axes in the world: x right, y up, z backward. So R = diag(1, -1, -1) A, t = -R C.
 
-    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor; `<fov_video>` (px,
-    both ends included) is the part of the sensor in the video. The radial and tangential (in the
+    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor, or in px where the
+    sensor (`sensorMaxU`) is; `<fov_video>` (px, both ends included) is the part of the sensor in
+    the video, the whole one in files without it. The radial and tangential (in the
     file: tangental) coefficients act on the normalised image plane and have no unit, so that they
     need no conversion: only lengths on the sensor are in 1/64 px. (Pose2Sim's reader divides them
     by 64 as well, which nearly removes the distortion.) `viewrotation` rotates only the view in
     QTM; the function ignores it.
     """
-    parts = {tag: _child(where, element, tag) for tag in ("transform", "intrinsic", "fov_video")}
+    parts = {tag: _child(where, element, tag) for tag in ("transform", "intrinsic")}
+    fov = element.find("fov_video")
+    parts |= {} if fov is None else {"fov_video": fov}
 
     def read(tag: str, keys: Sequence[str]) -> NDArray[np.float64]:
         return _numbers(f"{where}.{tag}", parts[tag], keys)
 
-    left, top, right, bottom = read("fov_video", ("left", "top", "right", "bottom"))
+    largest_px = 16384  # more are no pixels of a sensor, but parts of them
+    unit = 1.0 / 64.0
+    if fov is None or parts["intrinsic"].get("sensorMaxU") is not None:
+        last = read("intrinsic", ("sensorMaxU", "sensorMaxV"))
+        unit = unit if last.max() > largest_px else 1.0
+        last = 2.0 * np.ceil(0.5 * unit * last) - 1.0  # sensors have even sides
+    if fov is None:
+        left, top, right, bottom = 0.0, 0.0, *last
+    else:
+        left, top, right, bottom = read("fov_video", ("left", "top", "right", "bottom"))
     skew = parts["intrinsic"].get("skew", "0")
     if _parse(f"{where}.intrinsic.skew", skew, 1)[0] != 0.0:
         raise calibration_error(f"{where}.intrinsic.skew", "0", repr(skew))
@@ -175,8 +188,8 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
         element.get("serial", ""),
         Optics(
             np.array([right - left + 1, bottom - top + 1]),
-            read("intrinsic", ("focalLengthU", "focalLengthV")) / 64.0,
-            read("intrinsic", ("centerPointU", "centerPointV")) / 64.0 - [left, top],
+            unit * read("intrinsic", ("focalLengthU", "focalLengthV")),
+            unit * read("intrinsic", ("centerPointU", "centerPointV")) - [left, top],
             np.array([k1, k2, p1, p2, k3]),
         ),
         rotation=rotation,

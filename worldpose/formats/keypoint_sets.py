@@ -49,6 +49,8 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
 
     The numbers of names without such a place are their last ones. So they are if the last one is
     the same in all names and a single other one differs: that may be the camera's or the clip's.
+    No name has a frame if a number before it repeats and it does not rise with that number, as in
+    times of day or in pictures of several clips.
     """
     found: dict[str, list[int]] = {}
     for name in set(names):
@@ -63,6 +65,11 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
     chosen = min(distinct, key=lambda p: max(values[p]) - min(values[p]), default=1)
     if 1 not in differing and len(differing) == 1:
         chosen = 1
+    before = [numbers[-count:-chosen] for numbers in found.values()]
+    if 1 < len(set(map(tuple, before))) < len(found):
+        rising = [numbers[-chosen] for numbers in sorted(found.values(), key=lambda n: n[-count:])]
+        if rising != sorted(rising):  # a time, whose last number begins again each second
+            return {}
     return {name: numbers[-chosen] for name, numbers in found.items()}
 
 

@@ -30,19 +30,19 @@ from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 
 MATRIX_NAMES: Final = (
-    *("camera_matrix", "cameraMatrix", "Camera_Matrix", "camMatrix", "mtx", "K", "matrix"),
-    *("Intrinsics", "intrinsicMat", "intrinsic_matrix", "intrinsics", "k"),
+    *("cameramatrix", "cammatrix", "mtx", "K", "matrix", "intrinsic", "intrinsics"),
+    *("intrinsicmat", "intrinsicmatrix", "k"),
 )
 DISTORTION_NAMES: Final = (
-    *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs"),
-    *("dist_coefs", "dist_coeff", "distCoef", "distCoeff", "dist", "distortions", "distortion"),
-    *("distortion_coeffs", "Distortion", "D", "d"),
+    *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
+    *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
 SIZE_NAMES: Final = (
-    *(("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height")),
-    *(("image_size",), ("size",), ("imageSize",), ("resolution",), ("img_size",), ("w", "h")),
+    *(("imagewidth", "imageheight"), ("width", "height"), ("imagesize",), ("size",)),
+    *(("resolution",), ("imgsize",), ("w", "h")),
 )
-MODEL_NAMES: Final = ("distortion_model", "lens_model", "model_type", "fisheye_model", "fisheye")
+MODEL_NAMES: Final = ("distortionmodel", "lensmodel", "modeltype", "fisheyemodel", "fisheye")
+"""Names of entries, longer ones without underscores and capitals."""
 FISHEYE_WORDS: Final = (
     *("1", "1.0", "true", "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye"),
 )
@@ -62,7 +62,8 @@ def read_lenses(
 
     Args:
         files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
-            or JSON file, an npz file, or two npy files, one of them the 3 x 3 matrix.
+            or JSON file, an npz file, or two npy files, one of them the 3 x 3 matrix. Kalibr's
+            YAML, and JSON of multical and Panoptic Studio, name their cameras too.
         camera: the camera of a file that names none; None = a TOML file with names.
         sizes: width and height of each camera's images [px]. A lens of a file with another size
             and the same shape of image is scaled.
@@ -75,11 +76,11 @@ def read_lenses(
     first = files[0]
     if first.suffix.lower() == ".toml":
         return read_lens_toml(first, sizes, camera)
-    chain = _read_camchain(first)
-    if chain is not None:
-        if len(chain) == 1 and camera is not None:
-            chain = {camera: next(iter(chain.values()))}
-        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in chain.items()], sizes, camera)
+    named = _read_named(first)
+    if named is not None:
+        if len(named) == 1 and camera is not None:
+            named = {camera: next(iter(named.values()))}
+        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in named.items()], sizes, camera)
     if camera is None:
         raise InputError(
             str(first),
@@ -210,12 +211,28 @@ def _read_pickled_lens(file: Path) -> dict[str, Any]:
     return given
 
 
-def _read_camchain(file: Path) -> dict[str, dict[str, Any]] | None:
-    """Return the tables of a Kalibr camchain by camera; None for another file."""
-    if file.suffix.lower() not in (".yml", ".yaml") or is_storage(file):
+def _read_named(file: Path) -> dict[str, dict[str, Any]] | None:
+    """Return the tables of a file with several cameras by name; None for another file.
+
+    It is a camchain of Kalibr, or JSON of multical or Panoptic Studio with `cameras`.
+    """
+    if file.suffix.lower() not in (".yml", ".yaml", ".json") or is_storage(file):
         return None
-    content = read_yaml(file)
-    return dict(kalibr_tables(file, content)) if is_kalibr(content) else None
+    content = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
+    if is_kalibr(content):
+        return dict(kalibr_tables(file, content))
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if isinstance(cameras, list):
+        cameras = {str(each.get("name")): each for each in cameras if isinstance(each, dict)}
+    if not isinstance(cameras, dict) or not all(isinstance(one, dict) for one in cameras.values()):
+        return None
+    ours = {"K": "matrix", "dist": "distortions", "distCoef": "distortions"}
+    ours |= {"image_size": "size", "resolution": "size"}
+    return {
+        str(name): {ours.get(key, key): value for key, value in table.items()}
+        | ({"fisheye": True} if table.get("model") == "fisheye" else {})
+        for name, table in cameras.items()
+    }
 
 
 def is_kalibr(content: object) -> bool:
@@ -294,22 +311,28 @@ def _read_mapping(file: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in content.items():
         if isinstance(value, dict) and {"rows", "cols", "data"} <= value.keys():
+            shape = value["rows"], value["cols"]
             try:
-                found[str(name)] = np.reshape(value["data"], (value["rows"], value["cols"]))
+                found[str(name)] = np.reshape(value["data"], shape)
             except (ValueError, TypeError) as error:
-                raise calibration_error(
-                    f"{file}: {name}", "rows x cols numbers", say_failure(error)
-                ) from error
+                expected, count = "{} x {} numbers, as it says".format(*shape), np.size(value["data"])
+                raise calibration_error(f"{file}: {name}", expected, f"{count}") from error
         elif isinstance(value, list | int | float | str):
             found[str(name)] = value
     return found
 
 
+def _key(given: Mapping[str, Any], names: Sequence[str]) -> str | None:
+    """Return the key with the first of these names that there is, in any spelling."""
+    plain = {key if len(key) == 1 else key.replace("_", "").lower(): key for key in given}
+    return next((plain[name] for name in names if name in plain), None)
+
+
 def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str) -> NDArray[Any]:
     """Return the entry with one of the usual names."""
-    for name in names:
-        if name in given:
-            return np.asarray(given[name])
+    key = _key(given, names)
+    if key is not None:
+        return np.asarray(given[key])
     raise InputError(
         where,
         expected=f"{what} ({', '.join(names)})",
@@ -324,20 +347,20 @@ def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
     Raises:
         InputError: it names another lens model than those of OpenCV.
     """
-    for key in MODEL_NAMES:
-        if key in given:
-            said = str(np.ravel(given[key])[0]).lower()
-            if said not in FISHEYE_WORDS + OTHER_WORDS:
-                words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
-                raise calibration_error(f"{where}: {key}", f"one of {words}", repr(said))
-            return said in FISHEYE_WORDS
-    return False
+    key = _key(given, MODEL_NAMES)
+    if key is None:
+        return False
+    said = str(np.ravel(given[key])[0]).lower()
+    if said not in FISHEYE_WORDS + OTHER_WORDS:
+        words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
+        raise calibration_error(f"{where}: {key}", f"one of {words}", repr(said))
+    return said in FISHEYE_WORDS
 
 
 def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
     """Return the image size in a file, or the camera's own if the file has none."""
     for names in SIZE_NAMES:
-        values = np.concatenate([np.ravel(given.get(name, ())) for name in names])
+        values = np.concatenate([np.ravel(given.get(_key(given, [n]) or "", ())) for n in names])
         if len(values) == 2:
             return int(values[0]), int(values[1])
     return otherwise

@@ -138,6 +138,20 @@ def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):
         read_lenses(files, "right", {"right": (1440, 1080)})
 
 
+@pytest.mark.parametrize("form", ["multical", "panoptic"])
+def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
+    table = {"K": MATRIX.tolist(), "dist": DISTORTION.tolist(), "image_size": [1920, 1080]}
+    cameras = {"left": table, "right": table}
+    if form == "panoptic":
+        renamed = {"K": table["K"], "distCoef": DISTORTION[0].tolist(), "resolution": [1920, 1080]}
+        cameras = [{"name": name, **renamed} for name in cameras]
+    (tmp_path / "rig.json").write_text(json.dumps({"cameras": cameras}))
+    found = read_lenses([tmp_path / "rig.json"], None, SIZES)
+    assert found["left"].focal_px == pytest.approx(1402.0)
+    assert found["right"].distortion == tuple(DISTORTION[0].tolist())
+    assert [*read_lenses([tmp_path / "rig.json"], "left", SIZES)] == ["left"]
+
+
 @pytest.mark.parametrize("names", ["KDhw", "kd"])
 def test_the_nine_numbers_and_the_size_of_a_camera_info_are_read(names, tmp_path):
     half = np.diag([0.5, 0.5, 1.0]) @ MATRIX

@@ -135,12 +135,14 @@ def _read_tracks(root: Element) -> Iterator[MarkedImage]:
     found: dict[int, list[tuple[str, Element]]] = {}
     for track in root.iter("track"):
         for shape in track:
-            if shape.get("keyframe", "1") != "1" or shape.get("outside") == "1":
+            is_key = shape.get("keyframe", "1")  # the points of a skeleton have their own
+            parts = list(shape) if shape.tag == "skeleton" else [shape]
+            parts = [part for part in parts if part.get("keyframe", is_key) == "1"]
+            if not parts or shape.get("outside") == "1":
                 continue
             text = shape.get("frame", "")
             if not text.isdecimal() or len(text) > 9:
                 raise ContentError(f"track {track.get('id')}: frame {text[:40]!r}")
-            parts = list(shape) if shape.tag == "skeleton" else [shape]
             labels = [part.get("label", track.get("label", "")) for part in parts]
             found.setdefault(int(text), []).extend(zip(labels, parts, strict=True))
     first = root.findtext(".//start_frame") or "0"
@@ -282,9 +284,8 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
                 continue
             labels = names.get(each.category_id, ())
             if len(each.keypoints) != 3 * len(labels):
-                raise ContentError(
-                    f"{image.file_name}: {len(each.keypoints)} numbers for {len(labels)} keypoints"
-                )
+                what = f"{len(labels)} keypoints of category {each.category_id}"
+                raise ContentError(f"{image.file_name}: {len(each.keypoints)} numbers for {what}")
             for label, (x, y, visible) in zip(
                 labels, np.reshape(each.keypoints, (-1, 3)).tolist(), strict=True
             ):
