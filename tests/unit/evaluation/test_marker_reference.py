@@ -76,8 +76,8 @@ def test_c3d_gives_the_points_that_were_written(tmp_path, markers):
     np.testing.assert_allclose(joints, markers, atol=1e-5)
 
 
-def test_a_c3d_file_with_an_empty_list_of_analog_scales_is_read(tmp_path, markers):
-    """So ezc3d writes files without analog channels."""
+def test_a_c3d_file_whose_analog_scale_is_one_number_is_read(tmp_path, markers):
+    """So ezc3d writes files with no or one analog channel."""
     ezc3d = pytest.importorskip("ezc3d")
     content = ezc3d.c3d()
     content["parameters"]["POINT"]["RATE"]["value"] = [RATE]
@@ -85,6 +85,7 @@ def test_a_c3d_file_with_an_empty_list_of_analog_scales_is_read(tmp_path, marker
     content["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
     points = np.ones((4, 2, len(markers)))
     points[:3] = markers[:, 0, 11:13].transpose(2, 1, 0)
+    content["parameters"]["ANALOG"]["SCALE"]["value"] = [-1.0]
     content["data"]["points"] = points
     content.write(str(tmp_path / "a.c3d"))
     found = read_markers(tmp_path / "a.c3d")
