@@ -1,5 +1,7 @@
 """Marker files that the test writes, laid over a prediction whose place and time are known."""
 
+import struct
+
 import numpy as np
 import pytest
 from people_samples import person
@@ -88,6 +90,12 @@ def test_a_c3d_file_whose_analog_scale_is_one_number_is_read(tmp_path, markers):
     content["parameters"]["ANALOG"]["SCALE"]["value"] = [-1.0]
     content["data"]["points"] = points
     content.write(str(tmp_path / "a.c3d"))
+    whole = (tmp_path / "a.c3d").read_bytes()
+    at = whole.index(b"\x02SCALE") + len("\x02SCALE")
+    end = 512 * (int.from_bytes(whole[16:18], "little") - 1)  # of the parameters
+    scale = struct.pack("<HBB", struct.unpack_from("<H", whole, at)[0] - 1, 4, 0)
+    parameters = whole[:at] + scale + whole[at + 5 : end] + b"\0"
+    (tmp_path / "a.c3d").write_bytes(parameters + whole[end:])
     found = read_markers(tmp_path / "a.c3d")
     np.testing.assert_allclose(found.points, markers[:, 0, 11:13], atol=1e-5)
 
