@@ -126,8 +126,8 @@ def _read_tables(
             f"{path}: {lacking}",
             expected="the pose of the camera",
             found="a lens alone",
-            todo="Calibrate the poses too; or import the lenses (worldpose import --lens FILE), and "
-            "click the poses.",
+            todo="Calibrate the poses too; or import the lenses (worldpose import --lens FILE), "
+            "and click the poses.",
         )
     cameras = []
     for name in posed:

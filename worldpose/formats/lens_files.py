@@ -315,8 +315,8 @@ def _read_mapping(file: Path) -> dict[str, Any]:
             try:
                 found[str(name)] = np.reshape(value["data"], shape)
             except (ValueError, TypeError) as error:
-                expected, count = "{} x {} numbers, as it says".format(*shape), np.size(value["data"])
-                raise calibration_error(f"{file}: {name}", expected, f"{count}") from error
+                expected, size = "{} x {} numbers".format(*shape), np.size(value["data"])
+                raise calibration_error(f"{file}: {name}", expected, f"{size}") from error
         elif isinstance(value, list | int | float | str):
             found[str(name)] = value
     return found

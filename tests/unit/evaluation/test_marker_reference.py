@@ -1,7 +1,5 @@
 """Marker files that the test writes, laid over a prediction whose place and time are known."""
 
-import struct
-
 import numpy as np
 import pytest
 from people_samples import person
@@ -87,15 +85,14 @@ def test_a_c3d_file_whose_analog_scale_is_one_number_is_read(tmp_path, markers):
     content["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
     points = np.ones((4, 2, len(markers)))
     points[:3] = markers[:, 0, 11:13].transpose(2, 1, 0)
-    content["parameters"]["ANALOG"]["SCALE"]["value"] = [-1.0]
     content["data"]["points"] = points
     content.write(str(tmp_path / "a.c3d"))
     whole = (tmp_path / "a.c3d").read_bytes()
-    at = whole.index(b"\x02SCALE") + len("\x02SCALE")
+    empty = b"\x05\x02SCALE\x06\0\x04\x01\0\0"  # offset 6, float, one dimension of length 0
+    single = b"\x05\x02SCALE\x09\0\x04\0\0\0\x80\xbf\0"  # offset 9, float, no dimension, -1
+    assert empty in whole
     end = 512 * (int.from_bytes(whole[16:18], "little") - 1)  # of the parameters
-    scale = struct.pack("<HBB", struct.unpack_from("<H", whole, at)[0] - 1, 4, 0)
-    parameters = whole[:at] + scale + whole[at + 5 : end] + b"\0"
-    (tmp_path / "a.c3d").write_bytes(parameters + whole[end:])
+    (tmp_path / "a.c3d").write_bytes(whole[:end].replace(empty, single)[:end] + whole[end:])
     found = read_markers(tmp_path / "a.c3d")
     np.testing.assert_allclose(found.points, markers[:, 0, 11:13], atol=1e-5)
 
