@@ -161,6 +161,14 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
         counts = {name: getattr(found.changes, key) for name, found in read.items()}
         if total := sum(counts.values()):
             notes.append(f"{what}: {total} ({', '.join(name for name in counts if counts[name])})")
+    lacking = {
+        name: int((boxed & ~np.isfinite(found.people.confidence).any(axis=-1)).sum())
+        for name, found in read.items()
+        for boxed in [np.isfinite(found.people.boxes).all(axis=-1)]
+    }
+    if any(lacking.values()):
+        listed = ", ".join(f"{count} of {name}" for name, count in lacking.items() if count)
+        notes.append(f"warning: people have a box but no keypoint: {listed}")
     steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")

@@ -260,6 +260,13 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
         read_coco_results(path)
 
 
+def test_people_with_a_box_alone_are_told(tmp_path):
+    result = {"image_id": 3, "category_id": 1, "keypoints": [0] * 51, "bbox": [1, 2, 30, 40]}
+    (tmp_path / "a.json").write_text(json.dumps([result, result]))
+    found = {"a": read_people(tmp_path / "a.json")}
+    assert "warning: people have a box but no keypoint: 2 of a" in describe_changes(found)
+
+
 def test_annotations_without_points_take_the_set_of_the_others(tmp_path, monkeypatch):
     monkeypatch.setattr(coco_results, "BATCH", 2)
     path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}], BODY_25B)

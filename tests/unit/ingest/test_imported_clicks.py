@@ -227,6 +227,16 @@ def test_key_frames_of_tracks_are_clicks_at_their_frames(tmp_path, start, first)
     np.testing.assert_allclose(images[0].lines[0][1], [(100.0, 200.0), (300.0, 250.5)])
 
 
+def test_clicks_in_utf16_are_read_and_text_of_another_kind_is_refused(tmp_path):
+    path = cvat(tmp_path / "clicks.xml", list(CLICKS.items()))
+    text = path.read_text().replace("utf-8", "utf-16")
+    path.write_text(text, encoding="utf-16")
+    assert dict(read_marked_images(path)[0].points).keys() == CLICKS.keys()
+    path.write_text("label;x;y\ncorner_left_near;400;900\n", encoding="utf-16")
+    with pytest.raises(InputError, match="found neither XML nor JSON"):
+        read_marked_images(path)
+
+
 def test_points_of_a_skeleton_have_key_frames_of_their_own(tmp_path):
     """CVAT marks a skeleton as key frame at its first frame alone."""
     points = "".join(

@@ -25,6 +25,7 @@ from worldpose.formats.annotations.annotated_images import (
     ContentError,
     Given,
     decode_file,
+    first_character,
 )
 from worldpose.formats.annotations.programs import Answer, read_xml
 
@@ -70,10 +71,12 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
     max_bytes = 1 << 26  # maximum file size [bytes]
 
     def decode(content: bytes) -> list[MarkedImage]:
-        begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
-        decoders = {b"<": _read_cvat, b"[": _read_label_studio}
+        decoders = {b"<": _read_cvat, b"[": _read_label_studio, b"{": _read_coco}
+        begin = first_character(content)
+        if begin not in decoders:
+            raise ContentError("neither XML nor JSON")
         try:
-            found = list(decoders.get(begin, _read_coco)(content))
+            found = list(decoders[begin](content))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ContentError(f"no JSON: {error}") from error
         images = [image for image in found if image.points or image.lines]
