@@ -22,14 +22,14 @@ class InputError(WorldposeError):
         todo: what the user can do about it.
     """
 
-    def __init__(self, where: str, *, expected: str, found: str, todo: str) -> None:
+    def __init__(self, where: str, expected: str, found: str, todo: str) -> None:
         self.where, self.expected = _shorten(where), expected
         self.found, self.todo = _shorten(found), todo
         super().__init__(f"{self.where}: expected {expected}, found {self.found}. {todo}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Keyword-only arguments: without this the error cannot be unpickled from a worker.
-        return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
+        # Without this the error cannot be unpickled from a worker.
+        return type(self), (self.where, self.expected, self.found, self.todo)
 
 
 def _shorten(text: str) -> str:
@@ -39,12 +39,6 @@ def _shorten(text: str) -> str:
         return text
     half = max_length // 2 - 20  # leaves room for the text between, so the result is short enough
     return f"{text[:half]}...[{len(text) - 2 * half} characters]...{text[-half:]}"
-
-
-def _input_error(
-    kind: type[InputError], where: str, expected: str, found: str, todo: str
-) -> InputError:
-    return kind(where, expected=expected, found=found, todo=todo)
 
 
 class UsageError(InputError):

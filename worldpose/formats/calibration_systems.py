@@ -68,13 +68,11 @@ def read_calibration_xml(
         "calibrationProfile": _read_optitrack,
     }
     if root.tag not in readers:
-        raise InputError(
-            f"{path}: <{root.tag:.40}>",
-            expected="<calibration> of Qualisys, <Cameras> of Vicon, or <calibrationProfile> of "
-            "OptiTrack",
-            found=f"<{root.tag:.40}>",
-            todo="Export the calibration of the system again.",
+        expected = (
+            "<calibration> of Qualisys, <Cameras> of Vicon, or <calibrationProfile> of OptiTrack"
         )
+        todo = "Export the calibration of the system again."
+        raise InputError(f"{path}: <{root.tag:.40}>", expected, f"<{root.tag:.40}>", todo)
     return readers[root.tag](path, root, left_out)
 
 
@@ -218,11 +216,10 @@ def _read_vicon(
         left_out.update(dict.fromkeys(sorted(names), "it is not calibrated (no KeyFrame)"))
         elements = posed
     if others and not elements:
+        expected = "a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)"
+        todo = "Calibrate the video cameras with the others, and export again."
         raise InputError(
-            str(path),
-            expected="a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)",
-            found=f"cameras for markers alone: {', '.join(sorted(others)):.80}",
-            todo="Calibrate the video cameras with the others, and export again.",
+            str(path), expected, f"cameras for markers alone: {', '.join(sorted(others)):.80}", todo
         )
     cameras = [(where, _read_vicon_camera(where, element, left_out)) for where, element in elements]
     return index_by_name(path, cameras)
@@ -241,11 +238,10 @@ def _read_vicon_camera(
     frames = element.findall("KeyFrames/KeyFrame")
     where = f"{where} {name}".rstrip()
     if len(frames) != 1:
+        found = str(len(frames)) if frames else "none: the camera is not calibrated"
+        todo = "Calibrate the camera, or take it out of the file."
         raise InputError(
-            f"{where}.KeyFrames",
-            expected="one KeyFrame, of a camera that does not move",
-            found=str(len(frames)) if frames else "none: the camera is not calibrated",
-            todo="Calibrate the camera, or take it out of the file.",
+            f"{where}.KeyFrames", "one KeyFrame, of a camera that does not move", found, todo
         )
     (frame,) = frames
     for holder, key, only in (
@@ -303,12 +299,9 @@ def _vicon_optics(
     if text is not None:
         model, _, rest = text.strip().partition(" ")
         if model != "Vicon3Parameter":
-            raise InputError(
-                f"{where}.VICON_RADIAL2",
-                expected="Vicon3Parameter, the center, and three coefficients",
-                found=f"{text!r:.60}",
-                todo="Calibrate with the three-parameter lens model.",
-            )
+            expected = "Vicon3Parameter, the center, and three coefficients"
+            todo = "Calibrate with the three-parameter lens model."
+            raise InputError(f"{where}.VICON_RADIAL2", expected, f"{text!r:.60}", todo)
         numbers = _parse(f"{where}.VICON_RADIAL2", rest, 5)
         about, terms = numbers[:2], numbers[2:]
     else:

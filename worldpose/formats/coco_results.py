@@ -74,21 +74,19 @@ def read_coco_results(path: Path) -> PeopleFile:
             pointless += without
         batches.append(_read_batch(path, results, first))
     if not items.has_list:
-        raise InputError(
-            str(path),
-            expected="a list of COCO keypoint results, a COCO data set with `annotations`, or the "
-            "results of MMPose or Ultralytics",
-            found=_shorten(items.other or ", ".join(items.seen)),
-            todo="Export the poses as COCO keypoint results.",
+        expected = (
+            "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
+            "results of MMPose or Ultralytics"
         )
+        todo = "Export the poses as COCO keypoint results."
+        raise InputError(str(path), expected, _shorten(items.other or ", ".join(items.seen)), todo)
     found = _join(path, batches)
     points = found.points
     if pointless and pointless == len(points):
+        expected = "keypoints of people"
+        todo = "Export the poses, not the boxes alone."
         raise InputError(
-            f"{path}: annotations",
-            expected="keypoints of people",
-            found=f"{pointless} annotations without keypoints",
-            todo="Export the poses, not the boxes alone.",
+            f"{path}: annotations", expected, f"{pointless} annotations without keypoints", todo
         )
     if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible

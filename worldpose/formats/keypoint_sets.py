@@ -229,12 +229,9 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     if size == len(COCO17):
         other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
         if other <= plausible and misfits[0] - other >= _MARGIN:
-            raise InputError(
-                where,
-                expected="the 17 joints in COCO's order",
-                found="thighs, shanks and arms as in the order of Human3.6M",
-                todo="Estimate poses with a model of COCO, or write COCO's joints.",
-            )
+            found = "thighs, shanks and arms as in the order of Human3.6M"
+            todo = "Estimate poses with a model of COCO, or write COCO's joints."
+            raise InputError(where, "the 17 joints in COCO's order", found, todo)
     misfit = misfits[orders.index(chosen)]
     is_doubtful = chosen.name == "MPI-15" or (named is None and (stated or "").strip() != "")
     if (len(points) and is_doubtful and not misfit <= plausible) or (
@@ -253,12 +250,9 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
 
 def unknown_size(where: str, size: int) -> InputError:
     """Return the error of a set of points that no known estimator has."""
-    return InputError(
-        where,
-        expected=f"x, y and confidence of each point, of {KNOWN_SETS} points",
-        found=f"{size} points",
-        todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
-    )
+    expected = f"x, y and confidence of each point, of {KNOWN_SETS} points"
+    todo = "Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet')."
+    return InputError(where, expected, f"{size} points", todo)
 
 
 def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> float:
@@ -403,17 +397,11 @@ def _require_room(
     most = int(count.max(initial=0))
     fullest = frame[np.argmax(count)] if len(count) else 0
     if most > PEOPLE_LIMIT:
-        raise InputError(
-            str(path),
-            expected=f"at most {PEOPLE_LIMIT} people per frame",
-            found=f"{most} in frame {fullest}",
-            todo="Check image_id, or keep the detections of each image with the highest scores.",
-        )
+        expected = f"at most {PEOPLE_LIMIT} people per frame"
+        todo = "Check image_id, or keep the detections of each image with the highest scores."
+        raise InputError(str(path), expected, f"{most} in frame {fullest}", todo)
     limit = min(limit, ARRAY_BYTES)
     if len(frame) * most * 4 * (3 * points + 5) > limit:
-        raise InputError(
-            str(path),
-            expected=f"frames and people that fit into {limit} bytes",
-            found=f"{most} people in frame {fullest}",
-            todo="Check image_id.",
-        )
+        expected = f"frames and people that fit into {limit} bytes"
+        todo = "Check image_id."
+        raise InputError(str(path), expected, f"{most} people in frame {fullest}", todo)

@@ -82,12 +82,9 @@ def read_lenses(
             named = {camera: next(iter(named.values()))}
         return _lenses(first, [(f"{first}: {n}", n, t) for n, t in named.items()], sizes, camera)
     if camera is None:
-        raise InputError(
-            str(first),
-            expected="the camera of this lens",
-            found="a file without a name for it",
-            todo=f"Name it: --camera {next(iter(sizes), 'NAME')}.",
-        )
+        expected = "the camera of this lens"
+        todo = f"Name it: --camera {next(iter(sizes), 'NAME')}."
+        raise InputError(str(first), expected, "a file without a name for it", todo)
     if camera not in sizes:
         raise _unknown_camera(str(first), camera, sizes)
     given: dict[str, Any] = {}
@@ -186,12 +183,9 @@ def _read_file(file: Path) -> dict[str, Any]:
         return _read_pickled_lens(file)
     if suffix == ".xml":
         return read_file_storage(file)
-    raise InputError(
-        str(file),
-        expected="a lens file: .toml, .xml, .yml, .yaml, .json, .npy, .npz, or OpenCap's .pickle",
-        found=repr(file.suffix),
-        todo="Save the camera matrix and the distortion coefficients in one of these forms.",
-    )
+    expected = "a lens file: .toml, .xml, .yml, .yaml, .json, .npy, .npz, or OpenCap's .pickle"
+    todo = "Save the camera matrix and the distortion coefficients in one of these forms."
+    raise InputError(str(file), expected, repr(file.suffix), todo)
 
 
 def _read_pickled_lens(file: Path) -> dict[str, Any]:
@@ -333,12 +327,9 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
     key = _key(given, names)
     if key is not None:
         return np.asarray(given[key])
-    raise InputError(
-        where,
-        expected=f"{what} ({', '.join(names)})",
-        found=", ".join(sorted(given)) or "nothing",
-        todo="Add it to the file, or give the file that has it: --lens may come twice.",
-    )
+    expected = f"{what} ({', '.join(names)})"
+    todo = "Add it to the file, or give the file that has it: --lens may come twice."
+    raise InputError(where, expected, ", ".join(sorted(given)) or "nothing", todo)
 
 
 def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
@@ -434,20 +425,15 @@ def _scale(where: str, size: Floats, own: tuple[int, int]) -> float:
     """Return pixels of the camera's image per pixel of the calibrated one."""
     scale = np.array(own) / size
     if abs(scale[0] - scale[1]) > 0.002 * scale[0]:
-        raise InputError(
-            f"{where}: size",
-            expected=f"{own[0]} x {own[1]} px, the camera's images, or the same shape",
-            found=f"{size[0]:g} x {size[1]:g}",
-            todo="Give a lens that was calibrated in images of the video's shape: a crop has "
-            "another principal point.",
+        expected = f"{own[0]} x {own[1]} px, the camera's images, or the same shape"
+        todo = (
+            "Give a lens that was calibrated in images of the video's shape: a crop has "
+            "another principal point."
         )
+        raise InputError(f"{where}: size", expected, f"{size[0]:g} x {size[1]:g}", todo)
     return float(scale[0])
 
 
 def _unknown_camera(where: str, name: str, sizes: Mapping[str, object]) -> InputError:
-    return InputError(
-        where,
-        expected=f"a static camera of match.yaml: {', '.join(sizes)}",
-        found=repr(name),
-        todo="Correct the name, or read one camera alone: --camera NAME.",
-    )
+    todo = "Correct the name, or read one camera alone: --camera NAME."
+    return InputError(where, f"a static camera of match.yaml: {', '.join(sizes)}", repr(name), todo)

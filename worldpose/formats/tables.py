@@ -331,17 +331,12 @@ def read_parquet(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         table = parquet.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise InputError(
-            str(path), expected="a Parquet table", found=f"{error}", todo="Write it again."
-        ) from error
+        raise InputError(str(path), "a Parquet table", f"{error}", "Write it again.") from error
     missing = [name for name in columns if name not in table.column_names]
     if missing or not table.num_rows:
-        raise InputError(
-            str(path),
-            expected=f"rows with the columns {', '.join(columns)}",
-            found=f"{table.num_rows} rows with {', '.join(table.column_names)}",
-            todo="Write the file again.",
-        )
+        found = f"{table.num_rows} rows with {', '.join(table.column_names)}"
+        todo = "Write the file again."
+        raise InputError(str(path), f"rows with the columns {', '.join(columns)}", found, todo)
     return {name: table[name].to_numpy() for name in columns}
 
 
@@ -351,10 +346,7 @@ def _import_pyarrow(where: str, otherwise: str) -> tuple[Any, Any]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise UsageError(
-            where,
-            expected="worldpose with the extra tables, which reads and writes it",
-            found="none installed",
-            todo=f"Install it: pip install 'worldpose[tables]', or {otherwise}.",
-        ) from None
+        expected = "worldpose with the extra tables, which reads and writes it"
+        todo = f"Install it: pip install 'worldpose[tables]', or {otherwise}."
+        raise UsageError(where, expected, "none installed", todo) from None
     return pa, parquet
