@@ -319,8 +319,9 @@ def camera_tables(
     content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
-    entries = {"size", "matrix", "distortions", "rotation", "translation"}
+    entries = {"size", "matrix", "distortions"}
     known = [each for each in tables.values() if isinstance(each, dict) and entries & each.keys()]
+    entries |= set() if known else {"rotation", "translation"}  # also of pairs of cameras
     for key, table in tables.items():
         is_camera = isinstance(table, dict) and entries & table.keys()
         if key == "metadata" or (known and not is_camera):

@@ -25,7 +25,13 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
-from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml, require_file
+from worldpose.formats.files import (
+    SETTINGS_BYTES,
+    read_json,
+    read_toml,
+    read_yaml,
+    require_file,
+)
 from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 
@@ -49,6 +55,7 @@ FISHEYE_WORDS: Final = (
 OTHER_WORDS: Final = (
     *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
     *("rational_polynomial", "rational", "full_opencv"),
+    *("lensmodel_opencv4", "lensmodel_opencv5", "lensmodel_opencv8"),
 )
 """Values of `MODEL_NAMES`, in lower case."""
 ARRAY_BYTES: Final = 1 << 26
@@ -62,7 +69,7 @@ def read_lenses(
 
     Args:
         files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
-            or JSON file, an npz file, or two npy files, one of them the 3 x 3 matrix. Kalibr's
+            or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3 matrix. Kalibr's
             YAML, and JSON of multical and Panoptic Studio, name their cameras too.
         camera: the camera of a file that names none; None = a TOML file with names.
         sizes: width and height of each camera's images [px]. A lens of a file with another size
@@ -74,7 +81,9 @@ def read_lenses(
             unknown or not named.
     """
     first = files[0]
-    if first.suffix.lower() == ".toml":
+    if first.suffix.lower() == ".toml" and any(
+        isinstance(each, dict) for each in read_toml(first).values()
+    ):
         return read_lens_toml(first, sizes, camera)
     named = _read_named(first)
     if named is not None:
@@ -177,7 +186,7 @@ def _read_file(file: Path) -> dict[str, Any]:
         raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
-    if suffix in (".yml", ".yaml", ".json"):
+    if suffix in (".yml", ".yaml", ".json", ".toml"):
         return read_file_storage(file) if is_storage(file) else _read_mapping(file)
     if suffix in (".pkl", ".pickle"):
         return _read_pickled_lens(file)
@@ -291,15 +300,15 @@ def _chain(
 
 
 def _read_mapping(file: Path) -> dict[str, Any]:
-    """Return numbers, arrays and texts of plain JSON or YAML, as ROS's camera_calibration has.
+    """Return numbers, arrays and texts of plain JSON, YAML or TOML, as of ROS's camera_calibration.
 
     A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
 
     Raises:
         InputError: the file is no mapping, or a matrix has other sizes than it says.
     """
-    is_json = file.suffix.lower() == ".json"
-    content = read_json(file, SETTINGS_BYTES) if is_json else read_yaml(file)
+    readers = {".json": read_json, ".toml": read_toml}
+    content: Any = readers.get(file.suffix.lower(), read_yaml)(file)
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a mapping", type(content).__name__)
     found: dict[str, Any] = {}

@@ -56,7 +56,14 @@ def write_plain_json(folder):
     return [folder / "lens.json"]
 
 
+def write_flat_toml(folder):
+    text = f"resolution = [1920, 1080]\ncameraMatrix = {MATRIX.tolist()}\n"
+    (folder / "lens.toml").write_text(text + f"distCoeffs = {DISTORTION[0].tolist()}\n")
+    return [folder / "lens.toml"]
+
+
 WRITERS = {
+    "flat toml": write_flat_toml,
     "xml": lambda folder: write_opencv(folder / "lens.xml"),
     "yml": lambda folder: write_opencv(folder / "lens.yml", image_width=1920, image_height=1080),
     "json": lambda folder: write_opencv(folder / "lens.json"),

@@ -232,6 +232,11 @@ def test_qualisys_files_of_older_versions_have_pixels_and_the_whole_sensor(read)
     assert read(pixels, "rig.qca.txt") == expected
 
 
+def test_poses_of_pairs_beside_the_cameras_are_no_cameras(read):
+    pair = "\n[stereo_1_2]\nrotation = [0.1, 0.2, 0.3]\ntranslation = [1.0, 0.0, 0.0]\n"
+    assert read(ANIPOSE + pair) == read(ANIPOSE)
+
+
 def test_poses_that_are_all_null_are_told_to_be_lenses(refusal):
     without = CALISCOPE.replace("[[0.1], [0.2], [3.0]]", '"null"')
     without = without.replace("[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]", '"null"')
