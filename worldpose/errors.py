@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 
@@ -30,6 +30,18 @@ class InputError(WorldposeError):
     def __reduce__(self) -> tuple[object, ...]:
         # Without this the error cannot be unpickled from a worker.
         return type(self), (self.where, self.expected, self.found, self.todo)
+
+
+def describe_value(value: object) -> str:
+    """Return a value of a file for a message, in at most 60 characters."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, Mapping):
+        return f"a mapping of {len(value)}"
+    text = repr(value)
+    if isinstance(value, list | tuple) and len(text) > 60:
+        return f"a list of {len(value)}"
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _shorten(text: str) -> str:

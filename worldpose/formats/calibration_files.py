@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from data_contracts.cameras import COEFFICIENTS, CameraCalibration, LensName
-from worldpose.errors import InputError
+from worldpose.errors import InputError, describe_value
 from worldpose.formats.files import read_toml
 
 NUMBER_LIMIT: Final = 1e9
@@ -218,12 +218,6 @@ def calibration_error(where: str, expected: str, found: str) -> InputError:
     return InputError(where, expected=expected, found=found, todo="Correct the calibration file.")
 
 
-def _shorten(value: object) -> str:
-    """Return a value shortened for a message."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def read_calibration_toml(
     path: Path,
     left_out: LeftOut | None = None,
@@ -328,7 +322,7 @@ def camera_tables(
             continue  # caliscope's settings stand beside its cameras
         where = f"{path}: {key}" if tables is content else f"{path}: cameras.{key}"
         if not isinstance(table, dict):
-            raise calibration_error(where, "a table for each camera", _shorten(table))
+            raise calibration_error(where, "a table for each camera", describe_value(table))
         yield where, str(table.get("name", f"cam_{key}" if key.isdecimal() else key)), table
 
 
@@ -357,7 +351,7 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
     size = _read_numbers(table, where, keys.size, (2,))
     fisheye = table.get("fisheye", False)
     if fisheye not in (False, True):
-        raise calibration_error(f"{where}.fisheye", "true or false", _shorten(fisheye))
+        raise calibration_error(f"{where}.fisheye", "true or false", describe_value(fisheye))
     numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))
     distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, fisheye=bool(fisheye))
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
@@ -459,7 +453,7 @@ def _read_numbers(
         raise InputError(f"{where}.{key}", "a value", "nothing", todo)
     numbers = _plain_numbers(table[key])
     if numbers is None:
-        raise calibration_error(f"{where}.{key}", "numbers", _shorten(table[key]))
+        raise calibration_error(f"{where}.{key}", "numbers", describe_value(table[key]))
     if shape is not None and len(shape) == 1 and numbers.size == shape[0]:
         numbers = numbers.ravel()
     if shape is not None and numbers.shape != shape:
@@ -468,7 +462,7 @@ def _read_numbers(
         )
     if not np.all(np.abs(numbers) <= NUMBER_LIMIT):  # also NaN
         raise calibration_error(
-            f"{where}.{key}", f"finite numbers up to {NUMBER_LIMIT:g}", _shorten(table[key])
+            f"{where}.{key}", f"finite numbers up to {NUMBER_LIMIT:g}", describe_value(table[key])
         )
     return numbers
 

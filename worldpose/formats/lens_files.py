@@ -69,8 +69,8 @@ def read_lenses(
 
     Args:
         files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
-            or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3 matrix. Kalibr's
-            YAML, and JSON of multical and Panoptic Studio, name their cameras too.
+            or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3
+            matrix. Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too.
         camera: the camera of a file that names none; None = a TOML file with names.
         sizes: width and height of each camera's images [px]. A lens of a file with another size
             and the same shape of image is scaled.

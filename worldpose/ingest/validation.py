@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import unicodedata
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from data_contracts.records import Record
-from worldpose.errors import InputError, say_failure
+from worldpose.errors import InputError, describe_value, say_failure
 
 R = TypeVar("R", bound=Record)
 
@@ -70,7 +70,7 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     place = _place(detail["loc"])
     expected = detail["msg"].removeprefix("Input should be ")
-    found, todo = _brief(value), "Correct this value."
+    found, todo = describe_value(value), "Correct this value."
     if kind == "extra_forbidden":
         key = str(detail["loc"][-1])
         known = _known_keys(model, detail["loc"][:-1])
@@ -110,15 +110,6 @@ def _place(loc: tuple[int | str, ...]) -> str:
     return "".join(
         f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc
     ).removeprefix(".")
-
-
-def _brief(value: object) -> str:
-    if isinstance(value, Mapping):
-        return "a mapping"
-    if isinstance(value, list | tuple):
-        return f"a list of {len(value)}"
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _known_keys(model: type[Record], loc: tuple[int | str, ...]) -> list[str]:
