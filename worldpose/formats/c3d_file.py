@@ -120,11 +120,7 @@ def _parameters(
             "X_SCREEN": "+X",
             "Y_SCREEN": "+Z",
         },
-        "ANALOG": {
-            "USED": zero,
-            "GEN_SCALE": np.float32(1.0),
-            "RATE": np.float32(0.0),
-        },
+        "ANALOG": {"USED": zero, "GEN_SCALE": np.float32(1.0), "RATE": np.float32(0.0)},
         "FORCE_PLATFORM": {"USED": zero},
         "TRIAL": {
             # Pairs of the low and the high 16 bits.

@@ -267,13 +267,7 @@ def _read_vicon_camera(
     if left_out is not None and error > 0.0:
         how = f"{optics.lens_model} coefficients follow Vicon's lens within {error:.2g} px"
         left_out.notes.append(f"camera {name}: {how}")
-    return build_camera(
-        where,
-        name,
-        optics,
-        rotation=rotation,
-        translation=-rotation @ center,
-    )
+    return build_camera(where, name, optics, rotation=rotation, translation=-rotation @ center)
 
 
 def _vicon_optics(

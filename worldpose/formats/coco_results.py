@@ -343,12 +343,7 @@ def _optional(
 
 
 def _result_error(
-    path: Path,
-    index: int,
-    place: str,
-    expected: str,
-    found: str,
-    todo: str = "Correct the file.",
+    path: Path, index: int, place: str, expected: str, found: str, todo: str = "Correct the file."
 ) -> InputError:
     where = f"{path}: result {index}" + (f", {place}" if place else "")
     return InputError(where, expected=expected, found=found, todo=todo)

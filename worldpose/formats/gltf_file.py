@@ -395,11 +395,7 @@ class _Writer:
             "NORMAL": self.file.accessor(up, _VERTICES),
         }
         shapes: list[dict[str, Any]] = [
-            {
-                "attributes": quad,
-                "indices": self.file.accessor(halves, _INDICES),
-                "material": lawn,
-            }
+            {"attributes": quad, "indices": self.file.accessor(halves, _INDICES), "material": lawn}
         ]
         vertices, triangles = paint_strips(markings)
         painted = {

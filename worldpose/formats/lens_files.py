@@ -25,13 +25,7 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
-from worldpose.formats.files import (
-    SETTINGS_BYTES,
-    read_json,
-    read_toml,
-    read_yaml,
-    require_file,
-)
+from worldpose.formats.files import SETTINGS_BYTES, read_json, read_toml, read_yaml, require_file
 from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 

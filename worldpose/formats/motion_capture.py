@@ -83,12 +83,7 @@ def coco_dataset(
         },
         "licenses": [],
         "images": [
-            {
-                "id": frame,
-                "file_name": f"{camera_id}/{frame:06d}",
-                "width": width,
-                "height": height,
-            }
+            {"id": frame, "file_name": f"{camera_id}/{frame:06d}", "width": width, "height": height}
             for frame in dict.fromkeys(own_frames)
         ],
         "annotations": annotations,

@@ -262,9 +262,7 @@ def _strides(
     strides = []
     for run in find_runs(np.isfinite(ahead)):
         contacts, _ = find_peaks(
-            ahead[run],
-            distance=max(1, round(min_stride_s * fps)),
-            prominence=min_swing_m,
+            ahead[run], distance=max(1, round(min_stride_s * fps)), prominence=min_swing_m
         )
         for a, b in pairwise((contacts + run.start).tolist()):
             if _is_stride(float(frames[b] - frames[a]) / fps, ankle[b] - ankle[a]):
