@@ -200,7 +200,7 @@ def _read_vicon(
 ) -> dict[str, CameraCalibration]:
     """Return the video cameras of an XCP file by device id; those for markers make no video."""
     elements: list[tuple[str, ET.Element]] = []
-    others = set()
+    others: dict[str, str] = {}
     for index, element in enumerate(root.iterfind("Camera")):
         where = f"{path}: Camera[{index}]"
         kind = f"{element.get('DISPLAY_TYPE', '')} {element.get('TYPE', '')}".lower()
@@ -208,19 +208,19 @@ def _read_vicon(
         if is_digital or "video" in kind or "vue" in kind:
             elements.append((where, element))
         else:
-            others.add(element.get("DISPLAY_TYPE", "?"))
+            others[element.get("DEVICEID", where)] = element.get("DISPLAY_TYPE", "?")
     posed = [each for each in elements if each[1].find("KeyFrames/KeyFrame") is not None]
     if left_out is not None and posed:
         names = {element.get("DEVICEID", where) for where, element in elements}
         names -= {element.get("DEVICEID", where) for where, element in posed}
+        left_out.update(dict.fromkeys(others, "it records markers"))
         left_out.update(dict.fromkeys(sorted(names), "it is not calibrated (no KeyFrame)"))
         elements = posed
     if others and not elements:
         expected = "a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)"
         todo = "Calibrate the video cameras with the others, and export again."
-        raise InputError(
-            str(path), expected, f"cameras for markers alone: {', '.join(sorted(others)):.80}", todo
-        )
+        found = f"cameras for markers alone: {', '.join(sorted(set(others.values()))):.80}"
+        raise InputError(str(path), expected, found, todo)
     cameras = [(where, _read_vicon_camera(where, element, left_out)) for where, element in elements]
     return index_by_name(path, cameras)
 
@@ -357,6 +357,10 @@ def _read_optitrack(
         if element.get("Serial", "").startswith("C") or mode.get("VideoType") in ("1", "6"):
             filming.append(every[-1])
     chosen = filming or every
+    if left_out is not None:
+        others = [element.get("Serial", where) for where, element in every]
+        filmed = {element.get("Serial", where) for where, element in chosen}
+        left_out.update({name: "it records markers" for name in others if name not in filmed})
     return index_by_name(
         path, [(where, _read_optitrack_camera(where, element)) for where, element in chosen]
     )
