@@ -301,8 +301,10 @@ def _read_mapping(file: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is no mapping, or a matrix has other sizes than it says.
     """
-    readers = {".json": read_json, ".toml": read_toml}
-    content: Any = readers.get(file.suffix.lower(), read_yaml)(file)
+    suffix = file.suffix.lower()
+    content: Any = read_toml(file) if suffix == ".toml" else None
+    if content is None:
+        content = read_json(file) if suffix == ".json" else read_yaml(file)
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a mapping", type(content).__name__)
     found: dict[str, Any] = {}
