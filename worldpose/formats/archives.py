@@ -195,13 +195,11 @@ def require_size(
     elif ratio is not None and total > max(PACKED_BYTES, packed * ratio):
         expected = f"arrays packed at most {ratio} to 1"
     if expected is not None:
-        raise InputError(
-            str(path),
-            expected=expected,
-            found=f"{total} bytes of arrays in {packed}",
-            todo="Give dimensions no more room than their entries need, or save the arrays "
-            "without compression.",
+        todo = (
+            "Give dimensions no more room than their entries need, or save the arrays "
+            "without compression."
         )
+        raise InputError(str(path), expected, f"{total} bytes of arrays in {packed}", todo)
 
 
 def read_array(

@@ -122,13 +122,11 @@ def _read_tables(
         left_out.update({camera_id(name): "it has no pose" for name in tables if name not in posed})
     elif len(posed) < len(tables) or not posed:
         lacking = next((name for name in tables if name not in posed), "no camera")
-        raise InputError(
-            f"{path}: {lacking}",
-            expected="the pose of the camera",
-            found="a lens alone",
-            todo="Calibrate the poses too; or write the lenses as TOML, import them (worldpose "
-            "import --lens), and click the poses.",
+        todo = (
+            "Calibrate the poses too; or import the lenses (worldpose import --lens FILE), "
+            "and click the poses."
         )
+        raise InputError(f"{path}: {lacking}", "the pose of the camera", "a lens alone", todo)
     cameras = []
     for name in posed:
         where = f"{path}: {name}"
@@ -166,12 +164,9 @@ def read_openpose_cameras(
     for file in files:
         given, where = read_file_storage(file), str(file)
         if camera_id(file.stem) not in sizes:
-            raise InputError(
-                where,
-                expected=f"the image size of camera {file.stem}, which OpenPose's files lack",
-                found="no video of that name",
-                todo="Import the calibration with --videos, or write it as TOML with a size.",
-            )
+            expected = f"the image size of camera {file.stem}, which OpenPose's files lack"
+            todo = "Import the calibration with --videos, or write it as TOML with a size."
+            raise InputError(where, expected, "no video of that name", todo)
         pose = np.asarray(given.get("CameraMatrix"))
         if pose.shape != (3, 4):
             raise calibration_error(f"{where}: CameraMatrix", "shape (3, 4)", f"{pose.shape}")

@@ -215,9 +215,7 @@ _TITLES: Final[Mapping[str, str]] = {
     **dict.fromkeys(("fov_v", "fovy", "fov_vertical", "vertical_fov"), "fov_y"),
 }
 """Other names of columns; `_deg` or `_rad` may follow those of angles, a unit of length x, y, z."""
-_KNOWN: Final = {
-    *("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y"),
-}
+_KNOWN: Final = {*("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y")}
 
 
 def _read_columns(

@@ -408,10 +408,7 @@ def read_kit_array(path: Path, kind: str) -> Floats:
         isinstance(d, str) or n == d for n, d in zip(array.shape[2:], tail, strict=True)
     )
     if not fits:
-        raise InputError(
-            str(path),
-            expected=f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})",
-            found=f"{array.dtype} of shape {array.shape}",
-            todo="Write the file again.",
-        )
+        expected = f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})"
+        todo = "Write the file again."
+        raise InputError(str(path), expected, f"{array.dtype} of shape {array.shape}", todo)
     return array.astype(np.float64)

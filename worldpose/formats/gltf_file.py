@@ -50,12 +50,8 @@ def people_with_bodies(path: Path, people: Sequence[AnimatedBody]) -> list[Anima
     """
     present = [person for person in people if person.poses.known.any()]
     if not present:
-        raise InputError(
-            str(path),
-            expected="a person with a fitted body",
-            found="none",
-            todo="Run the match up to body_fitting, or export joints: --format c3d or csv.",
-        )
+        todo = "Run the match up to body_fitting, or export joints: --format c3d or csv."
+        raise InputError(str(path), "a person with a fitted body", "none", todo)
     return present
 
 
@@ -398,11 +394,7 @@ class _Writer:
             "NORMAL": self.file.accessor(up, _VERTICES),
         }
         shapes: list[dict[str, Any]] = [
-            {
-                "attributes": quad,
-                "indices": self.file.accessor(halves, _INDICES),
-                "material": lawn,
-            }
+            {"attributes": quad, "indices": self.file.accessor(halves, _INDICES), "material": lawn}
         ]
         vertices, triangles = paint_strips(markings)
         painted = {

@@ -271,9 +271,8 @@ def read_joints(path: str | os.PathLike[str]) -> JointTracks:
             )
         return JointTracks(**arrays, extra=extra)
     except InputError as error:
-        raise InputError(
-            f"{path}: {error.where}", expected=error.expected, found=error.found, todo=error.todo
-        ) from error
+        todo = error.todo
+        raise InputError(f"{path}: {error.where}", error.expected, error.found, todo) from error
 
 
 POSE_MEMBERS: Final = {

@@ -90,12 +90,9 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
             found = str(sizes["points"])
             raise wrong(f"{path}: point", f"1 to {points_limit} names as text", found)
         if sizes["detections"] > PEOPLE_LIMIT:
-            raise InputError(
-                f"{path}: score",
-                expected=f"at most {PEOPLE_LIMIT} people per frame",
-                found=f"room for {sizes['detections']}",
-                todo="Keep the detections of each frame with the highest scores.",
-            )
+            expected = f"at most {PEOPLE_LIMIT} people per frame"
+            todo = "Keep the detections of each frame with the highest scores."
+            raise InputError(f"{path}: score", expected, f"room for {sizes['detections']}", todo)
         require_size(path, infos.values(), ARRAY_BYTES, PACKED_RATIO)
         arrays = {
             name: read_array(path, file, info, _MEMBERS[name]) for name, info in infos.items()
@@ -221,12 +218,9 @@ def select_ranges(
     if len(seen) and not any(((seen >= first) & (seen < first + n)).any() for first, n in ranges):
         wanted = [f"{first} to {first + count - 1}" for first, count in ranges]
         more = f" and {len(wanted) - 5} more ranges" if len(wanted) > 5 else ""
-        raise InputError(
-            str(path),
-            expected=f"people in frames {', '.join(wanted[:5])}{more}",
-            found=f"frames {seen[0]} to {seen[-1]}",
-            todo="Check the frame numbers, the camera's offset_frames and the clips.",
-        )
+        expected = f"people in frames {', '.join(wanted[:5])}{more}"
+        todo = "Check the frame numbers, the camera's offset_frames and the clips."
+        raise InputError(str(path), expected, f"frames {seen[0]} to {seen[-1]}", todo)
     return on_frames(path, people, ranges)
 
 
@@ -243,11 +237,10 @@ def on_frames(
     total = sum(count for _, count in ranges)
     farthest = max(abs(first) for first, _ in ranges)
     if total * frame_bytes > ARRAY_BYTES or farthest > FRAME_LIMIT:
+        expected = f"frame numbers up to {FRAME_LIMIT} and arrays up to {ARRAY_BYTES} bytes"
+        found = f"{total} frames from {ranges[0][0]} on, with up to {detections} people"
         raise InputError(
-            str(path),
-            expected=f"frame numbers up to {FRAME_LIMIT} and arrays up to {ARRAY_BYTES} bytes",
-            found=f"{total} frames from {ranges[0][0]} on, with up to {detections} people",
-            todo="Check the frame numbers; cut a long match into clips.",
+            str(path), expected, found, "Check the frame numbers; cut a long match into clips."
         )
     wanted = [np.arange(first, first + count, dtype=np.int64) for first, count in ranges]
     return people.reindex(np.concatenate(wanted))

@@ -84,12 +84,7 @@ def coco_dataset(
         },
         "licenses": [],
         "images": [
-            {
-                "id": frame,
-                "file_name": f"{camera_id}/{frame:06d}",
-                "width": width,
-                "height": height,
-            }
+            {"id": frame, "file_name": f"{camera_id}/{frame:06d}", "width": width, "height": height}
             for frame in dict.fromkeys(own_frames)
         ],
         "annotations": annotations,
@@ -252,12 +247,9 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     centimetres = 100.0
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
     if not len(angles) or not np.isfinite([angles.sum(), poses.transl.sum()]).all():
-        raise InputError(
-            str(path),
-            expected="frames that all have a body",
-            found=f"{len(angles)} frames, some without" if len(angles) else "no frames",
-            todo="Write a file for each uninterrupted stretch.",
-        )
+        found = f"{len(angles)} frames, some without" if len(angles) else "no frames"
+        todo = "Write a file for each uninterrupted stretch."
+        raise InputError(str(path), "frames that all have a body", found, todo)
     betas = poses.betas[0]
     rest = model.joint_template + model.joint_directions @ betas
     turns = Rigid.from_rotvec(angles.reshape(len(angles), -1, 3), np.zeros(3)).rotation.copy()
@@ -419,12 +411,9 @@ def write_opensim_motion(
     """
     mot_decimals = 5  # decimals of degrees, metres and seconds
     if not len(coordinates) or not np.isfinite(coordinates).all():
-        raise InputError(
-            str(path),
-            expected="frames that all have a body",
-            found=f"{len(coordinates)} frames, some without" if len(coordinates) else "no frames",
-            todo="Write a file for each uninterrupted interval.",
-        )
+        found = f"{len(coordinates)} frames, some without" if len(coordinates) else "no frames"
+        todo = "Write a file for each uninterrupted interval."
+        raise InputError(str(path), "frames that all have a body", found, todo)
     rows = np.column_stack([times, coordinates])
     head = [
         "Coordinates",

@@ -273,11 +273,10 @@ def write_viewer(
         InputError: nobody is in the clips, or the file would be too large.
     """
     if not any(clip.has_people for clip in clips):
+        expected = "a person with joints, a body or a place on the pitch"
+        todo = "Run the match to the end, and see with `worldpose status` what it found."
         raise InputError(
-            str(path),
-            expected="a person with joints, a body or a place on the pitch",
-            found="none in " + ", ".join(clip.clip for clip in clips),
-            todo="Run the match to the end, and see with `worldpose status` what it found.",
+            str(path), expected, "none in " + ", ".join(clip.clip for clip in clips), todo
         )
     size = 0
     with whole_file(path) as draft, draft.open("w", encoding="utf-8", newline="\n") as file:
@@ -321,13 +320,12 @@ def _parts(clip: ViewerClip, video: Path | None) -> Iterator[tuple[str, bytes]]:
 
 def _require_size(path: Path, size: int) -> None:
     if size > MAX_FILE_BYTES:
-        raise InputError(
-            str(path),
-            expected=f"at most {MAX_FILE_BYTES / 1e6:g} MB, which browsers open",
-            found="more",
-            todo="Cut the match into shorter clips, export a folder with a file per clip, or leave "
-            "out --video.",
+        expected = f"at most {MAX_FILE_BYTES / 1e6:g} MB, which browsers open"
+        todo = (
+            "Cut the match into shorter clips, export a folder with a file per clip, or leave "
+            "out --video."
         )
+        raise InputError(str(path), expected, "more", todo)
 
 
 def _pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:

@@ -100,12 +100,9 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
     spec = read_spec(folder)
     pitch = read_pitch(folder, spec)
     if pitch is None:
-        raise InputError(
-            f"{folder / 'match.yaml'}: pitch",
-            expected="a pitch, whose markings were clicked",
-            found="pitch: none",
-            todo="Remove the line `pitch: none`.",
-        )
+        expected = "a pitch, whose markings were clicked"
+        todo = "Remove the line `pitch: none`."
+        raise InputError(f"{folder / 'match.yaml'}: pitch", expected, "pitch: none", todo)
     by_owner = _assign_images(file, images, spec, owner)
     report = ImportedClicks()
     labels = _Labels(file, images, pitch, report)
@@ -130,12 +127,8 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         report.clicks[name] = sum(len(image.points) + len(image.lines) for image in own)
     for name in records:
         if (folder / name).exists():
-            raise InputError(
-                str(folder / name),
-                expected="no clicks there yet",
-                found="a file",
-                todo="Move it away, or correct single clicks on the pages.",
-            )
+            todo = "Move it away, or correct single clicks on the pages."
+            raise InputError(str(folder / name), "no clicks there yet", "a file", todo)
     if report.own_points:
         refuse_unread_pitch(folder)
         known = dict(pitch.points)
@@ -159,12 +152,8 @@ def _assign_images(
     if owner in views:
         return {owner: (views[owner].camera, list(images))}
     if owner is not None and owner not in static:
-        raise InputError(
-            "--camera",
-            expected=f"one of {', '.join([*static, *views])}",
-            found=repr(owner),
-            todo="Name a static camera, or a clip of the broadcast camera.",
-        )
+        todo = "Name a static camera, or a clip of the broadcast camera."
+        raise InputError("--camera", f"one of {', '.join([*static, *views])}", repr(owner), todo)
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
         named = IMAGE_NAME.search(image.name)

@@ -92,13 +92,12 @@ def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> N
         if not least <= value <= most:
             units = [u for u, metres in OTHER_UNITS.items() if least <= value * metres <= most]
             guess = f", which looks like {units[0]}" if units else ""
-            raise InputError(
-                f"{file}: {key}",
-                expected=f"{least:g} to {most:g} metres",
-                found=f"{value:g}{guess}",
-                todo="Give all lengths and points in metres, name the game as template, or add "
-                '"any_size": true where the pitch is of another size.',
+            expected = f"{least:g} to {most:g} metres"
+            todo = (
+                "Give all lengths and points in metres, name the game as template, or add "
+                '"any_size": true where the pitch is of another size.'
             )
+            raise InputError(f"{file}: {key}", expected, f"{value:g}{guess}", todo)
 
 
 def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
@@ -157,9 +156,6 @@ def refuse_unread_pitch(folder: Path) -> None:
 
 
 def _two_pitches(folder: Path, named: str) -> InputError:
-    return InputError(
-        f"{folder / 'match.yaml'}: pitch",
-        expected=f"no `pitch: {named}` where pitch.json lies",
-        found="both",
-        todo="Take that line out if the world is the pitch's, or the file away.",
-    )
+    expected = f"no `pitch: {named}` where pitch.json lies"
+    todo = "Take that line out if the world is the pitch's, or the file away."
+    return InputError(f"{folder / 'match.yaml'}: pitch", expected, "both", todo)

@@ -221,6 +221,11 @@ def test_many_people_of_no_known_order_are_refused(tmp_path):
         (["cam1_000012_480.png", "cam1_000013_520.png"], [12, 13]),  # a time [ms]
         (["12_480_7.png", "13_520_7.png"], [12, 13]),
         (["cam000012.png", "cam000013.png"], [12, 13]),
+        # Times of day, and two clips in one folder, number no frames.
+        (["T_04_17.73.png", "T_04_17.98.png", "T_04_18.21.png"], [None] * 3),
+        (["take1_10.png", "take1_11.png", "take2_5.png"], [None] * 3),
+        (["0004_000100.png", "0004_000101.png"], [100, 101]),
+        (["cam1_frame_12.jpg", "cam1_frame_13.jpg"], [12, 13]),
     ],
 )
 def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
@@ -252,6 +257,13 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
     path.write_text(json.dumps(content | {"annotations": [ball, {**ball, "keypoints": []}]}))
     with pytest.raises(InputError, match="expected keypoints of people, found 2 annotations"):
         read_coco_results(path)
+
+
+def test_people_with_a_box_alone_are_told(tmp_path):
+    result = {"image_id": 3, "category_id": 1, "keypoints": [0] * 51, "bbox": [1, 2, 30, 40]}
+    (tmp_path / "a.json").write_text(json.dumps([result, result]))
+    found = {"a": read_people(tmp_path / "a.json")}
+    assert "warning: people have a box but no keypoint: 2 of a" in describe_changes(found)
 
 
 def test_alphapose_numbers_its_images_by_their_names(tmp_path):

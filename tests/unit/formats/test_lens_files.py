@@ -55,7 +55,14 @@ def write_plain_json(folder):
     return [folder / "lens.json"]
 
 
+def write_flat_toml(folder):
+    text = f"resolution = [1920, 1080]\ncameraMatrix = {MATRIX.tolist()}\n"
+    (folder / "lens.toml").write_text(text + f"distCoeffs = {DISTORTION[0].tolist()}\n")
+    return [folder / "lens.toml"]
+
+
 WRITERS = {
+    "flat toml": write_flat_toml,
     "xml": lambda folder: write_opencv(folder / "lens.xml"),
     "yml": lambda folder: write_opencv(folder / "lens.yml", image_width=1920, image_height=1080),
     "json": lambda folder: write_opencv(folder / "lens.json"),
@@ -103,6 +110,20 @@ def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):
     assert small.distortion == tuple(DISTORTION[0].tolist())
     with pytest.raises(InputError, match=r"expected 1440 x 1080 px.*found 1920 x 1080"):
         read_lenses(files, "right", {"right": (1440, 1080)})
+
+
+@pytest.mark.parametrize("form", ["multical", "panoptic"])
+def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
+    table = {"K": MATRIX.tolist(), "dist": DISTORTION.tolist(), "image_size": [1920, 1080]}
+    cameras = {"left": table, "right": table}
+    if form == "panoptic":
+        renamed = {"K": table["K"], "distCoef": DISTORTION[0].tolist(), "resolution": [1920, 1080]}
+        cameras = [{"name": name, **renamed} for name in cameras]
+    (tmp_path / "rig.json").write_text(json.dumps({"cameras": cameras}))
+    found = read_lenses([tmp_path / "rig.json"], None, SIZES)
+    assert found["left"].focal_px == pytest.approx(1402.0)
+    assert found["right"].distortion == tuple(DISTORTION[0].tolist())
+    assert [*read_lenses([tmp_path / "rig.json"], "left", SIZES)] == ["left"]
 
 
 @pytest.mark.parametrize("names", ["KDhw", "kd"])

@@ -180,9 +180,10 @@ def test_a_vicon_camera_looks_where_a_real_one_looks(tmp_path):
         'SENSOR_SIZE="1920 1200"><KeyFrames><KeyFrame FOCAL_LENGTH="2020.2893760912" '
         'ORIENTATION="0.0212356595799633 0.774555124454236 -0.632128503215528 0.00519243357047355" '
         'POSITION="-28.8969712138325 6497.81893431526 1828.97203757617" PRINCIPAL_POINT="960 600" '
-        'VICON_RADIAL="0 0"/></KeyFrames></Camera></Cameras>'
+        'VICON_RADIAL="0 0"/></KeyFrames></Camera><Camera DEVICEID="7"/></Cameras>'
     )
-    found = read_calibration(tmp_path / "c.xcp")["51433950"]
+    found = read_calibration(tmp_path / "c.xcp", left_out=(left_out := LeftOut()))["51433950"]
+    assert left_out == {"7": "it records markers"}
     low, high = project(found, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     assert np.all((low > 0) & (low < [1920, 1200]))
     assert low[1] > high[1] + 200
@@ -203,9 +204,10 @@ def test_an_optitrack_camera_looks_where_a_real_one_looks(tmp_path):
         '<calibrationProfile><Calibration><Cameras><Camera Serial="C11764">'
         '<Attributes ImagerPixelWidth="1920" ImagerPixelHeight="1080"/>'
         f"<IntrinsicStandardCameraModel {attributes(lens)}/><Extrinsic {attributes(place)}/>"
-        "</Camera></Cameras></Calibration></calibrationProfile>"
+        '</Camera><Camera Serial="M1"/></Cameras></Calibration></calibrationProfile>'
     )
-    found = read_calibration(tmp_path / "c.mcal")["C11764"]
+    found = read_calibration(tmp_path / "c.mcal", left_out=(left_out := LeftOut()))["C11764"]
+    assert left_out == {"M1": "it records markers"}
     # The same point by the published recipe: y up, rows as they stand, a negative focal length.
     world = np.array([0.2, 1.1, 0.3])  # y up
     x, y, z = np.array(turn).reshape(3, 3).T @ (world - [place[axis] for axis in "XYZ"])

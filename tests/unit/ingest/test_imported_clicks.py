@@ -201,6 +201,33 @@ def test_key_frames_of_tracks_are_clicks_at_their_frames(tmp_path, start, first)
     np.testing.assert_allclose(images[0].lines[0][1], [(100.0, 200.0), (300.0, 250.5)])
 
 
+def test_clicks_in_utf16_are_read_and_text_of_another_kind_is_refused(tmp_path):
+    path = cvat(tmp_path / "clicks.xml", list(CLICKS.items()))
+    text = path.read_text().replace("utf-8", "utf-16")
+    path.write_text(text, encoding="utf-16")
+    assert dict(read_marked_images(path)[0].points).keys() == CLICKS.keys()
+    path.write_text("label;x;y\ncorner_left_near;400;900\n", encoding="utf-16")
+    with pytest.raises(InputError, match="found neither XML nor JSON"):
+        read_marked_images(path)
+
+
+def test_points_of_a_skeleton_have_key_frames_of_their_own(tmp_path):
+    """CVAT marks a skeleton as key frame at its first frame alone."""
+    points = "".join(
+        f'<skeleton frame="{n}" keyframe="{int(n == 0)}">'
+        f'<points label="a" keyframe="{int(n in (0, 5))}" points="{10.5 + n},20.5"/>'
+        f'<points label="b" keyframe="{int(n in (0, 7))}" points="{30.5 + n},40.5"/></skeleton>'
+        for n in range(9)
+    )
+    (tmp_path / "clicks.xml").write_text(
+        "<annotations><meta><task><original_size><width>1920</width><height>1080</height>"
+        f'</original_size></task></meta><track id="0" label="body">{points}</track></annotations>'
+    )
+    images = read_marked_images(tmp_path / "clicks.xml")
+    found = [(each.name[-1], label, *at) for each in images for label, at in each.points]
+    assert found == [("0", "a", 10, 20), ("0", "b", 30, 40), ("5", "a", 15, 20), ("7", "b", 37, 40)]
+
+
 def test_lines_of_game_states_are_key_frames_from_the_first_image(tmp_path):
     images = [{"image_id": f"30000{n}", "file_name": f"{n:06d}.jpg"} for n in (1, 2, 3)]
     share = [{"x": x / SIZE[0], "y": y / SIZE[1]} for x, y in LINE]

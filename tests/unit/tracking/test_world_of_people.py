@@ -176,6 +176,16 @@ def test_a_run_names_the_axis_of_a_turned_world(ring, people):
     assert "--up y" in said
 
 
+def test_cameras_on_whom_no_people_agree_are_told(ring, people, seen):
+    others = {}
+    for n, (name, camera) in enumerate(records(ring(4)).items()):
+        turn = Rotation.from_euler("z", 40 + 20 * n, degrees=True).as_matrix() @ camera.rotation
+        others[name] = camera.model_copy(update={"rotation": tuple(map(tuple, turn.tolist()))})
+    keypoints = poses(*seen(ring(4), walk(people)))
+    _, notes = place_cameras(CALIBRATION, others, keypoints, FPS, NOTHING)
+    assert any("no people agree in the images of two cameras" in note for note in notes)
+
+
 def test_without_people_cameras_alone_decide(ring):
     near, far = (
         records(move_cameras(Similarity(np.array(scale), np.eye(3), np.zeros(3)), ring(4)))

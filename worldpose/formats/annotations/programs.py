@@ -273,11 +273,7 @@ def label_studio_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
     """Write Label Studio tasks, with the detections as predictions."""
     tasks = [
         {
-            "data": {
-                "image": picture.name,
-                "width": picture.size[0],
-                "height": picture.size[1],
-            },
+            "data": {"image": picture.name, "width": picture.size[0], "height": picture.size[1]},
             "predictions": [{"model_version": "worldpose", "result": _result(picture)}],
         }
         for picture in pictures

@@ -69,11 +69,10 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
     """
     missing = np.flatnonzero(np.isnan(camera.numbers).any(-1))
     if len(missing):
+        found = f"none in {len(missing)} of {len(camera.focal)}, the first {missing[0]}"
+        todo = "Calibrate the camera there, or shorten the clip."
         raise InputError(
-            str(path),
-            expected="a camera in every frame: the method knows no gaps",
-            found=f"none in {len(missing)} of {len(camera.focal)}, the first {missing[0]}",
-            todo="Calibrate the camera there, or shorten the clip.",
+            str(path), "a camera in every frame: the method knows no gaps", found, todo
         )
     pose = camera.cam_from_world
     transforms = np.tile(np.eye(4), (len(camera.focal), 1, 1))
@@ -211,12 +210,8 @@ def merge_people(
         InputError: there are no people.
     """
     if not people:
-        raise InputError(
-            "results of a method",
-            expected="at least one person",
-            found="no people",
-            todo="Check that this is the result for the clip, or run the method again.",
-        )
+        todo = "Check that this is the result for the clip, or run the method again."
+        raise InputError("results of a method", "at least one person", "no people", todo)
     frames = np.unique(np.concatenate([person.frames for person in people]))
     joints = np.full((len(frames), len(people), len(COCO17), 3), np.nan)
     around = np.full((len(frames), len(people), 4), np.nan)
@@ -309,12 +304,8 @@ def _take_rows(values: Floats, own: NDArray[np.int64], wanted: NDArray[np.int64]
 
 def format_error(where: object, expected: str, found: str) -> InputError:
     """Return the error about one place of a method's file."""
-    return InputError(
-        str(where),
-        expected=expected,
-        found=found,
-        todo="Give the file that the method's own code wrote, or name another method.",
-    )
+    todo = "Give the file that the method's own code wrote, or name another method."
+    return InputError(str(where), expected, found, todo)
 
 
 def read_pickled(path: Path) -> Part:
@@ -337,12 +328,9 @@ def read_pickled(path: Path) -> Part:
 
 
 def _reading_error(path: Path, found: str) -> InputError:
-    return InputError(
-        str(path),
-        expected="results of a method: arrays in a pickle, joblib, numpy or torch file",
-        found=found,
-        todo="Give the file that the method's own code wrote. Nothing in this file was run.",
-    )
+    expected = "results of a method: arrays in a pickle, joblib, numpy or torch file"
+    todo = "Give the file that the method's own code wrote. Nothing in this file was run."
+    return InputError(str(path), expected, found, todo)
 
 
 @dataclass(frozen=True)
