@@ -1,19 +1,32 @@
-"""What is wrong with or missing from a match that a person is creating."""
+"""The folder of a match that a person is creating, and what is wrong with it or missing from it."""
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
+import yaml
 from pydantic import JsonValue
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from flows.web.browser_words import in_browser
 from worldpose.errors import InputError
+from worldpose.formats.annotations.marked_images import read_marked_images
+from worldpose.formats.calibration_files import LeftOut
+from worldpose.formats.calibration_forms import FORMS, calibrations_in, read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.formats.keypoint_files import read_people
+from worldpose.ingest.camera_videos import fit_to_video
+from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.footage import read_still, require_footage
-from worldpose.ingest.match_folder import MatchFolder
+from worldpose.ingest.importing import describe_left_out, describe_people, import_lenses
+from worldpose.ingest.match_folder import MatchFolder, image_sizes, read_match, read_spec
 from worldpose.ingest.validation import list_problems
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
 from worldpose.video.names import is_video
@@ -23,6 +36,12 @@ Problem: TypeAlias = dict[str, str]
 """Its `message`, and its `place` in match.yaml or a file's name."""
 Index: TypeAlias = FrameIndex | tuple[int, int] | InputError
 """Frames of a video, size of a still, or why the file is neither."""
+GIVEN: Final = "given/"
+"""Folder of other tools' files in a draft, in front of their names."""
+GIVEN_ENDINGS: Final = tuple(
+    sorted({".npz", ".npy", *(end for form in FORMS for end in form.endings if end[0] == ".")})
+)
+"""Endings of calibrations, clicks, 2D poses and lenses of other tools."""
 
 
 def is_footage(name: str) -> bool:
@@ -81,11 +100,150 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
             yield {**describe(error, match.folder), "place": place}
 
 
-def describe(error: InputError, folder: Path | None = None) -> Problem:
+def build(
+    content: Mapping[str, JsonValue],
+    uploaded: Path,
+    built: Path,
+    indexes: Mapping[str, Index | None],
+) -> tuple[list[Problem], list[str]]:
+    """Make a match folder anew, of links to uploaded files and of what other tools' files say.
+
+    Args:
+        content: match.yaml.
+        uploaded: folder of the files.
+        built: the match folder.
+        indexes: frames of the videos and sizes of the stills, by path in the match folder.
+
+    Returns:
+        The errors that ingest finds, and sentences about what was taken from other tools' files.
+    """
+    shutil.rmtree(built, ignore_errors=True)
+    ignored = shutil.ignore_patterns(GIVEN.strip("/"))
+    shutil.copytree(uploaded, built, copy_function=os.link, ignore=ignored)
+    text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
+    (built / "match.yaml").write_text(text, encoding="utf-8")
+    given, notes = uploaded / GIVEN, list[str]()
+    try:
+        if given.is_dir() and any(given.iterdir()):
+            taken = take_given(given, built, indexes)
+            # No paths of this machine, no options of commands.
+            notes = [
+                re.sub(r"; --\w+ states another", "", it.replace(str(given), "")) for it in taken
+            ]
+        match = read_match(built)
+    except InputError as error:
+        return [describe(error, built, given)], notes
+    return list(footage_problems(match, indexes)), notes
+
+
+def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -> list[str]:
+    """Write what other tools' files say into a match folder; return sentences about it.
+
+    A calibration is told by its form. Any other file has 2D poses, clicks or a lens of the camera
+    with whose id its name begins; clicks may also be in images that are named after cameras.
+
+    Args:
+        given: folder of the files.
+        folder: the match folder, with match.yaml and the videos.
+        indexes: frames of the videos, by path in the match folder.
+
+    Raises:
+        InputError: a file is none of these, or contradicts the match or another file.
+    """
+    spec = read_spec(folder)
+    owners = [*(camera.id for camera in spec.static_cameras), *spec.broadcast_views]
+    posed = {file for _, files in calibrations_in(given) for file in files}
+    people: dict[str, KeypointDetections] = {}
+    lenses: dict[str, list[Path]] = {}
+    notes: list[str] = []
+    for file in sorted({*given.iterdir()} - posed):
+        named = [each for each in owners if file.stem.lower().startswith(each.lower())]
+        owner = max(named, key=len, default=None)
+        kind = _kind_of(file)
+        if kind == "calibration":
+            posed.add(file)
+        elif kind == "clicks":
+            found = import_clicks(file, folder, owner)
+            notes += [f"{file.name}: {n} clicks in {name}" for name, n in found.clicks.items()]
+            notes += found.notes
+        elif owner is None:
+            raise InputError(
+                str(file),
+                expected="a calibration or clicks; or 2D poses or a lens, with a name that begins "
+                f"with that of a camera: {', '.join(owners)}",
+                found="none of them" if kind == "lens" else f"{kind} of an unknown camera",
+                todo="Remove the file, or rename it and add it again.",
+            )
+        elif kind == "lens":
+            lenses.setdefault(owner, []).append(file)
+        else:
+            read = read_people(file)
+            people[owner] = read.people
+            (folder / "detections").mkdir(exist_ok=True)
+            os.link(file, folder / "detections" / f"{owner}{file.suffix.lower()}")
+            notes += [f"{file.name}: 2D poses of {owner}", *describe_people({owner: read})]
+    for owner, files in lenses.items():
+        import_lenses(files, folder, owner)
+        notes.append(f"{', '.join(file.name for file in files)}: lens of {owner}")
+    if posed:
+        where = posed.pop() if len(posed) == 1 else given
+        notes += _take_calibration(where, folder, indexes, people)
+    return notes
+
+
+def _kind_of(file: Path) -> str:
+    """Return what a file has: 2D poses, clicks, a calibration or a lens, the first that it can."""
+    readers: dict[str, Callable[[], object]] = {
+        "2D poses": lambda: read_people(file),
+        "clicks": lambda: read_marked_images(file),
+        "calibration": lambda: read_calibration(file, {}, LeftOut(), any_unit=True),
+    }
+    for kind, read in readers.items():
+        if kind == "2D poses" and file.suffix.lower() not in (".json", ".npz"):
+            continue
+        with suppress(InputError):
+            read()
+            return kind
+    return "lens"
+
+
+def _take_calibration(
+    source: Path,
+    folder: Path,
+    indexes: Mapping[str, Index | None],
+    people: Mapping[str, KeypointDetections],
+) -> list[str]:
+    """Write the cameras of a calibration to calibration.toml, in the pixels of their videos."""
+    from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
+
+    spec, left_out = read_spec(folder), LeftOut()
+    cameras = read_calibration(source, image_sizes(spec), left_out, any_unit=True)
+    known = {camera.id: camera for camera in spec.static_cameras if camera.id in cameras}
+    if not known:
+        raise InputError(
+            str(source),
+            expected=f"cameras of the match: {', '.join(each.id for each in spec.static_cameras)}",
+            found=", ".join(cameras) or "none",
+            todo="Call the cameras of the form as the calibration does.",
+        )
+    left_out.update({name: "the match has no such camera" for name in cameras if name not in known})
+    notes = [f"calibration of {', '.join(known)}", *describe_left_out(left_out)]
+    for name, camera in known.items():
+        index = indexes.get(camera.video or "")
+        if isinstance(index, FrameIndex) and camera.video is not None:
+            cameras[name] = fit_to_video(folder / camera.video, cameras[name], index, notes)
+    placed, changes = place_as_stated(None, None)(
+        source, {name: cameras[name] for name in known}, people, spec.fps
+    )
+    write_calibration_toml(folder / "calibration.toml", placed)
+    return notes + changes
+
+
+def describe(error: InputError, *folders: Path) -> Problem:
     """Return an error's place in match.yaml, and its message without paths of this machine."""
     where = error.where
     message = f"expected {error.expected}, found {error.found}. {in_browser(error.todo)}"
-    if folder is not None:
+    for folder in folders:
         where = where.replace(f"{folder}/", "").replace(str(folder), "the match")
         message = message.replace(f"{folder}/", "")
     file, _, place = where.partition(": ")

@@ -1,5 +1,6 @@
 """People create a match on the pages: uploads, picked videos, the form, and the inbox."""
 
+import json
 import os
 import shutil
 import time
@@ -256,6 +257,59 @@ def test_a_still_and_a_roster_arrive_with_the_match(place, footage, tmp_path):
     assert [person.name for person in match.spec.roster] == ["Harry Kane"]
 
 
+CALIBRATION = """
+[cam_0]
+name = "near_left"
+size = [192, 128]
+matrix = [[200.0, 0.0, 96.0], [0.0, 200.0, 64.0], [0.0, 0.0, 1.0]]
+distortions = [0.0, 0.0, 0.0, 0.0]
+rotation = [-1.8, 0.0, 0.0]
+translation = [0.0, 1.0, 20.0]
+"""
+CLICKS = """<annotations><version>1.1</version><image id="0" name="0.jpg" width="96" height="64">
+<points label="center_mark" points="40.00,30.00"></points></image></annotations>"""
+POSES = [{"image_id": 3, "category_id": 1, "score": 0.9, "keypoints": [20, 30, 0.8] * 17}]
+
+
+def add_given(browser, draft, name, text):
+    new = {"name": name, "size": len(text)}
+    file_id = browser.post(f"{DRAFTS}/{draft}/files", json=new).json()["file"]
+    assert put(browser, draft, file_id, 0, text.encode()).status_code == 200
+    return file_id
+
+
+def test_files_of_other_tools_become_calibration_clicks_and_poses(place, footage):
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    add_given(ada, draft, "Near_left clicks.xml", CLICKS)
+    poses = add_given(ada, draft, "near_left.poses.json", json.dumps(POSES))
+    stray = add_given(ada, draft, "poses.json", json.dumps(POSES))
+    content = a_match(view["files"][0]["name"])
+    view = save(ada, settle(ada, draft), content).json()
+    (problem,) = view["problems"]
+    assert "poses.json: expected a calibration or clicks" in problem["message"]
+    assert "2D poses of an unknown camera" in problem["message"]
+    view = ada.post(f"{DRAFTS}/{draft}/files/{stray}/removal", json={}).json()
+    assert (view["problems"], view["is_ready"]) == ([], True)
+    assert view["notes"] == [
+        "Near_left_clicks.xml: 1 clicks in near_left",
+        "near_left.poses.json: 2D poses of near_left",
+    ]
+    # A calibration in images of twice the size is scaled; people of one place give it no unit.
+    ada.post(f"{DRAFTS}/{draft}/files/{poses}/removal", json={})
+    add_given(ada, draft, "Scene.toml", CALIBRATION)
+    view = ada.get(f"{DRAFTS}/{draft}").json()
+    assert view["problems"] == []
+    assert "scaled by 0.5" in " ".join(view["notes"])
+    assert str(place) not in str(view["notes"]) and "--" not in str(view["notes"])
+    ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    match = read_match(place / "inbox" / "final")
+    assert match.calibrations["near_left"].focal_px == (100.0, 100.0)
+    assert match.clicked["near_left"].points[0].xy == (39.5, 29.5)  # the image begins at a corner
+    assert match.videos["near_left"].stat().st_nlink == 1
+    assert not (place / "inbox" / "final" / "given").exists()
+
+
 def test_a_still_of_another_size_is_said_at_its_field(place, footage, tmp_path):
     ada = open_pages(place)
     draft, _ = upload(ada, footage)
@@ -399,7 +453,7 @@ def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, 
     folder = place / "inbox" / ".drafts" / draft
     kept = shutil.copytree(folder, place / "kept")
     ada.post(f"{DRAFTS}/{draft}/finish", json={})
-    shutil.rmtree(kept / "match")
+    shutil.rmtree(kept / "built")
     shutil.copytree(kept, folder)  # the match has moved, the rest is still there
     text = (folder / "draft.json").read_text()
     done = text.replace('"finished_as": null', '"finished_as": "final"')
