@@ -102,9 +102,10 @@ class CameraLimits(Record):
     calibration page warns. People correct the cameras later (`bundle_adjustment`)."""
     expected_ground_error_p95_m: float = Field(default=_CALIBRATION.weak_p95_m, ge=0)
     """The same at its 95th percentile [m]: the far side, where a pixel is 5 to 20 cm."""
-    clicks_wrong: float = Field(default=0, ge=0)
-    """Clicks that are outliers to the others [1]. A click at the wrong marking is one, and the
-    annotator sees at once which click is wrong."""
+    clicks_wrong_share: float = Field(default=0.25, ge=0)
+    """Share of clicks that are outliers to the others [1]. Calibration excludes them, and a few do
+    no harm where the expected error is small; from a quarter on, the others may be the wrong ones.
+    Below, they are a reservation of the results."""
     weak: float = Field(default=0, ge=0)
     """1 if the clicks leave a direction of the camera undetermined [1]."""
 
@@ -195,6 +196,16 @@ class BroadcastLimits(Record):
 EXCESS: Final = "held_out_certain_excess_m"
 
 
+def _of_camera(figures: Figures) -> Figures:
+    wrong, used = figures.get("clicks_wrong", 0.0), figures.get("clicks_used", 0.0)
+    return {**figures, "clicks_wrong_share": wrong / max(1.0, wrong + used)}
+
+
+def _of_tracks(figures: Figures) -> Figures:
+    """Without a person in 3D no rays meet; the run says which cameras are too close together."""
+    return {"mean_ray_distance_m": 0.0, **figures}
+
+
 def _of_people(figures: Figures) -> Figures:
     """Zero `bridged_share` with a stride: then boxes are interpolated on purpose."""
     return {**figures, "bridged_share": 0.0} if figures.get("stride", 1) > 1 else figures
@@ -222,6 +233,7 @@ GATES: Final[Mapping[str, Gate]] = {
             "Do the projected markings match those in the image, in all parts of it?",
             CameraLimits(),
             "the clicks of this camera",
+            _of_camera,
         ),
         Gate(
             "detection",
@@ -241,6 +253,7 @@ GATES: Final[Mapping[str, Gate]] = {
             "Is every person one track over the whole clip?",
             IdentityLimits(),
             "the tracks: split, join",
+            _of_tracks,
         ),
         Gate(
             "triangulation",

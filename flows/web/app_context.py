@@ -181,8 +181,11 @@ class Continuing:
             lines = [beat.doing] if beat is not None and beat.doing else []
             stage = re.match(r"[a-z_]+", lines[0]) if lines else None
             if run.state != "begun":
+                others = [it for it in seen.open if it.state != "waiting" and it is not run]
+                # A resumed run keeps its place: what has begun is before it too.
+                first = seen.open.index(run)
                 ahead = [
-                    each for each in seen.open[: seen.open.index(run)] if each.state != "waiting"
+                    it for it in others if it.state == "begun" or seen.open.index(it) < first
                 ]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
                 lines = ["The run starts in a moment."]
