@@ -201,9 +201,13 @@ def _of_camera(figures: Figures) -> Figures:
     return {**figures, "clicks_wrong_share": wrong / max(1.0, wrong + used)}
 
 
-def _of_tracks(figures: Figures) -> Figures:
-    """Without a person in 3D no rays meet; the run says which cameras are too close together."""
-    return {"mean_ray_distance_m": 0.0, **figures}
+def _in_3d(figures: Figures) -> Figures:
+    """Metrics of people in 3D pass where nobody is in 3D: the run says so, and why."""
+    flat = figures.get("plane_people", 0.0) >= figures.get("people", 1.0)
+    names = ("mean_ray_distance_m", "standard_deviation_m", "filled_share")
+    return (
+        {**dict.fromkeys(names, 0.0), **figures} if flat or figures.get("joints") == 0 else figures
+    )
 
 
 def _of_people(figures: Figures) -> Figures:
@@ -253,13 +257,14 @@ GATES: Final[Mapping[str, Gate]] = {
             "Is every person one track over the whole clip?",
             IdentityLimits(),
             "the tracks: split, join",
-            _of_tracks,
+            _in_3d,
         ),
         Gate(
             "triangulation",
             "Are the joints where the images show them, and are the cameras healthy?",
             JointLimits(),
             "the keypoints in the images, or the cameras",
+            _in_3d,
         ),
         Gate(
             "bundle_adjustment",

@@ -184,9 +184,7 @@ class Continuing:
                 others = [it for it in seen.open if it.state != "waiting" and it is not run]
                 # A resumed run keeps its place: what has begun is before it too.
                 first = seen.open.index(run)
-                ahead = [
-                    it for it in others if it.state == "begun" or seen.open.index(it) < first
-                ]
+                ahead = [it for it in others if it.state == "begun" or seen.open.index(it) < first]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
                 lines = ["The run starts in a moment."]
                 if ahead:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -101,38 +100,36 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
 
 
 def build(
-    content: Mapping[str, JsonValue],
-    uploaded: Path,
-    built: Path,
-    indexes: Mapping[str, Index | None],
+    content: Mapping[str, JsonValue], draft: Path, indexes: Mapping[str, Index | None]
 ) -> tuple[list[Problem], list[str]]:
-    """Make a match folder anew, of links to uploaded files and of what other tools' files say.
+    """Make a match folder anew around its footage, with what all other files of a draft say.
 
     Args:
         content: match.yaml.
-        uploaded: folder of the files.
-        built: the match folder.
+        draft: folder of the draft: `match` is the match folder with its footage, `own` has files
+            of a match folder, and `given` those of other tools.
         indexes: frames of the videos and sizes of the stills, by path in the match folder.
 
     Returns:
         The errors that ingest finds, and sentences about what was taken from other tools' files.
     """
-    shutil.rmtree(built, ignore_errors=True)
-    ignored = shutil.ignore_patterns(GIVEN.strip("/"))
-    shutil.copytree(uploaded, built, copy_function=os.link, ignore=ignored)
+    folder, given, notes = draft / "match", draft / GIVEN, list[str]()
+    for each in folder.iterdir():
+        if each.is_file():
+            each.unlink()
+        elif each.name not in ("videos", "stills"):
+            shutil.rmtree(each)
+    for each in (draft / "own").glob("*"):
+        shutil.copyfile(each, folder / each.name)
     text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
-    (built / "match.yaml").write_text(text, encoding="utf-8")
-    given, notes = uploaded / GIVEN, list[str]()
+    (folder / "match.yaml").write_text(text, encoding="utf-8")
     try:
-        if given.is_dir() and any(given.iterdir()):
-            taken = take_given(given, built, indexes)
-            # No paths of this machine, no options of commands.
-            notes = [
-                re.sub(r"; --\w+ states another", "", it.replace(str(given), "")) for it in taken
-            ]
-        match = read_match(built)
+        taken = take_given(given, folder, indexes) if given.is_dir() else []
+        # No paths of this machine, no options of commands.
+        notes = [re.sub(r"; --\w+ states another", "", it.replace(str(given), "")) for it in taken]
+        match = read_match(folder)
     except InputError as error:
-        return [describe(error, built, given)], notes
+        return [describe(error, folder, given)], notes
     return list(footage_problems(match, indexes)), notes
 
 
@@ -180,7 +177,7 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
             read = read_people(file)
             people[owner] = read.people
             (folder / "detections").mkdir(exist_ok=True)
-            os.link(file, folder / "detections" / f"{owner}{file.suffix.lower()}")
+            shutil.copyfile(file, folder / "detections" / f"{owner}{file.suffix.lower()}")
             notes += [f"{file.name}: 2D poses of {owner}", *describe_people({owner: read})]
     for owner, files in lenses.items():
         import_lenses(files, folder, owner)
@@ -192,15 +189,14 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
 
 
 def _kind_of(file: Path) -> str:
-    """Return what a file has: 2D poses, clicks, a calibration or a lens, the first that it can."""
+    """Return what a file has: the first kind whose reader takes it, or else a lens."""
     readers: dict[str, Callable[[], object]] = {
-        "2D poses": lambda: read_people(file),
         "clicks": lambda: read_marked_images(file),
         "calibration": lambda: read_calibration(file, {}, LeftOut(), any_unit=True),
     }
+    if file.suffix.lower() in (".json", ".npz"):
+        readers = {"2D poses": lambda: read_people(file), **readers}
     for kind, read in readers.items():
-        if kind == "2D poses" and file.suffix.lower() not in (".json", ".npz"):
-            continue
         with suppress(InputError):
             read()
             return kind

@@ -1,8 +1,8 @@
 """Matches that people create on the pages: drafts beside the inbox, until they are finished.
 
 A draft is a folder in `INBOX/.drafts`, whose dot keeps it out of every scan of the inbox. Files
-grow in its `parts` and move to its `match` when they are whole. The match folder `built` of these
-moves into the inbox in one step. The state is on disk: a restart of the server loses none of it.
+grow in its `parts`, move to its folders when they are whole, and the match folder moves into the
+inbox in one step. The state is on disk: a restart of the server loses none of it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class DraftFile(Record):
 
     id: Name = "new"
     name: str = ""
-    """Path in the match folder."""
+    """Path in the match folder, or in the draft for a file of another tool."""
     title: str
     """Its name where it comes from."""
     size: Count
@@ -123,7 +123,7 @@ class Drafts:
         for folder in self._root.glob("[!.]*"):
             with suppress(WorldposeError, OSError, ValueError):  # damaged, or just removed
                 draft = self.read(folder.name)
-                if draft.finished_as is not None and not (folder / "built").exists():
+                if draft.finished_as is not None and not (folder / "match").exists():
                     shutil.rmtree(folder, ignore_errors=True)  # killed after the match had moved
                     continue
                 found.append(draft)
@@ -303,7 +303,7 @@ class Drafts:
             target.parent.mkdir(parents=True, exist_ok=True)
             self._write(draft.model_copy(update={"finished_as": name}))
             try:
-                (folder / "built").rename(target)
+                (folder / "match").rename(target)
             except OSError:
                 self._write(draft)
                 raise
@@ -329,7 +329,8 @@ class Drafts:
         return self._folder(draft_id) / "parts" / file.id
 
     def _whole(self, draft_id: str, file: DraftFile) -> Path:
-        return self._folder(draft_id) / "match" / file.name
+        top = "match" if is_footage(file.name) else "" if file.name.startswith(GIVEN) else "own"
+        return self._folder(draft_id) / top / file.name
 
     def _write(self, draft: Draft) -> None:
         with whole_file(self._folder(draft.id) / "draft.json") as file:
@@ -470,8 +471,7 @@ class Drafts:
             folder = self._folder(draft.id)
             footage = (it for it in draft.files if is_footage(it.name))
             indexes = {it.name: self._index(draft.id, it) for it in footage}
-            made = build(draft.content, folder / "match", folder / "built", indexes)
-            self._checked[draft.id] = (key, *made)
+            self._checked[draft.id] = (key, *build(draft.content, folder, indexes))
         return self._checked[draft.id][1:]
 
 
@@ -482,9 +482,8 @@ def _choose_name(title: str, taken: set[str]) -> str:
             raise _refusal(title, "one such file", "a second one", "Remove the first one.")
         return title
     stem, suffix = PurePosixPath(title).stem, PurePosixPath(title).suffix.lower()
-    folder, usual = ("videos", "video") if is_video(title) else ("stills", "still")
-    if not is_footage(title):
-        folder = usual = GIVEN.strip("/")
+    usual = "video" if is_video(title) else "still" if is_footage(title) else "file"
+    folder = f"{usual}s" if is_footage(title) else GIVEN.strip("/")
     stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or usual
     names = (f"{folder}/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
     return next(name for name in names if name not in taken)
