@@ -137,6 +137,7 @@ class Continuing:
                 for run in own:
                     if run.state == "waiting":
                         served.queue.change(run, "asked", "resumed")
+                self._seen = None  # another page may have looked meanwhile
                 return resumed
             if states & {"asked", "killed"}:
                 return {"state": "running", "how": "a run of it waits for its turn already"}

@@ -26,7 +26,9 @@ from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.footage import read_still, require_footage
 from worldpose.ingest.importing import describe_left_out, describe_people, import_lenses
 from worldpose.ingest.match_folder import MatchFolder, image_sizes, read_match, read_spec
+from worldpose.ingest.registration import register_match
 from worldpose.ingest.validation import list_problems
+from worldpose.store.store import Store
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
 from worldpose.video.names import is_video
 from worldpose.video.pictures import FrameIndex
@@ -100,11 +102,15 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
 
 
 def build(
-    content: Mapping[str, JsonValue], draft: Path, indexes: Mapping[str, Index | None]
+    store: Store,
+    content: Mapping[str, JsonValue],
+    draft: Path,
+    indexes: Mapping[str, Index | None],
 ) -> tuple[list[Problem], list[str]]:
     """Make a match folder anew around its footage, with what all other files of a draft say.
 
     Args:
+        store: its matches are not to be made again.
         content: match.yaml.
         draft: folder of the draft: `match` is the match folder with its footage, `own` has files
             of a match folder, and `given` those of other tools.
@@ -130,7 +136,26 @@ def build(
         match = read_match(folder)
     except InputError as error:
         return [describe(error, folder, given)], notes
-    return list(footage_problems(match, indexes)), notes
+    problems = list(footage_problems(match, indexes))
+    if not problems and (same := registered_as(store, match)):
+        said = (
+            f"These videos are the match {same}: open it in the list of matches, and discard this."
+        )
+        problems.append({"place": "", "message": said})
+    return problems, notes
+
+
+def registered_as(store: Store, match: MatchFolder) -> str | None:
+    """Return the registered match that has the content of a match folder; None if it is new."""
+    files = {*match.videos.values(), *match.detections.values()}
+    sizes = {str(file.relative_to(match.folder)): file.stat().st_size for file in files}
+    for name in store.matches():
+        known = store.registration(name)
+        listed = {} if known is None else {file.path: file.size for file in known.files}
+        is_like = known is not None and sizes.items() <= listed.items()
+        if is_like and register_match(match, None).identity == known.identity:
+            return name
+    return None
 
 
 def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -> list[str]:

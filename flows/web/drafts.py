@@ -471,7 +471,7 @@ class Drafts:
             folder = self._folder(draft.id)
             footage = (it for it in draft.files if is_footage(it.name))
             indexes = {it.name: self._index(draft.id, it) for it in footage}
-            self._checked[draft.id] = (key, *build(draft.content, folder, indexes))
+            self._checked[draft.id] = (key, *build(self.store, draft.content, folder, indexes))
         return self._checked[draft.id][1:]
 
 

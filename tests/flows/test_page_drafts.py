@@ -12,6 +12,7 @@ import page_client
 import pytest
 import yaml
 
+from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of
 from flows.web.access import Access, User, access_for
 from flows.web.app import create_app
@@ -134,6 +135,18 @@ def test_an_uploaded_match_arrives_whole(place, footage):
     assert match.videos["near_left"].read_bytes() == footage.read_bytes()
     assert ada.get(DRAFTS).json() == {"drafts": []}
     assert list((place / "inbox" / ".drafts").iterdir()) == []
+
+
+def test_videos_of_a_known_match_are_no_second_match(place, footage):
+    ada = open_pages(place)
+    for match_id in ("final", "again"):
+        draft, view = upload(ada, footage)
+        view = save(ada, view, a_match(view["files"][0]["name"], match_id=match_id)).json()
+        if match_id == "final":
+            ada.post(f"{DRAFTS}/{draft}/finish", json={})
+            register(Store.open(str(place / "project")), place / "inbox" / "final", unfinished=True)
+    (problem,) = view["problems"]
+    assert problem["message"].startswith("These videos are the match final:")
 
 
 def test_an_upload_survives_a_reload_and_a_restart(place, footage):
