@@ -18,6 +18,7 @@ from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
 from data_contracts.usability import UsableLimits
 from flows.stage import Match
+from worldpose.bundle_adjustment.settings import CHANCE
 from worldpose.review.journal import Journal, last_decision, requests_by_id, say
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.store.store import Store
@@ -219,7 +220,10 @@ def _of_adjustment(figures: Figures) -> Figures:
     before, after = figures.get("held_out_error_before_px"), figures.get("held_out_error_after_px")
     if after is None or not before:
         return figures
-    return {**figures, "held_out_growth": after / before}
+    # Above 1 by chance: the loss of the same people does not rise beyond its standard error.
+    certain = figures.get("held_out_significance", -CHANCE) <= -CHANCE
+    growth = after / before
+    return {**figures, "held_out_growth": growth if certain else min(growth, 1.0)}
 
 
 def _of_bodies(figures: Figures) -> Figures:

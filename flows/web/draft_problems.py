@@ -150,11 +150,10 @@ def registered_as(store: Store, match: MatchFolder) -> str | None:
     files = {*match.videos.values(), *match.detections.values()}
     sizes = {str(file.relative_to(match.folder)): file.stat().st_size for file in files}
     for name in store.matches():
-        known = store.registration(name)
-        listed = {} if known is None else {file.path: file.size for file in known.files}
-        is_like = known is not None and sizes.items() <= listed.items()
-        if is_like and register_match(match, None).identity == known.identity:
-            return name
+        if (known := store.registration(name)) is not None:
+            is_like = sizes.items() <= {file.path: file.size for file in known.files}.items()
+            if is_like and register_match(match, None).identity == known.identity:
+                return name
     return None
 
 

@@ -24,6 +24,7 @@ GOOD_CAMERA = {
     "clicks_wrong": 0.0,
     "weak": 0.0,
 }
+GREW = {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.02}
 ON_PITCH = {"undecided": 0.0, "unmatched_share": 0.1, "corrections_refused": 0.0}
 WRONG_CAMERA = GOOD_CAMERA | {"clicks_wrong": 4.0, "clicks_used": 8.0}
 
@@ -62,6 +63,8 @@ GOOD_BODIES = {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}
         ),
         # A growth that reads as the limit is none.
         (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.00035}, []),
+        (ADJUSTMENT, GREW | {"held_out_significance": -0.8}, []),  # by chance
+        (ADJUSTMENT, GREW | {"held_out_significance": -4.0}, ["held_out_growth is 1.01"]),
         (ADJUSTMENT, {"cameras_changed": 0.0}, ["held_out_error_after_px", "held_out_growth"]),
         (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
         (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
