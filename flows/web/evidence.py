@@ -179,7 +179,8 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     joints = result["joints"].values.astype(np.float64)
     if "ground" in result:
         by_feet = np.isnan(joints).all(axis=(-2, -1))
-        joints[by_feet, :, :2] = result["ground"].values[by_feet][:, None]
+        place = result["ground"].values[by_feet][:, None]
+        joints[by_feet] = np.concatenate([place, 0.0 * place[..., :1]], axis=-1)
     tracks = JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
