@@ -219,7 +219,10 @@ def _of_people(figures: Figures) -> Figures:
 def _of_adjustment(figures: Figures) -> Figures:
     before, after = figures.get("held_out_error_before_px"), figures.get("held_out_error_after_px")
     if after is None or not before:
-        return figures
+        # Nobody is held out: a question only if a camera was changed all the same.
+        names = ("held_out_error_after_px", "held_out_growth")
+        is_kept = figures.get("cameras_changed") == 0.0
+        return {**dict.fromkeys(names, 0.0), **figures} if is_kept else figures
     # Above 1 by chance: the loss of the same people does not rise beyond its standard error.
     certain = figures.get("held_out_significance", -CHANCE) <= -CHANCE
     growth = after / before

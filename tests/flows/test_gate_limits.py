@@ -65,7 +65,8 @@ GOOD_BODIES = {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}
         (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.00035}, []),
         (ADJUSTMENT, GREW | {"held_out_significance": -0.8}, []),  # by chance
         (ADJUSTMENT, GREW | {"held_out_significance": -4.0}, ["held_out_growth is 1.01"]),
-        (ADJUSTMENT, {"cameras_changed": 0.0}, ["held_out_error_after_px", "held_out_growth"]),
+        (ADJUSTMENT, {"cameras_changed": 0.0}, []),  # as cameras on one mast
+        (ADJUSTMENT, {"cameras_changed": 1.0}, ["held_out_error_after_px", "held_out_growth"]),
         (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
         (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
         (ACCEPTANCE, GOOD_BODIES | {"held_out_certain_excess_m.knee": 0.01}, []),
