@@ -230,7 +230,7 @@ def python_proxy(upstream, folder):
 
 @contextmanager
 def nginx(upstream, folder):
-    """nginx that passes the headers of docs/how-to/review.md, with names of a file in place of OpenID."""
+    """nginx that passes the headers of docs/how-to/review.md, with names of a file for OpenID."""
     if shutil.which("nginx") is None:
         pytest.skip("nginx is not installed")
     port = free_port()

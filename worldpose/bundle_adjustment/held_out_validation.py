@@ -10,7 +10,6 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clip, project_joints
 from worldpose.bundle_adjustment.residuals import (
-    MEDIAN_SQUARED,
     AdjustmentProblem,
     AdjustmentSolution,
     camera_knowledge,
@@ -23,7 +22,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.optimize.losses import cauchy_loss
+from worldpose.geometry.optimize.losses import MEDIAN_SQUARED, cauchy_loss
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 

@@ -21,7 +21,6 @@ HEADER_FRAMES: Final = 65535
 """The header counts frames in 16 bits; POINT:LONG_FRAMES and TRIAL:ACTUAL_END_FIELD count more."""
 MAX_DIMENSION: Final = 255
 """A dimension of a parameter has 8 bits."""
-_KINDS: Final = {"char": -1, "int16": 2, "float32": 4}
 _Value = str | Sequence[str] | np.generic | NDArray[np.generic]
 
 
@@ -191,9 +190,10 @@ def _encode(where: str, value: _Value) -> bytes:
     """Return kind, dimensions and data of a parameter, first dimension fastest."""
     # Maximum length of a text parameter, whose size has 15 bits, with its padding [byte].
     max_text_bytes = 32000
+    kinds = {"char": -1, "int16": 2, "float32": 4}
     if isinstance(value, str):
         text = value.encode()
-        return struct.pack("<bBB", _KINDS["char"], 1, len(text)) + text
+        return struct.pack("<bBB", kinds["char"], 1, len(text)) + text
     if isinstance(value, Sequence):
         rows = [row.encode() for row in value]
         width = max(map(len, rows), default=0)
@@ -204,9 +204,9 @@ def _encode(where: str, value: _Value) -> bytes:
                 found=f"{len(rows)} lines of {width} bytes",
                 todo="Give a shorter text, such as the licence's name and address.",
             )
-        sizes = struct.pack("<bBBB", _KINDS["char"], 2, width, len(rows))
+        sizes = struct.pack("<bBBB", kinds["char"], 2, width, len(rows))
         return sizes + b"".join(row.ljust(width) for row in rows)
-    sizes = struct.pack("<bB", _KINDS[value.dtype.name], value.ndim) + bytes(value.shape[::-1])
+    sizes = struct.pack("<bB", kinds[value.dtype.name], value.ndim) + bytes(value.shape[::-1])
     return sizes + value.tobytes()
 
 

@@ -51,16 +51,6 @@ OPENCAP_NAME: Final = "cameraIntrinsicsExtrinsics"
 OPENCAP_KEYS: Final = Keys("imageSize", "intrinsicMat", "distortion", "rotation", "translation")
 
 
-STANDING: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-"""(3, 3) from a board whose y points down to a world with z up."""
-
-ON_ITS_HEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""(3, 3) from a board whose y points up."""
-
-LYING: Final = np.diag([1.0, -1.0, -1.0])
-"""(3, 3) from a board on the ground, whose z points into it."""
-
-
 Sizes: TypeAlias = Mapping[str, tuple[int, int]]
 """Width and height [px] by camera."""
 
@@ -236,8 +226,14 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     upright = 0.75
     tables = {file: _read_pickle(file) for file in files}
     down = np.mean([_downward(file, table) for file, table in tables.items()], axis=0)
+    # (3, 3) from a board whose y points down to a world with z up.
+    from_standing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+    # (3, 3) from a board whose y points up.
+    from_turned = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    # (3, 3) from a board on the ground, whose z points into it.
+    from_lying = np.diag([1.0, -1.0, -1.0])
     cosine, axes = max(
-        ((down[1], STANDING), (-down[1], ON_ITS_HEAD), (down[2], LYING)),
+        ((down[1], from_standing), (-down[1], from_turned), (down[2], from_lying)),
         key=lambda place: float(place[0]),
     )
     if not cosine >= upright:

@@ -29,8 +29,6 @@ LENS_ERROR_PX: Final = 0.1
 """Maximum error of OpenCV's coefficients fitted to Vicon's lens, within the image [px]: a tenth of
 the error with which a detector finds a joint."""
 
-Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""(3, 3) from a world with y up to one with z up: x stays, y becomes minus z."""
 
 BACKWARD: Final = np.diag([1.0, -1.0, -1.0])
 """(3, 3) from camera axes x right, y up, z backward to OpenCV's."""
@@ -388,7 +386,9 @@ def _read_optitrack_camera(where: str, element: ET.Element) -> CameraCalibration
     k1, k2, k3 = _numbers(optics, lens, ("k1", "k2", "k3"))
     p1, p2 = _numbers(optics, lens, ("TangentialX", "TangentialY"))
     axes = _numbers(pose, place, [f"OrientMatrix{index}" for index in range(9)]).reshape(3, 3)
-    rotation = BACKWARD @ axes.T @ Y_UP.T
+    # (3, 3) from a world with y up to one with z up: x stays, y becomes minus z.
+    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rotation = BACKWARD @ axes.T @ y_up.T
     return build_camera(
         where,
         name,
@@ -399,5 +399,5 @@ def _read_optitrack_camera(where: str, element: ET.Element) -> CameraCalibration
             np.array([k1, k2, p1, p2, k3]),
         ),
         rotation=rotation,
-        translation=-rotation @ (Y_UP @ _numbers(pose, place, "XYZ")),
+        translation=-rotation @ (y_up @ _numbers(pose, place, "XYZ")),
     )

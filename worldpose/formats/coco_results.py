@@ -39,12 +39,10 @@ from worldpose.formats.keypoint_sets import (
 )
 from worldpose.formats.pose_forms import plain_entries
 
-BATCH: Final = 4096
+BATCH = 4096
 """Results per batch of Python objects."""
 
-_POINTS: Final = "x, y, confidence of each point"
 _COUNT_TODO: Final = "Export all points, and 0, 0, 0 where one is missing."
-_CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 0 is missing."
 _NUMBER_TODO: Final = (
     "Number the images from 0 in the order of the video, in image_id or file_name."
 )
@@ -94,7 +92,8 @@ def read_coco_results(path: Path) -> PeopleFile:
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
     wrong_scale = (sure < 0) | (sure > MAX_CONFIDENCE)  # NaN is a missing point
-    _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", _CONFIDENCE_TODO)
+    confidence_todo = "Scale the detector's scores so that 1 is certain and 0 is missing."
+    _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", confidence_todo)
     names, where = _point_names(path, items.kept.get("categories")), f"{path}: categories"
     names = names or _model_names(items.kept.get("meta_info"))
     if names and len(names) != points.shape[1] and len(points):
@@ -290,7 +289,8 @@ def _table(
 def _find_error(
     path: Path, rows: list[Any], indices: Sequence[int], key: str, width: int
 ) -> InputError:
-    what = f"{width} numbers: {_POINTS}" if key == "keypoints" else f"{width} numbers"
+    expected = "x, y, confidence of each point"
+    what = f"{width} numbers: {expected}" if key == "keypoints" else f"{width} numbers"
     todo = _COUNT_TODO if key == "keypoints" else "Correct the file."
     for index, row in zip(indices, rows, strict=True):
         if type(row) is not list:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,6 @@ from worldpose.formats.keypoint_sets import (
 )
 from worldpose.formats.pose_forms import plain_person
 from worldpose.parsing import read_cells
-
-KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
-"""Of OpenPose's version 1 and later, of its versions 0, and of other programs."""
-BOX_COLUMNS: Final = range(6, 11)
-"""Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9."""
 
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
@@ -124,7 +119,9 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
 
 def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
     entries = plain_person(person) or (person if isinstance(person, dict) else {})
-    key = next((key for key in KEYPOINTS_KEYS if key in entries), KEYPOINTS_KEYS[0])
+    # Of OpenPose's version 1 and later, of its versions 0, and of other programs.
+    keypoints_keys = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
+    key = next((key for key in keypoints_keys if key in entries), keypoints_keys[0])
     numbers = entries.get(key)
     if (
         not isinstance(numbers, list)
@@ -276,11 +273,13 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     sign = "." if has_commas else ","
     lines = [(n, ",".join(cell.replace(",", sign) for cell in row)) for n, row in cells]
     count = lines[0][1].count(",") + 1
+    # Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9.
+    box_columns = range(6, 11)
     for number, each in lines:
-        if each.count(",") + 1 != count or count not in BOX_COLUMNS:
+        if each.count(",") + 1 != count or count not in box_columns:
             raise wrong(
                 f"{file}: line {number}",
-                f"{count if count in BOX_COLUMNS else '6 to 10'} numbers, separated by commas",
+                f"{count if count in box_columns else '6 to 10'} numbers, separated by commas",
                 f"{each!r:.80}",
             )
     try:

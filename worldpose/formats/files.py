@@ -23,6 +23,15 @@ import yaml
 
 from worldpose.errors import InputError, say_failure
 
+ENTRY_LENGTH = 1 << 20
+"""Maximum characters of one entry; a person's keypoints have under a thousand."""
+
+CHUNK = 1 << 20
+"""Bytes per read."""
+
+EVENTS = 100_000
+"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
@@ -62,9 +71,6 @@ A full match has 0.1 MB; 5,000 calibrated cameras, as in the load test, take 2.0
 NESTING: Final = 32
 """Maximum levels of lists and mappings in YAML, of which match.yaml has four, and of elements in
 XML, of which annotations and calibrations have five."""
-
-EVENTS: Final = 100_000
-"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
@@ -257,11 +263,6 @@ def parse_xml(content: bytes) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ValueError(f"no XML: {error}") from error
 
-
-CHUNK: Final = 1 << 20
-"""Bytes per read."""
-ENTRY_LENGTH: Final = 1 << 20
-"""Maximum characters of one entry; a person's keypoints have under a thousand."""
 
 _SPACE: Final = " \t\n\r"
 _DECODER: Final = json.JSONDecoder()

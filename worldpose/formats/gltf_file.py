@@ -23,10 +23,7 @@ from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 
-_KINDS: Final = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
-_TYPES: Final = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _VERTICES, _INDICES = 34962, 34963
-_SHORT: Final = 32767
 INFLUENCES: Final = 8
 """Joints of a vertex in two sets of four; viewers must read one set, and most read both."""
 FACING: Final = np.diag([1.0, -1.0, -1.0])
@@ -125,18 +122,20 @@ class _File:
         """Append an array (rows, ...); return the index of its accessor.
 
         Args:
-            array: array of a type in `_KINDS`; 16-bit integers with a sign count as fractions.
+            array: array of a type in `kinds`; 16-bit integers with a sign count as fractions.
             target: use of the data, for vertices and indices.
             bounds: state the extreme values.
         """
         self.blob += b"\0" * (-len(self.blob) % 4)
         view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes}
         self.blob += np.ascontiguousarray(array).tobytes()
+        kinds = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+        types = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
         item = {
             "bufferView": self.add("bufferViews", view | ({"target": target} if target else {})),
-            "componentType": _KINDS[array.dtype.name],
+            "componentType": kinds[array.dtype.name],
             "count": len(array),
-            "type": _TYPES[array.shape[1:]],
+            "type": types[array.shape[1:]],
         }
         if array.dtype == np.int16:
             item["normalized"] = True
@@ -456,11 +455,12 @@ def _quantize_rotations(rotations: Floats, parents: NDArray[np.int64]) -> NDArra
     """
     rounded = np.empty((*rotations.shape[:2], 4), np.int16)
     became = np.empty_like(rotations)
+    largest = 32767
     for joint, parent in enumerate(parents):
         before = became[:, parent] if joint else np.eye(3)
         turn = np.swapaxes(before, -1, -2) @ rotations[:, joint]
         unit = _continuous(Rotation.from_matrix(turn).as_quat())
-        rounded[:, joint] = np.round(unit * _SHORT)
+        rounded[:, joint] = np.round(unit * largest)
         became[:, joint] = before @ Rotation.from_quat(_unit(rounded[:, joint])).as_matrix()
     return rounded
 

@@ -128,8 +128,6 @@ MODELS: Final = {
 }
 """Pose2Sim's names of models and the sets that they give."""
 
-FACE: Final = 5
-"""Number of COCO-17's joints that belong to the face, the first ones."""
 _BONES: Final = {
     "thigh": ((11, 13), (12, 14)),
     "shank": ((13, 15), (14, 16)),
@@ -159,7 +157,9 @@ def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
     plain = [_plain(str(name)) for name in names]
     if "left_ankle" not in plain:  # Human3.6M calls them feet
         plain = [re.sub(r"^(left|right)_foot$", r"\1_ankle", name) for name in plain]
-    missing = [joint for joint in COCO17[FACE:] if joint not in plain]
+    # Number of COCO-17's joints that belong to the face, the first ones.
+    face_joints = 5
+    missing = [joint for joint in COCO17[face_joints:] if joint not in plain]
     if missing or any(plain.count(joint) > 1 for joint in (*COCO17, *FEET)):
         unknown = [str(n) for n, one in zip(names, plain, strict=True) if one not in COCO17]
         raise InputError(

@@ -51,8 +51,6 @@ OTHER_WORDS: Final = (
     *("rational_polynomial", "rational", "full_opencv"),
 )
 """Values of `MODEL_NAMES`, in lower case."""
-ARRAY_BYTES: Final = 1 << 26
-"""Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
 
 
 def read_lenses(
@@ -177,8 +175,10 @@ def _read_file(file: Path) -> dict[str, Any]:
             return {"K" if array.shape == (3, 3) else "dist": array}
     except (OSError, ValueError, EOFError) as error:
         raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
+    # Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards.
+    max_bytes = 1 << 26
     if suffix == ".npz":
-        return dict(read_npz(file, ARRAY_BYTES))
+        return dict(read_npz(file, max_bytes))
     if suffix in (".yml", ".yaml", ".json"):
         return read_file_storage(file) if is_storage(file) else _read_mapping(file)
     if suffix in (".pkl", ".pickle"):

@@ -198,9 +198,6 @@ def people_table(positions: Positions, fps: float) -> pd.DataFrame:
     )
 
 
-_SIDES: Final = {"left": 15, "right": 16}
-
-
 def strides_table(tracks: JointTracks, fps: float) -> pd.DataFrame:
     """Return one row per stride: from one contact of a foot to the next of the same foot.
 
@@ -212,9 +209,10 @@ def strides_table(tracks: JointTracks, fps: float) -> pd.DataFrame:
     import pandas as pd  # late: it takes half a second
 
     rows = []
+    ankle_of = {"left": 15, "right": 16}
     for index, person in enumerate(tracks.person_ids.tolist()):
         hips = tracks.joints[:, index, 11:13, :2].mean(axis=1)
-        for side, joint in _SIDES.items():
+        for side, joint in ankle_of.items():
             ankle = tracks.joints[:, index, joint, :2]
             unseen = np.zeros(len(ankle), np.bool_)
             if tracks.views is not None:

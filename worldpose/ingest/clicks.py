@@ -34,8 +34,6 @@ from worldpose.pitch.template import PitchTemplate
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
-REPEATED_SUFFIX: Final = ".again"
-"""Suffix of the second click with one label."""
 
 
 @dataclass(frozen=True)
@@ -230,14 +228,16 @@ class _Labels:
         """Return the clicked markings of an image of a camera or clip."""
         points, seen = [], Counter[str]()
         first: dict[str, tuple[float, float]] = {}
+        # Suffix of the second click with one label.
+        repeated_suffix = ".again"
         for label, pixel in image.points:
             name = self._name(image, label)
             seen[name] += 1
             where = (float(pixel[0]), float(pixel[1]))
             if seen[name] > 1:
-                place, names = self._place(name), (name, name + REPEATED_SUFFIX)
+                place, names = self._place(name), (name, name + repeated_suffix)
                 if seen[name] > 2:
-                    names = (name, f"{name}{REPEATED_SUFFIX}{seen[name]}")
+                    names = (name, f"{name}{repeated_suffix}{seen[name]}")
                 self._report.repeated.append(
                     RepeatedClick(owner, image.name, label, names, (first[name], where))
                 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
@@ -41,9 +41,6 @@ from worldpose.ingest.importing import (
 from worldpose.ingest.writing import write_match
 from worldpose.video.folder import index_video
 from worldpose.video.pictures import FrameIndex
-
-_SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
-"""Entries of Config.toml that hold."""
 
 
 def import_pose2sim(
@@ -199,6 +196,8 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
         )
     files = [place / "Config.toml" for place in (project, project.resolve().parent)]
     given: dict[str, Any] = {}
+    # Entries of Config.toml that hold.
+    held_entries = ("frame_rate", "frame_range", "pose_model")
     for file in reversed(files):
         content = read_toml(file) if file.is_file() else {}
         for name in ("project", "pose"):
@@ -210,7 +209,7 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
                     found=f"{table!r:.40}",
                     todo="Correct it.",
                 )
-            given |= {key: (table[key], file) for key in _SETTINGS if key in table}
+            given |= {key: (table[key], file) for key in held_entries if key in table}
     model, _ = given.get("pose_model", (None, files[0]))
     settings: dict[str, Any] = {"pose_model": model} if isinstance(model, str) else {}
     rate, place = given.get("frame_rate", ("auto", files[0]))

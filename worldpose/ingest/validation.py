@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
@@ -20,8 +20,6 @@ from data_contracts.records import Record
 from worldpose.errors import InputError, say_failure
 
 R = TypeVar("R", bound=Record)
-
-_NAME_RULE: Final = "up to 64 letters, digits and . _ - with a letter or digit first"
 
 
 def validate_record(model: type[R], data: object, file: str) -> R:
@@ -75,6 +73,7 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
     place = _place(detail["loc"])
     expected = detail["msg"].removeprefix("Input should be ")
     found, todo = _brief(value), "Correct this value."
+    name_rule = "up to 64 letters, digits and . _ - with a letter or digit first"
     if kind == "extra_forbidden":
         key = str(detail["loc"][-1])
         known = _known_keys(model, detail["loc"][:-1])
@@ -86,7 +85,7 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
     elif kind == "missing":
         expected, found, todo = "a value", "nothing", "Add this key."
     elif kind == "string_pattern_mismatch":
-        expected, todo = _NAME_RULE, "Rename it."
+        expected, todo = name_rule, "Rename it."
     elif kind == "string_type" and isinstance(value, bool):
         found = f"{value}: YAML reads no, off, yes, on, true and false as truth values"
         word = "yes" if value else "no"

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from camera_builders import look_at_camera
 
+from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import check_consistency
-from worldpose.camera_consistency.hypotheses import LEFT_RIGHT, lens_hypotheses, tangential_shift
+from worldpose.camera_consistency.hypotheses import lens_hypotheses, tangential_shift
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
@@ -115,7 +116,7 @@ def test_a_wrong_calibration_is_named_with_its_fault(kind):
     cameras = rig()
     keypoints = seen(cameras, walkers())
     if kind == "both":  # a mirrored image, whose clicks have exchanged names
-        keypoints[:, 3] = (keypoints[:, 3] * [-1.0, 1.0] + [1919.0, 0.0])[..., LEFT_RIGHT, :]
+        keypoints[:, 3] = (keypoints[:, 3] * [-1.0, 1.0] + [1919.0, 0.0])[..., COCO17_FLIP, :]
     cameras[3] = stated(cameras[3], "mirrored" if kind == "both" else kind)
     result = check(cameras, keypoints)
     assert named(result) == [(3, {"degrees": "pose", "both": "mirrored"}.get(kind, kind))]
