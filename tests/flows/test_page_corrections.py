@@ -94,6 +94,7 @@ def test_first_clicks_are_no_corrections(store, ada):
             "It moved. Run worldpose run x --gates auto. It is late.",
             "It moved. Run the match on its page. It is late.",
         ),
+        ("The clocks differ (worldpose synchronize)", "The clocks differ"),
         ("the worldpose-data folder", "the worldpose-data folder"),
     ],
 )

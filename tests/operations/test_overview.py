@@ -31,12 +31,13 @@ REQUEST = "static_calibration.cam03.1f2e3d4c5b6a"
 CONTENT, OTHER = "c" * 64, "d" * 64
 ASKED = datetime(2026, 5, 1, 12, tzinfo=UTC)
 ENDED = ASKED + timedelta(minutes=5)
-WRONG = "clicks_wrong is 1, at most 0 passes"
-IN_WORDS = "clicks that contradict the others: 1, limit 0"
+WRONG = "clicks_wrong_share is 0.3333, at most 0.25 passes"
+IN_WORDS = "clicks that contradict the others: 33.3 %, limit 25 %"
 FIGURES = {
     "expected_ground_error_median_m": 0.01,
     "expected_ground_error_p95_m": 0.04,
     "clicks_wrong": 1.0,
+    "clicks_used": 2.0,
     "weak": 0.0,
 }
 

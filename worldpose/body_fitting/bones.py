@@ -109,7 +109,7 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
 
     The prior of betas is normal with variance 1; without bones they are 0 with covariance 1.
     """
-    ends = np.array([JOINT_OF_POINT[name] for name in COCO17])[np.array(COCO17_RIGID_BONES)]
+    ends = np.array([[JOINT_OF_POINT[COCO17[k]] for k in bone] for bone in COCO17_RIGID_BONES])
     template = model.joint_template[ends[:, 1]] - model.joint_template[ends[:, 0]]
     directions = model.joint_directions[ends[:, 1]] - model.joint_directions[ends[:, 0]]
     seen = np.isfinite(bones.length)
