@@ -313,13 +313,12 @@ def camera_tables(
     content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
-    entries = {"size", "matrix", "distortions"}
+    entries = {"size", "matrix", "distortions", "rotation", "translation"}
     known = [each for each in tables.values() if isinstance(each, dict) and entries & each.keys()]
-    entries |= set() if known else {"rotation", "translation"}  # also of pairs of cameras
     for key, table in tables.items():
         is_camera = isinstance(table, dict) and entries & table.keys()
-        if key == "metadata" or (known and not is_camera):
-            continue  # caliscope's settings stand beside its cameras
+        if key == "metadata" or (known and not is_camera) or re.fullmatch(r"stereo_\d+_\d+", key):
+            continue  # caliscope's settings and poses of pairs stand beside its cameras
         where = f"{path}: {key}" if tables is content else f"{path}: cameras.{key}"
         if not isinstance(table, dict):
             raise calibration_error(where, "a table for each camera", describe_value(table))

@@ -31,6 +31,7 @@ from worldpose.formats.keypoint_sets import (
     MAX_CONFIDENCE,
     PeopleFile,
     clean_points,
+    describe_fault,
     frame_numbers,
     order_by_names,
     order_by_points,
@@ -206,10 +207,12 @@ def _frames(path: Path, images: Sequence[int | str], listed: object) -> NDArray[
     for index, image in enumerate(images):
         frame = frame_of.get(image, None if is_set or isinstance(image, str) else image)
         if frame is None or frame > FRAME_LIMIT:
-            what = "an id of `images`" if is_set else "a number in the name of the image"
+            what, found = "an id of `images`", describe_value(image)
             if frame is not None:
                 what = f"a frame from 0 to {FRAME_LIMIT}, in file_name where there are `images`"
-            found = describe_value(image if frame in (None, image) else f"{image}, frame {frame}")
+                found = describe_value(image if frame == image else f"{image}, frame {frame}")
+            elif not is_set:
+                what, found = describe_fault(image, frame_of, "a number in the name of the image")
             raise _result_error(path, index, "image_id", what, found, _NUMBER_TODO)
         frames[index] = frame
     return frames
@@ -226,7 +229,8 @@ def _listed_frames(path: Path, listed: Sequence[Any]) -> dict[int | str, int]:
             number = image["frame_id"]
         if number is None or type(image.get("id")) not in (int, str):
             expected = "an id, and the frame's number in file_name or frame_id"
-            raise _wrong(f"{path}: images[{index}]", expected, describe_value(name))
+            fault = describe_fault(name, number_of, expected)
+            raise _wrong(f"{path}: images[{index}]", *fault)
         frames[image["id"]] = number
     _require_distinct(path, "images", frames, len(listed))
     return frames

@@ -23,6 +23,7 @@ from worldpose.formats.keypoint_sets import (
     SIZES,
     PeopleFile,
     clean_points,
+    describe_fault,
     frame_numbers,
     order_by_points,
     people_by_frame,
@@ -72,9 +73,9 @@ def _frame_files(folder: Path) -> dict[int, Path]:
     files: dict[int, Path] = {}
     for name, file in there.items():
         if numbers.get(name, FRAME_LIMIT + 1) > FRAME_LIMIT:
+            todo = "Name the files of one clip as cam01_000012.json, and move others elsewhere."
             expected = f"a frame number up to {FRAME_LIMIT} in the name"
-            todo = "Name it as cam01_000012.json, or move it elsewhere."
-            raise InputError(str(file), expected, name, todo)
+            raise InputError(str(file), *describe_fault(name, numbers, expected), todo)
         if numbers[name] in files:
             found = f"{files[numbers[name]].name} with the same frame number"
             todo = "Keep the poses of one camera and one estimator in a folder."

@@ -8,10 +8,11 @@ two sets of one size. Points that worldpose does not use are left out.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path, PureWindowsPath
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from data_contracts.conventions import COCO17, FEET
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
 from worldpose.body.keypoints import BODY25
-from worldpose.errors import InputError
+from worldpose.errors import InputError, describe_value
 
 MAX_CONFIDENCE: Final = 2.0
 """Largest confidence that counts as 1 [1]: peaks of heat maps and of SimCC exceed 1; a larger one
@@ -49,8 +50,8 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
 
     The numbers of names without such a place are their last ones. So they are if the last one is
     the same in all names and a single other one differs: that may be the camera's or the clip's.
-    No name has a frame if a number before it repeats and it does not rise with that number, as in
-    times of day or in pictures of several clips.
+    No name has a frame if the numbers before it repeat, and it neither rises with them nor counts
+    on where they change: it is a time of day, or there are several clips.
     """
     found: dict[str, list[int]] = {}
     for name in set(names):
@@ -65,12 +66,22 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
     chosen = min(distinct, key=lambda p: max(values[p]) - min(values[p]), default=1)
     if 1 not in differing and len(differing) == 1:
         chosen = 1
-    before = [numbers[-count:-chosen] for numbers in found.values()]
-    if 1 < len(set(map(tuple, before))) < len(found):
-        rising = [numbers[-chosen] for numbers in sorted(found.values(), key=lambda n: n[-count:])]
-        if rising != sorted(rising):  # a time, whose last number begins again each second
+    rows = sorted((numbers[-chosen], numbers[-count:-chosen]) for numbers in found.values())
+    before = [part for _, part in rows]
+    parts = len(set(map(tuple, before)))
+    if before != sorted(before) and parts < len(found):
+        steps = [b[0] - a[0] for a, b in pairwise(rows) if a[1] != b[1]]
+        if len(steps) >= parts or set(steps) != {1}:  # a time begins again each second
             return {}
     return {name: numbers[-chosen] for name, numbers in found.items()}
+
+
+def describe_fault(name: object, numbers: Mapping[Any, int], otherwise: str) -> tuple[str, str]:
+    """Return what is expected, perhaps `otherwise`, and found in a name without a frame."""
+    if isinstance(name, str) and name not in numbers and frame_numbers([name]):
+        expected = "one number that rises by image through all files"
+        return expected, f"{describe_value(name)} and others: several clips or times of day"
+    return otherwise, describe_value(name)
 
 
 class PointOrder(NamedTuple):

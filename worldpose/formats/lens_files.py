@@ -8,6 +8,7 @@ In the TOML form each table has `size`, `matrix` and `distortions` as in calibra
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +18,7 @@ from pydantic import ValidationError
 
 from data_contracts.arrays import Floats
 from data_contracts.cameras import LensCalibration
-from worldpose.errors import InputError, say_failure
+from worldpose.errors import InputError, describe_value, say_failure
 from worldpose.formats.archives import read_npz
 from worldpose.formats.calibration_files import (
     calibration_error,
@@ -30,8 +31,8 @@ from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 
 MATRIX_NAMES: Final = (
-    *("cameramatrix", "cammatrix", "mtx", "K", "matrix", "intrinsic", "intrinsics"),
-    *("intrinsicmat", "intrinsicmatrix", "k"),
+    *("cameramatrix", "cammatrix", "mtx", "K", "matrix", "intrinsicmat", "intrinsicmatrix"),
+    *("intrinsic", "intrinsics", "k"),
 )
 DISTORTION_NAMES: Final = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
@@ -49,7 +50,6 @@ FISHEYE_WORDS: Final = (
 OTHER_WORDS: Final = (
     *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
     *("rational_polynomial", "rational", "full_opencv"),
-    *("lensmodel_opencv4", "lensmodel_opencv5", "lensmodel_opencv8"),
 )
 """Values of `MODEL_NAMES`, in lower case."""
 
@@ -73,27 +73,28 @@ def read_lenses(
             unknown or not named.
     """
     first = files[0]
-    if first.suffix.lower() == ".toml" and any(
-        isinstance(each, dict) for each in read_toml(first).values()
-    ):
-        return read_lens_toml(first, sizes, camera)
+    if first.suffix.lower() == ".toml":
+        content = read_toml(first)
+        tables = any(isinstance(each, dict) for each in content.values())
+        if tables and not _has_matrix(content):
+            return read_lens_toml(first, sizes, camera)
     named = _read_named(first)
     if named is not None:
         if len(named) == 1 and camera is not None:
-            named = {camera: next(iter(named.values()))}
-        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in named.items()], sizes, camera)
+            named = [(camera, named[0][1])]
+        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in named], sizes, camera)
     if camera is None:
         expected = "the camera of this lens"
         todo = f"Name it: --camera {next(iter(sizes), 'NAME')}."
         raise InputError(str(first), expected, "a file without a name for it", todo)
     if camera not in sizes:
         raise _unknown_camera(str(first), camera, sizes)
-    given: dict[str, Any] = {}
-    for file in files:
-        given |= _read_file(file)
+    given = _read_files(files)
     where = ", ".join(map(str, files))
-    matrix = _pick(where, given, MATRIX_NAMES, "a 3 x 3 camera matrix")
-    distortion = np.ravel(_pick(where, given, DISTORTION_NAMES, "distortion coefficients"))
+    usual = "a 3 x 3 camera matrix, named camera_matrix, mtx or K"
+    matrix = _pick(where, given, MATRIX_NAMES, usual)
+    usual = "distortion coefficients, named distortion_coefficients, dist_coeffs, dist or D"
+    distortion = np.ravel(_pick(where, given, DISTORTION_NAMES, usual))
     try:
         matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
     except (ValueError, TypeError) as error:
@@ -165,6 +166,19 @@ def write_lens_toml(path: Path, lenses: Mapping[str, LensCalibration]) -> None:
     path.write_text("\n".join(lines), encoding="utf-8")
 
 
+def _read_files(files: Sequence[Path]) -> dict[str, Any]:
+    """Return the entries of the files of one lens; no two of one name may differ."""
+    names = {*MATRIX_NAMES, *DISTORTION_NAMES, *chain(*SIZE_NAMES), *MODEL_NAMES}
+    given: dict[str, Any] = {}
+    for file in files:
+        for key, value in _read_file(file).items():
+            other = _key(given, names & {_plain(key)})
+            if other is not None and not np.array_equal(given[other], value):
+                raise calibration_error(f"{file}: {key}", f"the value of {other}", "another one")
+            given[key] = value
+    return given
+
+
 def _read_file(file: Path) -> dict[str, Any]:
     """Return the arrays and numbers of a file by name."""
     suffix = file.suffix.lower()
@@ -208,28 +222,34 @@ def _read_pickled_lens(file: Path) -> dict[str, Any]:
     return given
 
 
-def _read_named(file: Path) -> dict[str, dict[str, Any]] | None:
-    """Return the tables of a file with several cameras by name; None for another file.
+def _read_named(file: Path) -> list[tuple[str, dict[str, Any]]] | None:
+    """Return names and tables of a file with several cameras; None for another file.
 
-    It is a camchain of Kalibr, or JSON of multical or Panoptic Studio with `cameras`.
+    It is a camchain of Kalibr, or JSON of multical or Panoptic Studio: `cameras` have the matrices.
     """
     if file.suffix.lower() not in (".yml", ".yaml", ".json") or is_storage(file):
         return None
     content = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
     if is_kalibr(content):
-        return dict(kalibr_tables(file, content))
+        return list(kalibr_tables(file, content))
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(cameras, list):
-        cameras = {str(each.get("name")): each for each in cameras if isinstance(each, dict)}
-    if not isinstance(cameras, dict) or not all(isinstance(one, dict) for one in cameras.values()):
+        cameras = [(each.get("name") if isinstance(each, dict) else None, each) for each in cameras]
+    else:
+        cameras = list(cameras.items()) if isinstance(cameras, dict) else []
+    if _has_matrix(content) or not any(_has_matrix(one) for _, one in cameras):
         return None
     ours = {"K": "matrix", "dist": "distortions", "distCoef": "distortions"}
     ours |= {"image_size": "size", "resolution": "size"}
-    return {
-        str(name): {ours.get(key, key): value for key, value in table.items()}
-        | ({"fisheye": True} if table.get("model") == "fisheye" else {})
-        for name, table in cameras.items()
-    }
+    found = []
+    for index, (name, table) in enumerate(cameras):
+        if name in (None, "") or not isinstance(table, dict):
+            where = f"{file}: cameras[{index}]"
+            raise calibration_error(where, "a lens with a name", describe_value(table))
+        lens = {ours.get(key, key): value for key, value in table.items()}
+        fisheye = {"fisheye": True} if table.get("model") == "fisheye" else {}
+        found.append((str(name), lens | fisheye))
+    return found
 
 
 def is_kalibr(content: object) -> bool:
@@ -310,20 +330,31 @@ def _read_mapping(file: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in content.items():
         if isinstance(value, dict) and {"rows", "cols", "data"} <= value.keys():
-            shape = value["rows"], value["cols"]
             try:
-                found[str(name)] = np.reshape(value["data"], shape)
-            except (ValueError, TypeError) as error:
-                expected, size = "{} x {} numbers".format(*shape), np.size(value["data"])
-                raise calibration_error(f"{file}: {name}", expected, f"{size}") from error
+                found[str(name)] = np.reshape(value["data"], (value["rows"], value["cols"]))
+            except (ValueError, TypeError, OverflowError) as error:
+                parts = [f"{key} {describe_value(value[key])}" for key in ("rows", "cols", "data")]
+                expected = "data of rows x cols numbers"
+                raise calibration_error(f"{file}: {name}", expected, ", ".join(parts)) from error
         elif isinstance(value, list | int | float | str):
             found[str(name)] = value
     return found
 
 
-def _key(given: Mapping[str, Any], names: Sequence[str]) -> str | None:
+def _has_matrix(given: object) -> bool:
+    """Return whether a mapping has a camera matrix itself, not in a table of that name."""
+    own = given.items() if isinstance(given, dict) else ()
+    plain = {str(key): each for key, each in own if not isinstance(each, dict) or "data" in each}
+    return _key(plain, MATRIX_NAMES) is not None
+
+
+def _plain(key: str) -> str:
+    return key if len(key) == 1 else key.replace("_", "").lower()
+
+
+def _key(given: Mapping[str, Any], names: Iterable[str]) -> str | None:
     """Return the key with the first of these names that there is, in any spelling."""
-    plain = {key if len(key) == 1 else key.replace("_", "").lower(): key for key in given}
+    plain = {_plain(key): key for key in given}
     return next((plain[name] for name in names if name in plain), None)
 
 
@@ -332,8 +363,8 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
     key = _key(given, names)
     if key is not None:
         return np.asarray(given[key])
-    expected = f"{what} ({', '.join(names)})"
     todo = "Add it to the file, or give the file that has it: --lens may come twice."
+    expected = f"{what} (capitals and underscores of words do not matter)"
     raise InputError(where, expected, ", ".join(sorted(given)) or "nothing", todo)
 
 

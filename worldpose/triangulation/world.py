@@ -36,6 +36,7 @@ from worldpose.tracking.vertical import (
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
 from worldpose.triangulation.reinterpretation import reinterpret_calibration
 
+Found: TypeAlias = "tuple[People | None, bool]"
 Placed: TypeAlias = tuple[dict[str, CameraCalibration], list[str]]
 LEVEL: Final = float(np.cos(np.radians(10.0)))
 """Cosine of the steepest ground, and of the largest mean lean of people who walk [1]."""
@@ -224,7 +225,7 @@ class People(NamedTuple):
         return cls(statures, vertical, up, ground, on_feet, walkers.nose_ahead(up))
 
 
-def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> People | None:
+def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> Found:
     """Return what the people in the cameras' images tell of their world, whatever its unit.
 
     Args:
@@ -233,7 +234,8 @@ def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> 
         fps: frames per second [1/s].
 
     Returns:
-        None if no two cameras agree on their people.
+        people: None if they tell nothing.
+        agree: whether two cameras agree on their people.
     """
     longest, settings = 250, TrackingSettings()
     detections = detections[select_busiest_frames(detections.confidence, longest)]
@@ -241,16 +243,17 @@ def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> 
     pairs = list(combinations(range(len(cameras.focal)), 2))
     some = pairs[:: -(-len(pairs) // 15)]
     matched = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in some]
+    agreeing = [m for m in matched if m.agrees]
     # Rays that are nearly parallel tell no size.
-    wide = [m.matches["size"] for m in matched if m.agrees and m.angle >= settings.min_angle_rad]
+    wide = [m.matches["size"] for m in agreeing if m.angle >= settings.min_angle_rad]
     sizes = np.concatenate([np.empty(0), *wide])
     sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
     if not len(sizes):
-        return None
+        return None, bool(agreeing)
     size = float(np.median(sizes))
     motion = Similarity(np.array(1.0 / size), np.eye(3), np.zeros(3))
     tracks = track_people(move_cameras(motion, cameras), detections, fps, settings)
-    return People.of(size * tracks.joints, fps) if len(tracks.person) else None
+    return People.of(size * tracks.joints, fps) if len(tracks.person) else None, True
 
 
 def doubt_statures(statures: Floats) -> str:
@@ -376,28 +379,26 @@ def place_cameras(
         [Camera.from_calibration(each, f"{calibration}: {name}") for name, each in cameras.items()]
     )
     people = None
-    told = [
-        f"warning: {fold}"
-        for n, name in enumerate(cameras)
-        if (fold := batch[n].describe_fold(name))
-    ]
+    folds = (batch[n].describe_fold(name) for n, name in enumerate(cameras))
+    told = [f"warning: {each}" for each in folds if each]
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
-        people = find_people(batch, stacked, fps)
+        find = partial(find_people, detections=stacked, fps=fps)
+        people, agree = find(batch)
         if people is None:
             cameras, said = reinterpret_calibration(
                 calibration,
                 cameras,
                 stacked,
-                lambda other: bool((p := find_people(other, stacked, fps)) and p.vertical.is_clear),
+                lambda other: bool((p := find(other)[0]) and p.vertical.is_clear),
             )
             told += said
             batch = Camera.stack([Camera.from_calibration(each) for each in cameras.values()])
-            people = find_people(batch, stacked, fps) if said else None
-        if people is None and np.isfinite(stacked.confidence).any():
+            people, agree = find(batch) if said else (None, agree)
+        if not agree and np.isfinite(stacked.confidence).any():
             told.append(
-                "warning: no people agree in the images of two cameras, so that nothing confirms "
-                "the calibration: is it of these cameras, as they stood?"
+                "warning: no person is consistent between two cameras; check that the calibration "
+                "belongs to these cameras and that they did not move since"
             )
     scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
     up, turned, doubt = _find_up(batch, people, stated.up)

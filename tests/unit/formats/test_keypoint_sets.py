@@ -224,12 +224,38 @@ def test_many_people_of_no_known_order_are_refused(tmp_path):
         # Times of day, and two clips in one folder, number no frames.
         (["T_04_17.73.png", "T_04_17.98.png", "T_04_18.21.png"], [None] * 3),
         (["take1_10.png", "take1_11.png", "take2_5.png"], [None] * 3),
+        ([f"T12_04_{s}.png" for s in ("17.738369", "17.771702", "18.005036")], [None] * 3),
+        (["T_17.920.png", "T_17.960.png", "T_18.000.png", "T_18.040.png"], [None] * 4),
+        (["take1_3.png", "take1_5.png", "take2_4.png", "take2_2.png"], [None] * 4),
+        # One clip whose day, chunk or part falls where its frames count on.
+        (["cam_31_12_23_000001", "cam_31_12_23_000002", "cam_01_01_00_000003"], [1, 2, 3]),
+        (["3_000001", "3_000002", "2_000003"], [1, 2, 3]),
+        (["part_2_frame_0", "part_2_frame_1", "part_1_frame_2"], [0, 1, 2]),
         (["0004_000100.png", "0004_000101.png"], [100, 101]),
         (["cam1_frame_12.jpg", "cam1_frame_13.jpg"], [12, 13]),
     ],
 )
 def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
     assert list(map(frame_numbers(names).get, names))[: len(wanted)] == wanted
+
+
+def test_a_refusal_of_several_clips_says_so(tmp_path):
+    names = ["take1_10", "take1_11", "take2_5"]
+    (tmp_path / "a_json").mkdir()
+    for name in names:
+        (tmp_path / "a_json" / f"{name}.json").write_text('{"people": []}')
+    people = [{"image_id": f"{name}.jpg", "keypoints": points(COCO17)} for name in names]
+    (tmp_path / "b.json").write_text(json.dumps(people))
+    images = [{"id": n, "file_name": f"{name}.jpg"} for n, name in enumerate(names)]
+    listed = data_set(tmp_path / "c.json", images)
+    said = r"expected one number that rises by image .*found 'take1_10\..*several clips or times"
+    for read, path in (
+        (read_openpose_folder, tmp_path / "a_json"),
+        (read_coco_results, tmp_path / "b.json"),
+        (read_coco_results, listed),
+    ):
+        with pytest.raises(InputError, match=said):
+            read(path)
 
 
 def test_pictures_of_one_number_are_refused_and_frame_id_helps_out(tmp_path):

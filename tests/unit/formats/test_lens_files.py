@@ -37,6 +37,11 @@ def write_npz(folder):
     return [folder / "lens.npz"]
 
 
+def write_npz_of(folder, matrix):
+    np.savez(folder / "other.npz", mtx=matrix)
+    return [folder / "other.npz"]
+
+
 def write_toml(folder):
     text = f"""[cameras.7]
 name = "left"
@@ -126,6 +131,73 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
     assert [*read_lenses([tmp_path / "rig.json"], "left", SIZES)] == ["left"]
 
 
+LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}
+ENTRY = {"K": MATRIX.tolist(), "dist": DISTORTION[0].tolist(), "image_size": [1920, 1080]}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("names.json", json.dumps({**LENS, "cameras": ["a", "b"]})),
+        ("none.yaml", json.dumps({**LENS, "cameras": []})),
+        ("serials.json", json.dumps({**LENS, "cameras": {"left": {"serial": 1}}})),
+        ("order.json", json.dumps({**ENTRY, "intrinsics": [1.0] * 4, "intrinsic_matrix": [[0]]})),
+        (
+            "vector.json",
+            json.dumps(
+                {"intrinsics": [1400.0] * 4, "intrinsic_matrix": MATRIX.tolist(), "d": [0.1] * 5}
+            ),
+        ),
+        (
+            "meta.toml",
+            f"dist = {LENS['dist']}\nK = {LENS['camera_matrix']}\n[meta]\nsize = [1, 1]\n",
+        ),
+        (
+            "inline.toml",
+            f"dist = {LENS['dist']}\n"
+            f"camera_matrix = {{rows = 3, cols = 3, data = {MATRIX.ravel().tolist()}}}\n",
+        ),
+        ("spelt.json", json.dumps({**LENS, "cameraMatrix": MATRIX.tolist()})),
+    ],
+)
+def test_a_file_with_a_matrix_of_its_own_has_one_lens(name, content, tmp_path):
+    (tmp_path / name).write_text(content)
+    assert read_lenses([tmp_path / name], "left", SIZES)["left"].focal_px == 1402.0
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"cameras": [{"name": "left", **ENTRY}] * 2}, "name of its own, found 'left' a second"),
+        (
+            {"cameras": [{"name": "left", **ENTRY}, ENTRY]},
+            r"cameras\[1\]: expected a lens with a name",
+        ),
+        ({"cameras": {"left": ENTRY, "right": 3}}, r"cameras\[1\]: .* found 3"),
+        (
+            {**LENS, "cameraMatrix": np.eye(3).tolist()},
+            "cameraMatrix: expected the value of camera_matrix",
+        ),
+        (
+            {"camera_matrix": {"rows": 3, "cols": 3, "data": [[1], [1, 2]]}},
+            r"data \[\[1\], \[1, 2\]\]",
+        ),
+        (
+            {"camera_matrix": {"rows": "x", "cols": 3, "data": [1]}},
+            "rows x cols numbers, found rows 'x'",
+        ),
+        ({"camera_matrix": {"rows": 10**30, "cols": 3, "data": [1]}}, "rows x cols numbers"),
+        ({"camera_matrix": {"rows": 3, "cols": 3, "data": None}}, "data nothing"),
+        ({"dist": [0.0] * 5}, "camera_matrix, mtx or K .capitals and underscores"),
+        ({**LENS, "lensmodel": "LENSMODEL_OPENCV8"}, "found 'lensmodel_opencv8'"),
+    ],
+)
+def test_entries_that_contradict_or_lack_a_name_are_refused(content, said, tmp_path):
+    (tmp_path / "lens.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=said):
+        read_lenses([tmp_path / "lens.json"], "left", SIZES)
+
+
 @pytest.mark.parametrize("names", ["KDhw", "kd"])
 def test_the_nine_numbers_and_the_size_of_a_camera_info_are_read(names, tmp_path):
     half = np.diag([0.5, 0.5, 1.0]) @ MATRIX
@@ -144,6 +216,11 @@ def test_written_lenses_are_read_back_with_their_deviations(tmp_path):
 
 
 BAD = {
+    "two matrices": (
+        lambda folder: write_npz(folder) + write_npz_of(folder, 2.0 * MATRIX),
+        "left",
+        r"other\.npz: mtx: expected the value of mtx",
+    ),
     "no camera": (write_npz, None, r"--camera left"),
     "unknown camera": (write_npz, "middle", r"match\.yaml: left, right.*'middle'"),
     "matrix alone": (lambda folder: write_npy(folder)[:1], "left", "distortion coefficients"),

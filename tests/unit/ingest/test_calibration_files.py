@@ -237,6 +237,11 @@ def test_poses_of_pairs_beside_the_cameras_are_no_cameras(read):
     assert read(ANIPOSE + pair) == read(ANIPOSE)
 
 
+def test_a_posed_camera_with_a_misspelt_lens_is_refused(refusal):
+    bad = "\n[cam_09]\nK = [1.0]\nrotation = [0.1, 0.2, 0.3]\ntranslation = [1.0, 0.0, 0.0]\n"
+    assert refusal(ANIPOSE + bad).where.endswith("cam_09.matrix")
+
+
 def test_poses_that_are_all_null_are_told_to_be_lenses(refusal):
     without = CALISCOPE.replace("[[0.1], [0.2], [3.0]]", '"null"')
     without = without.replace("[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]", '"null"')

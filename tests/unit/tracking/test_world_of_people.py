@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 from scipy.spatial.transform import Rotation
 
 from data_contracts.keypoints import KeypointDetections
@@ -183,7 +184,18 @@ def test_cameras_on_whom_no_people_agree_are_told(ring, people, seen):
         others[name] = camera.model_copy(update={"rotation": tuple(map(tuple, turn.tolist()))})
     keypoints = poses(*seen(ring(4), walk(people)))
     _, notes = place_cameras(CALIBRATION, others, keypoints, FPS, NOTHING)
-    assert any("no people agree in the images of two cameras" in note for note in notes)
+    assert any("no person is consistent between two cameras; check" in note for note in notes)
+
+
+def test_people_who_agree_from_nearby_cameras_cast_no_doubt_on_them(people, seen):
+    # Rays of cameras 1.5 m apart meet at 0.05 rad, which is too little for a position.
+    near = [
+        look_at_camera([30.0, y, 6.0], (0.0, 0.0, 0.0), 1500.0, middle=(960.0, 540.0))
+        for y in (0.0, 1.5)
+    ]
+    keypoints = poses(*seen(Camera.stack(near), walk(people)))
+    _, notes = place_cameras(CALIBRATION, records(Camera.stack(near)), keypoints, FPS, NOTHING)
+    assert not any("consistent" in note or "agree" in note for note in notes), notes
 
 
 def test_without_people_cameras_alone_decide(ring):
