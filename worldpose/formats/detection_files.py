@@ -73,7 +73,7 @@ def _frame_files(folder: Path) -> dict[int, Path]:
     files: dict[int, Path] = {}
     for name, file in there.items():
         if numbers.get(name, FRAME_LIMIT + 1) > FRAME_LIMIT:
-            todo = "Name the files of one clip as cam01_000012.json, and move others elsewhere."
+            todo = "Name it as cam01_000012.json, or move it elsewhere."
             expected = f"a frame number up to {FRAME_LIMIT} in the name"
             raise InputError(str(file), *describe_fault(name, numbers, expected), todo)
         if numbers[name] in files:

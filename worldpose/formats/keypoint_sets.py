@@ -68,10 +68,10 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
         chosen = 1
     rows = sorted((numbers[-chosen], numbers[-count:-chosen]) for numbers in found.values())
     before = [part for _, part in rows]
-    parts = len(set(map(tuple, before)))
-    if before != sorted(before) and parts < len(found):
+    groups = len(set(map(tuple, before)))
+    if before != sorted(before) and groups < len(found):
         steps = [b[0] - a[0] for a, b in pairwise(rows) if a[1] != b[1]]
-        if len(steps) >= parts or set(steps) != {1}:  # a time begins again each second
+        if len(steps) >= groups or set(steps) != {1}:  # a time begins again each second
             return {}
     return {name: numbers[-chosen] for name, numbers in found.items()}
 

@@ -246,7 +246,7 @@ def _read_named(file: Path) -> list[tuple[str, dict[str, Any]]] | None:
         if name in (None, "") or not isinstance(table, dict):
             where = f"{file}: cameras[{index}]"
             raise calibration_error(where, "a lens with a name", describe_value(table))
-        lens = {ours.get(key, key): value for key, value in table.items()}
+        lens = {ours.get(str(key), str(key)): value for key, value in table.items()}
         fisheye = {"fisheye": True} if table.get("model") == "fisheye" else {}
         found.append((str(name), lens | fisheye))
     return found
