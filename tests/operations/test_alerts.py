@@ -314,13 +314,6 @@ def ended(match, state, message="", number=1, **more):
     )
 
 
-def test_an_alert_of_a_partial_run_says_so_and_why(plan):
-    text = "run 0003 of m: partial, 1 unit failed, 7 are blocked. tracking/clip: no light"
-    (alert,) = alerts_now(plan, [], [], [ended("m", "failed", text)])
-    assert alert.text == f"run m, 1 is partial: {text}"
-    assert alert.match_id == "m"
-
-
 def test_a_later_run_that_ended_well_ends_the_alert_and_old_failures_raise_none(plan):
     first = ended("m", "failed", "dark")
     assert len(alerts_now(plan, [], [], [first])) == 1

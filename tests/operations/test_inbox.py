@@ -255,16 +255,6 @@ def test_what_was_ended_on_purpose_or_by_an_error_is_no_death(desk, drop, monkey
     assert [each.state for each in desk.take_in()] == ["taken"]
 
 
-def test_a_damaged_note_of_an_arrival_is_made_again(desk, drop):
-    drop()
-    desk.look()
-    (file,) = (desk.state.folder / "arrivals").glob("*.json")
-    file.write_bytes(file.read_bytes()[:30])
-    assert desk.look() == 0
-    assert desk.look() == 1
-    assert [each.state for each in desk.take_in()] == ["taken"]
-
-
 def test_priorities_are_folders_unless_these_are_matches(desk, drop):
     drop("background")  # holds a match.yaml
     drop("urgent/b")

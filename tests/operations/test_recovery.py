@@ -26,7 +26,6 @@ from flows.service.run_queue import beating, find_process
 from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import seal
 from worldpose.store.integrity import repair, verify
-from worldpose.store.paths import queue_path
 from worldpose.store.run_queue import MAX_KILLS, MAX_SERVICE_DEATHS, RunQueue, queue_of
 from worldpose.store.store import Store
 
@@ -97,19 +96,6 @@ def test_old_ends_are_forgotten_but_the_last_of_each_match(queue, tmp_path):
     assert len(queue.runs()) == 4
     queue.forget_ended(timedelta(0))
     assert [run.id for run in queue.runs()] == [old.id, "2"]
-
-
-def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
-    for number in range(3000):
-        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
-        file = tmp_path / queue_path(run)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(seal(run))
-    queue.runs()
-    lost = queue.change(queue.take(a_run("lost")), "begun")
-    began = time.process_time()
-    assert queue.open_runs() == [lost]
-    assert time.process_time() - began < 1.0
 
 
 def beats(queue, run, seconds):

@@ -39,7 +39,7 @@ TRIES = 8
 @pytest.mark.slow  # a service, four starts of it, and the runs of two matches
 @pytest.mark.timeout(3600)
 def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_database(
-    served, webhook, tmp_path, capsys
+    served, webhook, tmp_path
 ):
     store, names = Store.create(str(served.project)), []
     for seed in (1, 2):
@@ -48,7 +48,7 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     served.options = {"--workers": 1, "--stall-minutes": 1, "--disk-gb": 0}
     served.environment["PREFECT_SERVER_SERVICES_DB_VACUUM_LOOP_SECONDS"] = "20"
     served.begin()
-    queue, times = RunQueue(LocalBlobs(served.project)), {}
+    queue = RunQueue(LocalBlobs(served.project))
 
     def runs_of(match):
         return [run for run in queue.runs() if run.match_id == match]
@@ -106,11 +106,9 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     while not any(it.number > run.number + 1 for it in runs_of(names[0])):
         assert time.monotonic() - began < RESTART_SECONDS, served.explain()
         time.sleep(0.2)
-    times["asked for again after a kill"] = round(time.monotonic() - began, 1)
 
     # A frozen engine is an alert, and the other match is computed.
     run = wait_until(lambda: at_work(names[0], run.number), served.explain)
-    times["at work again"] = round(time.monotonic() - began, 1)
     os.kill(run.pid, signal.SIGSTOP)
     began = time.monotonic()
     browser.ask(f"/api/matches/{names[1]}/runs", {"gates": "never"})
@@ -119,7 +117,6 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
         return [it for _, it in webhook.posted if it["alert"] == "run_stalled"]
 
     (alert,) = wait_until(stalls, served.explain)
-    times["alert of a frozen engine"] = round(time.monotonic() - began, 1)
     assert alert["match"] == names[0] and "no progress for 1 min" in alert["text"]
     assert "no progress" in served.check().out
     assert "no progress" in browser.ask("/status")
@@ -130,7 +127,6 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
         return set(states.values()) == {"complete"}
 
     wait_until(are_complete, served.explain)
-    times["both matches complete"] = round(time.monotonic() - began, 1)
     assert [store.run(name).state for name in names] == ["complete", "complete"]
     wait_until(lambda: served.check().json["healthy"], served.explain)
 
@@ -150,8 +146,6 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     wait_until(lambda: runs_of(names[0])[-1].state == "complete", served.explain)
     assert len(runs_of(names[0])) == count
     assert served.end() == 0
-    with capsys.disabled():
-        print(f"\nseconds: {times}")
 
 
 @pytest.mark.slow  # summaries of all matches are made, and a service starts twice
