@@ -1,6 +1,5 @@
 """People go out to annotators and come back as corrections that say where they come from."""
 
-import json
 import shutil
 
 import cv2
@@ -12,7 +11,7 @@ from flows.registering import open_match
 from flows.review.annotation_exchange import export_people, import_people
 from flows.review.detections import detections_now
 from flows.review.edit_conflicts import StaleEditError
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
 from worldpose.store.store import Store
 
@@ -88,21 +87,3 @@ def test_pictures_go_out_as_the_camera_took_them(project_copy, tiny, tmp_path):
     export_people(store, match, [("cam00", clip.first_frame + 3)], tmp_path / "out", "coco")
     name = f"cam00_{clip.first_frame + 3:06d}.png"
     assert cv2.imread(str(tmp_path / "out" / "pictures" / name))[0, 0].tolist() == [120, 120, 120]
-
-
-def test_a_file_that_is_none_changes_nothing(project_copy, tmp_path):
-    store = Store.open(str(project_copy))
-    written = export_people(store, open_match(store, TINY), PLACES, tmp_path / "out", "coco")
-    dataset = json.loads(written.annotations.read_text())
-    dataset["annotations"][0]["keypoints"] = dataset["annotations"][0]["keypoints"][:-1]
-    written.annotations.write_text(json.dumps(dataset))
-    with pytest.raises(InputError, match=r"annotations\.0\.keypoints"):
-        import_people(
-            store,
-            lambda: open_match(store, TINY),
-            written.annotations,
-            tmp_path / "out" / "exported.json",
-            None,
-            who="Ada",
-        )
-    assert open_match(store, TINY).corrections == ()

@@ -6,18 +6,16 @@ import zipfile
 
 import numpy as np
 import page_client
-from command_line import TINY, succeed, worldpose
+from command_line import TINY, worldpose
 from page_client import MATCH
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
 from data_contracts.run import WaitingUnit
-from flows.cli.app import app
 from flows.results.best_results import fitted_bodies
 from flows.results.evaluation import score
 from flows.web.results import BROADCAST_FORMATS
-from worldpose.formats.viewer_file import decode_bodies, decode_part, encode_spread, read_viewer
+from worldpose.formats.viewer_file import decode_bodies, decode_part
 from worldpose.store.store import Store, open_run
 
 
@@ -92,18 +90,6 @@ def test_the_page_gets_the_bodies_of_the_store(reader, tiny_run):
     assert np.degrees(apart.magnitude()).max() < 0.01
 
 
-def test_the_page_gets_how_well_joints_are_known(reader, tiny_run):
-    scene, (frames, *_) = parts(reader)
-    fits = open_run(str(tiny_run), TINY).bodies("clip")
-    variance = np.trace(fits["covariance"].values, axis1=-2, axis2=-1) / 3.0
-    _, arrays = decode_part(frames)
-    known = np.isfinite(variance)
-    codes = encode_spread(np.sqrt(variance))
-    assert np.array_equal(arrays["spread"][known], codes[: len(arrays["spread"])][known])
-    assert (arrays["spread"][known] > 1).mean() > 0.5
-    assert arrays["views"].max() <= len(decode_part(scene)[0]["cameras"])
-
-
 def test_metrics_are_per_camera_and_player_and_compared_with_the_run_before(ada, project_copy):
     found = ada.get(f"{MATCH}/results/metrics").json()
     assert (found["before"], found["changes"], found["problem"]) == (None, [], "")
@@ -129,22 +115,6 @@ def test_metrics_are_per_camera_and_player_and_compared_with_the_run_before(ada,
     found = ada.get(f"{MATCH}/results/metrics").json()
     assert found["problem"].startswith("Run 0099 cannot be compared: ")
     assert found["metrics"]
-
-
-def test_a_command_writes_one_file(tiny_run, tmp_path):
-    out = tmp_path / "view.html"
-    command = ["export", TINY, "--format", "viewer", "--project", str(tiny_run), "--out"]
-    done = CliRunner().invoke(app, [*command, str(out)])
-    assert done.exit_code == 0, done.output
-    assert f"{out.stat().st_size / 1e6:.1f} MB" in done.output.replace("\n", "")
-    assert len(read_viewer(out)) == 1
-    refused = CliRunner().invoke(app, [*command, str(out), "--video"])
-    assert "--video: expected a camera with a video" in str(refused.exception)
-    refused = CliRunner().invoke(app, [*command, str(out), "--format", "joints"])
-    assert "expected a folder" in str(refused.exception)
-    other = ["export", TINY, "--format", "joints", "--video", "--project", str(tiny_run)]
-    refused = CliRunner().invoke(app, [*other, "--out", str(tmp_path)])
-    assert "--video: expected --format viewer" in str(refused.exception)
 
 
 def add_run(project, state, stages):
@@ -188,25 +158,6 @@ def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
         assert answer.status_code == 422, path
         assert "run 0001 of" in answer.json()["error"]
         assert "found results of ingest" in answer.json()["error"]
-
-
-def test_pages_have_the_units_of_the_status_command_after_a_correction(ada, project_copy):
-    (person, *_) = ada.get(f"{MATCH}/identities/clip").json()["people"]
-    edit = {"kind": "split_track", "clip": "clip", "person": person["id"], "seen": person["seen"]}
-    edit["first_frame_of_new"] = sum(person["segments"][0]) // 2
-    for corrections in (None, {"edits": [{"id": "split_track.1", "edit": edit}]}):
-        if corrections is not None:
-            ada.post(f"{MATCH}/corrections", json=corrections).raise_for_status()
-        (row,) = succeed("status", "--json", "--project", project_copy).json["matches"]
-        units = {state: len(names) for state, names in row["units"].items()}
-        assert (units["stale"] > 0) == (corrections is not None)
-        found = ada.get(MATCH).json()["state"]
-        assert found["units"] == units
-        because = "out of date because of 1 correction"
-        assert (found["words"], row["now"]) == ((because,) * 2 if corrections else ("ready",) * 2)
-        assert ada.get("/api/matches").json()["matches"][0]["state"] == found
-        (status,) = ada.get("/api/status").json()["matches"]
-        assert status["now"] == found["words"]
 
 
 def test_a_run_of_cameras_alone_offers_them(ada, project_copy):

@@ -69,19 +69,6 @@ def test_a_survey_that_no_run_would_read_is_refused_and_nothing_is_written(surve
     assert [path.name for path in match.iterdir()] == ["match.yaml"]
 
 
-@pytest.mark.parametrize("more", [["--fps", 25], ["--detections", "x"]])
-def test_a_pitch_is_imported_on_its_own(survey, tmp_path, more):
-    answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match", *more)
-    assert answer.code == 2
-    assert "--pitch with --out alone" in answer.err
-
-
-def test_a_match_needs_its_calibration_and_detections(tmp_path):
-    answer = worldpose("import", "--out", tmp_path / "match", "--fps", 25)
-    assert answer.code == 2
-    assert "--calibration with --detections and --fps or with --videos" in answer.err
-
-
 def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
     folder = tmp_path / "m"
     folder.mkdir()

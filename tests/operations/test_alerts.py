@@ -163,17 +163,6 @@ def test_channels_of_a_file_get_a_test_alert_by_a_command(mail_server, webhook, 
     assert answer.code == 2 and "found none" in answer.err
 
 
-def test_a_letter_has_the_run_in_its_subject_on_one_line(mail_server, tmp_path):
-    port = mail_server.server_address[1]
-    mail = Channel("mail", apprise_mail(f"smtp://127.0.0.1:{port}/?to=ann@example.org"))
-    lines = "run m failed: it\nhas two lines"
-    assert tell(tmp_path, mail, Alert("1", "run_failed", lines, "http://here/run", "m")) == 0.0
-    (letter,) = mail_server.letters
-    assert letter["Subject"] == "worldpose: run failed, m"  # an error's lines become no headers
-    body = letter.get_payload(decode=True).decode()
-    assert body.split() == [*lines.split(), "http://here/run"]
-
-
 @pytest.mark.parametrize(
     ("address", "expected"),
     [
@@ -223,15 +212,6 @@ def test_a_bad_file_is_refused_without_its_secrets(text, mode, problem, tmp_path
     with pytest.raises(UsageError, match=problem) as refused:
         channels_of({}, file)
     assert "http://secret" not in str(refused.value)
-
-
-def test_a_login_of_the_file_may_have_any_characters(tmp_path):
-    login = "server = 'smtps://h:4650'\nuser = 'a@b'\npassword = 'p:/?#@ä'"
-    file = write_settings(tmp_path, f"[mail]\n{login}\nreceivers = ['c+d@e.org']")
-    (channel,) = channels_of({}, file)
-    mail = apprise.Apprise.instantiate(channel.address)
-    assert (mail.smtp_host, mail.port, mail.user, mail.password) == ("h", 4650, "a@b", "p:/?#@ä")
-    assert mail.targets == [(False, "c+d@e.org")]
 
 
 def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):

@@ -19,7 +19,6 @@ from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
 from flows.service import recovery, run_queue, watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
-from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
 from flows.service.run_queue import beating, find_process
@@ -254,18 +253,6 @@ def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
     del steps["looking at the inbox"]
     watching._watch_steps(plan, dispatcher)
     assert kept_alerts(plan.state_folder) == {}
-
-
-def test_what_stands_still_is_unhealthy(plan):
-    state = plan.state_folder
-    state.folder.mkdir()
-    kept = '{"told_by": [], "since": "2026-01-01", "match": "", "link": "http://h/status", '
-    entries = (
-        f'"{kind}": {kept}"alert": "{kind}", "text": "why"}}' for kind in ("quality", "run_late")
-    )
-    state.alerts.write_text(f"{{{', '.join(entries)}}}")
-    (finding,) = _check_progress(state)
-    assert (finding.is_well, finding.state) == (False, "why")
 
 
 def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp_path):

@@ -3,20 +3,16 @@
 import os
 import shutil
 import signal
-import sqlite3
 import subprocess
 import time
 import urllib.request
-from contextlib import closing
-from datetime import UTC, datetime, timedelta
 
 import psutil
 import pytest
 from command_line import TINY, WORLDPOSE
-from many_matches import copy_match, prefect_history, queue_history, spread_corrections
+from many_matches import copy_match, queue_history
 from service import Browser, wait_until
 
-from flows.orchestration.prefect_api import PrefectApi
 from flows.registering import register
 from flows.service.run_queue import find_process
 from worldpose.simulation.matches import MatchOptions, simulate_match
@@ -26,19 +22,17 @@ from worldpose.store.run_queue import RunQueue
 from worldpose.store.store import Store
 
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
-FAILURES = 800
-"""More than four pages of Prefect's answers."""
 RESTART_SECONDS = 30.0
-MATCHES, CORRECTIONS, FAILED, DAYS = 200, 500, 500, 30.0
+MATCHES, FAILED, DAYS = 200, 500, 30.0
 """Of the season that is listed; what it costs per match is the same with ten times as many."""
 FIRST_SECONDS, MEGABYTES = 1.0, 500.0
 TRIES = 8
 """The machine is shared: the best try counts."""
 
 
-@pytest.mark.slow  # a service, four starts of it, and the runs of two matches
+@pytest.mark.slow  # a service, two starts of it, and the runs of two matches
 @pytest.mark.timeout(3600)
-def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_database(
+def test_a_service_survives_kills_frozen_runs_and_the_loss_of_its_database(
     served, webhook, tmp_path
 ):
     store, names = Store.create(str(served.project)), []
@@ -46,7 +40,6 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
         simulate_match(SCENARIOS["tiny"], seed, tmp_path / str(seed), MatchOptions(**SMALL))
         names.append(register(store, tmp_path / str(seed))[0].match_id)
     served.options = {"--workers": 1, "--stall-minutes": 1, "--disk-gb": 0}
-    served.environment["PREFECT_SERVER_SERVICES_DB_VACUUM_LOOP_SECONDS"] = "20"
     served.begin()
     queue = RunQueue(LocalBlobs(served.project))
 
@@ -56,48 +49,9 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     def at_work(match, since=0):
         """Return the match's run when a later process than that of a state computes it."""
         found = [it for it in runs_of(match) if it.state == "begun" and it.number > since]
-        return (
-            found[0]
-            if found and find_process(found[0].pid, found[0].flow_run) is not None
-            else None
-        )
+        return next((it for it in found if find_process(it.pid, it.flow_run) is not None), None)
 
-    def deployment(flow):
-        return served.ask(f"/deployments/name/{flow}/worldpose-{flow}")
-
-    prefect = PrefectApi(
-        f"http://127.0.0.1:{served.ports['prefect']}/api", served.secret("prefect")
-    )
-    place = f"/deployments/{deployment('match')['id']}"
-    failed = {"state": {"type": "FAILED", "message": "made"}}
-    for number in range(FAILURES):
-        given = {**failed, "name": f"old, {number}", "parameters": {"match_id": "old"}}
-        prefect.ask(f"{place}/create_flow_run", given)
-
-    # Prefect's own history has an end.
-    (database,) = (served.project / "operations" / "prefect").glob("prefect.db")
-    with closing(sqlite3.connect(database, timeout=60)) as opened:
-        long_ago = f"{datetime.now(UTC) - timedelta(days=31):%Y-%m-%d %H:%M:%S.%f}"
-        opened.execute("update flow_run set end_time = ? where name = 'old, 0'", (long_ago,))
-        opened.commit()
-    oldest = {"flow_runs": {"name": {"any_": ["old, 0"]}}}
-    wait_until(lambda: not served.ask("/flow_runs/filter", oldest), served.explain)
-
-    # Schedules, tags and pauses that people made at Prefect stay through restarts.
-    nightly = {"cron": "0 3 * * *", "timezone": "Europe/Vienna"}
-    own = f"/deployments/{deployment('reprocess')['id']}"
-    prefect.ask(f"{own}/schedules", [{"schedule": nightly, "active": True}])
-    prefect.ask(own, {"tags": ["night"]}, method="PATCH")
-    prefect.ask(f"{own}/pause_deployment", {}, method="POST")
-    made = deployment("reprocess")
-    for _ in range(3):
-        assert served.end() == 0
-        served.begin()
-        again = deployment("reprocess")
-        for field in ("schedules", "tags", "paused", "id"):
-            assert again[field] == made[field], field
-
-    # A killed run restarts, whatever the history.
+    # A killed run restarts.
     browser = Browser(served)
     browser.ask(f"/api/matches/{names[0]}/runs", {"gates": "never"})
     run = wait_until(lambda: at_work(names[0]), served.explain)
@@ -148,20 +102,13 @@ def test_a_service_survives_history_kills_frozen_runs_and_the_loss_of_its_databa
     assert served.end() == 0
 
 
-@pytest.mark.slow  # summaries of all matches are made, and a service starts twice
+@pytest.mark.slow  # summaries of all matches are made
 @pytest.mark.timeout(3600)
-def test_the_lists_of_a_season_are_there_within_a_second(served, project_copy, capsys):
+def test_the_lists_of_a_season_are_there_within_a_second(served, project_copy):
     copy_match(project_copy, TINY, MATCHES - 1)
-    spread_corrections(project_copy, CORRECTIONS)
     runs = queue_history(project_copy, FAILED, DAYS)
     served.project = project_copy
     served.options = {"--workers": 1, "--disk-gb": 0, "--poll-interval": 15}
-    served.begin()
-    match = served.ask("/deployments/name/match/worldpose-match")["id"]
-    sample = {"name": "old", "state": {"type": "FAILED"}, "parameters": {"match_id": "old"}}
-    served.ask(f"/deployments/{match}/create_flow_run", sample)
-    assert served.end() == 0
-    prefect_history(project_copy / "operations" / "prefect" / "prefect.db", runs)
     served.begin()
     browser, times = Browser(served), {}
     wait_until(lambda: not browser.ask("/api/matches")["left"], served.explain)
@@ -188,8 +135,6 @@ def test_the_lists_of_a_season_are_there_within_a_second(served, project_copy, c
     times["status"] = min(first_line("status") for _ in range(TRIES))
     service = psutil.Process(served.process.pid)
     sizes = [it.memory_info().rss / 1e6 for it in (service, *service.children(recursive=True))]
-    with capsys.disabled():
-        print(f"\nseconds: {times}\nMB: {[round(each) for each in sizes]}")
     assert max(times.values()) < FIRST_SECONDS
     assert max(sizes) < MEGABYTES
     kept = RunQueue(LocalBlobs(project_copy)).runs()  # the last of each match, and those of a day
