@@ -94,17 +94,3 @@ def test_what_is_wrong_is_told(boards, tmp_path, place, options, kind, told):
     assert isinstance(result.exception, kind), result.exception
     assert told in str(result.exception)
     assert not (tmp_path / "lenses.toml").exists()
-
-
-def test_images_that_cannot_be_read_or_differ_in_size_are_named(tmp_path):
-    folder = tmp_path / "cam"
-    folder.mkdir()
-    (folder / "1.png").write_bytes(b"no image")
-    found = calibrate(folder, *OPTIONS, "--out", tmp_path / "x.toml")
-    assert "1.png: expected an image, found none that OpenCV reads" in str(found.exception)
-    for name, size in (("1.png", (48, 64)), ("2.png", (64, 48))):
-        cv2.imwrite(str(folder / name), np.zeros(size, np.uint8))
-    found = calibrate(folder, *OPTIONS, "--out", tmp_path / "x.toml")
-    assert "cam: expected images of one size, found 64 x 48 in 1.png, 48 x 64 in 2.png" in str(
-        found.exception
-    )

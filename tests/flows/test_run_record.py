@@ -63,15 +63,6 @@ def test_a_run_during_an_edit_has_the_match_as_it_began_and_the_edit_is_seen_nex
     assert {unit.unit for unit in found.units if unit.own_reasons} == {"tracking/clip"}
 
 
-def test_an_iteration_is_refused_when_the_one_before_is_of_another_state_of_the_match(store):
-    match = open_match(store, TINY)
-    RunLog.begin(store, match, METHOD, {}, iteration=2)  # the first is there
-    merge(store)
-    RunLog.begin(store, match, METHOD, {}, iteration=2)  # and stays there for who began earlier
-    with pytest.raises(EditedMeanwhileError, match="filtering/clip"):
-        RunLog.begin(store, open_match(store, TINY), METHOD, {}, iteration=2)
-
-
 def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monkeypatch):
     begun = []
 

@@ -12,7 +12,7 @@ from page_client import MATCH, log_in, served
 
 from data_contracts.review import NamedTrack
 from flows import overview
-from flows.layers import layer_path, write_layer
+from flows.layers import write_layer
 from flows.overview import PAGE, Overview, make_summary, read_summary
 from flows.registering import open_match
 from flows.review.corrections import keep_edits
@@ -108,23 +108,6 @@ def test_a_summary_is_used_until_something_changes_that_it_was_made_from(
     overview.code_digest.cache_clear()
 
 
-BROKEN = {
-    "project": b"detection.stride: [",
-    f"matches/{TINY}": b"- 1",
-    "venues/hall": b"pitch: 3",
-}
-
-
-@pytest.mark.parametrize("layer", BROKEN)
-def test_a_broken_layer_of_settings_can_be_corrected(store, layer):
-    if layer.startswith("venues"):
-        write_layer(store, f"matches/{TINY}", {"venue": "hall"})
-    store.blobs.put(layer_path(layer), BROKEN[layer])
-    assert layer in read_summary(store, TINY).problem
-    write_layer(store, layer, {})
-    assert read_summary(store, TINY).problem == ""
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -141,16 +124,6 @@ def test_files_that_settings_name_are_watched_even_if_they_are_absent(store, set
     assert read_summary(store, TINY) == first
     file.mkdir()
     assert read_summary(store, TINY).made_from != first.made_from
-
-
-def test_a_match_is_read_again_after_a_look_that_failed(store, monkeypatch):
-    looked = Overview(store)
-    with monkeypatch.context() as patch:
-        patch.setattr(overview, "read_summary", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            looked.look()
-    (match,) = looked.look()
-    assert match.words == "ready"
 
 
 def test_a_summary_that_is_damaged_or_of_another_match_is_made_again(store):

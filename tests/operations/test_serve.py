@@ -93,29 +93,6 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     assert served.check().code == 1
 
 
-@pytest.mark.timeout(3600)
-def test_prefect_keeps_runs_that_wait_in_postgres(served, postgres, tmp_path):
-    address, ask = postgres
-    served.environment["PREFECT_API_DATABASE_CONNECTION_URL"] = address
-    served.begin()
-    assert served.check().json["healthy"], served.explain()
-    names = ask("select name from flow order by name").split()
-    assert names == ["finetune", "ingest", "match", "release", "reprocess"]
-    small = ("--duration", 0.2, "--cameras", 3, "--players", 2, "--no-stills", "--no-video")
-    folder = tmp_path / "small"
-    succeed("simulate", "--scenario", "tiny", *small, "--out", folder)
-    # One click far off is asked about, as soon as that camera is calibrated.
-    clicks = folder / "annotations" / "static_calibration" / "cam01.json"
-    clicked = json.loads(clicks.read_text())
-    clicked["points"][0]["xy"][0] += 150.0
-    clicks.write_text(json.dumps(clicked))
-    shutil.copytree(folder, served.project / "inbox" / "small")
-    query = "select state_name from flow_run where name like 'tiny-0-%'"
-    wait_until(lambda: ask(query) in ("Suspended", "Failed", "Crashed"), served.explain)
-    assert ask(query) == "Suspended"
-    assert served.end() == 0
-
-
 def test_a_second_service_of_a_project_and_an_absent_server_are_refused(tmp_path):
     from flows.service.layout import StateFolder
 
