@@ -5,22 +5,18 @@ import os
 import re
 
 import numpy as np
-
 from worldpose.video.files import write_video
 
-from .kinds import FILES, add, exchange, one
+from .kinds import FILES, add, exchange, mutation, one
 
 PER_PERSON, JOINTS = ("keypoints", "confidence", "boxes", "score"), ("keypoints", "confidence")
 
 
-def people(change, everywhere=True):
+@mutation
+def people(draft, rng, change, everywhere=True):
     """Replace arrays of one camera, or of all, by what a function of them and of chance returns."""
-
-    def apply(draft, rng):
-        for name in list(draft.seen) if everywhere else [one(rng, draft.seen)]:
-            draft.seen[name].update(change(draft.seen[name], rng))
-
-    return apply
+    for name in list(draft.seen) if everywhere else [one(rng, draft.seen)]:
+        draft.seen[name].update(change(draft.seen[name], rng))
 
 
 def arrays(change, names=PER_PERSON, everywhere=True):
@@ -166,14 +162,12 @@ def clip(**values):
     return lambda draft, rng: draft.spec["clips"][0].update(values)
 
 
-def true_offset(offset):
-    def apply(draft, rng):
-        name = one(rng, draft.cameras)
-        if name in draft.seen:
-            draft.camera_spec(name)["offset_frames"] = offset
-            draft.seen[name]["frame"] = draft.seen[name]["frame"] + offset
-
-    return apply
+@mutation
+def true_offset(draft, rng, offset):
+    name = one(rng, draft.cameras)
+    if name in draft.seen:
+        draft.camera_spec(name)["offset_frames"] = offset
+        draft.seen[name]["frame"] = draft.seen[name]["frame"] + offset
 
 
 CLIP = {"id": "a", "first_frame": 0, "frame_count": 5}
@@ -204,18 +198,16 @@ add(
 )
 
 
-def camera_id(new):
-    def apply(draft, rng):
-        old = one(rng, draft.cameras)
-        draft.camera_spec(old)["id"] = new
-        for content in (draft.cameras, draft.seen, draft.clicks):
-            if old in content:
-                content[new] = content.pop(old)
-        for each in (draft.given or {}).values():
-            if each.get("name") == old:
-                each["name"] = new
-
-    return apply
+@mutation
+def camera_id(draft, rng, new):
+    old = one(rng, draft.cameras)
+    draft.camera_spec(old)["id"] = new
+    for content in (draft.cameras, draft.seen, draft.clicks):
+        if old in content:
+            content[new] = content.pop(old)
+    for each in (draft.given or {}).values():
+        if each.get("name") == old:
+            each["name"] = new
 
 
 IDS = {
@@ -301,20 +293,17 @@ ROLES = {
 """The match that has a file of each role, and its path, by camera."""
 
 
-def strike(role, change, is_known=False):
+@mutation
+def strike(draft, rng, role, change, is_known=False):
     """Change one written file; the meaning of its bytes is then unknown, unless it is said."""
-
-    def apply(draft, rng):
-        draft.coco = draft.coco or role == "coco"
-        if role == "pitch":
-            draft.pitch = {"length": 105.0, "width": 68.0, "crown": 0.2}
-        path = ROLES[role][1].format(one(rng, draft.cameras))
-        own = np.random.default_rng(int(rng.integers(2**32)))
-        draft.after.append(lambda folder: (folder / path).is_file() and change(folder / path, own))
-        if not is_known:
-            draft.truth = None
-
-    return apply
+    draft.coco = draft.coco or role == "coco"
+    if role == "pitch":
+        draft.pitch = {"length": 105.0, "width": 68.0, "crown": 0.2}
+    path = ROLES[role][1].format(one(rng, draft.cameras))
+    own = np.random.default_rng(int(rng.integers(2**32)))
+    draft.after.append(lambda folder: (folder / path).is_file() and change(folder / path, own))
+    if not is_known:
+        draft.truth = None
 
 
 def rewrite(change):

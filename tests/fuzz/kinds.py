@@ -42,6 +42,15 @@ def add(group, functions, *, phase=DATA, base="any", harmless=""):
         KINDS[name] = Kind(group, apply, phase, base, is_harmless)
 
 
+def mutation(function):
+    """Let a function of a draft, of chance, and of more be named in a table with what is more."""
+
+    def stated(*values, **named):
+        return lambda draft, rng: function(draft, rng, *values, **named)
+
+    return stated
+
+
 def one(rng, values):
     """One of the values, by chance."""
     values = list(values)
@@ -55,58 +64,48 @@ def middle_of(draft):
     return draft.people.reshape(-1, 3).mean(axis=0)
 
 
-def change(**values):
+@mutation
+def change(draft, rng, **values):
     """Change one camera; a function is of its former value."""
-
-    def apply(draft, rng):
-        name = one(rng, draft.cameras)
-        camera = draft.cameras[name]
-        new = {k: v(getattr(camera, k)) if callable(v) else v for k, v in values.items()}
-        draft.cameras[name] = replace(camera, **new)
-
-    return apply
+    name = one(rng, draft.cameras)
+    camera = draft.cameras[name]
+    new = {k: v(getattr(camera, k)) if callable(v) else v for k, v in values.items()}
+    draft.cameras[name] = replace(camera, **new)
 
 
 def focal(factor):
     return change(focal=lambda f: tuple(np.multiply(f, factor).tolist()))
 
 
-def scale(*factors):
-    def apply(draft, rng):
-        for name, factor in zip(list(draft.cameras), np.broadcast_to(factors, 4), strict=False):
-            camera = draft.cameras[name]
-            sizes = [max(1, round(side * factor)) for side in (camera.width, camera.height)]
-            principal = tuple((c + 0.5) * factor - 0.5 for c in camera.principal)
-            long = tuple(f * factor for f in camera.focal)
-            draft.cameras[name] = replace(
-                camera, width=sizes[0], height=sizes[1], focal=long, principal=principal
-            )
-        draft.pixel_noise *= min(1.0, *factors)
-        draft.click_noise *= min(1.0, *factors)
-
-    return apply
-
-
-def roll(angle):
-    def apply(draft, rng):
-        name = one(rng, draft.cameras)
+@mutation
+def scale(draft, rng, *factors):
+    for name, factor in zip(list(draft.cameras), np.broadcast_to(factors, 4), strict=False):
         camera = draft.cameras[name]
-        draft.cameras[name] = camera.looking(camera.center, middle_of(draft), roll=angle)
+        sizes = [max(1, round(side * factor)) for side in (camera.width, camera.height)]
+        principal = tuple((c + 0.5) * factor - 0.5 for c in camera.principal)
+        long = tuple(f * factor for f in camera.focal)
+        draft.cameras[name] = replace(
+            camera, width=sizes[0], height=sizes[1], focal=long, principal=principal
+        )
+    draft.pixel_noise *= min(1.0, *factors)
+    draft.click_noise *= min(1.0, *factors)
 
-    return apply
+
+@mutation
+def roll(draft, rng, angle):
+    name = one(rng, draft.cameras)
+    camera = draft.cameras[name]
+    draft.cameras[name] = camera.looking(camera.center, middle_of(draft), roll=angle)
 
 
-def place(out, height, aside):
+@mutation
+def place(draft, rng, out, height, aside):
     """Put a camera so far from the people, and let it look past them [m]."""
-
-    def apply(draft, rng):
-        name, middle = one(rng, draft.cameras), middle_of(draft)
-        camera = draft.cameras[name]
-        way = (camera.center - middle)[:2] / np.linalg.norm((camera.center - middle)[:2])
-        aim = middle + [-aside * way[1], aside * way[0], 0.0]
-        draft.cameras[name] = camera.looking([*(middle[:2] + out * way), height], aim)
-
-    return apply
+    name, middle = one(rng, draft.cameras), middle_of(draft)
+    camera = draft.cameras[name]
+    way = (camera.center - middle)[:2] / np.linalg.norm((camera.center - middle)[:2])
+    aim = middle + [-aside * way[1], aside * way[0], 0.0]
+    draft.cameras[name] = camera.looking([*(middle[:2] + out * way), height], aim)
 
 
 def put(draft, name, camera):
@@ -115,13 +114,11 @@ def put(draft, name, camera):
     draft.spec["cameras"].append({"id": name, "width": camera.width, "height": camera.height})
 
 
-def count_of(count):
-    def apply(draft, rng):
-        for name in list(draft.cameras)[count:]:
-            del draft.cameras[name]
-        draft.spec["cameras"] = draft.spec["cameras"][:count]
-
-    return apply
+@mutation
+def count_of(draft, rng, count):
+    for name in list(draft.cameras)[count:]:
+        del draft.cameras[name]
+    draft.spec["cameras"] = draft.spec["cameras"][:count]
 
 
 BARREL, SIXTH = (-0.15, 0.03, 0.0, 0.0, 0.0), (-0.2, 0.08, 0.0, 0.0, -0.02)
@@ -155,15 +152,12 @@ add("camera", lenses, phase=FILM, base="given", harmless="all")
 # ------------------------------------------------------------- calibration.toml and pitch
 
 
-def table(change, everywhere=False):
+@mutation
+def table(draft, rng, change, everywhere=False):
     """Change one table of the calibration, or all."""
-
-    def apply(draft, rng):
-        every = list(draft.given.values())
-        for each in every if everywhere else [one(rng, every)]:
-            change(each)
-
-    return apply
+    every = list(draft.given.values())
+    for each in every if everywhere else [one(rng, every)]:
+        change(each)
 
 
 def entry(key, value, everywhere=False):
@@ -278,17 +272,14 @@ def points_of(draft, rng):
 SIDES, ENDS = {"left": "right", "right": "left"}, {"near": "far", "far": "near"}
 
 
-def rename(words, everywhere=False):
+@mutation
+def rename(draft, rng, words, everywhere=False):
     """Exchange words in the names of points, in one camera or in all."""
-
-    def apply(draft, rng):
-        every = [content["points"] for content in draft.clicks.values()]
-        for points in every if everywhere else [points_of(draft, rng)]:
-            for point in points:
-                parts = point["name"].split("_")
-                point["name"] = "_".join(words.get(part, part) for part in parts)
-
-    return apply
+    every = [content["points"] for content in draft.clicks.values()]
+    for points in every if everywhere else [points_of(draft, rng)]:
+        for point in points:
+            parts = point["name"].split("_")
+            point["name"] = "_".join(words.get(part, part) for part in parts)
 
 
 def turn_pitch(draft, rng):
@@ -296,25 +287,20 @@ def turn_pitch(draft, rng):
     draft.truth = draft.people * [-1.0, -1.0, 1.0]
 
 
-def noise(size, share=1.0):
-    def apply(draft, rng):
-        for point in points_of(draft, rng):
-            if rng.random() < share:
-                xy = np.add(point["xy"], rng.normal(0, size, 2))
-                point["xy"] = np.clip(xy, 0, None).round(2).tolist()
-
-    return apply
+@mutation
+def noise(draft, rng, size, share=1.0):
+    for point in points_of(draft, rng):
+        if rng.random() < share:
+            xy = np.add(point["xy"], rng.normal(0, size, 2))
+            point["xy"] = np.clip(xy, 0, None).round(2).tolist()
 
 
-def move_clicks(change):
+@mutation
+def move_clicks(draft, rng, change):
     """Move the clicks of one camera."""
-
-    def apply(draft, rng):
-        name = one(rng, draft.clicks)
-        for point in draft.clicks[name]["points"]:
-            point["xy"] = [float(v) for v in change(point["xy"], draft.cameras[name])]
-
-    return apply
+    name = one(rng, draft.clicks)
+    for point in draft.clicks[name]["points"]:
+        point["xy"] = [float(v) for v in change(point["xy"], draft.cameras[name])]
 
 
 def shuffle_clicks(draft, rng):
@@ -322,26 +308,22 @@ def shuffle_clicks(draft, rng):
         rng.shuffle(content["points"])
 
 
-def few_clicks(count):
-    def apply(draft, rng):
-        del points_of(draft, rng)[count:]
-
-    return apply
+@mutation
+def few_clicks(draft, rng, count):
+    del points_of(draft, rng)[count:]
 
 
-def draw(count, *, is_wrong=False, alone=False):
-    def apply(draft, rng):
-        for name, content in draft.clicks.items():
-            for line in LINES:
-                if pixels := drawn_line(draft, draft.cameras[name], line, count, rng):
-                    called = one(rng, sorted(LINES.keys() - {line})) if is_wrong else line
-                    if called not in [each["name"] for each in content["drawn"]]:
-                        content["drawn"].append({"name": called, "xy": pixels})
-                    break
-            if alone:
-                content["points"] = []
-
-    return apply
+@mutation
+def draw(draft, rng, count, *, is_wrong=False, alone=False):
+    for name, content in draft.clicks.items():
+        for line in LINES:
+            if pixels := drawn_line(draft, draft.cameras[name], line, count, rng):
+                called = one(rng, sorted(LINES.keys() - {line})) if is_wrong else line
+                if called not in [each["name"] for each in content["drawn"]]:
+                    content["drawn"].append({"name": called, "xy": pixels})
+                break
+        if alone:
+            content["points"] = []
 
 
 UNKNOWN = {"name": "sideline", "xy": [[1.0, 2.0]]}

@@ -5,9 +5,8 @@ import re
 import shutil
 
 import numpy as np
-from fastapi.testclient import TestClient
-
 from data_contracts.match import Registration
+from fastapi.testclient import TestClient
 from flows.cli.project import _match_status
 from flows.registering import open_match
 from flows.review.verdicts import reviews_of, warnings_of
@@ -21,7 +20,7 @@ from worldpose.store.store import Store, open_run
 
 from .content_kinds import SPOILS
 from .judging import run_match
-from .kinds import add, one
+from .kinds import add, mutation, one
 
 MATCH, TOKEN = "fuzz", "a-token-of-twenty-four.."
 PLACES = {
@@ -47,18 +46,15 @@ class Project:
             file.write_bytes(seal(known.model_copy(update={"folder": str(self.folder)})))
 
 
-def spoil(pattern, change):
+@mutation
+def spoil(project, rng, pattern, change):
     """Change one file of the store; None removes it."""
-
-    def apply(project, rng):
-        files = sorted(path for path in project.root.glob(pattern) if path.is_file())
-        if files and change is None:
-            one(rng, files).unlink()
-        elif files:
-            file = one(rng, files)
-            file.write_bytes(change(file.read_bytes() or b"x", rng))
-
-    return apply
+    files = sorted(path for path in project.root.glob(pattern) if path.is_file())
+    if files and change is None:
+        one(rng, files).unlink()
+    elif files:
+        file = one(rng, files)
+        file.write_bytes(change(file.read_bytes() or b"x", rng))
 
 
 def act(change):
