@@ -104,6 +104,27 @@ def test_always_asks_behind_every_gate_in_turn(store):
     assert run(store, "always").run_id == latest_run(store, TINY).run_id
 
 
+def test_a_verdict_holds_for_the_bytes_whatever_key_gives_them(store):
+    """A setting that changes nothing of a camera changes its key; its approval stands."""
+    run(store, "auto")
+    approve(store)
+    match = open_match(store, TINY)
+    results = store.run(TINY, "0001").results
+    manifest = store.manifest(TINY, "static_calibration", "cam03", results[WRONG])
+
+    class Twin:
+        """The store, with the same result under another key."""
+
+        def manifest(self, *place):
+            return manifest
+
+    gatekeeper = Gatekeeper(Twin(), match, "auto")
+    assert gatekeeper.list_held_units("static_calibration", {WRONG: "f" * 32}) == ()
+    changed = manifest.model_copy(update={"content": "0" * 64})
+    Twin.manifest = lambda self, *place: changed
+    assert units(gatekeeper.list_held_units("static_calibration", {WRONG: "f" * 32})) == [WRONG]
+
+
 def test_what_was_approved_is_asked_again_only_if_it_got_worse(store, monkeypatch):
     key = store.run(TINY, "0001").results[WRONG]
     manifest = store.manifest(TINY, "static_calibration", "cam03", key)

@@ -13,7 +13,7 @@ from page_client import HERE, MATCH, TOKEN, a_click, moved
 
 from flows.cli.options import certificate_and_key
 from flows.web.access import EDITING, SESSION_SECONDS, WRONG_TOKENS, access_for
-from flows.web.app import OPEN, create_app
+from flows.web.app import BODY_BYTES, OPEN, create_app
 from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
@@ -179,6 +179,18 @@ def test_guesses_are_limited_for_all_addresses_together_but_not_for_a_known_brow
     assert codes[-1] == 429
 
 
+def test_a_slow_guesser_locks_nobody_out():
+    access = access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
+    assert [access.may_try("", now=0.0) for _ in range(WRONG_TOKENS + 1)][-2:] == [True, False]
+    assert access.may_try("another", now=0.0)
+    tried = [access.may_try("", now=second) for second in range(20, 120, 2)]
+    assert all(tried)
+    for _ in range(50):  # right tokens use nothing up
+        assert access.may_try("", now=121.0)
+        access.forgive("")
+    assert access.guesser("Ada", "forged.0123") == ""
+
+
 @pytest.mark.parametrize(("mode", "is_private"), [(0o600, True), (0o400, True), (0o644, False)])
 def test_a_key_that_others_can_read_is_refused(mode, is_private, tmp_path):
     key = tmp_path / "key.pem"
@@ -202,6 +214,13 @@ def test_a_name_that_would_forge_a_log_line_logs_nobody_in(stranger, caplog):
 
 
 JSON = {"content-type": "application/json"}
+
+
+def test_a_body_that_is_too_long_or_of_unknown_length_is_refused(ada):
+    long = ada.post(f"{MATCH}/runs", content=b" " * (BODY_BYTES + 1), headers=JSON)
+    assert long.status_code == 413
+    pieces = ada.post(f"{MATCH}/runs", content=iter([b"{", b"}"]), headers=JSON)
+    assert pieces.status_code == 411
 
 
 def test_listening_to_other_machines_needs_a_token_and_a_name():

@@ -129,6 +129,18 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
     assert "tracking/clip" in {unit.unit for unit in run_status(store, TINY).units}
 
 
+def test_a_later_iteration_is_stale_in_every_pass(store):
+    write_layer(store, PROJECT, {"iterations": 2})
+    finish(store, iteration=2)
+    found = run_status(store, TINY)
+    # Nothing of the second pass is there; the first pass stands in the run before.
+    assert {unit.iteration for unit in found.units} == {2}
+    edit_box(store)
+    found = run_status(store, TINY)
+    assert {unit.iteration for unit in found.units} == {1, 2}
+    assert len({unit.key for unit in found.to_compute}) == len(found.to_compute)
+
+
 def test_a_result_that_holds_a_withdrawn_edit_is_not_taken_for_one_without_it():
     edits = [MergedTracks(clip="clip", kept=0, merged=person) for person in (1, 2, 3)]
     held = [edit.model_dump(mode="json") for edit in edits[:2]]

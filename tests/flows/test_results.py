@@ -16,6 +16,7 @@ from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.registering import open_match
 from flows.reports import viewer
 from flows.reports.people import body_tables
+from flows.results.best_results import LIMB_ENDS
 from worldpose import open_run
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
@@ -61,6 +62,23 @@ def test_a_report_compares_bodies_with_joints_in_held_out_cameras(tiny_run):
         assert row[1:3] == tuple(f"{1e3 * value:.1f}" for value in shown)
         certain = figures[f"held_out_certain_excess_m.{row[0]}"]
         assert (row[-1] != "") == (certain > 0.0)
+
+
+def test_joints_of_bodies_are_exported_where_the_detector_sees_them(tiny_run, tmp_path):
+    succeed(*("export", TINY, "--format", "joints", "--out", tmp_path, "--project", tiny_run))
+    tracks = read_joints(tmp_path / "joints.npz")
+    result = open_run(tiny_run, TINY)["body_fitting/clip"]
+    ends = np.isin(np.arange(17), LIMB_ENDS)
+    offsets = np.where(ends[:, None], 0.0, result["joint_offsets"].values)
+    from_body = np.where(tracks.source >= 2, 1.0, np.nan)[..., None]
+    moved = np.linalg.norm(from_body * (tracks.joints - result["joints"].values), axis=-1)
+    assert np.abs(offsets).max() > 1e-3
+    np.testing.assert_allclose(
+        np.nanmax(moved, axis=(0, 1)), np.linalg.norm(offsets, axis=-1), rtol=1e-6, atol=1e-12
+    )
+    # The error that all views share is one about a constant offset: it stays.
+    same = from_body[..., None] * np.stack([tracks.covariance, result["covariance"].values])
+    np.testing.assert_array_equal(*same)
 
 
 def test_exported_coco_lies_on_the_detections(tiny, tiny_run, tmp_path):

@@ -302,6 +302,13 @@ def test_a_venue_that_does_not_exist_is_refused_and_a_wrong_one_can_be_corrected
     assert shown(store, TINY)["tracking.gate_m"] == (0.6, "venue parken")
 
 
+def test_exports_have_the_pitch_of_the_layers(store):
+    registration = open_match(store, TINY).registration
+    folder = registration.model_copy(update={"folder": store.url})  # without pitch.json
+    write_layer(store, "project", {"pitch": {"length": 101.0, "width": 66.0}})
+    assert layers.pitch_of(store, folder).length == 101.0
+
+
 @pytest.mark.parametrize(
     ("text", "found"),
     [

@@ -163,6 +163,17 @@ def test_channels_of_a_file_get_a_test_alert_by_a_command(mail_server, webhook, 
     assert answer.code == 2 and "found none" in answer.err
 
 
+def test_a_letter_has_the_run_in_its_subject_on_one_line(mail_server, tmp_path):
+    port = mail_server.server_address[1]
+    mail = Channel("mail", apprise_mail(f"smtp://127.0.0.1:{port}/?to=ann@example.org"))
+    lines = "run m failed: it\nhas two lines"
+    assert tell(tmp_path, mail, Alert("1", "run_failed", lines, "http://here/run", "m")) == 0.0
+    (letter,) = mail_server.letters
+    assert letter["Subject"] == "worldpose: run failed, m"  # an error's lines become no headers
+    body = letter.get_payload(decode=True).decode()
+    assert body.split() == [*lines.split(), "http://here/run"]
+
+
 @pytest.mark.parametrize(
     ("address", "expected"),
     [

@@ -7,6 +7,7 @@ import re
 import shutil
 from contextvars import copy_context
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from threading import Thread
 from uuid import uuid4
 
@@ -24,6 +25,7 @@ from flows.orchestration.prefect_api import UnreachablePrefectError
 from flows.registering import register
 from flows.service import recovery
 from flows.service.alerts import alerts_now
+from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, install
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
@@ -300,6 +302,15 @@ def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan
         for each in runs:
             with pytest.raises(RefusedRunError, match=reason):
                 require_installed(each, installed)
+
+
+def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_path):
+    store = Store.create(tmp_path)
+    assert release_folder(store, "m", "v1.0", None) == tmp_path / "releases" / "m" / "v1.0"
+    assert release_folder(store, "m", "v1.0", "/elsewhere") == Path("/elsewhere")
+    for bad in ("", "../x", "/x", "a/b", ".hidden"):
+        with pytest.raises(UsageError, match="name"):
+            release_folder(store, "m", bad, None)
 
 
 def test_another_project_of_the_same_name_is_refused(plan):
