@@ -1,7 +1,5 @@
 """Traces of a run: Prefect's spans and ours in one trace, sent to an OTLP collector."""
 
-import time
-
 import pytest
 from command_line import TINY, succeed
 
@@ -24,17 +22,11 @@ def collector(webhook):
     return webhook.base, spans
 
 
-def run(tiny, project, **environment):
-    began = time.monotonic()
-    succeed("run", tiny, "--project", project, environment=environment)
-    return time.monotonic() - began
-
-
 @pytest.mark.slow
 def test_spans_of_prefect_and_of_units_are_one_trace(collector, tiny, tmp_path):
     base, spans = collector
     asked = {"OTEL_EXPORTER_OTLP_ENDPOINT": base, "OTEL_SERVICE_NAME": "lab"}
-    run(tiny, tmp_path / "project", **asked)
+    succeed("run", tiny, "--project", tmp_path / "project", environment=asked)
     found = list(spans())
     record = Store.open(str(tmp_path / "project")).run(TINY)
     assert len({span.trace_id for _, span in found}) == 1
