@@ -208,22 +208,6 @@ def test_what_schedules_missed_runs_once_after_a_start(plan, prefect, is_updated
         prefect.ask(f"/flow_runs/{run['id']}", method="DELETE")
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("reprocess=0 3 * *", "Invalid cron string"),
-        ("reprocess=0 3 * * * Mars/X", "Invalid timezone"),
-        ("match=0 3 * * *", "'match'"),
-        ("0 3 * * *", "'0 3"),
-    ],
-)
-def test_a_schedule_that_cannot_be_is_refused_before_anything_starts(text, said):
-    with pytest.raises(UsageError, match=re.escape(said)):
-        parse_schedules([text])
-    with pytest.raises(UsageError, match="twice"):
-        parse_schedules(["reprocess=0 3 * * * UTC", "reprocess=0 4 * * * UTC"])
-
-
 def planned_runs(prefect, deployment):
     wanted = {"deployment_id": {"any_": [deployment]}, "tags": {"all_": ["auto-scheduled"]}}
     return prefect.list_all("flow_runs", flow_runs=wanted)
