@@ -28,7 +28,7 @@ from flows.service.health import check_worker
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan, deployment_names
-from flows.service.run_queue import find_process, queued_run
+from flows.service.run_queue import FIXED, find_process, queued_run
 from worldpose.errors import InputError
 from worldpose.store.run_queue import ENDED, RunQueue, queue_of
 
@@ -74,7 +74,8 @@ def recover(plan: ServePlan, *, at_start: bool = False) -> list[str]:
 def adopt_due(runs: MatchRuns) -> None:
     """Take runs into the queue that schedules and people made at Prefect, and that are due.
 
-    Of runs that a schedule missed, the last one with the same parameters stands for all.
+    Of runs that a schedule missed, the last one with the same parameters stands for all; what a
+    deployment decides does not count.
     """
     kinds = of_types("SCHEDULED", "PENDING", "RUNNING")
     passed = {"before_": datetime.now(UTC).isoformat()}
@@ -82,7 +83,8 @@ def adopt_due(runs: MatchRuns) -> None:
     last: dict[object, dict[str, Any]] = {}
     for run in sorted(due, key=lambda run: parse_time(run["expected_start_time"])):
         if "auto-scheduled" in run["tags"] and run["state_name"] in ("Scheduled", "Late"):
-            same = (run["deployment_id"], json.dumps(run["parameters"], sort_keys=True))
+            own = {name: it for name, it in run["parameters"].items() if name not in FIXED}
+            same = (run["deployment_id"], json.dumps(own, sort_keys=True))
             if (missed := last.get(same)) is not None:
                 why = "it was missed; a later run stands for it"
                 LOG.info("%s: %s", missed["name"], why)
@@ -108,13 +110,15 @@ def _recover(
     plan: ServePlan, runs: MatchRuns, run: QueuedRun, there: PrefectRun | None, patience: timedelta
 ) -> bool:
     """Bring a run that has not ended forward; return whether it was started again."""
-    kind = None if there is None else there["state_type"]
-    is_over = there is not None and kind not in ACTIVE
-    killed: QueuedRun | None = run
     if run.state == "begun":
         is_elsewhere = not plan.owns_prefect and run.host != platform.node()
         if is_elsewhere or find_process(run.pid, run.flow_run) is not None:
             return False
+    there = _with_these_options(plan, runs, run, there)
+    kind = None if there is None else there["state_type"]
+    is_over = there is not None and kind not in ACTIVE
+    killed: QueuedRun | None = run
+    if run.state == "begun":
         if kind == "PAUSED":  # suspended, and killed before the queue was told
             runs.queue.change(run, "waiting", "for review")
             return False
@@ -141,6 +145,23 @@ def _recover(
         return False
     _start_again(runs, killed, there)
     return True
+
+
+def _with_these_options(
+    plan: ServePlan, runs: MatchRuns, run: QueuedRun, there: PrefectRun | None
+) -> PrefectRun | None:
+    """Return a run at Prefect; None if it has former options of the service, and is replaced.
+
+    A scan of the inbox has the options as a parameter, and the worker refuses others than its own.
+    """
+    own = plan.model_dump(mode="json")
+    if there is None or there["state_type"] not in ("SCHEDULED", "PENDING", "RUNNING"):
+        return there
+    if there["parameters"].get("plan", own) == own:
+        return there
+    why = "the options of the service have changed; a run with the new ones stands for it"
+    runs.set_state(run.flow_run, "CANCELLED", why)
+    return None
 
 
 def _start_again(runs: MatchRuns, run: QueuedRun, there: PrefectRun | None) -> None:

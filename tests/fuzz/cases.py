@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
 from worldpose.video.files import write_video
 
 from . import content_kinds  # noqa: F401 - it registers

@@ -5,6 +5,7 @@ import os
 import re
 
 import numpy as np
+
 from worldpose.video.files import write_video
 
 from .kinds import FILES, add, exchange, mutation, one

@@ -12,12 +12,13 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
+
 from flows.match import task_of
 from flows.registering import register
 from flows.review.advice import clock_advice
 from flows.run_record import RunLog
 from flows.settings import parse_overrides, selected_stages
-from scipy.optimize import linear_sum_assignment
 from worldpose.errors import DegenerateError, InputError, InternalError, StoreError, WorldposeError
 from worldpose.store.store import Store
 

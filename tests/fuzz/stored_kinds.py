@@ -5,8 +5,9 @@ import re
 import shutil
 
 import numpy as np
-from data_contracts.match import Registration
 from fastapi.testclient import TestClient
+
+from data_contracts.match import Registration
 from flows.cli.project import _match_status
 from flows.registering import open_match
 from flows.review.verdicts import reviews_of, warnings_of

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worldpose.errors import InputError, InternalError
-from worldpose.store.store import Store
 
 from fuzz import judging
 from fuzz.cases import base_of, build, draw_case, parse_case, run_case
 from fuzz.judging import failure_class, forked
 from fuzz.kinds import KINDS
+from worldpose.errors import InputError, InternalError
+from worldpose.store.store import Store
 
 
 @pytest.mark.parametrize("cases", [20, pytest.param(48, marks=pytest.mark.slow)])

@@ -86,7 +86,8 @@ def images(limits, tmp_path_factory):
     shared = ["--network=host", "--build-arg", f"BASE={BASE}"]
     shared += [f"--volume={mount}" for mount in mounts]
     file = ROOT / "infra" / "container" / "Containerfile"
-    podman("build", *shared, "-f", file, "-t", "localhost/worldpose", ROOT)
+    plain = ["--build-arg", "REQUIREMENTS=constraints.txt"]  # PyTorch as this machine has it
+    podman("build", *shared, *plain, "-f", file, "-t", "localhost/worldpose", ROOT)
     for name in ("postgres", "s3", "prometheus"):
         file = STAND_INS / f"{name}.Containerfile"
         podman("build", *shared, "-f", file, "-t", f"localhost/worldpose-test-{name}", STAND_INS)

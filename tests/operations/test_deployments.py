@@ -21,7 +21,7 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary
 from service import wait_until
 
 from data_contracts.review import ReviewDecision
-from flows.orchestration.prefect_api import UnreachablePrefectError
+from flows.orchestration.prefect_api import UnreachablePrefectError, of_types
 from flows.registering import register
 from flows.service import recovery
 from flows.service.alerts import alerts_now
@@ -206,6 +206,26 @@ def test_what_schedules_missed_runs_once_after_a_start(plan, prefect, is_updated
             prefect.cancel(run, "")
     for run in left:
         prefect.ask(f"/flow_runs/{run['id']}", method="DELETE")
+
+
+def test_a_week_of_missed_scans_is_one_scan_with_the_options_of_now(plan, prefect):
+    found = prefect.deployment("ingest/ops-ingest")
+    for day in range(7, 0, -1):
+        at = (datetime.now(UTC) - timedelta(days=day)).isoformat()
+        state = {"type": "SCHEDULED", "state_details": {"scheduled_time": at}}
+        missed = {"name": f"scan {day}", "tags": ["auto-scheduled"], "state": state}
+        prefect.ask(f"/deployments/{found['id']}/create_flow_run", missed)
+    changed = plan.model_copy(update={"settle_seconds": 7.0})
+    installed = install(changed)
+    for _ in range(3):
+        recover(changed)
+    kinds = of_types("SCHEDULED", "PENDING")
+    (left,) = prefect.runs(["ops-ingest"], state=kinds, name={"like_": "scan "})
+    require_installed(FlowRun.model_validate(left), installed)
+    (run,) = (run for run in prefect.queue.open_runs() if run.name.startswith("scan "))
+    assert run.flow_run == left["id"]
+    prefect.cancel(run, "")
+    install(plan)
 
 
 def planned_runs(prefect, deployment):

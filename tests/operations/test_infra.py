@@ -4,6 +4,7 @@ import re
 import shutil
 import ssl
 import subprocess
+import tomllib
 from pathlib import Path
 
 import dask
@@ -25,6 +26,27 @@ def options_of_serve():
     commands = typer.main.get_command(app)
     command = commands.get_command(typer.Context(commands), "serve")
     return {option for parameter in command.params for option in parameter.opts}
+
+
+def test_the_image_installs_what_is_tested_together_and_checks_every_file():
+    root = INFRA.parent
+    tested = {
+        name.lower().replace("_", "-"): version
+        for name, version in re.findall(
+            r"^([\w.-]+)==(\S+)", (root / "constraints.txt").read_text(), re.M
+        )
+    }
+    image = (INFRA / "container" / "requirements.txt").read_text()
+    entries = re.findall(r"^([\w.-]+)==([^ ]+)(.*?)(?=^[\w.-]+==|\Z)", image, re.M | re.S)
+    assert all("--hash=sha256:" in rest for _, _, rest in entries)
+    pinned = {name: version for name, version, _ in entries}
+    assert {name: tested[name] for name in pinned if name in tested} == {
+        name: version for name, version in pinned.items() if name in tested
+    }
+    wanted = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    extras = wanted["optional-dependencies"]
+    for each in (*wanted["dependencies"], *extras["s3"], *extras["detectors"], *extras["tracing"]):
+        assert re.split(r"[^\w.-]", each)[0] in pinned
 
 
 def test_compose_opens_its_ports_to_this_machine_alone_and_holds_no_secret():

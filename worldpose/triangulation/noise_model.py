@@ -82,9 +82,11 @@ class NoiseModel:
         precision = np.empty(confidence.shape)
         rows = np.ascontiguousarray(confidence).reshape(-1, len(self.joint))
         out = precision.reshape(-1, len(self.joint))
-        _precision(rows, 1.0 / self.joint, self.confidence, self.precision_at, out)
+        factor, known, people = self.joint[None, None], np.zeros_like(rows, np.uint8), 1
         if keypoints is not None:
-            precision /= self.camera[:, None] * self.condition[conditions(keypoints)]
+            factor = self.joint * self.camera[:, None] * self.condition[:, None]
+            known, people = conditions(keypoints).reshape(rows.shape), confidence.shape[-2]
+        _precision(rows, known, people, 1.0 / factor, self.confidence, self.precision_at, out)
         return precision
 
 
@@ -121,15 +123,19 @@ def _find_conditions(keypoints: AnyFloats, edges: Floats, found: NDArray[np.uint
             middle = 0.25 * (at[5] + at[6] + at[11] + at[12])
             length = up[0] ** 2 + up[1] ** 2
             for j in range(joints):
-                x, y = at[j]
-                away = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
+                away = (at[j, 0] - middle[0]) ** 2 + (at[j, 1] - middle[1]) ** 2
                 for edge in edges:
                     found[image, n, j] += away > edge * edge * length
-                for other in range(people):
+            for other in range(people):
+                if not box[n, 3] < box[other, 3] or box[n, 2] <= box[other, 0]:
+                    continue
+                if box[other, 2] <= box[n, 0] or box[n, 3] <= box[other, 1]:
+                    continue
+                for j in range(joints):
+                    x, y = at[j]
                     inside = box[other, 0] < x < box[other, 2] and box[other, 1] < y
-                    if inside and y < box[other, 3] and box[n, 3] < box[other, 3]:
+                    if inside and y < box[other, 3] and found[image, n, j] <= len(edges):
                         found[image, n, j] += len(edges) + 1
-                        break
 
 
 def learn_noise(
@@ -271,15 +277,21 @@ def _residuals(
 @compile_kernel
 def _precision(
     confidence: NDArray[np.floating],
+    condition: NDArray[np.uint8],
+    people: int,
     weight: Floats,
     knots: Floats,
     values: Floats,
     out: Floats,
 ) -> None:
-    """Write (rows, joints): the interpolated value, constant beyond the knots, times the weight."""
+    """Write (rows, joints): the interpolated value, constant beyond the knots, times the weight.
+
+    Weights are (cameras, conditions, joints); `people` rows of a camera follow one another.
+    """
     last = len(knots) - 1
     for row in range(len(confidence)):
-        for joint in range(len(weight)):
+        camera = row // people % len(weight)
+        for joint in range(weight.shape[2]):
             # Without branches, which processors predict badly here.
             given = float(confidence[row, joint])
             k = 1
@@ -290,7 +302,7 @@ def _precision(
             share = min(1.0, max(0.0, share))
             value = values[k - 1] + share * (values[min(k, last)] - values[k - 1])
             there = (given > 0.0) & (given < np.inf)
-            out[row, joint] = value * weight[joint] if there else 0.0
+            out[row, joint] = value * weight[camera, condition[row, joint], joint] if there else 0.0
 
 
 OCCLUDED: Final = 2.0

@@ -7,7 +7,7 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting import estimate
 from worldpose.body_fitting.estimate import fit_bodies
-from worldpose.body_fitting.evidence import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.evidence import JOINT_SPREAD, MIRRORED_OFFSETS, body_axes
 from worldpose.body_fitting.report import report_fit
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
@@ -40,14 +40,15 @@ def test_what_a_detector_always_gets_wrong_is_found():
     unknowns[2] = 0.05  # of the eyes, forward
     offsets = MIRRORED_OFFSETS @ unknowns
     truths = [walker(60, rng) for _ in range(4)]
-    parts = [seen(truth, 0.01, rng) for truth in truths]
+    # A detector sees eyes better than hips, and triangulation states it.
+    parts = [seen(truth, 0.01 * JOINT_SPREAD, rng) for truth in truths]
     joints = np.concatenate([part[0] for part in parts], axis=1)
     covariance = np.concatenate([part[1] for part in parts], axis=1)
     joints = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
     fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     moved = np.abs(offsets).max(axis=-1) > 0.0
     # A head is rigid, so that pose explains nothing of it, and shape and the prior but a part.
-    np.testing.assert_allclose(fit.offsets[moved], offsets[moved], atol=0.025)
+    np.testing.assert_allclose(fit.offsets[moved], offsets[moved], atol=0.02)
 
 
 def test_gaps_are_filled_marked_and_less_sure():

@@ -34,8 +34,9 @@ def walker(frames, rng, *, fps=50.0, upside_down=False):
 
 
 def seen(parameters, noise, rng):
-    """Joints (frames, 1, 17, 3) with noise, and their covariance."""
+    """Joints (frames, 1, 17, 3) with noise [m], of all joints or (17,), and their covariance."""
     joints = KEYPOINTS(parameters)[:, None]
-    joints = joints + noise * rng.standard_normal(joints.shape)
-    spread = max(noise, 0.005) ** 2 * np.eye(3)
+    std = np.broadcast_to(noise, 17)[:, None]
+    joints = joints + std * rng.standard_normal(joints.shape)
+    spread = np.maximum(std, 0.005)[..., None] ** 2 * np.eye(3)
     return joints, np.broadcast_to(spread, (*joints.shape, 3)).copy()
