@@ -127,6 +127,7 @@ class Editor:
         edits = {"edits": [{"id": number, "edit": edit} for number, edit in batch.items()]}
         while (answer := self.ask("POST", f"{MATCH}/corrections", edits)) is None:
             self.server.revive()
+            self.insist("GET", "/api/health")
             if self.rng.random() < 0.3:
                 self.look()
                 return
