@@ -25,6 +25,7 @@ from flows.review.verdicts import (
 from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match
+from tasks.static_calibration import static_calibration
 from worldpose.errors import InputError
 from worldpose.review.journal import say
 from worldpose.store.integrity import verify
@@ -206,6 +207,26 @@ def test_a_correction_that_no_longer_applies_is_listed(store, tmp_path):
     assert warnings_of(match) == [f"correction {stale.id} no longer applies: {reason}"]
     assert (match.corrections, stale.who) == ((), "Ada")
     assert "when it was corrected" in reason
+
+
+def test_a_corrected_result_is_computed_again_to_the_same_bytes(store):
+    """With all automatic results gone, the journal alone leads back to what was approved."""
+    run(store, "auto")
+    match = open_match(store, TINY)
+    correct(store, match, [wrong_click(match)], who="Ada", why="")
+
+    def computed():
+        corrected = open_match(store, TINY)
+        unit = {each.name: each for each in plan_run(store, corrected, {})}[WRONG]
+        static_calibration.fn(unit.work(store.url, corrected, "0002"))
+        return store.manifest(TINY, "static_calibration", "cam03", unit.key)
+
+    automatic = store.run(TINY, "0001").results[WRONG]
+    first = computed()
+    assert first.content != store.manifest(TINY, *WRONG.split("/"), automatic).content
+    shutil.rmtree(store.blobs.root / "results")
+    again = computed()
+    assert (again.key, again.content) == (first.key, first.content)
 
 
 def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp_path):

@@ -9,13 +9,15 @@ import page_client
 from command_line import TINY, worldpose
 from page_client import MATCH
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
 from data_contracts.run import WaitingUnit
+from flows.cli.app import app
 from flows.results.best_results import fitted_bodies
 from flows.results.evaluation import score
 from flows.web.results import BROADCAST_FORMATS
-from worldpose.formats.viewer_file import decode_bodies, decode_part
+from worldpose.formats.viewer_file import decode_bodies, decode_part, read_viewer
 from worldpose.store.store import Store, open_run
 
 
@@ -97,6 +99,22 @@ def test_metrics_are_per_camera_and_player(reader):
     assert kinds == {"match", "clip", "camera", "player"}
     (player, *_) = (each for each in found["metrics"] if each["kind"] == "player")
     assert any(name.endswith(" residual_m") for name in player["values"])
+
+
+def test_a_command_writes_one_file(tiny_run, tmp_path):
+    out = tmp_path / "view.html"
+    command = ["export", TINY, "--format", "viewer", "--project", str(tiny_run), "--out"]
+    done = CliRunner().invoke(app, [*command, str(out)])
+    assert done.exit_code == 0, done.output
+    assert f"{out.stat().st_size / 1e6:.1f} MB" in done.output.replace("\n", "")
+    assert len(read_viewer(out)) == 1
+    refused = CliRunner().invoke(app, [*command, str(out), "--video"])
+    assert "--video: expected a camera with a video" in str(refused.exception)
+    refused = CliRunner().invoke(app, [*command, str(out), "--format", "joints"])
+    assert "expected a folder" in str(refused.exception)
+    other = ["export", TINY, "--format", "joints", "--video", "--project", str(tiny_run)]
+    refused = CliRunner().invoke(app, [*other, "--out", str(tmp_path)])
+    assert "--video: expected --format viewer" in str(refused.exception)
 
 
 def add_run(project, state, stages):

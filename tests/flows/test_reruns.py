@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 
+from flows.iterate import iterate_match
+from flows.registering import open_match
+from flows.reprocess import reprocess_matches
 from flows.results.best_results import joint_tracks
+from flows.running import RunRequest, run_match, settle
+from flows.service import deployed
 from worldpose import open_run
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.store.integrity import verify
@@ -85,6 +90,28 @@ def test_a_triangulation_setting_leaves_tracking_alone(tiny, stricter_copy):
     assert (back["run"], back["executed"]) == ("0003", 0)
     store = Store.open(str(stricter_copy))
     assert store.run(TINY, "0003").results == store.run(TINY, "0001").results
+
+
+def test_every_way_to_start_a_run_keeps_the_settings_of_the_latest(tiny, stricter_copy):
+    again = succeed("run", tiny, "--project", stricter_copy, environment=NO_ORCHESTRATOR)
+    assert "settings: triangulation.min_views=3 (match); see worldpose settings" in again.err
+    store = Store.open(str(stricter_copy))
+    match, plain = open_match(store, TINY), RunRequest({})
+    assert run_match(store, match, plain).run_id == "0002"
+    assert iterate_match(store, match, plain, 1).record.run_id == "0002"
+    assert deployed.match.fn(str(stricter_copy), TINY, gates="never") == "0002"
+    assert [each.state for each in reprocess_matches(store, [TINY], plain)] == ["current"]
+    assert store.runs(TINY) == ("0001", "0002")
+
+    # A run that states another setting keeps this one, too, even if it is killed at once.
+    settle(store, match, RunRequest({"tracking": {"gate_m": 0.6}}, iterations=2))
+    _, request = settle(store, open_match(store, TINY), plain)
+    assert request.settings == {"tracking": {"gate_m": 0.6}, "triangulation": {"min_views": 3}}
+    assert request.iterations == 2
+    for part in ({"until_stage": "tracking"}, {"default_settings": True}):
+        _, request = settle(store, open_match(store, TINY), RunRequest({}, **part))
+        assert request.iterations == 1
+    assert request.settings == {}
 
 
 def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path):

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 from run_records import run_record
 
 from flows.results import comparison
-from flows.results.comparison import compare_runs, pair_people
+from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
+from worldpose.geometry.rigid import Rigid
 
 
 def record(figures):
@@ -79,3 +81,23 @@ def test_who_stands_where_somebody_stood_is_that_person():
     assert pair_people(before, after + 2.0) == {}
     assert pair_people(before, np.repeat(before[:, :1], 2, axis=1)) == {0: 0}
     assert pair_people(before[:, :0], after) == {}
+
+
+def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):
+    # Two metres in front of 1000 px: 2 cm are 10 px. The second person moves most, in frame 11.
+    camera = plain_camera(1000.0, (500.0, 500.0), Rigid(np.eye(3), np.zeros(3)), (1000, 1000))
+    before = np.zeros((3, 2, 17, 3))
+    before[..., 2] = 2.0
+    before[:, 1, :, 0] = 0.5
+    after = before[:, ::-1].copy()
+    after[1, 0, :, 1] += 0.02
+    after[2, 1, :, 1] += 0.01
+    bodies = BodiesOfBoth("clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before, after)
+    (picture,) = comparison._worst(bodies, "cam01", {"cam01": camera}, {"cam01": camera})
+    assert (picture.camera, picture.frame, picture.person) == ("cam01", 11, 7)
+    assert picture.moved_px == pytest.approx(10.0)
+    # Nobody in the image, nothing to look at.
+    away = BodiesOfBoth(
+        "clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before + 9.0, after + 9.0
+    )
+    assert comparison._worst(away, "cam01", {"cam01": camera}, {"cam01": camera}) == []

@@ -227,6 +227,15 @@ def test_match_yaml_names_its_venue_and_the_venue_gives_pitch_and_side(store, ti
     assert match.pitch_source["length"] == 101.0
 
 
+def test_the_list_has_one_short_line_per_setting_and_the_rest_by_name():
+    lines = command("settings", "--list").splitlines()
+    assert max(map(len, lines)) <= 100
+    assert any(line.startswith("  min_views = 2  ") for line in lines)
+    assert command("run", "any", "--set", "list").splitlines() == lines
+    about = command("settings", "--describe", "triangulation.min_views")
+    assert about.startswith("triangulation.min_views = 2, built in\n")
+
+
 def test_a_page_shows_and_saves_the_layers(store, ada, bob):
     found = ada.get(f"/api/settings?match={TINY}").json()
     names = ["project", f"matches/{TINY}"]
