@@ -21,12 +21,13 @@ from worldpose.body.keypoints import CHALLENGE15, fold_keypoints
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.monocular import parse_monocular
-from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane, stand_on_ground
+from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
 from worldpose.body_fitting.pose_space import load_pose_prior
 from worldpose.body_fitting.poses import PoseSolver
 from worldpose.body_fitting.residuals import Pose
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.standing import stand_on_ground
 from worldpose.evaluation.challenge import HIPS
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.challenge import challenge_truth

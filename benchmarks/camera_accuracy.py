@@ -1,22 +1,19 @@
-"""Accuracy and coverage of cameras in simulation: static, adjusted, moving, and their clocks."""
+"""Accuracy and coverage of cameras in simulation: static, adjusted and moving."""
 
 from __future__ import annotations
 
 import time
 from argparse import Namespace
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from common import places_of_feet, quantile, simulate, tell
 from registry import Table, Tables, benchmark, duration, integer, option, seeds
 from scipy.stats import chi2
 
-import worldpose
 from data_contracts.arrays import Flags, Floats, Image
-from data_contracts.keypoints import KeypointDetections
 from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.players import People
@@ -34,8 +31,7 @@ from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.scene import Scene
 from worldpose.simulation.settings import Scenario
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.parameters import (
@@ -47,10 +43,8 @@ from worldpose.static_calibration.report import StaticCalibration, calibration_a
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.clocks import shift_in_time
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.synchronization import Synchronization, shift_frames, synchronize
 from worldpose.video.files import VideoReader
 
 SHARES = (0.5, 0.8, 0.95, 0.99)
@@ -61,17 +55,6 @@ MOMENTS = 6
 """Number of frames of a clip whose players count."""
 
 LASTING, ANEW = 0.01, 0.02
-
-SHIFTS = np.array([-12.0, -3.5, 0.0, 2.25, 20.0])
-
-WANTED = 0.2
-"""Largest error that counts as found [frame]."""
-
-CASES = {"tiny": 16, "crossing": 8, "penalty-box": 8, "match": 4, "hard": 4}
-
-FINE = 4
-
-TILT = 1e-3
 
 
 @benchmark(
@@ -415,99 +398,3 @@ def distances(
         "cameras": chi2.cdf(frame, len(judged)),
         "places": chi2.cdf(places, 2),
     }
-
-
-@benchmark(
-    "synchronization",
-    "clock offsets of cameras, found without a hint",
-    option("--shelf", type=Path, help="data with shelf_dev; simulated clips without it"),
-    integer("first", 100, "seed of the first simulated clip"),
-)
-def score_clocks(options: Namespace) -> Tables:
-    """Cameras are shifted by -12, -3.5, 0, 2.25 and 20 frames in several orders.
-
-    Real detections are tracked and interpolated between frames; their own offsets, estimated before
-    the shift, count as true. Simulated are 40 clips of 4 s in five scenarios, at four times the
-    frame rate, so that fractions are exact, before five cameras whose orientation has an error of 1
-    mrad per axis. Found: all offsets within 0.2 frames.
-    """
-    if options.shelf is None:
-        cases = simulate_cases(options.first)
-    else:
-        given = options.shelf / "shelf_dev" / "import"
-        known = worldpose.read_cameras(given / "calibration.toml")
-        files = [given / "detections" / f"{name}.json" for name in known]
-        seen = KeypointDetections.stack([worldpose.read_observations(file) for file in files])
-        cases = shift_real_detections(Camera.stack(list(known.values())), seen, 25.0)
-    rows = list(cases)
-    found = sum(row[-1] for row in rows)
-    columns = ["case", "worst [frame]", "not told", "largest deviation [frame]", "found"]
-    return {"clocks": Table(f"{found} of {len(rows)} cases found", columns, rows)}
-
-
-def orders(cameras: int) -> Iterator[Floats]:
-    """Yield the shifts (cameras,) of five orders [frame]."""
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        yield np.resize(SHIFTS, max(cameras, 5))[rng.permutation(max(cameras, 5))][:cameras]
-
-
-def shift(
-    cameras: Camera, seen: KeypointDetections, fps: float, late: Floats
-) -> tuple[KeypointDetections, Floats]:
-    """Return detections whose frame t shows the time t + late, and these offsets."""
-    people = track_people(cameras, seen, fps).detection_index
-    every = np.arange(len(late))
-    if not people.shape[2]:
-        whole = np.rint(late)
-        return shift_frames(seen, every, -whole.astype(np.int64)), whole
-    return shift_in_time(seen.assign_people(people), -late), late
-
-
-def report(name: str, found: Synchronization, true: Floats) -> list[Any]:
-    """Return a row; the last value is whether all offsets are found within `WANTED`."""
-    off = found.late - true
-    off = off - np.nanmedian(off) if np.isfinite(off).any() else off
-    unknown = int(np.isnan(off).sum())
-    worst = float(np.nanmax(np.abs(off))) if unknown < len(off) else np.nan
-    is_found = unknown == 0 and bool(worst <= WANTED)
-    return [name, worst, unknown, quantile(found.std, 1.0), is_found]
-
-
-def shift_real_detections(
-    cameras: Camera, seen: KeypointDetections, fps: float
-) -> Iterator[list[Any]]:
-    """Yield the rows of shifted real detections."""
-    own = synchronize(cameras, seen, fps)
-    for late in orders(int(cameras.batch_shape[0])):
-        moved, true = shift(cameras, seen, fps, late)
-        found = synchronize(cameras, moved, fps)
-        yield report(str(true.tolist()), found, true + own.late)
-
-
-def simulate_cases(first: int) -> Iterator[list[Any]]:
-    """Yield the rows of simulated cases."""
-    for name, count in CASES.items():
-        for seed in range(first, first + count):
-            scenario = SCENARIOS[name]
-            fps, before, frames = scenario.fps, 20, round(4.0 * scenario.fps)
-            rig = scenario.rig.model_copy(update={"cameras": 5, "clock_std_frames": 0.0})
-            seconds = (frames + before + 25) / fps
-            changes = {"fps": FINE * fps, "duration": seconds, "rig": rig, "broadcast": ()}
-            scene = simulate_scene(scenario.model_copy(update=changes), seed)
-            rng = np.random.default_rng(seed)
-            late = SHIFTS[rng.permutation(5)]
-            rows = np.rint(FINE * (np.arange(frames)[:, None] + before + late)).astype(int)
-            given = scene.static_views().detections
-            arrays = {n: array[rows, np.arange(5)] for n, array in given.arrays().items()}
-            cameras = []
-            for camera in scene.cameras.values():
-                error = Rigid.from_rotvec(rng.normal(0.0, TILT, 3), np.zeros(3))
-                cameras.append(replace(camera, cam_from_world=error @ camera.cam_from_world))
-            found = synchronize(
-                Camera.stack(cameras),
-                KeypointDetections(frame=np.arange(frames), **arrays),
-                fps,
-                pitch=PitchTemplate.from_spec(scenario.pitch),
-            )
-            yield report(f"{name} {seed} {late.tolist()}", found, late)

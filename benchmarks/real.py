@@ -41,8 +41,18 @@ import mvor
 import numpy as np
 import shelf
 import stills
-from common import distances_to_polyline, run_in_process
-from registry import DATA, Table, Tables, as_data, benchmark, format_table, option
+from common import distances_to_polyline, quantile, run_in_process
+from registry import (
+    DATA,
+    REGISTRY,
+    Table,
+    Tables,
+    as_data,
+    benchmark,
+    flatten,
+    format_table,
+    option,
+)
 from scipy.spatial import KDTree
 
 from data_contracts.broadcast_calibration import KeyFrames
@@ -77,16 +87,11 @@ Metrics = dict[str, Any]
 
 PAIR_M = 2.0
 """Largest distance of two cameras' positions of one person [m]."""
-
 WANTED_PAIRS = 8.0
 """Least number of pairs per frame from which distances of feet are comparable."""
-
 MAX_OFFSET_FRAMES = 3.0
 """Largest clock offset between the cameras of the static pair, beyond the stated one [frame]."""
-
-FPS = 25.0
-"""Of the static pair."""
-
+FPS = 25.0  # of the static pair
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi")
 
 
@@ -262,17 +267,14 @@ def _score_feet(left: Floats, right: Floats) -> Metrics:
     offsets = np.arange(-MAX_OFFSET_FRAMES, MAX_OFFSET_FRAMES + 0.05, 0.1)
     by_offset = [pair_feet(left, right, float(offset)) for offset in offsets]
     by_offset = [frames for frames in by_offset if frames]
-    best = min(by_offset, key=lambda frames: _quantile(np.concatenate(frames), 0.5, np.inf))
+    medians = [quantile(np.concatenate(frames)) for frames in by_offset]
+    best = by_offset[int(np.argmin(np.nan_to_num(medians, nan=np.inf)))]
     pairs = np.concatenate(best)
     return {
-        "feet_m_median": _quantile(pairs, 0.5, math.nan),
-        "feet_m_p95": _quantile(pairs, 0.95, math.nan),
+        "feet_m_median": quantile(pairs),
+        "feet_m_p95": quantile(pairs, 0.95),
         "people_per_frame": len(pairs) / len(best),
     }
-
-
-def _quantile(values: Floats, share: float, otherwise: float) -> float:
-    return float(np.quantile(values, share)) if len(values) else otherwise
 
 
 def score_panorama(folder: Path, frames: int | None) -> Metrics:
@@ -311,9 +313,11 @@ def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
             found=", ".join(file.name for file in videos) or "none",
             todo="Keep the video of the moving camera there, and no other.",
         )
-    keys = _read_key_frames(folder / "key_frames.json")
-    lines = folder / "lines.json"
-    drawn = _read_key_frames(lines) if lines.exists() else keys
+    clicks, lines = folder / "key_frames.json", folder / "lines.json"
+    keys, drawn = (
+        validate_record(KeyFrames, read_json(file), str(file))
+        for file in (clicks, lines if lines.exists() else clicks)
+    )
     pitch = PitchTemplate.standard()
     if (folder / "pitch.json").exists():
         given = read_json(folder / "pitch.json")
@@ -357,10 +361,6 @@ def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
         "stated_px": float(np.nanmedian(calibration.report.reprojection_error)),
         "center_m": calibration.camera.center.tolist(),
     }
-
-
-def _read_key_frames(file: Path) -> KeyFrames:
-    return validate_record(KeyFrames, read_json(file), str(file))
 
 
 def score_stills(folder: Path, frames: int | None) -> Metrics:
@@ -433,17 +433,6 @@ NOTES = {
 }
 
 
-def flatten(metrics: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested metrics by their dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            found |= flatten(value, f"{prefix}{name}.")
-        else:
-            found[prefix + name] = value
-    return found
-
-
 def measure(data: Path, only: Sequence[str], frames: int | None) -> dict[str, Any]:
     """Return metrics by part, and under `skipped` why others have none."""
     chosen = [name for name in PARTS if not only or name in only]
@@ -493,9 +482,8 @@ def tabulate(result: Mapping[str, Any]) -> Table:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--only", action="append", choices=tuple(PARTS), default=[])
-    parser.add_argument("--frames", type=int, help="frames, stills or moments per part")
+    for names, how in REGISTRY["real"].options:
+        parser.add_argument(*names, **how)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if options.frames is not None and options.frames < 1:
@@ -504,10 +492,8 @@ def main() -> None:
         result = measure(options.data, options.only, options.frames)
     except WorldposeError as error:
         sys.exit(f"error: {error}")
-    if options.json:
-        print(json.dumps(as_data(result), indent=2))
-    else:
-        print(format_table(tabulate(result)))
+    table = format_table(tabulate(result))
+    print(json.dumps(as_data(result), indent=2) if options.json else table)
 
 
 if __name__ == "__main__":

@@ -64,8 +64,14 @@ COCO17_BODY_BONES = (
 COCO17_LIMBS = ((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16))
 """Upper and lower ends of upper arms, forearms, thighs and shanks, left before right."""
 
+COCO17_RIGID_BONES = (*COCO17_LIMBS, (5, 6), (11, 12))
+"""Bones whose length no pose changes: the limbs, and the lines between shoulders and hips."""
+
 COCO17_TORSO = (5, 6, 11, 12)
 """Left and right shoulder, left and right hip."""
+
+COCO17_HIPS = COCO17_TORSO[2:]
+"""Left and right hip."""
 
 COCO17_FLIP = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 """The joint that each joint becomes in the mirror image."""
@@ -90,6 +96,8 @@ toes, backs of the heels."""
 _PAIRED_SIGMAS = (0.025, 0.035, 0.079, 0.072, 0.062, 0.107, 0.087, 0.089)
 COCO17_SIGMAS = (0.026, *(sigma for sigma in _PAIRED_SIGMAS for _ in ("left", "right")))
 """COCO's per-joint spread of human labels, as a fraction of person size."""
+COCO17_SPREAD = tuple(sigma / 0.08 for sigma in COCO17_SIGMAS)
+"""Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Order of distortion coefficients, OpenCV's; a coefficient that a lens model lacks is 0."""

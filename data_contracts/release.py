@@ -28,6 +28,7 @@ from data_contracts.usability import Usability
 EXPORT_PURPOSES: Final[Mapping[str, str]] = {
     "joints": "joints with covariances for numpy",
     "coco": "keypoints per camera image, for training and labelling tools",
+    "alphapose": "26 points of Halpe per camera image, for MotionBERT and others",
     "worldpose": "SMPL bodies and cameras as in the WorldPose data set",
     "positions": "a table of positions and speeds on the pitch",
     "minimap": "a video of the pitch from above",

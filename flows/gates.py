@@ -18,6 +18,7 @@ from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
 from data_contracts.usability import UsableLimits
 from flows.stage import Match
+from worldpose.bundle_adjustment.settings import CHANCE
 from worldpose.review.journal import Journal, last_decision, requests_by_id, say
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.store.store import Store
@@ -102,9 +103,10 @@ class CameraLimits(Record):
     calibration page warns. People correct the cameras later (`bundle_adjustment`)."""
     expected_ground_error_p95_m: float = Field(default=_CALIBRATION.weak_p95_m, ge=0)
     """The same at its 95th percentile [m]: the far side, where a pixel is 5 to 20 cm."""
-    clicks_wrong: float = Field(default=0, ge=0)
-    """Clicks that are outliers to the others [1]. A click at the wrong marking is one, and the
-    annotator sees at once which click is wrong."""
+    clicks_wrong_share: float = Field(default=0.25, ge=0)
+    """Share of clicks that are outliers to the others [1]. Calibration excludes them, and a few do
+    no harm where the expected error is small; from a quarter on, the others may be the wrong ones.
+    Below, they are a reservation of the results."""
     weak: float = Field(default=0, ge=0)
     """1 if the clicks leave a direction of the camera undetermined [1]."""
 
@@ -195,6 +197,20 @@ class BroadcastLimits(Record):
 EXCESS: Final = "held_out_certain_excess_m"
 
 
+def _of_camera(figures: Figures) -> Figures:
+    wrong, used = figures.get("clicks_wrong", 0.0), figures.get("clicks_used", 0.0)
+    return {**figures, "clicks_wrong_share": wrong / max(1.0, wrong + used)}
+
+
+def _in_3d(figures: Figures) -> Figures:
+    """Metrics of people in 3D pass where nobody is in 3D: the run says so, and why."""
+    flat = figures.get("plane_people", 0.0) >= figures.get("people", 1.0)
+    names = ("mean_ray_distance_m", "standard_deviation_m", "filled_share")
+    return (
+        {**dict.fromkeys(names, 0.0), **figures} if flat or figures.get("joints") == 0 else figures
+    )
+
+
 def _of_people(figures: Figures) -> Figures:
     """Zero `bridged_share` with a stride: then boxes are interpolated on purpose."""
     return {**figures, "bridged_share": 0.0} if figures.get("stride", 1) > 1 else figures
@@ -203,8 +219,14 @@ def _of_people(figures: Figures) -> Figures:
 def _of_adjustment(figures: Figures) -> Figures:
     before, after = figures.get("held_out_error_before_px"), figures.get("held_out_error_after_px")
     if after is None or not before:
-        return figures
-    return {**figures, "held_out_growth": after / before}
+        # Nobody is held out: a question only if a camera was changed all the same.
+        names = ("held_out_error_after_px", "held_out_growth")
+        is_kept = figures.get("cameras_changed") == 0.0
+        return {**dict.fromkeys(names, 0.0), **figures} if is_kept else figures
+    # Above 1 by chance: the loss of the same people does not rise beyond its standard error.
+    certain = figures.get("held_out_significance", -CHANCE) <= -CHANCE
+    growth = after / before
+    return {**figures, "held_out_growth": growth if certain else min(growth, 1.0)}
 
 
 def _of_bodies(figures: Figures) -> Figures:
@@ -222,6 +244,7 @@ GATES: Final[Mapping[str, Gate]] = {
             "Do the projected markings match those in the image, in all parts of it?",
             CameraLimits(),
             "the clicks of this camera",
+            _of_camera,
         ),
         Gate(
             "detection",
@@ -241,12 +264,14 @@ GATES: Final[Mapping[str, Gate]] = {
             "Is every person one track over the whole clip?",
             IdentityLimits(),
             "the tracks: split, join",
+            _in_3d,
         ),
         Gate(
             "triangulation",
             "Are the joints where the images show them, and are the cameras healthy?",
             JointLimits(),
             "the keypoints in the images, or the cameras",
+            _in_3d,
         ),
         Gate(
             "bundle_adjustment",

@@ -96,8 +96,10 @@ class Reporter:
     def run_progress(self) -> Progress:
         """How far the run is, by the expected work; as the stage without a plan."""
         total = sum(self._work.values())
-        if not total or self._began is None:
+        if not total:
             return self.stage_progress
+        if self._began is None:  # all stages so far had their results
+            return Progress(0.0, None)
         done = sum(self._work.get(stage, 0.0) for stage in self._reached[:-1])
         done += self._work.get(self._reached[-1], 0.0) * self.stage_progress.share
         share = min(done / total, 1.0)

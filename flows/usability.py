@@ -86,7 +86,6 @@ _RULES: Final = (
         "max_ray_distance_m",
         "cameras disagree about the people in {unit} by {value}. Check the calibration and the "
         "clocks of the cameras.",
-        is_required=True,
     ),
     _Rule(
         "triangulation",

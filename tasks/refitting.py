@@ -70,7 +70,7 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
     fitted = inputs.open(f"body_fitting/{unit}")
     stage = "broadcast_calibration/"
     names = sorted(name for name in inputs.recipe.inputs if name.startswith(stage))
-    views = [_BroadcastView.open(inputs, name.removeprefix(stage), fitted) for name in names]
+    views = [_RefittedView.open(inputs, name.removeprefix(stage), fitted) for name in names]
     people = open_people(inputs, views)
     weight = before.settings(BodyFittingSettings).shape_weight
     known = _known_shapes(inputs, people.person, weight)
@@ -101,7 +101,7 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _BroadcastView:
+class _RefittedView:
     """Images of a broadcast camera, one per frame of the clip, and what they show.
 
     Attributes:
@@ -121,7 +121,7 @@ class _BroadcastView:
     estimates: MonocularEstimates | None
 
     @classmethod
-    def open(cls, inputs: UnitInputs, view: str, fitted: xr.Dataset) -> _BroadcastView:
+    def open(cls, inputs: UnitInputs, view: str, fitted: xr.Dataset) -> _RefittedView:
         """Open the images of a broadcast view of the unit's clip, whose bodies are `fitted`."""
         sources, name = inputs.sources, f"broadcast_calibration/{view}"
         ends = "" if view == inputs.unit else f".{view}"

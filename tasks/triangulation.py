@@ -238,10 +238,9 @@ def _find_changes(
             break
         clip = open_tracked_clip(inputs, further=aside)
         health = measure_departures(clip.cameras, clip.detections, fps, settings, rows)
-    for change in new:
-        warnings.append(f"{describe_change(change)}.")
-        if change.kind == "clock":
-            result.figures[CLOCK_CHANGE + change.camera] = change.late_frames
+    warnings += [f"{describe_change(change)}." for change in new]
+    clocks = [change for change in new if change.kind == "clock"]
+    result.figures |= {CLOCK_CHANGE + each.camera: each.late_frames for each in clocks}
     if len(names) - len(spoilt) < 3 < len(names):
         those = ", ".join(sorted(spoilt))
         warnings.append(f"changes of other cameras can hide behind those of {those}.")

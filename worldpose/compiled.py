@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from pathlib import Path
-from typing import Final, Literal, TypeVar, cast
+from typing import Literal, TypeVar, cast
 
 from numba import njit
 from numba.core import config
@@ -21,10 +21,6 @@ from worldpose.sources import code_version
 Function = TypeVar("Function", bound=Callable[..., object])
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-THREADS: Final = 2
-"""Threads of one unit: the only clip of a match uses two cores, and the units of many clips on a
-large machine do not hinder each other."""
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -60,17 +56,20 @@ def _compile(function: Function, inline: Literal["never", "always"]) -> Function
 
 
 def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield the result for each item, in order; `THREADS` of them are computed at the same time.
+    """Yield the result for each item, in order; two threads compute them at the same time.
 
     Kernels and large numpy operations release the interpreter lock. Results are those of a loop:
-    each item is computed by itself. At most `THREADS` results wait, so memory stays flat.
+    each item is computed by itself. At most two results wait, so memory stays flat.
     """
     waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as threads:
+    # Threads of one unit: the only clip of a match uses two cores, and the units of many clips on a
+    # large machine do not hinder each other.
+    max_threads = 2
+    with ThreadPoolExecutor(min(max_threads, os.cpu_count() or 1)) as threads:
         for item in items:
             # With the caller's settings of numpy's warnings.
             waiting.append(threads.submit(copy_context().run, function, item))
-            if len(waiting) > THREADS:
+            if len(waiting) > max_threads:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 
@@ -22,14 +22,26 @@ class InputError(WorldposeError):
         todo: what the user can do about it.
     """
 
-    def __init__(self, where: str, *, expected: str, found: str, todo: str) -> None:
+    def __init__(self, where: str, expected: str, found: str, todo: str) -> None:
         self.where, self.expected = _shorten(where), expected
         self.found, self.todo = _shorten(found), todo
         super().__init__(f"{self.where}: expected {expected}, found {self.found}. {todo}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Keyword-only arguments: without this the error cannot be unpickled from a worker.
-        return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
+        # Without this the error cannot be unpickled from a worker.
+        return type(self), (self.where, self.expected, self.found, self.todo)
+
+
+def describe_value(value: object) -> str:
+    """Return a value of a file for a message, in at most 60 characters."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, Mapping):
+        return f"a mapping of {len(value)}"
+    text = repr(value)
+    if isinstance(value, list | tuple) and len(text) > 60:
+        return f"a list of {len(value)}"
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _shorten(text: str) -> str:
@@ -39,12 +51,6 @@ def _shorten(text: str) -> str:
         return text
     half = max_length // 2 - 20  # leaves room for the text between, so the result is short enough
     return f"{text[:half]}...[{len(text) - 2 * half} characters]...{text[-half:]}"
-
-
-def _input_error(
-    kind: type[InputError], where: str, expected: str, found: str, todo: str
-) -> InputError:
-    return kind(where, expected=expected, found=found, todo=todo)
 
 
 class UsageError(InputError):

@@ -19,12 +19,6 @@ from worldpose.cache_folder import find_cache_folder
 from worldpose.errors import StoreError
 from worldpose.parsing import parse_in_turn
 
-FOLLOWED: Final = ("tasks", "worldpose", "data_contracts")
-"""Packages whose imports affect a result."""
-NOT_FOLLOWED: Final = "worldpose.store"
-"""The storage code does not affect numbers of results; its `STORE_FORMAT` covers their bytes."""
-DATA_SUFFIXES: Final = (".npz", ".safetensors")
-
 _HOME: Final = (Path(__file__).resolve().parents[1],)
 
 
@@ -129,7 +123,8 @@ def parse_source(source: bytes) -> ParsedSource:
     tree = parse_in_turn(lambda: ast.parse(source))
     nodes = _drop_text(tree)
     texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
-    data = [text for text in texts if isinstance(text, str) and text.endswith(DATA_SUFFIXES)]
+    data_suffixes = (".npz", ".safetensors")
+    data = [text for text in texts if isinstance(text, str) and text.endswith(data_suffixes)]
     imports = []
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -219,13 +214,17 @@ def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], fr
     for data in sorted(path.parent.iterdir()) if parsed.data else ():
         if data.name in parsed.data:
             versions[f"{name}:{data.name}"] = _digest(data.read_bytes())
+    # Packages whose imports affect a result.
+    followed = ("tasks", "worldpose", "data_contracts")
     modules = {
         each if _source_file(each, roots) else each.rpartition(".")[0]
         for each in parsed.imports
-        if each.partition(".")[0] in FOLLOWED
+        if each.partition(".")[0] in followed
     }
+    # The storage code does not affect numbers of results; its `STORE_FORMAT` covers their bytes.
+    not_followed = "worldpose.store"
     return versions, frozenset(
-        each for each in modules if not f"{each}.".startswith(f"{NOT_FOLLOWED}.")
+        each for each in modules if not f"{each}.".startswith(f"{not_followed}.")
     )
 
 

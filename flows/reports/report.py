@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.evaluation import Evaluation
 from data_contracts.release import DataSetStatistics
 from data_contracts.review import (
@@ -241,11 +242,9 @@ def _own_reference(match: Match) -> str | None:
 
 def extent_of(run: Run, match: Match) -> DataSetStatistics:
     """Count clips, frames, poses and distances of a run; a person's position is the mid-hip."""
-    from worldpose.reports.drawing import HIPS
-
     clips = {}
     for clip in find_clips(run.record):
-        places = joint_tracks(run, clip, definition="detector").joints[:, :, HIPS].mean(2)
+        places = joint_tracks(run, clip, definition="detector").joints[:, :, COCO17_HIPS].mean(2)
         moving = broadcast_cameras(run, clip).values()
         kinds = [kind_of(each.focal.mean(-1), each.cam_from_world.rotation) for each in moving]
         kind = most_moving(kinds) if kinds else "S"

@@ -13,14 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from data_contracts.triangulation import CameraChange
 from flows.results import best_results
 from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
-from flows.results.run_cameras import broadcast_views, estimated_pitch, moving_cameras
+from flows.results.run_cameras import (
+    broadcast_views,
+    camera_in_frames,
+    estimated_pitch,
+    moving_cameras,
+)
 from flows.results.tool_exports import TOOL_EXPORTS
+from worldpose.body.keypoints import HALPE26, fold_keypoints
+from worldpose.body.occlusions import visible_joints
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.formats import challenge
@@ -30,7 +37,7 @@ from worldpose.formats.baselines.result import (
     write_tracks,
 )
 from worldpose.formats.joints_file import write_joints, write_poses
-from worldpose.formats.motion_capture import coco_dataset, write_coco
+from worldpose.formats.motion_capture import alphapose_results, coco_dataset, write_json
 from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
@@ -59,41 +66,49 @@ def export_joints(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 
 
 def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `<camera>.json` for each static camera, in `<clip>/` if there are several.
-
-    Raises:
-        UsageError: the match has no static cameras.
-    """
-    if not origin.spec.static_cameras:
-        raise UsageError(
-            "--format coco",
-            expected="a match with static cameras, whose keypoints this format holds",
-            found="a match with a broadcast camera alone",
-            todo="Choose another format, such as joints.",
-        )
+    """Write `<camera or broadcast view>.json`, in `<clip>/` if there are several clips."""
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        placed = best_results.placed_joints(origin.run, clip)
         frames = tracks.frames.astype(np.int64)
-        inliers = placed["inliers"]
-        changes = [CameraChange.model_validate(each) for each in placed.attrs["changes"]]
-        for camera_id, camera in origin.static_cameras.items():
-            dataset = coco_dataset(
-                camera_id,
-                camera,
-                tracks,
-                inliers.sel(camera=camera_id).values,
-                number=unit_frames(origin.spec, camera_id).numbers(frames),
-                move=partial(
-                    move_on,
-                    frame=frames,
-                    camera=camera,
-                    changes=[c for c in changes if (c.camera, c.kind) == (camera_id, "view")],
-                ),
-            )
-            path = (out if len(origin.clips) == 1 else out / clip) / f"{camera_id}.json"
-            write_coco(path, dataset)
+        for name, camera, number, move in _views(origin, clip, frames):
+            if name in origin.static_cameras:
+                placed = best_results.placed_joints(origin.run, clip)
+                seen = placed["inliers"].sel(camera=name).values
+            else:
+                seen = visible_joints(tracks.joints, camera)[1]
+            path = (out if len(origin.clips) == 1 else out / clip) / f"{name}.json"
+            write_json(path, coco_dataset(name, camera, tracks, seen, number=number, move=move))
             yield path
+
+
+def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
+    """Write `alphapose/<clip>/<camera or broadcast view>.json` of fitted bodies."""
+    for clip in origin.clips:
+        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        points = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
+        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
+        for name, camera, number, move in _views(origin, clip, frames.astype(np.int64)):
+            pixels, seen = visible_joints(points, camera)
+            size = camera.image_size.reshape(-1, 2)[0]
+            path = out / "alphapose" / clip / f"{name}.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, alphapose_results(move(pixels), seen, persons, size, number))
+            yield path
+
+
+def _views(
+    origin: best_results.Origin, clip: str, frames: Integers
+) -> Iterator[tuple[str, Camera, Integers, Callable[[Floats], Floats]]]:
+    """Yield name, camera, own frames, and where pixels move, of a clip's cameras and views."""
+    for name, camera in origin.static_cameras.items():
+        stated = best_results.placed_joints(origin.run, clip).attrs["changes"]
+        changes = [CameraChange.model_validate(each) for each in stated]
+        own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
+        move = partial(move_on, frame=frames, camera=camera, changes=own)
+        yield name, camera, unit_frames(origin.spec, name).numbers(frames), move
+    for view in broadcast_views(origin.run, clip):
+        number = unit_frames(origin.spec, view).numbers(frames)
+        yield view, camera_in_frames(origin.run, view, frames), number, lambda pixels: pixels
 
 
 def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
@@ -290,6 +305,7 @@ def export_viewer(origin: best_results.Origin, out: Path) -> list[Path]:
 EXPORTS: dict[str, Callable[[best_results.Origin, Path], Iterable[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
+    "alphapose": export_alphapose,
     "worldpose": export_worldpose,
     "positions": export_positions,
     "minimap": export_minimap,

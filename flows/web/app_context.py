@@ -137,6 +137,7 @@ class Continuing:
                 for run in own:
                     if run.state == "waiting":
                         served.queue.change(run, "asked", "resumed")
+                self._seen = None  # another page may have looked meanwhile
                 return resumed
             if states & {"asked", "killed"}:
                 return {"state": "running", "how": "a run of it waits for its turn already"}
@@ -181,9 +182,10 @@ class Continuing:
             lines = [beat.doing] if beat is not None and beat.doing else []
             stage = re.match(r"[a-z_]+", lines[0]) if lines else None
             if run.state != "begun":
-                ahead = [
-                    each for each in seen.open[: seen.open.index(run)] if each.state != "waiting"
-                ]
+                others = [it for it in seen.open if it.state != "waiting" and it is not run]
+                # A resumed run keeps its place: what has begun is before it too.
+                first = seen.open.index(run)
+                ahead = [it for it in others if it.state == "begun" or seen.open.index(it) < first]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
                 lines = ["The run starts in a moment."]
                 if ahead:

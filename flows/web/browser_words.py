@@ -10,6 +10,8 @@ from worldpose.errors import InputError
 _COMMAND: Final = re.compile(
     r"\bworldpose (?P<command>[a-z][a-z-]+)|(?<![\w-])--[a-z][a-z-]*|\bpip install\b"
 )
+_ASIDE: Final = re.compile(r" \(worldpose [a-z-]+[^()]*\)")
+"""A command that a sentence adds to what it says."""
 _SENTENCE: Final = re.compile(r"(?<=[.!?]) +")
 _ON_PAGES: Final = {
     "run": "Run the match on its page.",
@@ -24,7 +26,7 @@ _ELSE: Final = "Ask the operator of this service."
 def in_browser(text: str) -> str:
     """Return a message in which each sentence with a command says what a page offers instead."""
     said: list[str] = []
-    for sentence in _SENTENCE.split(text):
+    for sentence in _SENTENCE.split(_ASIDE.sub("", text)):
         found = _COMMAND.search(sentence)
         if found is None:
             said.append(sentence)

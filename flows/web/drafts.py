@@ -1,8 +1,8 @@
 """Matches that people create on the pages: drafts beside the inbox, until they are finished.
 
-A draft is a folder in `INBOX/.drafts`, whose dot keeps it out of every scan of the inbox. Videos
-grow in its `parts`, move to its match folder when they are whole, and the match folder moves into
-the inbox in one step. The state is on disk: a restart of the server loses none of it.
+A draft is a folder in `INBOX/.drafts`, whose dot keeps it out of every scan of the inbox. Files
+grow in its `parts`, move to its folders when they are whole, and the match folder moves into the
+inbox in one step. The state is on disk: a restart of the server loses none of it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from threading import Lock
 from typing import Any, Final, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
@@ -30,11 +29,12 @@ from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
 from flows.web.draft_problems import (
+    GIVEN,
+    GIVEN_ENDINGS,
     Index,
     Problem,
-    describe,
+    build,
     describe_broken,
-    footage_problems,
     form_problems,
     is_footage,
 )
@@ -42,7 +42,6 @@ from flows.web.video_folders import open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import whole_file
 from worldpose.ingest.footage import read_still
-from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.validation import validate_record
 from worldpose.store.store import Store
 from worldpose.video.files import VideoReader, index_frames
@@ -71,7 +70,7 @@ class DraftFile(Record):
 
     id: Name = "new"
     name: str = ""
-    """Path in the match folder."""
+    """Path in the match folder, or in the draft for a file of another tool."""
     title: str
     """Its name where it comes from."""
     size: Count
@@ -114,6 +113,8 @@ class Drafts:
     _budget: Lock = field(default_factory=Lock)
     _locks: dict[str, Lock] = field(default_factory=dict)
     _jobs: dict[str, Future[Index | str]] = field(default_factory=dict)
+    _checked: dict[str, tuple[Any, list[Problem], list[str]]] = field(default_factory=dict)
+    """Problems and notes of a draft's match folder, with what they were found for."""
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
 
     def all(self) -> list[Draft]:
@@ -187,10 +188,11 @@ class Drafts:
         """
         title = PurePosixPath(file.title.replace("\\", "/")).name
         title = title.lower() if title.lower() in MATCH_FILES else title
-        if title not in MATCH_FILES and not is_footage(title):
+        is_given = title.lower().endswith(GIVEN_ENDINGS) and title.lower() != "match.yaml"
+        if title not in MATCH_FILES and not is_footage(title) and not is_given:
             known = f"a video ({' '.join(VIDEO_SUFFIXES)}), a still ({' '.join(IMAGE_SUFFIXES)})"
-            sought = f"{known} or one of {', '.join(sorted(MATCH_FILES))}"
-            raise _refusal(title, sought, "another file", "Convert a video with any video tool.")
+            sought = f"{known}, or calibration, clicks or 2D poses ({' '.join(GIVEN_ENDINGS)})"
+            raise _refusal(title, sought, "another file", "Convert it with the tool it is from.")
         with self._hold(draft_id):
             draft = self.read(draft_id)
             for each in draft.files:
@@ -271,11 +273,13 @@ class Drafts:
 
     def _view(self, draft: Draft) -> dict[str, Any]:
         files = [self._describe_file(draft.id, file) for file in draft.files]
-        problems = form_problems(draft.content, files) or self._folder_problems(draft)
+        wrong = form_problems(draft.content, files)
+        problems, notes = (wrong, []) if wrong else self._folder_problems(draft)
         return {
             **draft.model_dump(include={"id", "who", "created_at", "revision", "content"}),
             "files": files,
             "problems": problems,
+            "notes": notes,
             "is_ready": not problems,
         }
 
@@ -325,7 +329,8 @@ class Drafts:
         return self._folder(draft_id) / "parts" / file.id
 
     def _whole(self, draft_id: str, file: DraftFile) -> Path:
-        return self._folder(draft_id) / "match" / file.name
+        top = "match" if is_footage(file.name) else "" if file.name.startswith(GIVEN) else "own"
+        return self._folder(draft_id) / top / file.name
 
     def _write(self, draft: Draft) -> None:
         with whole_file(self._folder(draft.id) / "draft.json") as file:
@@ -453,26 +458,21 @@ class Drafts:
         except OSError as error:
             return error.strerror or str(error)
 
-    def _folder_problems(self, draft: Draft) -> list[Problem]:
-        """Write match.yaml, and return the errors that ingest finds in the match folder."""
-        folder = self._folder(draft.id) / "match"
-        with whole_file(folder / "match.yaml") as file:
-            file.write_text(
-                yaml.safe_dump(draft.content, sort_keys=False, allow_unicode=True), encoding="utf-8"
-            )
+    def _folder_problems(self, draft: Draft) -> tuple[list[Problem], list[str]]:
+        """Build the match folder; return the errors that ingest finds, and sentences about it."""
         spec = validate_record(MatchSpec, draft.content, "match.yaml")
         is_taken = spec.match_id in self.store.matches()
         places = (self.inbox / at / spec.match_id for at in (".", "urgent", "background"))
         if is_taken or any(place.exists() for place in places):
             message = "expected an id of its own, found that of another match. Choose another one."
-            return [{"place": "match_id", "message": message}]
-        try:
-            match = read_match(folder)
-        except InputError as error:
-            return [describe(error, folder)]
-        footage = (file for file in draft.files if is_footage(file.name))
-        indexes = {file.name: self._index(draft.id, file) for file in footage}
-        return list(footage_problems(match, indexes))
+            return [{"place": "match_id", "message": message}], []
+        key = (draft.revision, draft.files)
+        if self._checked.get(draft.id, (None,))[0] != key:
+            folder = self._folder(draft.id)
+            footage = (it for it in draft.files if is_footage(it.name))
+            indexes = {it.name: self._index(draft.id, it) for it in footage}
+            self._checked[draft.id] = (key, *build(self.store, draft.content, folder, indexes))
+        return self._checked[draft.id][1:]
 
 
 def _choose_name(title: str, taken: set[str]) -> str:
@@ -482,7 +482,8 @@ def _choose_name(title: str, taken: set[str]) -> str:
             raise _refusal(title, "one such file", "a second one", "Remove the first one.")
         return title
     stem, suffix = PurePosixPath(title).stem, PurePosixPath(title).suffix.lower()
-    folder, usual = ("videos", "video") if is_video(title) else ("stills", "still")
+    usual = "video" if is_video(title) else "still" if is_footage(title) else "file"
+    folder = f"{usual}s" if is_footage(title) else GIVEN.strip("/")
     stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or usual
     names = (f"{folder}/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
     return next(name for name in names if name not in taken)

@@ -176,10 +176,15 @@ def _consistency(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     result = run[f"tracking/{clip}"]
+    joints = result["joints"].values.astype(np.float64)
+    if "ground" in result:
+        by_feet = np.isnan(joints).all(axis=(-2, -1))
+        place = result["ground"].values[by_feet][:, None]
+        joints[by_feet] = np.concatenate([place, 0.0 * place[..., :1]], axis=-1)
     tracks = JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
-        joints=result["joints"].values.astype(np.float64),
+        joints=joints,
     )
     cameras = static_cameras(run, match.folder.spec, "triangulation")
     png = plot_paths(tracks, cameras=cameras, pitch=match.folder.pitch)

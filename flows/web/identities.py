@@ -10,6 +10,7 @@ from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image, find_runs
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.review import Correction, SplitTrack
 from flows.reports.match_pictures import frame_picture
 from flows.review.descriptions import in_words
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 TRAJECTORY_POINTS: Final = 300
 """Points of a person's trajectory that are sent."""
-HIPS: Final = (11, 12)
-"""Indices of the hips in COCO-17."""
 CROP_HALF_HEIGHT: Final = 0.9
 """Half the height of a person's crop, as a multiple of the height of the person's box."""
 
@@ -132,7 +131,7 @@ def _ways(found: Identities, tracked: xr.Dataset) -> NDArray[np.float64]:
 
     The tracks of the latest run have the places of feet.
     """
-    hips = found.joints[:, :, HIPS, :2].astype(np.float64)
+    hips = found.joints[:, :, COCO17_HIPS, :2].astype(np.float64)
     known = np.asarray(np.isfinite(hips).all(axis=3))
     total = np.where(known[..., None], hips, 0.0).sum(axis=2)
     count = known.sum(axis=2)[..., None]

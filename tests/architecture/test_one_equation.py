@@ -46,8 +46,3 @@ def test_an_equation_is_defined_once(name, home):
 @pytest.mark.parametrize(("sign", "home"), SIGNS.items())
 def test_no_other_file_writes_the_equation_again(sign, home):
     assert files_with(sign) == [home]
-
-
-def test_a_second_damping_rule_is_seen(tmp_path):
-    (tmp_path / "loop.py").write_text("damping = max(0.1 * damping, 1e-9)\n")
-    assert files_with(list(SIGNS)[-1], tmp_path) == ["loop.py"]

@@ -1,7 +1,11 @@
 """An installation contains every file of the packages, since users do not install in place."""
 
+import importlib
+import re
 import tomllib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 ONLY_FOR_TESTS = {"flows/web/static/built_from.sha256"}
@@ -31,3 +35,25 @@ def test_every_pattern_of_package_data_matches_a_file():
     for package, patterns in tools["package-data"].items():
         for pattern in patterns:
             assert list((ROOT / package).glob(pattern)), f"{package}: {pattern}"
+
+
+PAGES = sorted((Path(__file__).parents[2] / "docs" / "method").glob("*.md"))
+NAME = re.compile(r"`((?:worldpose|tasks|flows)\.[\w.]+)`")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_name_of_a_page_exists(page):
+    names = NAME.findall(page.read_text(encoding="utf-8"))
+    assert names
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError:
+            module, _, part = name.rpartition(".")
+            assert hasattr(importlib.import_module(module), part), name
+
+
+def test_the_table_has_each_equation_of_the_paper():
+    page = next(page for page in PAGES if page.stem == "index").read_text(encoding="utf-8")
+    equations = [line for line in page.partition("## The paper's")[2].splitlines() if "`" in line]
+    assert len(equations) == 19

@@ -85,6 +85,9 @@ await page.click("[data-use]");
 await page.setInputFiles("[data-upload]", task.still);
 await page.waitForSelector('li[data-file="first.png"][data-state="ready"]');
 await page.locator("select[data-still]").first().selectOption("stills/first.png");
+// Clicks of CVAT belong to the camera with whose name their file begins.
+await page.setInputFiles("[data-upload]", task.clicks);
+await page.waitForSelector('[data-notes] >> text="second_keypoints.xml: 1 clicks in second"');
 await page.click("text=Paste a list");
 await page.fill("[data-paste]", "kane; Harry Kane; England\npickford\tJordan Pickford\tEngland\tgoalkeeper");
 await page.click("text=Add these people");

@@ -52,6 +52,11 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     write_noise(tmp_path / "first.mp4", 60)
     write_noise(recordings / "second.mp4", 40)
     cv2.imwrite(str(tmp_path / "first.png"), np.full((180, 320, 3), 90, dtype=np.uint8))
+    clicks = tmp_path / "second_keypoints.xml"
+    clicks.write_text(
+        '<annotations><image id="0" name="0.jpg" width="320" height="180">'
+        '<points label="center_mark" points="40.00,30.00"></points></image></annotations>'
+    )
     size = (tmp_path / "first.mp4").stat().st_size
     assert size > 2_000_000
     port, signal = page_client.free_port(), tmp_path / "signal"
@@ -75,6 +80,7 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
             "token": page_client.TOKEN,
             "video": str(tmp_path / "first.mp4"),
             "still": str(tmp_path / "first.png"),
+            "clicks": str(clicks),
             "size": size,
             "signal": str(signal),
         }
@@ -97,7 +103,9 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     first, second = (match.videos[name].read_bytes() for name in ("first", "second"))
     assert first == (tmp_path / "first.mp4").read_bytes()
     assert second == (recordings / "second.mp4").read_bytes()
-    assert (match.spec.fps, match.spec.clips[0].frame_count) == (25, 40)
+    assert match.clicked["second"].points[0].name == "center_mark"
+    # Both show 37 frames: the second video has 40, and begins 3 late.
+    assert (match.spec.fps, match.spec.clips[0].frame_count) == (25, 37)
     assert [camera.offset_frames for camera in match.spec.cameras] == [0, 3]
     assert match.stills["first"].read_bytes() == (tmp_path / "first.png").read_bytes()
     assert [(each.id, each.name, each.role) for each in match.spec.roster] == [

@@ -1,5 +1,6 @@
 """People create a match on the pages: uploads, picked videos, the form, and the inbox."""
 
+import json
 import os
 import shutil
 import time
@@ -10,6 +11,7 @@ import numpy as np
 import page_client
 import pytest
 
+from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of
 from flows.web.access import access_for
 from flows.web.app import create_app
@@ -134,6 +136,18 @@ def test_an_uploaded_match_arrives_whole(place, footage):
     assert list((place / "inbox" / ".drafts").iterdir()) == []
 
 
+def test_videos_of_a_known_match_are_no_second_match(place, footage):
+    ada = open_pages(place)
+    for match_id in ("final", "again"):
+        draft, view = upload(ada, footage)
+        view = save(ada, view, a_match(view["files"][0]["name"], match_id=match_id)).json()
+        if match_id == "final":
+            ada.post(f"{DRAFTS}/{draft}/finish", json={})
+            register(Store.open(str(place / "project")), place / "inbox" / "final", unfinished=True)
+    (problem,) = view["problems"]
+    assert problem["message"].startswith("These videos are the match final:")
+
+
 def test_an_upload_survives_a_reload_and_a_restart(place, footage):
     content = footage.read_bytes()
     draft, file, new = begin(ada := open_pages(place), footage)
@@ -208,20 +222,25 @@ def test_a_video_is_picked_from_a_named_folder(place, footage):
     assert copied.stat().st_ino != (recordings / "cam.mp4").stat().st_ino
 
 
-def add_still(browser, draft, tmp_path, size):
-    """Upload an image of a size; return the draft."""
-    file = tmp_path / "near left.png"
-    cv2.imwrite(str(file), np.full((size[1], size[0], 3), 90, dtype=np.uint8))
-    new = {"name": file.name, "size": file.stat().st_size}
+def add(browser, draft, name, content):
+    """Upload a file; return its id."""
+    new = {"name": name, "size": len(content)}
     file_id = browser.post(f"{DRAFTS}/{draft}/files", json=new).json()["file"]
-    assert put(browser, draft, file_id, 0, file.read_bytes()).status_code == 200
+    assert put(browser, draft, file_id, 0, content).status_code == 200
+    return file_id
+
+
+def add_still(browser, draft, size):
+    """Upload an image of a size; return the draft."""
+    image = np.full((size[1], size[0], 3), 90, dtype=np.uint8)
+    add(browser, draft, "near left.png", cv2.imencode(".png", image)[1].tobytes())
     return settle(browser, draft)
 
 
-def test_a_still_and_a_roster_arrive_with_the_match(place, footage, tmp_path):
+def test_a_still_and_a_roster_arrive_with_the_match(place, footage):
     ada = open_pages(place)
     draft, _ = upload(ada, footage)
-    view = add_still(ada, draft, tmp_path, SIZE)
+    view = add_still(ada, draft, SIZE)
     video, still = view["files"]
     assert (still["name"], still["width"], still["height"]) == ("stills/near_left.png", *SIZE)
     roster = [{"id": "kane", "name": "Harry Kane", "team": "England", "role": "player"}]
@@ -235,6 +254,52 @@ def test_a_still_and_a_roster_arrive_with_the_match(place, footage, tmp_path):
     match = read_match(place / "inbox" / "final")
     assert match.stills["near_left"].name == "near_left.png"
     assert [person.name for person in match.spec.roster] == ["Harry Kane"]
+
+
+CALIBRATION = b"""
+[cam_0]
+name = "near_left"
+size = [192, 128]
+matrix = [[200.0, 0.0, 96.0], [0.0, 200.0, 64.0], [0.0, 0.0, 1.0]]
+distortions = [0.0, 0.0, 0.0, 0.0]
+rotation = [-1.8, 0.0, 0.0]
+translation = [0.0, 1.0, 20.0]
+"""
+CLICKS = b"""<annotations><image id="0" name="0.jpg" width="96" height="64">
+<points label="center_mark" points="40.00,30.00"></points></image></annotations>"""
+PERSON = {"image_id": 3, "category_id": 1, "score": 0.9, "keypoints": [20, 30, 0.8] * 17}
+POSES = json.dumps([PERSON]).encode()
+
+
+def test_files_of_other_tools_become_calibration_clicks_and_poses(place, footage):
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    add(ada, draft, "Near_left clicks.xml", CLICKS)
+    poses = add(ada, draft, "near_left.poses.json", POSES)
+    stray = add(ada, draft, "poses.json", POSES)
+    content = a_match(view["files"][0]["name"])
+    view = save(ada, settle(ada, draft), content).json()
+    (problem,) = view["problems"]
+    assert "poses.json: expected a calibration or clicks" in problem["message"]
+    assert "2D poses of an unknown camera" in problem["message"]
+    view = ada.post(f"{DRAFTS}/{draft}/files/{stray}/removal", json={}).json()
+    assert (view["problems"], view["is_ready"]) == ([], True)
+    assert view["notes"] == [
+        "Near_left_clicks.xml: 1 clicks in near_left",
+        "near_left.poses.json: 2D poses of near_left",
+    ]
+    # A calibration in images of twice the size is scaled; people of one place give it no unit.
+    ada.post(f"{DRAFTS}/{draft}/files/{poses}/removal", json={})
+    add(ada, draft, "Scene.toml", CALIBRATION)
+    view = ada.get(f"{DRAFTS}/{draft}").json()
+    assert view["problems"] == []
+    assert "scaled by 0.5" in " ".join(view["notes"])
+    assert str(place) not in str(view["notes"]) and "--" not in str(view["notes"])
+    ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    match = read_match(place / "inbox" / "final")
+    assert match.calibrations["near_left"].focal_px == (100.0, 100.0)
+    assert match.clicked["near_left"].points[0].xy == (39.5, 29.5)  # the image begins at a corner
+    assert not (place / "inbox" / "final" / "given").exists()
 
 
 def test_frames_of_an_uploaded_video_are_shown(place, footage):

@@ -2,6 +2,7 @@
 
 import csv
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import page_client
@@ -10,7 +11,9 @@ from test_broadcast_run import errors_of
 
 import worldpose as library
 from flows.match import IncompleteRunError
+from flows.registering import open_for_review
 from flows.web.app_context import Continuing
+from flows.web.evidence import draw_evidence
 from worldpose.formats.viewer_file import decode_part, read_viewer
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
@@ -35,6 +38,15 @@ def check_pages(folder, match):
     crop = {"person": person["id"], "frame": person["segments"][0][0]}
     answer = ada.get(f"{path}/identities/clip/crop", params=crop)
     assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png"), answer.text
+
+    # A question about the tracks shows the paths of the feet.
+    store = Store.open(str(project))
+    asked = SimpleNamespace(
+        gate="tracking", run_id=store.run(match).run_id, keys={"tracking/clip": ""}
+    )
+    with patch("flows.web.evidence.plot_paths") as plot:
+        draw_evidence(store, open_for_review(store, match), asked)
+    assert np.isfinite(plot.call_args[0][0].joints).all(axis=-1).any(axis=(0, 2)).sum() >= 10
 
 
 def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch):

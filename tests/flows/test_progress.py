@@ -35,7 +35,8 @@ def clock(monkeypatch):
 def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     heard = Reporter()
     heard.run_planned({"ingest": 10.0, "tracking": 30.0})
-    assert heard.run_progress.share == 1.0  # no stage has begun, and no unit is planned yet
+    heard.stage_started("registration", "all there", units=2, missing=0)
+    assert str(heard.run_progress) == "0 %"  # nothing was to be computed so far
     heard.stage_started("ingest", "take in", units=4, missing=4)
     assert heard.run_progress.share == 0.0 and heard.run_progress.seconds_left is None
     clock[0] += 5.0

@@ -1,6 +1,7 @@
 """Formats made from what a run would hold, without running anything."""
 
 import dataclasses
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.export import CLASHING, COUNTED, EXPORTS, export
 from worldpose.body.body_file import load_open_body
-from worldpose.body.keypoints import CHALLENGE15, fold_keypoints
+from worldpose.body.keypoints import CHALLENGE15, HALPE26, fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import ORIGINS
 from worldpose.errors import UsageError, WorldposeError
@@ -114,6 +115,24 @@ def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
     for name in EXPORT_FORMATS:
         assert re.search(rf"\b{name}\b(?!-)", help_text), name
         assert f"| `{name}` |" in page
+
+
+def test_alphapose_results_are_the_projected_bodies(match_folder, tmp_path):
+    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
+    (results,) = write("alphapose", run, tmp_path)
+    entries = json.loads(results.read_text())
+    # The second person is missing in the third frame, and the camera in the last.
+    shown = [("0.jpg", 3), ("0.jpg", 8), ("1.jpg", 3), ("1.jpg", 8), ("2.jpg", 3)]
+    assert [(each["image_id"], each["idx"]) for each in entries] == shown
+    model, poses, _ = best_results.fitted_bodies(run.run, "A_1")
+    world = fold_keypoints(model, HALPE26)(poses)[0, 0]
+    # From 70 m in front of the centre spot and 2 m up, with 4000 px.
+    across = 960.0 + 4000.0 * world[:, 0] / (world[:, 1] + 70.0)
+    down = 540.0 - 4000.0 * (world[:, 2] - 2.0) / (world[:, 1] + 70.0)
+    points = np.array(entries[0]["keypoints"]).reshape(26, 3)
+    np.testing.assert_allclose(points[:, :2], np.stack([across, down], axis=-1), atol=0.0051)
+    assert (points[:, 2] == 1.0).all()  # the people stand 2 m apart
+    assert points[17, 1] == points[:, 1].min()  # the top of the head
 
 
 @pytest.mark.parametrize("form", ["challenge", "challenge-2025"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mvor import NO_BOX, NO_IDENTITY, judge_result, load_moments, measure, name_detections
+from mvor import load_moments, measure
 
 from worldpose.tracking.settings import TrackingSettings
 
@@ -19,33 +19,6 @@ FILES = [MVOR / "camma_mvor_2018.json", MVOR / "openpose_kps.json"]
 needs_data = pytest.mark.skipif(
     not all(file.is_file() for file in FILES), reason="WORLDPOSE_TEST_DATA has no mvor"
 )
-
-
-def test_a_detection_is_named_by_the_box_around_it():
-    boxes = np.array([[0, 0, 100, 200, 4], [60, 0, 100, 200, NO_IDENTITY], [0, 0, 400, 400, 7.0]])
-    joints = np.full((3, 17, 3), np.nan)
-    joints[0, :4] = [[10, 10, 1], [90, 10, 1], [90, 190, 1], [10, 190, 1]]
-    joints[1, :4] = [[70, 10, 1], [150, 10, 1], [150, 190, 1], [70, 190, 1]]
-    joints[2, :2] = [[500, 10, 1], [510, 20, 1]]
-    assert name_detections(boxes, joints) == [4, NO_IDENTITY, NO_BOX]
-    assert name_detections(np.empty((0, 5)), joints) == [NO_BOX] * 3
-
-
-@pytest.mark.parametrize(
-    ("names", "elsewhere", "taken", "verdict"),
-    [
-        ([3, 3, 5], [{3}, {3}, {5}], set(), ("real", 3)),
-        ([3, 3], [{3}, {3}], {3}, ("false", 3)),
-        ([3, 5], [{3}, {5}], set(), ("false", None)),
-        ([3, NO_BOX], [{3}, set()], set(), ("false", None)),
-        ([3, NO_IDENTITY], [{3}, {NO_IDENTITY}], set(), ("real", 3)),
-        ([3, NO_IDENTITY], [{3}, {3, NO_IDENTITY}], set(), ("false", None)),
-        ([NO_IDENTITY, NO_IDENTITY], [{NO_IDENTITY}] * 2, set(), ("unknown", None)),
-        ([NO_BOX, NO_IDENTITY], [set(), {NO_IDENTITY}], set(), ("false", None)),
-    ],
-)
-def test_boxes_tell_whether_a_result_is_a_person(names, elsewhere, taken, verdict):
-    assert judge_result(names, elsewhere, taken) == verdict
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldpose.detection.interfaces import People
 from worldpose.training.labels import read_labels
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -29,31 +28,3 @@ def test_the_labels_cover_what_the_table_states(labels):
     assert (joints[:, :5] == 0).all()  # no face was labelled
     assert ((joints > 0).sum(axis=1) > 0).sum() == 74
     assert (joints == 2).sum() >= 690
-
-
-def test_perfect_boxes_score_one_and_the_crowd_does_not_count_on_the_pitch(labels):
-    outlines = stills.pitch_outlines(stills.LABELS)
-    found = []
-    for still in labels:
-        real = still.boxes[~still.ignored]
-        crowd = [[5.0, 1.0, 15.0, 20.0]] if outlines[still.path.name][:, 1].min() > 40 else []
-        boxes = np.concatenate([real, np.array(crowd).reshape(-1, 4)])
-        scores = np.concatenate([np.full(len(real), 0.9), np.full(len(crowd), 0.95)])
-        found.append(People(boxes, scores))
-    everywhere = stills.score_boxes(found, labels, 0.4)
-    assert everywhere["recall"] == 1.0
-    assert everywhere["precision"] < 1.0
-    on_pitch = stills.score_boxes(*stills.keep_pitch(found, labels, outlines), 0.4)
-    assert on_pitch == {"recall": 1.0, "precision": 1.0, "ap50": 1.0}
-
-
-def test_a_second_box_and_a_shifted_box_are_false(labels):
-    still = next(each for each in labels if each.path.name == "off2.jpg")
-    box = still.boxes[~still.ignored][0]
-    width = box[2] - box[0]
-    shifted = box + [width, 0.0, width, 0.0]
-    scores, right = stills.judge_boxes(
-        People(np.stack([box, box + 1.0, shifted]), np.array([0.9, 0.8, 0.7])), still
-    )
-    assert scores.tolist() == [0.9, 0.8, 0.7]
-    assert right.tolist() == [True, False, False]

@@ -125,20 +125,6 @@ def test_a_camera_may_film_one_clip_alone(tmp_path, reading):
     assert any("it shows frames 2 to 13 of 2 to 29" in text for text in told)
 
 
-@pytest.mark.parametrize(("tall", "told"), [(20.0, False), (900.0, True)])
-def test_people_too_large_for_the_bundled_detector_are_told(
-    filmed, tmp_path, reading, monkeypatch, tall, told
-):
-    boxes = np.array([[0.0, 0.0, 8.0, tall]])
-    detect = staticmethod(lambda pictures: [People(boxes, np.array([0.9])) for _ in pictures])
-    monkeypatch.setattr(Reading, "detect", detect)
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
-    warnings = store.manifest("filmed", "detection", "left.late", results["detection/left.late"])
-    assert any("people of 28 to 160 px" in text for text in warnings.warnings) == told
-
-
 def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, tmp_path, reading):
     path = filmed / "videos" / "left.mp4"
     with av.open(str(path)) as video:
@@ -187,18 +173,6 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     metrics = [{k: v for k, v in each.figures.items() if k not in speed} for each in (fresh, kept)]
     assert metrics[0] == metrics[1]
     assert fresh.figures["corrections_refused"] == 0
-
-
-def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    names = [stage.name for stage in METHOD]
-    results = computed(store, match, names.index("detection"))
-    plan = RunPlan(store, match, {}, results=results)
-    planned = plan.plan_stage(METHOD[names.index("detection")])
-    monkeypatch.setattr(tasks.detection, "weights_of", lambda settings: {"embedded": "another"})
-    with pytest.raises(InputError, match="planned with"):
-        task_of(METHOD[names.index("detection")]).fn(planned[0].work(store.url, match, "0001"))
 
 
 def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(filmed, tmp_path):
@@ -251,3 +225,29 @@ def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, m
     np.testing.assert_array_equal(found[..., 1], np.where(np.isnan(expected), np.nan, [10.0, 20.0]))
     manifest = store.manifest("filmed", "detection", "right.early", after["detection/right.early"])
     assert manifest.figures["empty_share"] == 0.5
+
+
+def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    names = [stage.name for stage in METHOD]
+    results = computed(store, match, names.index("detection"))
+    plan = RunPlan(store, match, {}, results=results)
+    planned = plan.plan_stage(METHOD[names.index("detection")])
+    monkeypatch.setattr(tasks.detection, "weights_of", lambda settings: {"embedded": "another"})
+    with pytest.raises(InputError, match="planned with"):
+        task_of(METHOD[names.index("detection")]).fn(planned[0].work(store.url, match, "0001"))
+
+
+@pytest.mark.parametrize(("tall", "told"), [(20.0, False), (900.0, True)])
+def test_people_too_large_for_the_bundled_detector_are_told(
+    filmed, tmp_path, reading, monkeypatch, tall, told
+):
+    boxes = np.array([[0.0, 0.0, 8.0, tall]])
+    detect = staticmethod(lambda pictures: [People(boxes, np.array([0.9])) for _ in pictures])
+    monkeypatch.setattr(Reading, "detect", detect)
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+    warnings = store.manifest("filmed", "detection", "left.late", results["detection/left.late"])
+    assert any("people of 28 to 160 px" in text for text in warnings.warnings) == told

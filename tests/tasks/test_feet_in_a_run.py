@@ -11,7 +11,7 @@ from data_contracts.conventions import FEET
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
-from flows.results.best_results import LIMB_ENDS, clip_positions, joint_tracks
+from flows.results.best_results import clip_positions, joint_tracks
 from flows.run_plan import plan_run
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
@@ -118,29 +118,6 @@ def test_bodies_follow_them(run):
     assert np.nanmedian(np.linalg.norm(feet - true_people(result, truth), axis=-1)) < 0.025
 
 
-def test_joint_tracks_carry_them_in_both_definitions(run):
-    results = Results(run[0])
-    body, seen = (
-        joint_tracks(results, "clip", definition=name).extra for name in ("body", "detector")
-    )
-    placed = joint_tracks(results, "clip", "retriangulation")
-    assert body.points == seen.points == placed.extra.points == FEET
-    result = results["body_fitting/clip"]
-    np.testing.assert_array_equal(body.joints, result["extra_joints"].values)
-    length = np.linalg.norm(result["extra_offsets"].values, axis=-1)
-    moved = np.linalg.norm(seen.joints - body.joints, axis=-1)
-    np.testing.assert_allclose(
-        moved[np.isfinite(moved).all(axis=-1)].mean(axis=0), length, atol=1e-9
-    )
-    # Offsets bring bodies nearer to what the views show.
-    near, far = (
-        np.nanmedian(np.linalg.norm(each.joints - placed.extra.joints, axis=-1))
-        for each in (seen, body)
-    )
-    assert near < far + 1e-3
-    assert (body.views == placed.extra.views).all()
-
-
 def test_best_joints_are_those_of_bodies_as_detected_and_tell_their_source(run):
     results = Results(run[0])
     fitted = results["body_fitting/clip"].copy(deep=True)
@@ -173,15 +150,3 @@ def test_best_joints_are_those_of_bodies_as_detected_and_tell_their_source(run):
     found = np.isfinite(hips)
     assert found[:5, 0].all()
     np.testing.assert_array_equal(places.xy[:, column][found], hips[found])
-
-
-def test_bodies_of_people_whom_one_camera_films_have_the_model_s_wrists_and_ankles(run):
-    views = run[0]["retriangulation/clip"]["views"]
-    fitted = run[0]["body_fitting/clip"].drop_vars("extra_joints").assign(views=views)
-    results = Results({"body_fitting/clip": fitted})
-    results["broadcast_tracking/clip"] = run[0]["tracking/clip"]
-    tracks = joint_tracks(results, "clip", definition="detector")
-    model = fitted["joints"].values[:, :, LIMB_ENDS]
-    np.testing.assert_array_equal(tracks.joints[:, :, LIMB_ENDS], model)
-    assert 3 in tracks.source[:, :, LIMB_ENDS]
-    assert 3 not in np.delete(tracks.source, LIMB_ENDS, axis=2)

@@ -55,7 +55,7 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_of
         open_first=lambda pooled, calibrated: results[calibrated],
         made_from=lambda name: calibrated,
     )
-    pictures = refitting._BroadcastView.open(inputs, "clip", {"joints": None})
+    pictures = refitting._RefittedView.open(inputs, "clip", {"joints": None})
     # Match frame 100 is at 104.25 of the video: its image 104 was taken a quarter earlier. The
     # feed was measured to show what static cameras show one and a half frames on.
     assert (pictures.clock.late + pictures.late).tolist() == [late] * 3
@@ -77,7 +77,7 @@ def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(late):
     estimates = MonocularEstimates(104 + frame, rotations, middle, False)
     nobody, joints = xr.DataArray(np.full((12, 1, 17, 2), np.nan)), xr.DataArray(runner(frame))
     clock = ImageClock(104 + frame, np.zeros(12), 1.0)
-    views = refitting._BroadcastView(clock, camera, late, nobody, joints, estimates)
+    views = refitting._RefittedView(clock, camera, late, nobody, joints, estimates)
     _, found = views(slice(0, 12))
     there = np.isfinite(found.orient).all(axis=(-2, -1))[:, 0]
     assert there.sum() >= 10

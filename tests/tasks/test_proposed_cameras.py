@@ -95,32 +95,6 @@ def test_an_image_that_shows_too_little_leaves_its_camera_out(folder, tmp_path):
     assert "Click four or more named points" in reasons[TURNED]
 
 
-def test_only_cameras_without_clicks_have_proposals_unless_people_must_decide(folder, tmp_path):
-    store = Store.create(tmp_path / "project")
-
-    def planned():
-        match, _ = register(store, folder)
-        units = plan_run(store, match, {})
-        return {unit.name: set(unit.recipe.inputs) for unit in units}
-
-    before = planned()
-    assert not any(name.startswith("proposal/") for name in before)
-    grass = np.full((SIZE[1], SIZE[0], 3), (60, 120, 50), np.uint8)
-    take_clicks(folder, {TURNED: "far"}, grass)
-    stated = planned()
-    assert stated[f"proposal/{TURNED}"] == set()
-    assert stated[f"static_calibration/{TURNED}"] == {f"proposal/{TURNED}"}
-    assert stated["static_calibration/cam00"] == set()
-    text = (folder / "match.yaml").read_text()
-    (folder / "match.yaml").write_text(text.replace("  side: far\n", ""))
-    state_side(folder, "cam00", "near")
-    together = planned()
-    cameras = {f"cam0{number}" for number in range(6)}
-    assert together["proposal/cam00"] == {"ingest/cam00"}
-    assert together[f"static_calibration/{TURNED}"] == {f"proposal/{each}" for each in cameras}
-    assert together["static_calibration/cam00"] == set()
-
-
 def test_one_side_has_to_be_stated(folder, tmp_path):
     store = Store.create(tmp_path / "project")
     grass = np.full((SIZE[1], SIZE[0], 3), (60, 120, 50), np.uint8)

@@ -187,6 +187,28 @@ def test_what_may_pass_is_tried_again(failure, retried):
     assert task.retry_condition_fn(task, None, Failed(data=failure)) is retried
 
 
+@pytest.mark.parametrize(
+    ("raised", "told"),
+    [
+        (ValueError("odd shapes"), "This is a bug in worldpose, not in your data"),
+        (MemoryError("7 GiB"), "not enough memory (7 GiB)"),
+    ],
+)
+def test_a_bug_in_a_unit_is_not_blamed_on_the_match(planned, monkeypatch, raised, told):
+    _, match, _ = planned
+    store = planned[0]
+    unit = plan_run(store, match, {})[0]
+
+    def compute(inputs, result):
+        raise raised
+
+    monkeypatch.setattr("tasks.unit.require_same_code", lambda work, module: None)
+    with pytest.raises(WorldposeError) as caught:
+        unit_task(compute).fn(unit.work(store.url, match, "0001"))
+    assert unit.name in str(caught.value)
+    assert told in str(caught.value)
+
+
 def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
     store, match, first = planned
     failed = f"static_calibration/{first.recipe.unit}"
@@ -210,25 +232,3 @@ def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
     )
     # The other cameras have their results: only what needs all of them waits.
     assert len(record.executed) == len(plan_run(store, match, {})) - 8
-
-
-@pytest.mark.parametrize(
-    ("raised", "told"),
-    [
-        (ValueError("odd shapes"), "This is a bug in worldpose, not in your data"),
-        (MemoryError("7 GiB"), "not enough memory (7 GiB)"),
-    ],
-)
-def test_a_bug_in_a_unit_is_not_blamed_on_the_match(planned, monkeypatch, raised, told):
-    _, match, _ = planned
-    store = planned[0]
-    unit = plan_run(store, match, {})[0]
-
-    def compute(inputs, result):
-        raise raised
-
-    monkeypatch.setattr("tasks.unit.require_same_code", lambda work, module: None)
-    with pytest.raises(WorldposeError) as caught:
-        unit_task(compute).fn(unit.work(store.url, match, "0001"))
-    assert unit.name in str(caught.value)
-    assert told in str(caught.value)

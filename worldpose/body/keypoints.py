@@ -129,6 +129,13 @@ BODY25: Final = (
 )
 """OpenPose's 25 points in its order."""
 
+HALPE26: Final = (
+    *COCO17,
+    *("head_top", "neck", "mid_hip"),
+    *_both("big_toe", "small_toe", "heel"),
+)
+"""The 26 points of Halpe Full-Body in its order."""
+
 CHALLENGE15: Final = (
     "nose",
     *(
@@ -143,6 +150,7 @@ SKELETONS: Final = MappingProxyType(
     {
         "coco17": COCO17,
         "body25": BODY25,
+        "halpe26": HALPE26,
         # The joints that the paper scores (E4).
         "evaluated14": (
             "nose",
@@ -213,6 +221,8 @@ def fold_keypoints(model: BodyModel, points: tuple[str, ...]) -> FoldedKeypoints
     for row, point in enumerate(points):
         if point in JOINT_OF_POINT:
             joint_shares[row, JOINT_OF_POINT[point]] = 1.0
+        elif point == "head_top":
+            vertex_shares[row, model.template[:, 1].argmax()] = 1.0
         elif point in VERTEX_OF_POINT and len(model.template) == SMPL_VERTICES:
             vertex_shares[row, VERTEX_OF_POINT[point]] = 1.0
         else:

@@ -84,9 +84,6 @@ SMPL_VERTICES: Final = 6890
 POSE_FEATURES: Final = 9 * (JOINTS - 1)
 """Length of the pose feature: the 23 rotation matrices minus the identity."""
 
-_CHUNK: Final = 32
-"""Bodies whose surfaces are computed at a time; 24 MB of transforms in SMPL's layout."""
-
 
 @dataclass(frozen=True, eq=False)
 class Articulation:
@@ -246,8 +243,10 @@ class BodyModel:
         flat = parameters.flat()
         count = len(self.template)
         surfaces = np.empty((*flat.batch_shape, count, 3))
-        for start in range(0, len(surfaces), _CHUNK):
-            chunk = slice(start, start + _CHUNK)
+        # Bodies whose surfaces are computed at a time; 24 MB of transforms in SMPL's layout.
+        bodies_at_once = 32
+        for start in range(0, len(surfaces), bodies_at_once):
+            chunk = slice(start, start + bodies_at_once)
             surfaces[chunk] = self._surface(flat[chunk])
         return surfaces.reshape(*parameters.batch_shape, count, 3)
 

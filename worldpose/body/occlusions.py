@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
+from data_contracts.conventions import COCO17_TORSO
 from worldpose.geometry.cameras import Camera
 
 Capsules = tuple[tuple[int, int, float], ...]
@@ -17,7 +18,6 @@ CAPSULES: Final[Capsules] = (
     *((11, 13, 0.045), (12, 14, 0.045), (13, 15, 0.03), (14, 16, 0.03), (3, 4, 0.055)),
 )
 """Joint pairs of body parts, and their half widths [stature]."""
-TRUNK: Final = (5, 6, 11, 12)
 
 
 def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
@@ -29,10 +29,10 @@ def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
 
 
 def find_hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
-    """Return the nearest of the persons before a joint (frames, persons, 17), -1 for none.
+    """Return the nearest of the persons before a joint (frames, persons, joints), -1 for none.
 
     Args:
-        pixels: (frames, persons, 17, 2) joints [px].
+        pixels: (frames, persons, joints, 2) [px], COCO-17 first.
         depth: (frames, persons) of trunks [m].
         size: (frames, persons) height of a standing person there [px].
     """
@@ -72,19 +72,31 @@ def is_covered(points: Floats, body: Floats, size: Floats, parts: Capsules = CAP
     return covered
 
 
+def visible_joints(joints: Floats, camera: Camera) -> tuple[Floats, Flags]:
+    """Return pixels, and which joints are in the image and hidden by no nearer person.
+
+    Shapes are (frames, persons, joints, 2) and (frames, persons, joints).
+
+    Args:
+        joints: (frames, persons, joints, 3) [m], world, COCO-17 first; NaN where missing.
+        camera: one camera, or (frames,); NaN where a frame has none.
+    """
+    stature = 1.8  # mean height of a person [m]
+    frames, persons, count, _ = joints.shape
+    pixels = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
+    trunk = joints[:, :, COCO17_TORSO].mean(axis=2)
+    depth = np.linalg.norm(trunk - camera.center[..., None, :], axis=-1)
+    size = stature * camera.focal.mean(axis=-1)[..., None] / depth
+    within = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)
+    return pixels, within.all(-1) & (find_hiders(pixels, depth, size) < 0)
+
+
 def visible_shares(joints: Floats, camera: Camera) -> Floats:
     """Return the share of joints in the image that no other hides (frames, persons) [0..1].
 
     Joints are (frames, persons, 17, 3) [m], world; NaN where a person, or the camera, is missing.
     """
-    stature = 1.8  # mean height of a person [m]
-    frames, persons, count, _ = joints.shape
-    pixels = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
-    trunk = joints[:, :, TRUNK].mean(axis=2)
-    depth = np.linalg.norm(trunk - camera.center[..., None, :], axis=-1)
-    size = stature * camera.focal.mean(axis=-1)[..., None] / depth
-    seen = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)
-    seen = seen.all(-1) & (find_hiders(pixels, depth, size) < 0)
+    seen = visible_joints(joints, camera)[1]
     placed = np.asarray(np.isfinite(camera.center).all(axis=-1))
     known = np.isfinite(joints).all((-1, -2)) & placed[..., None]
     return np.where(known, seen.mean(-1), np.nan)

@@ -15,14 +15,10 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_RIGID_BONES
 from worldpose.body.keypoints import JOINT_OF_POINT
 from worldpose.body.model import BodyModel
 
-BONES: Final = (
-    *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),
-)
-"""Pairs of COCO-17 joints whose distance no pose changes."""
 DEFINITION_STD_M: Final = 0.02
 """Distance between a detector's definition of a joint and the body model's [m]: no number of frames
 makes a bone's length more accurate than this times sqrt(2)."""
@@ -30,7 +26,7 @@ makes a bone's length more accurate than this times sqrt(2)."""
 
 @dataclass(frozen=True, eq=False)
 class BoneLengths:
-    """Lengths of a person's `BONES`."""
+    """Lengths of a person's `COCO17_RIGID_BONES`."""
 
     length: Floats
     """(bones,) [m]; NaN for bones that were never seen."""
@@ -56,8 +52,8 @@ def measure_bones(joints: Floats, covariance: Floats, correlated_frames: float) 
         covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
         correlated_frames: frames with correlated errors, which count as one.
     """
-    lengths, variances = np.full(len(BONES), np.nan), np.full(len(BONES), np.inf)
-    for index, (a, b) in enumerate(BONES):
+    lengths, variances = (np.full(len(COCO17_RIGID_BONES), value) for value in (np.nan, np.inf))
+    for index, (a, b) in enumerate(COCO17_RIGID_BONES):
         bone = joints[:, b] - joints[:, a]
         error = covariance[:, a] + covariance[:, b]
         seen = np.isfinite(bone).all(-1) & np.isfinite(error).all((-1, -2))
@@ -113,11 +109,11 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
 
     The prior of betas is normal with variance 1; without bones they are 0 with covariance 1.
     """
-    ends = np.array([[JOINT_OF_POINT[COCO17[joint]] for joint in bone] for bone in BONES])
+    ends = np.array([[JOINT_OF_POINT[COCO17[k]] for k in bone] for bone in COCO17_RIGID_BONES])
     template = model.joint_template[ends[:, 1]] - model.joint_template[ends[:, 0]]
     directions = model.joint_directions[ends[:, 1]] - model.joint_directions[ends[:, 0]]
     seen = np.isfinite(bones.length)
-    weight = np.zeros(len(BONES))
+    weight = np.zeros(len(COCO17_RIGID_BONES))
     weight[seen] = 1.0 / (bones.variance[seen] + 2.0 * DEFINITION_STD_M**2)
     betas, precision = np.zeros(model.shapes), np.eye(model.shapes)
     # Lengths are almost linear in the betas: from the third step on nothing changes.

@@ -15,7 +15,6 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shapes import Shapes, fit_shapes, spread_intervals
 from worldpose.compiled import map_in_threads
 
-WINDOW_FRAMES: Final = 3000
+WINDOW_FRAMES = 3000
 """Frames that are solved together: a person's equations take 60 KB per frame."""
 
 

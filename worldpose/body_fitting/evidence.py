@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17, COCO17_SIGMAS
+from data_contracts.conventions import COCO17, COCO17_SPREAD
 from worldpose.body.model import BodyModel
 from worldpose.body_fitting.point_equations import invert_symmetric
 from worldpose.body_fitting.pose_space import cross
 from worldpose.body_fitting.settings import BodyFittingSettings
 
-JOINT_SPREAD: Final = np.array(COCO17_SIGMAS) / 0.08
-"""Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
+JOINT_SPREAD: Final = np.array(COCO17_SPREAD)
 
 MIN_INFORMATION: Final = 1e-6
 """Added to singular information [1/m^2]: one line leaves a direction undetermined."""

@@ -118,15 +118,7 @@ def learn_point_offsets(
         moved = move_points(solver, points, offsets)
         medians, spreads = [], []
         for own in map_in_threads(residuals, people):
-            seen = np.isfinite(own[..., 0])
-            median = np.full(offsets.shape, np.nan)
-            spread = np.full(offsets.shape, np.nan)
-            for point in np.flatnonzero(seen.any(axis=0)):
-                its = own[seen[:, point], point]
-                median[point] = np.median(its, axis=0)
-                # Standard deviation of a normal distribution over its median absolute deviation
-                # [1].
-                spread[point] = (1.4826 * np.median(np.abs(its - median[point]), axis=0)) ** 2
+            median, spread = _describe_residuals(own)
             medians.append(median)
             spreads.append(spread)
         each, around = np.array(medians), np.array(spreads)
@@ -142,6 +134,18 @@ def learn_point_offsets(
     with np.errstate(invalid="ignore"):
         varying = np.nan_to_num(np.nansum(around, axis=0) / np.isfinite(around).sum(axis=0))
     return offsets, variance, varying
+
+
+def _describe_residuals(own: Floats) -> tuple[Floats, Floats]:
+    """Return median and robust variance (points, 3) of residuals (frames, points, 3)."""
+    seen = np.isfinite(own[..., 0])
+    median, spread = (np.full(own.shape[1:], np.nan) for _ in range(2))
+    for point in np.flatnonzero(seen.any(axis=0)):
+        its = own[seen[:, point], point]
+        median[point] = np.median(its, axis=0)
+        # Standard deviation of a normal distribution over its median absolute deviation [1].
+        spread[point] = (1.4826 * np.median(np.abs(its - median[point]), axis=0)) ** 2
+    return median, spread
 
 
 def _kept_variance(

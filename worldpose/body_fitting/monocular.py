@@ -22,18 +22,12 @@ from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
 from worldpose.body.model import JOINTS
-from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps
+from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps, nearest_known
 from worldpose.errors import InputError
 from worldpose.formats.archives import read_npz
 from worldpose.formats.files import require_file
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-
-WHOLE: Final = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
-"""Names of all 24 rotations in one array."""
-ROOT: Final = ("global_orient", "pred_global_orient")
-REST: Final = ("body_pose", "pred_body_pose")
-"""Names of the pelvis' rotation and of the 23 others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +71,20 @@ def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> Monocula
     Raises:
         InputError: arrays are missing or have wrong shapes; the error names `where`.
     """
-    whole = _first_present(arrays, WHOLE)
+    # Names of all 24 rotations in one array.
+    names_of_all = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
+    whole = _first_present(arrays, names_of_all)
+    names_of_root = ("global_orient", "pred_global_orient")
+    # Names of the pelvis' rotation and of the 23 others.
+    names_of_rest = ("body_pose", "pred_body_pose")
     if whole is None:
-        root, rest = _first_present(arrays, ROOT), _first_present(arrays, REST)
+        root, rest = _first_present(arrays, names_of_root), _first_present(arrays, names_of_rest)
         if root is None or rest is None:
-            expected = f"{' or '.join(WHOLE)}; or {ROOT[0]} and {REST[0]}"
+            expected = f"{' or '.join(names_of_all)}; or {names_of_root[0]} and {names_of_rest[0]}"
             raise _format_error(where, expected, ", ".join(arrays) or "nothing")
         parts = [
-            _rotation_matrices(root, where, ROOT[0], 1),
-            _rotation_matrices(rest, where, REST[0], JOINTS - 1),
+            _rotation_matrices(root, where, names_of_root[0], 1),
+            _rotation_matrices(rest, where, names_of_rest[0], JOINTS - 1),
         ]
         if len(parts[0]) != len(parts[1]):
             raise _format_error(
@@ -416,3 +415,30 @@ def monocular_priors(
         orient, bend, left = carry_errors(orient, bend, off, used, CORRELATION_S * fps)
         guided[person] = MonocularPrior(orient, bend, used, precision, correlated_frames, left)
     return guided
+
+
+def smooth_poses(
+    poses: MonocularPoses,
+    person: int,
+    at: NDArray[np.int64],
+    frames: NDArray[np.int64],
+    reach: float,
+) -> tuple[Floats, Floats]:
+    """Return robust means of a person's orientations (frames, 3) and angles (frames, 30) [rad]."""
+    orient = np.empty((len(frames), 3, 3))
+    angles = np.empty((len(frames), SIZE))
+    width = np.maximum(reach, np.abs(frames - nearest_known(at, frames)))
+    first = np.searchsorted(at, frames - width)
+    last = np.searchsorted(at, frames + width, side="right")
+    for row in range(len(frames)):
+        near = at[first[row] : last[row]]
+        turns = poses.orient[near, person]
+        weight = np.ones(len(near))
+        for _ in range(3):
+            u, _, vt = np.linalg.svd(np.einsum("n,nab->ab", weight, turns))
+            u[:, -1] *= np.linalg.det(u @ vt)
+            mean = u @ vt
+            off = np.linalg.norm(Rigid(turns @ mean.T, np.zeros(3)).rotvec, axis=-1)
+            weight = 1.0 / (1.0 + (off / PRIOR_SPREAD) ** 2)
+        orient[row], angles[row] = mean, np.median(poses.angles[near, person], axis=0)
+    return Rigid(orient, np.zeros(3)).rotvec, angles

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_TORSO
 from data_contracts.keypoints import TrackedFrames
 from worldpose.body.differentiable import DifferentiableBody
 from worldpose.body.keypoints import fold_keypoints
@@ -18,7 +18,7 @@ from worldpose.body_fitting.estimate import long_gaps, split_windows
 from worldpose.body_fitting.results import BodyFit, EvidenceSource, FittedArrays
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.geometry.cameras import Camera
-from worldpose.reference_method.body_fitting import TORSO, fit_person
+from worldpose.reference_method.body_fitting import fit_person
 from worldpose.reference_method.cameras import TensorCameras
 
 
@@ -80,7 +80,7 @@ def _fit(
     """Write one person's bodies from the first frame with joints to the last."""
     if (betas := shapes.get(person)) is not None:
         arrays.betas[person], arrays.betas_covariance[person] = betas, np.eye(len(betas))
-    usable = np.isfinite(joints[:, TORSO, 0]).sum(-1) >= 3
+    usable = np.isfinite(joints[:, COCO17_TORSO, 0]).sum(-1) >= 3
     if not usable.any():
         return
     here = np.flatnonzero(np.isfinite(joints).any((1, 2)))

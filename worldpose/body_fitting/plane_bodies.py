@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_HIPS
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel
@@ -36,6 +36,7 @@ from worldpose.body_fitting.monocular import (
     MonocularPoses,
     MonocularPrior,
     place_monocular_poses,
+    smooth_poses,
 )
 from worldpose.body_fitting.pose_space import SIZE, load_pose_prior, nearest_known
 from worldpose.body_fitting.poses import PoseSolver, pose_covariance
@@ -44,15 +45,12 @@ from worldpose.body_fitting.residuals import PersonObjective, Pose
 from worldpose.body_fitting.results import BodyFit, FittedArrays
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shapes import Piece, Shapes, solve_shapes, spread_intervals
-from worldpose.body_fitting.standing import find_standing_distance
+from worldpose.body_fitting.standing import find_standing_distance, stand_on_ground
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
+from worldpose.tracking.plane.feet import PIXEL_STD
 from worldpose.tracking.plane.kalman import CORRELATION_S as PLACE_CORRELATION_S
 
-HIPS: Final = (11, 12)
-"""Hips in COCO-17; the place on the pitch is below their middle."""
-PIXEL_STD: Final = 1.0
-"""Standard deviation of a keypoint in the image [px], in addition to `ray_std_m`."""
 MIN_KEYPOINTS: Final = 6
 """Minimum keypoints of a frame to judge an estimate [1]."""
 MAX_MISFIT: Final = 0.85
@@ -128,12 +126,8 @@ def fit_bodies_on_plane(
     solver = PoseSolver(ChainedKeypoints.of(keypoints), load_pose_prior(), settings, ground)
     lifted = _lift_keypoints(evidence)
     poses = place_monocular_poses(estimates, evidence.camera, evidence.number, lifted)
-    mean = Pose(
-        np.zeros((frames, 3)),
-        np.zeros((frames, 3)),
-        np.zeros((frames, SIZE)),
-        np.zeros(model.shapes),
-    )
+    still = np.zeros((frames, 3))
+    mean = Pose(still, still, np.zeros((frames, SIZE)), np.zeros(model.shapes))
     placed = np.full((frames, persons, 17, 3), np.nan)
     for person in range(persons):
         known = Rigid(poses.orient[:, person], np.zeros(3))
@@ -230,9 +224,8 @@ class _Clip:
         span = slice(int(first), int(last) + 1)
         own = frames[span]
         place = np.stack([np.interp(own, frames[known], axis[known]) for axis in place.T], axis=-1)
-        # Monocular poses so near in time make a start [s]: single frames with a wrong pose drop
-        # out.
-        orient, angles = _smooth_poses(self.poses, person, at, own, 0.2 * fps)
+        # Monocular poses so near in time make a start [s]: single wrong poses drop out.
+        orient, angles = smooth_poses(self.poses, person, at, own, 0.2 * fps)
         betas = np.zeros(self.solver.chained.model.shapes)
         start = stand_on_ground(
             self.solver, Pose(np.zeros_like(orient), orient, angles, betas), place
@@ -259,7 +252,7 @@ class _Clip:
             pose, _ = free.search(track, start, shapes.offsets)
             joints = self.solver.chained.place(pose.parameters())
             center = evidence.camera.center[own.span]
-            hips = joints[:, HIPS, :2].mean(axis=1)
+            hips = joints[:, COCO17_HIPS, :2].mean(axis=1)
             sight = hips - center[:, :2]
             distance = np.linalg.norm(sight, axis=-1)
             sight /= distance[:, None]
@@ -289,12 +282,7 @@ class _Clip:
         return replace(self, evidence=evidence, lifted=_lift_keypoints(evidence)), moved
 
     def track(
-        self,
-        person: int,
-        rows: NDArray[np.int64],
-        fps: float,
-        *,
-        for_shape: bool,
+        self, person: int, rows: NDArray[np.int64], fps: float, *, for_shape: bool
     ) -> PersonObjective:
         """Return the evidence of a person in some frames, `rows`, at the rate `fps` [1/s].
 
@@ -349,17 +337,17 @@ class _Clip:
         weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + PLACE_CORRELATION_S * fps)) * known
         by_place = np.zeros_like(by_ray)
         outer = np.nan_to_num(sight[:, :, None] * sight[:, None])
-        by_place[:, HIPS] = (weight[:, None, None] * outer)[:, None]
+        by_place[:, COCO17_HIPS] = (weight[:, None, None] * outer)[:, None]
         joints = np.where(seen[..., None], points, np.nan)
-        hips = joints[:, HIPS]
+        hips = joints[:, COCO17_HIPS]
         target = np.broadcast_to(place[:, None], hips.shape)
         hips = np.where(np.isfinite(hips), hips, target)
         information = by_ray + by_place
         moved = np.linalg.solve(
-            information[:, HIPS] + MIN_INFORMATION * np.eye(3),
-            by_place[:, HIPS] @ np.nan_to_num(target - hips)[..., None],
+            information[:, COCO17_HIPS] + MIN_INFORMATION * np.eye(3),
+            by_place[:, COCO17_HIPS] @ np.nan_to_num(target - hips)[..., None],
         )[..., 0]
-        joints[:, HIPS] = hips + moved
+        joints[:, COCO17_HIPS] = hips + moved
         information[~np.isfinite(joints).all(axis=-1)] = 0.0
         return PersonEvidence(joints, information)
 
@@ -421,19 +409,6 @@ class _Clip:
         # degrees.
         line *= 0.08 * (joints[..., 2:] - place[:, None, 2:])
         return np.asarray(shared[:, None] + line[..., :, None] * line[..., None, :])
-
-
-def stand_on_ground(solver: PoseSolver, pose: Pose, place: Floats) -> Pose:
-    """Return a pose with its mid-hip above `place` (frames, 2) [m], lower ankle on the ground."""
-    assert solver.ground is not None
-    model = solver.chained.model
-    pose = replace(pose, transl=np.zeros_like(pose.transl))
-    joints = solver.chained.place(pose.parameters())
-    xy = place - joints[:, HIPS, :2].mean(axis=1)
-    feet = joints[:, ANKLES, :2] + xy[:, None]
-    floor = solver.ground(feet[..., 0], feet[..., 1]) + ankle_height(model, pose.betas)
-    up = (floor - joints[:, ANKLES, 2]).max(axis=1)
-    return replace(pose, transl=np.concatenate([xy, up[:, None]], axis=1))
 
 
 def _lift_keypoints(evidence: PlaneEvidence) -> Floats:
@@ -517,30 +492,3 @@ def _judge_fit(misfit: Floats, turned: Floats) -> str | None:
             f"round (misfit {middle:.1f} times their noise, turned {other:.1f})"
         )
     return None
-
-
-def _smooth_poses(
-    poses: MonocularPoses,
-    person: int,
-    at: NDArray[np.int64],
-    frames: NDArray[np.int64],
-    reach: float,
-) -> tuple[Floats, Floats]:
-    """Return robust means of a person's orientations (frames, 3) and angles (frames, 30) [rad]."""
-    orient = np.empty((len(frames), 3, 3))
-    angles = np.empty((len(frames), SIZE))
-    width = np.maximum(reach, np.abs(frames - nearest_known(at, frames)))
-    first = np.searchsorted(at, frames - width)
-    last = np.searchsorted(at, frames + width, side="right")
-    for row in range(len(frames)):
-        near = at[first[row] : last[row]]
-        turns = poses.orient[near, person]
-        weight = np.ones(len(near))
-        for _ in range(3):
-            u, _, vt = np.linalg.svd(np.einsum("n,nab->ab", weight, turns))
-            u[:, -1] *= np.linalg.det(u @ vt)
-            mean = u @ vt
-            off = np.linalg.norm(Rigid(turns @ mean.T, np.zeros(3)).rotvec, axis=-1)
-            weight = 1.0 / (1.0 + (off / PRIOR_SPREAD) ** 2)
-        orient[row], angles[row] = mean, np.median(poses.angles[near, person], axis=0)
-    return Rigid(orient, np.zeros(3)).rotvec, angles

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17_TORSO
 from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.body.model import BODY_POSE, BodyModel
 from worldpose.compiled import compile_kernel
@@ -142,8 +143,6 @@ def load_pose_prior() -> PosePrior:
     return PosePrior(mean, np.linalg.inv(covariance + np.diag(widening**2)))
 
 
-TORSO: Final = (5, 6, 11, 12)
-"""Shoulders and hips of COCO-17."""
 _LIMBS: Final = (
     # COCO's joints, the body's joints, slices of their coordinates, and the hinge of the second.
     ((5, 7, 9), (16, 18, 20), (slice(18, 21), slice(24, 27)), "elbow"),
@@ -226,11 +225,11 @@ def start_poses(
     """
     rest = model.joint_template + model.joint_directions @ betas
     torso = rest[[16, 17, 1, 2]]
-    turns, place = align_root(torso, joints[:, TORSO])
+    turns, place = align_root(torso, joints[:, COCO17_TORSO])
     # Without torso joints, the person is at the mean of the other joints.
     shown = np.asarray(np.isfinite(joints[..., 0]))
     center = np.where(shown[..., None], joints, 0.0).sum(1) / np.maximum(shown.sum(1), 1)[:, None]
-    some = np.asarray(shown[:, TORSO].any(-1))
+    some = np.asarray(shown[:, COCO17_TORSO].any(-1))
     place = np.where(some[:, None], place, center)
     middle = joints[:, 11:13].mean(axis=1)
     from_torso = place + turns @ (rest[1:3].mean(axis=0) - torso.mean(axis=0))

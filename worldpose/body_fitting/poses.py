@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +31,6 @@ from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
 from worldpose.geometry.rigid import Rigid
-
-ACCELERATION_WEIGHT: Final = float((1.0 / ACCELERATION_SCALE**2).sum())
-"""Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a body
-accelerates as one: the search may count them all, the covariance of its poses may not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +158,12 @@ def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
 def damp_motion(objective: PersonObjective) -> PersonObjective:
     """Return a solved objective for the covariance of its poses: a body accelerates as one."""
     contacts = objective.contacts
+    # Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a
+    # body accelerates as one: the search may count them all, the covariance of its poses may not.
+    acceleration_weight = float((1.0 / ACCELERATION_SCALE**2).sum())
     return replace(
         objective,
-        acceleration=objective.acceleration * ACCELERATION_WEIGHT**0.5,
+        acceleration=objective.acceleration * acceleration_weight**0.5,
         contacts=None if contacts is None else contacts.of(objective.evidence.known),
     )
 

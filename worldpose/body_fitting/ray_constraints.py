@@ -9,7 +9,6 @@ detections are assigned to known people.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,6 @@ from data_contracts.keypoints import KeypointDetections, TrackedFrames
 from worldpose.body_fitting.pose_space import interpolate_gaps
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-
-BLOCK: Final = 256
-"""Frames of detections in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +57,11 @@ def find_ray_constraints(
     """
     origins = np.full(joints.shape, np.nan)
     directions = np.full(joints.shape, np.nan)
+    # Frames of detections in memory at a time.
+    block_frames = 256
     blocks = [
-        slice(first, min(first + BLOCK, len(joints))) for first in range(0, len(joints), BLOCK)
+        slice(first, min(first + block_frames, len(joints)))
+        for first in range(0, len(joints), block_frames)
     ]
 
     def find(block: tuple[slice, KeypointDetections]) -> tuple[Floats, Floats]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from data_contracts.arrays import AnyFloats, Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_RIGID_BONES
 from data_contracts.keypoints import KeypointDetections, TrackedFrames
 from data_contracts.records import Record
-from worldpose.body_fitting.bones import BONES
 from worldpose.body_fitting.evidence import ANKLES, perceived_joints
 from worldpose.body_fitting.results import BodyFit
 from worldpose.compiled import map_in_threads
@@ -75,7 +74,7 @@ class FitMetrics:
             fit.guided.sum(),
         )
         perceived = perceived_joints(fit.joints, fit.offsets)
-        ends = np.array(BONES)
+        ends = np.array(COCO17_RIGID_BONES)
         limbs = np.linalg.norm(joints[:, :, ends[:, 1]] - joints[:, :, ends[:, 0]], axis=-1)
         step = np.linalg.norm(np.diff(fit.joints[:, :, ANKLES], axis=0), axis=-1)
         jerk = np.linalg.norm(np.diff(fit.joints, n=3, axis=0), axis=-1) * self._fps**3

@@ -127,20 +127,22 @@ def solve_shapes(
             )
             for person, slope in gradients.items()
         }
-        moved = []
-        for piece, solved in zip(pieces, solutions, strict=True):
-            shared = np.concatenate([betas_change[piece.person], change])
-            pose_step = -solved[..., -1] - solved[..., :-1] @ shared
-            moved.append(
-                replace(piece, pose=piece.pose.apply_step(pose_step, betas_change[piece.person]))
-            )
-        pieces = moved
+        pieces = [
+            _move_poses(piece, solved, betas_change[piece.person], change)
+            for piece, solved in zip(pieces, solutions, strict=True)
+        ]
         for piece in pieces:
             by_offset = by_offsets[piece.person]
             covariance = inverses[piece.person] + by_offset @ spread @ by_offset.T
             found[piece.person] = Shape(piece.pose.betas, covariance)
     by_joint = np.einsum("jau,uv,jbv->jab", MIRRORED_OFFSETS, spread, MIRRORED_OFFSETS)
     return Shapes(found, MIRRORED_OFFSETS @ unknowns, by_joint)
+
+
+def _move_poses(piece: Piece, solved: Floats, betas_change: Floats, change: Floats) -> Piece:
+    """Return a piece whose poses follow the steps of its person's betas and of the offsets."""
+    pose_step = -solved[..., -1] - solved[..., :-1] @ np.concatenate([betas_change, change])
+    return replace(piece, pose=piece.pose.apply_step(pose_step, betas_change))
 
 
 def _eliminate_poses(

@@ -15,12 +15,17 @@ the start at which every foot stands.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17_HIPS
+from worldpose.body_fitting.evidence import ANKLES, ankle_height
+from worldpose.body_fitting.poses import PoseSolver
+from worldpose.body_fitting.residuals import Pose
 from worldpose.geometry.optimize.banded import BandedFactor
 from worldpose.tracking.plane.kalman import Motion
 
@@ -72,3 +77,16 @@ def find_standing_distance(
         other = np.logaddexp(lifted, gross - np.log(0.5))
         standing = known / (1.0 + np.exp(np.clip(other - stands, -500.0, 500.0)))
     return found, spread
+
+
+def stand_on_ground(solver: PoseSolver, pose: Pose, place: Floats) -> Pose:
+    """Return a pose with its mid-hip above `place` (frames, 2) [m], lower ankle on the ground."""
+    assert solver.ground is not None
+    model = solver.chained.model
+    pose = replace(pose, transl=np.zeros_like(pose.transl))
+    joints = solver.chained.place(pose.parameters())
+    xy = place - joints[:, COCO17_HIPS, :2].mean(axis=1)
+    feet = joints[:, ANKLES, :2] + xy[:, None]
+    floor = solver.ground(feet[..., 0], feet[..., 1]) + ankle_height(model, pose.betas)
+    up = (floor - joints[:, ANKLES, 2]).max(axis=1)
+    return replace(pose, transl=np.concatenate([xy, up[:, None]], axis=1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
@@ -96,7 +95,3 @@ def displace(points: PointEvidence, problem: ClipProblem, paint_offsets: Floats)
     if problem.size_row >= 0:
         world += (points.by_size * paint_offsets[problem.size_row :]).sum(axis=1)
     return replace(points, world=world)
-
-
-RATE: Final = 1e-3
-"""Learning rate of every parameter [its unit; thousands of pixels for the principal point] (M5)."""

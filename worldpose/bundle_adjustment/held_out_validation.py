@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
@@ -11,20 +10,19 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clip, project_joints
 from worldpose.bundle_adjustment.residuals import (
-    MEDIAN_SQUARED,
     AdjustmentProblem,
     AdjustmentSolution,
     camera_knowledge,
     known_covariance,
 )
-from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.bundle_adjustment.settings import CHANCE, BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solver import solve
 from worldpose.bundle_adjustment.uncertainty import align_points
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.optimize.losses import cauchy_loss
+from worldpose.geometry.optimize.losses import MEDIAN_SQUARED, cauchy_loss
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
@@ -123,11 +121,6 @@ def compare_errors(before: HeldOutErrors, after: HeldOutErrors) -> Verdict:
     fall = before.loss - after.loss
     significance = np.array([_significance(fall[:, c]) for c in range(count)])
     return Verdict(judges, loss, error, significance)
-
-
-CHANCE: Final = 2.0
-"""Standard errors by which a loss falls or rises by chance [1]: where many people judge, one in
-forty falls by more."""
 
 
 def judge_cameras(verdict: Verdict, alone: Flags, min_judges: int) -> tuple[Flags, Flags]:

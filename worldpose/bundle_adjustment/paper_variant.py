@@ -18,7 +18,7 @@ from worldpose.bundle_adjustment.report import (
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.geometry.cameras import Camera
 from worldpose.reference_method.cameras import K1_K2, TensorCameras
-from worldpose.reference_method.reprojection import Views, adjust
+from worldpose.reference_method.reprojection import Views, minimize_reprojection
 
 
 def adjust_unguarded(
@@ -55,7 +55,7 @@ def adjust_unguarded(
     views = Views(*(torch.tensor(np.concatenate(each)) for each in (row, camera, image)))
     places = torch.tensor(np.concatenate(points))
     moving = torch.arange(len(places)) >= still
-    solved = adjust(TensorCameras.of(clip.cameras), places, views, moving, K1_K2)
+    solved = minimize_reprojection(TensorCameras.of(clip.cameras), places, views, moving, K1_K2)
     found = solved.cameras.camera()
     cameras = Camera.stack([found[c] if changed[c] else clip.cameras[c] for c in range(count)])
     motion = np.where(changed[:, None], camera_motion(clip.cameras, cameras), 0.0)

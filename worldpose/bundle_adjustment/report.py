@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.bundle_adjustment.clip import Clicks, Clip, project_joints
-from worldpose.bundle_adjustment.held_out_validation import CHANCE, PooledEvidence, Verdict
+from worldpose.bundle_adjustment.held_out_validation import PooledEvidence, Verdict
 from worldpose.bundle_adjustment.residuals import KeypointNoise
-from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.bundle_adjustment.settings import CHANCE, BundleAdjustmentSettings
 from worldpose.bundle_adjustment.uncertainty import weak_direction
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera, camera_arrays

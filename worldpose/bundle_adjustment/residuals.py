@@ -25,11 +25,9 @@ from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, Solve
 from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.covariance import invert_free
-from worldpose.geometry.optimize.losses import cauchy_weight
+from worldpose.geometry.optimize.losses import MEDIAN_SQUARED, cauchy_weight
 from worldpose.static_calibration.parameters import project_with_jacobian
 
-MEDIAN_SQUARED: Final = 2.0 * np.log(2.0)
-"""Median squared length of a standard Gaussian in two dimensions [1]."""
 MARKINGS_SOLVER: Final = SolverSettings(max_iterations=500, min_cost_change=1e-6)
 """For ill-conditioned directions as long and flat as those of a lens determined by six clicks."""
 

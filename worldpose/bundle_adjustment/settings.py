@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field
 
 from data_contracts.records import Frame, Record
 from worldpose.static_calibration.settings import SURVEY_ERROR
+
+CHANCE: Final = 2.0
+"""Standard errors by which a loss falls or rises by chance [1]: where many people judge, one in
+forty falls by more."""
 
 
 class SolverSettings(Record):

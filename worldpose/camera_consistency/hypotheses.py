@@ -12,13 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.camera_consistency import FaultKind
-from data_contracts.conventions import DISTORTION, OTHER_UNITS
+from data_contracts.conventions import COCO17_FLIP, DISTORTION, OTHER_UNITS
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
 
-LEFT_RIGHT: Final = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15])
-"""COCO-17 with left and right swapped."""
 LENS_ORDERS: Final = (
     (0, 1, 3, 4, 2),
     (0, 1, 4, 2, 3),
@@ -65,7 +63,7 @@ class Hypothesis:
     def correct(self, stated: Floats, size: Integers) -> Floats:
         """Return detections (..., 17, 2) [px] as a correct video would show them."""
         if self.mirrored:
-            image = stated[..., LEFT_RIGHT, :].copy()
+            image = stated[..., COCO17_FLIP, :].copy()
             image[..., 0] = size[0] - 1.0 - image[..., 0]
             return image
         if self.upside_down:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Final
 
 import numpy as np
 
@@ -15,10 +14,6 @@ from worldpose.dataset.contents import PointSource, ShippedClip, convention, sam
 from worldpose.dataset.faults import LIMITS
 from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.boxes import box_iou
-
-_BODIES: Final = 400
-"""Maximum number of sampled bodies."""
-_AS_SHIPPED: Final = "the camera's x, y, z"
 
 
 def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]:
@@ -69,7 +64,9 @@ def skeleton_findings(
     frame, person = np.nonzero(known)
     if not len(frame):
         return
-    picked = sample_evenly(len(frame), _BODIES)
+    # Maximum number of sampled bodies.
+    max_bodies = 400
+    picked = sample_evenly(len(frame), max_bodies)
     frame, person = frame[picked], person[picked]
     bodies, pixels = skel_3d[frame, person], skel_2d[frame, person]
     upper, lower = (skeleton.index(f"left_{name}") for name in plausibility.BONES["thighs"])
@@ -86,7 +83,8 @@ def skeleton_findings(
     if not told.any():
         return
     row, bodies, plane, focal = row[told], bodies[told], plane[told], focal[told]
-    guesses = {_AS_SHIPPED: bodies}
+    as_shipped = "the camera's x, y, z"
+    guesses = {as_shipped: bodies}
     for name, axes in known_faults.axis_orders():
         guesses[f"the camera's {name}"] = bodies @ axes
     turned = rows.rotation[row]
@@ -96,7 +94,7 @@ def skeleton_findings(
         in_world = np.einsum("nab,njb->nja", turned[posed], bodies[posed])
         left["the world's x, y, z"] = _left(in_world, plane[posed], focal[posed])
     best = min(left, key=lambda name: left[name])
-    shipped, least = left[_AS_SHIPPED], left[best]
+    shipped, least = left[as_shipped], left[best]
     if shipped - least > LIMITS.min_gain_px and least < LIMITS.max_share_left * shipped:
         says = f"x, y, z of the skeletons are {best} and not the camera's"
         figures = {"shipped_median_px": min(shipped, 1e6), "explained_median_px": least}

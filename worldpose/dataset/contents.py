@@ -59,7 +59,7 @@ class PointSource:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """One camera and its 2D points of people."""
 
     name: str
@@ -97,7 +97,7 @@ class ShippedClip:
     name: str
     fps: float
     sources: tuple[PointSource, ...]
-    views: tuple[View, ...]
+    views: tuple[CameraView, ...]
     pitch: bool = True
     """Whether the ground is z = 0; otherwise the world frame is that of the camera calibration."""
     findings: tuple[Finding, ...] = field(default=())
@@ -151,10 +151,6 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
 
 
 SUBMISSIONS = ("submission.zip", "submission.npz")
-_FRAMES = 200
-"""Maximum number of frames, with all people, posed per chunk."""
-ONLY = "clip"
-"""Name of the one clip of a data set without clip names."""
 
 
 def list_clips(folder: Path) -> tuple[str, ...]:
@@ -168,8 +164,10 @@ def list_clips(folder: Path) -> tuple[str, ...]:
     for name in SUBMISSIONS:
         if (folder / name).is_file():
             names |= set(submission_clips(folder / name))
+    # Name of the one clip of a data set without clip names.
+    only_clip = "clip"
     if not names and (folder / "joints.npz").is_file():
-        names = {ONLY}
+        names = {only_clip}
     if not names:
         raise InputError(
             str(folder),
@@ -211,7 +209,7 @@ def read_clip(
     for name, camera in rows.items():
         file = coco / f"{name}.json"
         pixels = read_coco(file, ids, frames) if file.is_file() else None
-        views.append(View(name, camera, pixels, COCO17))
+        views.append(CameraView(name, camera, pixels, COCO17))
     given = None
     if (folder / "boxes.npz").is_file() or any((folder / "boxes").glob("*.npy")):
         given = read_challenge(folder, clip).get(clip)
@@ -222,7 +220,7 @@ def read_clip(
             pixels = np.where(gone[..., None, None], np.nan, given.skel_2d)
             skeleton = BODY25 if pixels.shape[2] == len(BODY25) else CHALLENGE15
             views = [
-                View(view.name, view.rows, pixels, skeleton) if view.name == clip else view
+                CameraView(view.name, view.rows, pixels, skeleton) if view.name == clip else view
                 for view in views
             ]
             sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])
@@ -343,8 +341,10 @@ def _points(model: BodyModel, poses: BodyParameters) -> Floats:
     keypoints = fold_keypoints(model, BODY25)
     persons, frames = poses.batch_shape
     points = np.empty((frames, persons, len(BODY25), 3))
-    for start in range(0, frames, _FRAMES):
-        part = slice(start, min(start + _FRAMES, frames))
+    # Maximum number of frames, with all people, posed per chunk.
+    max_frames = 200
+    for start in range(0, frames, max_frames):
+        part = slice(start, min(start + max_frames, frames))
         points[part] = keypoints(poses[:, part]).swapaxes(0, 1)
     return points
 

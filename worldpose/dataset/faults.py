@@ -11,7 +11,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.release import Finding
-from worldpose.dataset.contents import PointSource, View, sample_evenly
+from worldpose.dataset.contents import CameraView, PointSource, sample_evenly
 from worldpose.formats.release_cameras import CameraRows
 from worldpose.geometry.cameras import Camera
 
@@ -249,7 +249,7 @@ class _Sample:
     pixels: Floats
 
 
-def compare_view(source: PointSource, view: View) -> Agreement | None:
+def compare_view(source: PointSource, view: CameraView) -> Agreement | None:
     """Return the residuals between a source and a view, and the fault that explains them best.
 
     A fault is named if its repair removes most of the error; a 2D point that the camera cannot see
@@ -296,11 +296,14 @@ def compare_view(source: PointSource, view: View) -> Agreement | None:
 def agreement_findings(found: Iterable[Agreement]) -> Iterator[Finding]:
     """Yield findings, one per fault of a source, with the cameras that show it."""
     named: dict[tuple[str, str, str], list[Agreement]] = {}
+    unexplained = (
+        "the projected 3D points differ from the 2D points, and no known convention explains it"
+    )
     for one in found:
         if one.fault is not SOUND:
             named.setdefault((one.source, one.fault.name, one.fault.says), []).append(one)
         elif one.median_px > LIMITS.max_error * one.height_px:
-            named.setdefault((one.source, "reprojection", _UNEXPLAINED), []).append(one)
+            named.setdefault((one.source, "reprojection", unexplained), []).append(one)
     for (source, name, says), group in named.items():
         yield Finding(
             fault=name,
@@ -314,12 +317,7 @@ def agreement_findings(found: Iterable[Agreement]) -> Iterator[Finding]:
         )
 
 
-_UNEXPLAINED = (
-    "the projected 3D points differ from the 2D points, and no known convention explains it"
-)
-
-
-def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
+def _sample(source: PointSource, view: CameraView, size: int) -> _Sample | None:
     """Sample 2D points evenly from those that the source also has."""
     shared = view.shared_points(source)
     if shared is None:
@@ -374,7 +372,7 @@ def _median(errors: Floats) -> float:
     return float(np.sort(errors)[len(errors) // 2]) if len(errors) else np.inf
 
 
-def _height(view: View) -> float:
+def _height(view: CameraView) -> float:
     """Return the median height [px] of the people in a view."""
     if view.pixels is None:
         return np.nan
@@ -392,11 +390,9 @@ def _capped_median(values: list[float]) -> float:
 
 _POINTS: Final = 8
 """Minimum number of points of a body: their mean has a third of the error of each."""
-_BODIES: Final = 1500
-"""Maximum number of sampled bodies."""
 
 
-def find_frame_offset(source: PointSource, view: View) -> Fault | None:
+def find_frame_offset(source: PointSource, view: CameraView) -> Fault | None:
     """Return the frame offset that explains the errors of whole bodies in a view."""
     shared = view.shared_points(source)
     if shared is None:
@@ -407,7 +403,9 @@ def find_frame_offset(source: PointSource, view: View) -> Fault | None:
     frame, person = np.nonzero(known[: len(points)])
     if not len(frame):
         return None
-    picked = sample_evenly(len(frame), _BODIES)
+    # Maximum number of sampled bodies.
+    max_bodies = 1500
+    picked = sample_evenly(len(frame), max_bodies)
     frame, person = frame[picked], person[picked]
 
     def error(fault: Fault) -> float:

@@ -9,7 +9,13 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.release import Finding
-from worldpose.dataset.contents import PointSource, View, convention, implausible, sample_evenly
+from worldpose.dataset.contents import (
+    CameraView,
+    PointSource,
+    convention,
+    implausible,
+    sample_evenly,
+)
 from worldpose.dataset.faults import (
     LATEST,
     LIMITS,
@@ -20,9 +26,6 @@ from worldpose.dataset.faults import (
 )
 from worldpose.formats.release_cameras import CameraRows
 
-FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
-ANKLE = 0.09
-"""Height of an ankle above the ground if a skeleton has no sole [m]."""
 BONES = {
     "upper arms": ("shoulder", "elbow"),
     "forearms": ("elbow", "wrist"),
@@ -196,10 +199,20 @@ def _handedness(source: PointSource) -> float:
 
 def _feet(source: PointSource) -> Floats:
     """Return the height (frames, persons) [m] of every body's lowest foot above z = 0."""
-    soles = [name for name in FEET if name in source.skeleton]
+    foot_points = (
+        "left_big_toe",
+        "right_big_toe",
+        "left_heel",
+        "right_heel",
+        "left_ankle",
+        "right_ankle",
+    )
+    soles = [name for name in foot_points if name in source.skeleton]
     lift = 0.0
+    # Height of an ankle above the ground if a skeleton has no sole [m].
+    ankle_height_m = 0.09
     if soles and all("ankle" in name for name in soles):
-        lift = ANKLE
+        lift = ankle_height_m
     elif any("heel" in name for name in soles):
         soles = [name for name in soles if "ankle" not in name]
     z = source.points[:, :, [source.skeleton.index(name) for name in soles], 2]
@@ -207,12 +220,8 @@ def _feet(source: PointSource) -> Floats:
     return np.where(np.isinf(lowest), np.nan, lowest)
 
 
-TALL: Final = (8.0, 1500.0)
-"""Minimum and maximum height of a person in the image [px]."""
 STAND: Final = (0.5, 150.0)
 """Minimum and maximum height of a camera above the ground [m]."""
-FAR: Final = 500.0
-"""Maximum distance of a camera from the centre spot [m]."""
 
 
 def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
@@ -225,7 +234,9 @@ def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> floa
     # Distance of a camera's centre from its median beyond which its pose is invalid [m].
     travel = 2.0
     center = camera_center(rows)
-    if not STAND[0] < center[2] < STAND[1] or np.linalg.norm(center) > FAR:
+    # Maximum distance of a camera from the centre spot [m].
+    max_distance_m = 500.0
+    if not STAND[0] < center[2] < STAND[1] or np.linalg.norm(center) > max_distance_m:
         return 0.0
     if np.linalg.norm(centers(rows) - center, axis=-1).max() > travel:
         return 0.0
@@ -245,7 +256,9 @@ def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> floa
     pixels = camera.project(ends[frame[picked], person[picked]])
     tall = pixels[:, 1:, 1].mean(-1) - pixels[:, 0, 1]
     inside = (pixels >= 0.0) & (pixels <= camera.image_size[..., None, :])
-    shown = inside.all((-1, -2)) & (tall > TALL[0]) & (tall < TALL[1])
+    # Minimum and maximum height of a person in the image [px].
+    heights_px = (8.0, 1500.0)
+    shown = inside.all((-1, -2)) & (tall > heights_px[0]) & (tall < heights_px[1])
     return float(shown.mean())
 
 
@@ -270,7 +283,7 @@ def is_blind(source: PointSource, rows: CameraRows) -> bool:
 
 
 def visibility_findings(
-    source: PointSource, views: Sequence[View]
+    source: PointSource, views: Sequence[CameraView]
 ) -> Iterator[tuple[Finding, Fault | None]]:
     """Yield findings on cameras that show too few people, and the fault that explains each.
 
@@ -302,7 +315,7 @@ def visibility_findings(
 
 
 def _make_finding(
-    views: Sequence[View], which: Flags, fault: Fault | None, share: Floats
+    views: Sequence[CameraView], which: Flags, fault: Fault | None, share: Floats
 ) -> Finding:
     where = tuple(f"cameras/{view.name}" for view, ours in zip(views, which, strict=True) if ours)
     figures = {"explained_share_seen": float(share[which].min())}
@@ -313,13 +326,7 @@ def _make_finding(
     return Finding(fault="sees_nobody", kind="damage", where=where, says=says, figures=figures)
 
 
-_FRAMES: Final = 150
-"""Maximum number of sampled frames."""
-_POINTS: Final = 30
-"""Minimum number of points of a frame for a rotation estimate: more than one person."""
-
-
-def turning_findings(source: PointSource, view: View) -> Iterator[Finding]:
+def turning_findings(source: PointSource, view: CameraView) -> Iterator[Finding]:
     """Yield the frame offset that explains a source and a camera's 2D, independent of its poses."""
     posed = np.isfinite(view.rows.rotation).all((-1, -2))
     shared = view.shared_points(source)
@@ -345,11 +352,15 @@ def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
     camera, center = rows.lens(), camera_center(rows)
     first, last = max(0, -late), min(len(seen), len(points) - late, len(rows.rotation))
     errors = []
-    for frame in np.unique(np.linspace(first, last - 1, _FRAMES).round().astype(np.int64)):
+    # Maximum number of sampled frames.
+    max_frames = 150
+    # Minimum number of points of a frame for a rotation estimate: more than one person.
+    min_points = 30
+    for frame in np.unique(np.linspace(first, last - 1, max_frames).round().astype(np.int64)):
         here, there = seen[frame].reshape(-1, 2), points[frame + late].reshape(-1, 3)
         plane = camera[int(frame)].normalize(here)
         known = np.isfinite(plane).all(-1) & np.isfinite(there).all(-1)
-        if known.sum() < _POINTS:
+        if known.sum() < min_points:
             continue
         plane = plane[known]
         rays = _unit(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))

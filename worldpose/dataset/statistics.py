@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -17,11 +17,6 @@ from worldpose.formats.joints_file import read_joints, read_poses
 from worldpose.formats.release_cameras import read_camera_rows
 
 CameraKind = Literal["S", "M", "M+Z"]
-KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")
-"""Static, moving, or moving and zooming cameras, as in the paper's table."""
-
-_TURN: Final = 1e-3
-"""Maximum rotation of a static camera [rad]: a pixel in a broadcast image."""
 
 
 def read_places(folder: Path, clip: str) -> Floats:
@@ -99,7 +94,9 @@ def data_set_statistics(
 
 def most_moving(kinds: Iterable[CameraKind | None]) -> CameraKind | None:
     """Return the kind of the camera that moves most; None if none is known."""
-    return max((kind for kind in kinds if kind), key=KINDS.index, default=None)
+    # Static, moving, or moving and zooming cameras, as in the paper's table.
+    kinds_of_camera = ("S", "M", "M+Z")
+    return max((kind for kind in kinds if kind), key=kinds_of_camera.index, default=None)
 
 
 def camera_kind(path: Path) -> CameraKind | None:
@@ -126,4 +123,6 @@ def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
         return None
     # The angle of R1^T R2 is below a when the trace is above 1 + 2 cos a.
     traces = np.einsum("fab,ab->f", turns, turns[0]) if len(turns) else np.empty(0)
-    return "M" if (traces < 1.0 + 2.0 * np.cos(_TURN)).any() else "S"
+    # Maximum rotation of a static camera [rad]: a pixel in a broadcast image.
+    max_turn_rad = 1e-3
+    return "M" if (traces < 1.0 + 2.0 * np.cos(max_turn_rad)).any() else "S"

@@ -31,9 +31,9 @@ from worldpose.detection.suppression import suppress
 
 NMS_IOU: Final = 0.7
 """Boxes with a larger intersection over union are of one person [1]."""
-View = Callable[[], Frame]
+ReadFrame = Callable[[], Frame]
 """Returns an image that the net shall see."""
-Steps = Generator[Sequence[View], list[People], People]
+Steps = Generator[Sequence[ReadFrame], list[People], People]
 """Yields what the net shall see, gets the people there, and returns those of the frame."""
 
 
@@ -69,7 +69,7 @@ class BundledDetector:
         frames = place_frames(images, self._net.device)
         steps = [_search(frame, parts) for frame in frames]
 
-        def see(_: list[int], asked: list[Sequence[View]]) -> list[list[People]]:
+        def see(_: list[int], asked: list[Sequence[ReadFrame]]) -> list[list[People]]:
             views = list(chain.from_iterable(asked))
             most = 16 * self._net.batch  # bounds the memory of their maps
             starts = range(0, len(views), most)
@@ -78,7 +78,7 @@ class BundledDetector:
 
         return run_together(steps, see)
 
-    def _detect(self, views: Sequence[View]) -> list[People]:
+    def _detect(self, views: Sequence[ReadFrame]) -> list[People]:
         """Return the detections in images; the same person may be there twice."""
         images = [view() for view in views]
         same = defaultdict[tuple[int, ...], list[int]](list)
@@ -122,7 +122,7 @@ def _search(frame: Frame, parts: Sequence[Part] | None) -> Steps:
     return (yield from _find_all(frame, None))
 
 
-def _close_up(frame: Frame, usual: float) -> Generator[Sequence[View], list[People], float]:
+def _close_up(frame: Frame, usual: float) -> Generator[Sequence[ReadFrame], list[People], float]:
     """Return the reduction of a frame that people fill; 1 for other frames [1].
 
     People who fill a frame are as high at these reductions as in the training.

@@ -21,6 +21,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from data_contracts.conventions import COCO17
 from worldpose.detection.crops import MAP_COUNT
 from worldpose.errors import InputError
 
@@ -32,7 +33,6 @@ COARSEST: Final = 32
 """Frames are padded to multiples of this [px]."""
 CELL: Final = 2
 """Pixels of the crop per cell of the keypoint maps [px]."""
-JOINTS: Final = 17
 GREY_MEAN: Final = 115.0
 GREY_SPREAD: Final = 58.0
 """Mean and standard deviation of grey levels, by which images are normalized [of 255]."""
@@ -164,9 +164,9 @@ class KeypointNet(nn.Module):
         self.pyramid = Pyramid(stem, (32, 64, 128), (2, 2, 2))
         self.around = nn.Conv2d(MAP_COUNT, 32, 3, padding=1, bias=False)
         nn.init.zeros_(self.around.weight)
-        self.head = nn.Sequential(Block(32, 64), nn.Conv2d(64, 4 * JOINTS, 1))
-        self.doubt = nn.Linear(128, JOINTS)
-        self.trust = nn.Parameter(torch.ones(JOINTS))
+        self.head = nn.Sequential(Block(32, 64), nn.Conv2d(64, 4 * len(COCO17), 1))
+        self.doubt = nn.Linear(128, len(COCO17))
+        self.trust = nn.Parameter(torch.ones(len(COCO17)))
         self.outline = nn.Sequential(Block(32, 32), nn.Conv2d(32, 4, 1))
         self.fit = nn.Sequential(nn.Linear(128 + 4, 32), nn.ReLU(), nn.Linear(32, 1))
 
@@ -304,10 +304,6 @@ def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     return CELL * torch.stack([x, y], dim=1) + 0.5 * (CELL - 1), mass
 
 
-MIN_MASS: Final = 0.01
-"""Candidate positions of less probability are dropped, except the likeliest of a joint [1]."""
-
-
 def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return candidate positions of each joint, finer than cells, the likeliest first.
 
@@ -320,7 +316,7 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Returns:
         Positions (batch, joints, count, 2) [px of the crop], and the probability around each
-        (batch, joints, count); 0 where a map has fewer peaks with a probability of `MIN_MASS`.
+        (batch, joints, count); 0 where a map has fewer peaks with a probability of 0.01.
     """
     shape, (rows, columns) = maps.shape[:2], maps.shape[2:]
     chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, rows, columns)
@@ -328,7 +324,9 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     blocks = chance.view(-1, rows // 4, 4, columns)
     high = _largest([blocks[:, :, k] for k in range(4)]).unflatten(2, (-1, 4))
     high = _largest([high[..., k] for k in range(4)])
-    least = high.amax(dim=(1, 2), keepdim=True).clamp(max=MIN_MASS / 25.0)
+    # Candidate positions of less probability are dropped, except the likeliest of a joint [1].
+    min_mass = 0.01
+    least = high.amax(dim=(1, 2), keepdim=True).clamp(max=min_mass / 25.0)
     index, row, column = torch.nonzero(high >= least, as_tuple=True)
     step = torch.arange(-3, 4, device=maps.device)
     best = _around(chance, (index, 4 * row, 4 * column), step[3:]).flatten(1).max(dim=1)

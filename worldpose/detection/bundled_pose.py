@@ -19,10 +19,9 @@ from scipy.special import expit
 from torch import Tensor
 
 from data_contracts.arrays import Flags, Floats, Image
-from data_contracts.conventions import COCO17_FLIP
+from data_contracts.conventions import COCO17, COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.bundled_nets import (
-    JOINTS,
     KeypointNet,
     Seen,
     decode_candidates,
@@ -130,7 +129,7 @@ class BundledPoseEstimator:
         """Return the net's output for the crops of some frames."""
         others = [one for _, each in asked for one in each]
         if not others:
-            shape = (0, JOINTS, CANDIDATES)
+            shape = (0, len(COCO17), CANDIDATES)
             flat = np.empty(shape)
             return CropEstimates(np.empty((*shape, 2)), flat, flat, np.empty((0, 4)), np.empty(0))
         boxes = [each for each, _ in asked]

@@ -20,11 +20,6 @@ from worldpose.parsing import parse_in_turn
 
 STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))
 """Strides of the grids of YOLO nets, without and with a fourth level [px]."""
-PERSON_NAMES: Final = frozenset({"goalkeeper", "keeper", "person", "player", "referee"})
-"""Classes of people in nets that name their classes."""
-COCO_PERSON: Final = {80: 0, 91: 1, 92: 1}
-"""Class of people by number of classes: COCO's 80, its 91 numbered ones, and these with a last
-class for no object."""
 Outputs = Sequence[NDArray[Any]]
 Decoder = Callable[[Outputs, tuple[int, int], Sequence[int]], People]
 
@@ -214,19 +209,24 @@ def _person_classes(
                 todo="Correct detection.person_classes.",
             )
         return tuple(asked)
-    people = tuple(k for k, name in names.items() if name.lower() in PERSON_NAMES)
+    # Classes of people in nets that name their classes.
+    person_names = frozenset({"goalkeeper", "keeper", "person", "player", "referee"})
+    people = tuple(k for k, name in names.items() if name.lower() in person_names)
     if people:
         return people
-    if names or (count is not None and count > 1 and count not in COCO_PERSON):
+    # Class of people by number of classes: COCO's 80, its 91 numbered ones, and these with a last
+    # class for no object.
+    coco_person = {80: 0, 91: 1, 92: 1}
+    if names or (count is not None and count > 1 and count not in coco_person):
         raise InputError(
             where,
-            expected="a class of people: " + ", ".join(sorted(PERSON_NAMES)),
+            expected="a class of people: " + ", ".join(sorted(person_names)),
             found=", ".join(f"{k} {name}" for k, name in names.items())
             or f"{count} classes without names",
             todo="Set detection.person_classes to the numbers of these classes, "
             "for example detection.person_classes=[0].",
         )
-    return (COCO_PERSON.get(count or 0, 0),)
+    return (coco_person.get(count or 0, 0),)
 
 
 class _OnnxDetector:

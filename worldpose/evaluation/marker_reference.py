@@ -142,6 +142,8 @@ def _read_c3d(path: Path) -> Markers:
             given = reader.get("POINT:UNITS")
             unit = "" if given is None else given.string_value.strip().lower()
             names = c3d_labels(reader)
+            # Analog channels are not read; the reader fails at a single scale.
+            reader.get_analog_transform = lambda: (1.0, 0.0)
             # Copies: the reader reuses its array. Residual -1 means missing.
             rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
             rate = float(reader.point_rate)

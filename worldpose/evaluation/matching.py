@@ -177,10 +177,6 @@ def box_overlaps(predicted: Floats, true: Floats) -> Floats:
     return np.where(missing, np.nan, box_iou(true, predicted))
 
 
-_CHUNK: Final = 64
-"""Frames per batch of distances: tens of megabytes for 25 people on either side."""
-
-
 def select_frames(rows: Floats, own_frames: Integers, frames: Integers) -> Floats:
     """Return rows (own frames, ...) at other frames (frames, ...), NaN in frames without a row."""
     selected = np.full((len(frames), *rows.shape[1:]), np.nan)
@@ -196,8 +192,10 @@ def joint_distances(predicted: Floats, true: Floats) -> Floats:
     (frames, persons, joints, 3) [m]; NaN where missing.
     """
     distances = np.empty((len(true), true.shape[1], predicted.shape[1]))
-    for start in range(0, len(true), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    # Frames per batch of distances: tens of megabytes for 25 people on either side.
+    chunk_frames = 64
+    for start in range(0, len(true), chunk_frames):
+        part = slice(start, start + chunk_frames)
         offset = predicted[part, None] - true[part, :, None]
         each = np.sqrt(np.einsum("...i,...i->...", offset, offset))
         common = np.isfinite(each)
@@ -279,12 +277,6 @@ def take_matched(people: Floats, match: Integers) -> Floats:
     return np.where((match >= 0)[..., None, None], chosen, np.nan)
 
 
-_FRAMES: Final = 48
-"""Sample frames, evenly spread: enough to distinguish paths."""
-_PAIRS: Final = 400
-"""Maximum pairs of people to try, by falling number of common joints: all of 20 against 20."""
-
-
 def register_world(predicted: Floats, true: Floats, gate: float) -> Similarity | None:
     """Return the similarity that matches most predicted people to true ones, None if none match.
 
@@ -299,7 +291,9 @@ def register_world(predicted: Floats, true: Floats, gate: float) -> Similarity |
     shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
     if not len(shared):
         return None
-    frames = shared[np.unique(np.linspace(0, len(shared) - 1, _FRAMES).round().astype(int))]
+    # Sample frames, evenly spread: enough to distinguish paths.
+    max_frames = 48
+    frames = shared[np.unique(np.linspace(0, len(shared) - 1, max_frames).round().astype(int))]
     predicted, true = predicted[frames], true[frames]
     rows, columns = _pairs(predicted, true)
     if not len(rows):
@@ -340,7 +334,9 @@ def _pairs(predicted: Floats, true: Floats) -> tuple[Integers, Integers]:
     known_true = np.isfinite(np.swapaxes(true[..., 0], 0, 1)).reshape(true.shape[1], -1)
     known = np.isfinite(np.swapaxes(predicted[..., 0], 0, 1)).reshape(predicted.shape[1], -1)
     common = known_true.astype(np.int64) @ known.astype(np.int64).T
-    order = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
+    # Maximum pairs of people to try, by falling number of common joints: all of 20 against 20.
+    max_pairs = 400
+    order = np.argsort(-common, axis=None, kind="stable")[:max_pairs]
     order = order[common.ravel()[order] >= true.shape[2]]
     rows, columns = np.divmod(order, predicted.shape[1])
     return rows, columns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,6 +14,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.losses import MEDIAN_SQUARED
 
 Places = NDArray[np.int64]
 
@@ -87,8 +87,6 @@ def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyView
     return BodyViews(image, variance, scale)
 
 
-MEDIAN: Final = 2.0 * math.log(2.0)
-"""Median squared distance in two dimensions, in variances of an axis."""
 LEAST: Final = 0.05
 """Smallest factor: bodies that follow their keypoints exactly must not create outliers."""
 
@@ -141,7 +139,7 @@ def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Flo
             expected = by_bin[bins] * by_joint[joints] * base
             ratio, shares = squares / (expected + given), expected / (expected + given)
             for each, mine in groups:
-                median = float(np.median(ratio[mine])) / MEDIAN
+                median = float(np.median(ratio[mine])) / MEDIAN_SQUARED
                 # The factor excludes the variance of the body.
                 share = float(np.median(shares[mine]))
                 factor[each] = max(LEAST, factor[each] * (1.0 + (median - 1.0) / max(share, 0.3)))

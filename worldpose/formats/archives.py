@@ -26,10 +26,6 @@ absent people reach 50."""
 PACKED_BYTES: Final = 1 << 26
 """Unpacked bytes up to which any ratio is allowed."""
 
-_KINDS: Final = {"float": "f", "int": "iu", "text": "U"}
-_MEANINGS: Final = {"float": "float numbers", "int": "int numbers", "text": "text"}
-_READ_AS: Final[Mapping[str, type]] = {"float": np.float64, "int": np.int64, "text": np.str_}
-
 
 @dataclass(frozen=True)
 class Member:
@@ -145,14 +141,16 @@ def check_members(
         raise wrong(str(path), expected, ", ".join(names[:8]) or "nothing")
     infos = {name: file.getinfo(f"{name}.npy") for name in members if f"{name}.npy" in found}
     sizes: dict[str, int] = {}
+    kinds = {"float": "f", "int": "iu", "text": "U"}
+    meanings = {"float": "float numbers", "int": "int numbers", "text": "text"}
     for name, info in infos.items():
         where, member = f"{path}: {name}", members[name]
         shape, _, dtype = _read_header(path, file, info)
         if member.dtype is not None and dtype != np.dtype(member.dtype):
             exact = np.dtype(member.dtype)
             raise wrong(where, f"{exact.str} ({exact.name}, little-endian)", dtype.str)
-        if dtype.kind not in _KINDS[member.kind]:
-            raise wrong(where, _MEANINGS[member.kind], dtype.str)
+        if dtype.kind not in kinds[member.kind]:
+            raise wrong(where, meanings[member.kind], dtype.str)
         fits = len(shape) == len(member.dims) and all(
             n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
             for n, dim in zip(shape, member.dims, strict=True)
@@ -197,13 +195,11 @@ def require_size(
     elif ratio is not None and total > max(PACKED_BYTES, packed * ratio):
         expected = f"arrays packed at most {ratio} to 1"
     if expected is not None:
-        raise InputError(
-            str(path),
-            expected=expected,
-            found=f"{total} bytes of arrays in {packed}",
-            todo="Give dimensions no more room than their entries need, or save the arrays "
-            "without compression.",
+        todo = (
+            "Give dimensions no more room than their entries need, or save the arrays "
+            "without compression."
         )
+        raise InputError(str(path), expected, f"{total} bytes of arrays in {packed}", todo)
 
 
 def read_array(
@@ -214,7 +210,8 @@ def read_array(
     Raises:
         InputError: the bytes are damaged.
     """
-    dtype = None if form is None else form.dtype or _READ_AS[form.kind]
+    read_as = {"float": np.float64, "int": np.int64, "text": np.str_}
+    dtype = None if form is None else form.dtype or read_as[form.kind]
     try:
         with file.open(info) as member:
             array = read_npy(member)

@@ -21,7 +21,6 @@ HEADER_FRAMES: Final = 65535
 """The header counts frames in 16 bits; POINT:LONG_FRAMES and TRIAL:ACTUAL_END_FIELD count more."""
 MAX_DIMENSION: Final = 255
 """A dimension of a parameter has 8 bits."""
-_KINDS: Final = {"char": -1, "int16": 2, "float32": 4}
 _Value = str | Sequence[str] | np.generic | NDArray[np.generic]
 
 
@@ -52,12 +51,9 @@ def write_c3d(
     max_frames = 1 << 24
     count = int(tracks.frames[-1] - tracks.frames[0]) + 1 if len(tracks.frames) else 0
     if not 1 <= count <= max_frames:
-        raise InputError(
-            str(path),
-            expected=f"1 to {max_frames} frames, which C3D can count",
-            found=f"{count}",
-            todo="Choose another format, such as parquet, or shorter clips.",
-        )
+        expected = f"1 to {max_frames} frames, which C3D can count"
+        todo = "Choose another format, such as parquet, or shorter clips."
+        raise InputError(str(path), expected, f"{count}", todo)
     names = tracks.markers.points
     parameters = _parameters(f"person_{tracks.person_ids[person]}", names, count, fps, notes)
     # The start of the data is itself a parameter, whose length does not depend on its value.
@@ -123,11 +119,7 @@ def _parameters(
             "X_SCREEN": "+X",
             "Y_SCREEN": "+Z",
         },
-        "ANALOG": {
-            "USED": zero,
-            "GEN_SCALE": np.float32(1.0),
-            "RATE": np.float32(0.0),
-        },
+        "ANALOG": {"USED": zero, "GEN_SCALE": np.float32(1.0), "RATE": np.float32(0.0)},
         "FORCE_PLATFORM": {"USED": zero},
         "TRIAL": {
             # Pairs of the low and the high 16 bits.
@@ -191,22 +183,20 @@ def _encode(where: str, value: _Value) -> bytes:
     """Return kind, dimensions and data of a parameter, first dimension fastest."""
     # Maximum length of a text parameter, whose size has 15 bits, with its padding [byte].
     max_text_bytes = 32000
+    kinds = {"char": -1, "int16": 2, "float32": 4}
     if isinstance(value, str):
         text = value.encode()
-        return struct.pack("<bBB", _KINDS["char"], 1, len(text)) + text
+        return struct.pack("<bBB", kinds["char"], 1, len(text)) + text
     if isinstance(value, Sequence):
         rows = [row.encode() for row in value]
         width = max(map(len, rows), default=0)
         if max(width, len(rows)) > MAX_DIMENSION or width * len(rows) > max_text_bytes:
-            raise InputError(
-                where,
-                expected=f"a text of at most {MAX_DIMENSION} lines and {max_text_bytes} bytes",
-                found=f"{len(rows)} lines of {width} bytes",
-                todo="Give a shorter text, such as the licence's name and address.",
-            )
-        sizes = struct.pack("<bBBB", _KINDS["char"], 2, width, len(rows))
+            expected = f"a text of at most {MAX_DIMENSION} lines and {max_text_bytes} bytes"
+            todo = "Give a shorter text, such as the licence's name and address."
+            raise InputError(where, expected, f"{len(rows)} lines of {width} bytes", todo)
+        sizes = struct.pack("<bBBB", kinds["char"], 2, width, len(rows))
         return sizes + b"".join(row.ljust(width) for row in rows)
-    sizes = struct.pack("<bB", _KINDS[value.dtype.name], value.ndim) + bytes(value.shape[::-1])
+    sizes = struct.pack("<bB", kinds[value.dtype.name], value.ndim) + bytes(value.shape[::-1])
     return sizes + value.tobytes()
 
 

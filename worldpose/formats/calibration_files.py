@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from data_contracts.cameras import COEFFICIENTS, CameraCalibration, LensName
-from worldpose.errors import InputError
+from worldpose.errors import InputError, describe_value
 from worldpose.formats.files import read_toml
 
 NUMBER_LIMIT: Final = 1e9
@@ -149,28 +149,20 @@ def require_optics(
     ratio = focal / np.max(size)
     if np.any(ratio < focal_ratios[0]) or np.any(ratio > focal_ratios[1]):
         low, high = (bound * float(np.max(size)) for bound in focal_ratios)
-        raise InputError(
-            f"{where}: focal length",
-            expected=f"positive pixels, {low:g} to {high:g} for {size[0]:g} x {size[1]:g}",
-            found=str(focal.tolist()),
-            todo="Give it in pixels: focal length in mm / sensor width in mm * image width.",
-        )
+        expected = f"positive pixels, {low:g} to {high:g} for {size[0]:g} x {size[1]:g}"
+        todo = "Give it in pixels: focal length in mm / sensor width in mm * image width."
+        raise InputError(f"{where}: focal length", expected, str(focal.tolist()), todo)
     if np.any(np.abs(principal_point - size / 2) > center_sizes * np.max(size)):
-        raise InputError(
-            f"{where}: principal point",
-            expected=f"pixels within {center_sizes} image sizes of the image's centre",
-            found=str(principal_point.tolist()),
-            todo="Give it in pixels from the image's top-left corner.",
-        )
+        expected = f"pixels within {center_sizes} image sizes of the image's centre"
+        todo = "Give it in pixels from the image's top-left corner."
+        raise InputError(f"{where}: principal point", expected, str(principal_point.tolist()), todo)
     away = [float(np.abs(principal_point / each - 0.5).max()) for each in (size, size[::-1])]
     if away[0] > 0.2 and away[1] < 0.1:
-        raise InputError(
-            f"{where}: size",
-            expected=f"width and height with the principal point {principal_point.tolist()} near "
-            "the middle",
-            found=f"width {size[0]:g} and height {size[1]:g}, which seem to be exchanged",
-            todo="Exchange them.",
+        expected = (
+            f"width and height with the principal point {principal_point.tolist()} near the middle"
         )
+        found = f"width {size[0]:g} and height {size[1]:g}, which seem to be exchanged"
+        raise InputError(f"{where}: size", expected, found, "Exchange them.")
 
 
 def camera_id(name: str) -> str:
@@ -213,24 +205,17 @@ def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
     """Raise InputError if several cameras are all in one place."""
     centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
     if len(cameras) > 1 and np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max():
-        raise InputError(
-            f"{path}: translation",
-            expected="the poses of the cameras",
-            found="all cameras in one place: a calibration before the poses were found",
-            todo="Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
-            "cameras by clicks or by worldpose locate-cameras.",
+        found = "all cameras in one place: a calibration before the poses were found"
+        todo = (
+            "Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
+            "cameras by clicks or by worldpose locate-cameras."
         )
+        raise InputError(f"{path}: translation", "the poses of the cameras", found, todo)
 
 
 def calibration_error(where: str, expected: str, found: str) -> InputError:
     """Return the error for an entry of a calibration file."""
     return InputError(where, expected=expected, found=found, todo="Correct the calibration file.")
-
-
-def _shorten(value: object) -> str:
-    """Return a value shortened for a message."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def read_calibration_toml(
@@ -261,14 +246,12 @@ def read_calibration_toml(
     cameras = []
     for where, name, given in tables:
         table = _with_size(given, sizes.get(camera_id(name)))
-        if "matrix" in table and not {"rotation", "translation"} & table.keys():
-            raise InputError(
-                f"{where}.rotation",
-                expected="the pose of the camera, rotation and translation",
-                found="a lens alone",
-                todo="Import lenses with worldpose import --lens FILE --out MATCH, and click the "
-                "pose.",
+        if _has_lens_alone(table):
+            expected = "the pose of the camera, rotation and translation"
+            todo = (
+                "Import lenses with worldpose import --lens FILE --out MATCH, and click the pose."
             )
+            raise InputError(f"{where}.rotation", expected, "a lens alone", todo)
         cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
     return index_by_name(path, cameras)
 
@@ -282,11 +265,15 @@ def _with_size(table: Mapping[str, Any], size: tuple[int, int] | None) -> Mappin
     return {**table, "size": list(size)} if near else table
 
 
+def _has_lens_alone(table: Mapping[str, Any]) -> bool:
+    pose = [table.get(key) for key in ("rotation", "translation")]
+    return "matrix" in table and all(each in (None, "null", "None", "", []) for each in pose)
+
+
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
     """Return whether a camera has a lens but no pose, an empty one, or one with NaN."""
-    pose = [table.get(key) for key in ("rotation", "translation")]
-    empty = all(value in (None, "null", "None", "", []) for value in pose)
-    return "matrix" in table and (empty or "nan" in repr(pose))
+    pose = repr([table.get(key) for key in ("rotation", "translation")])
+    return _has_lens_alone(table) or ("matrix" in table and "nan" in pose)
 
 
 def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
@@ -326,15 +313,16 @@ def camera_tables(
     content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
-    entries = {"size", "matrix", "distortions", "rotation", "translation"}
+    entries = {"size", "matrix", "distortions"}
     known = [each for each in tables.values() if isinstance(each, dict) and entries & each.keys()]
+    entries |= set() if known else {"rotation", "translation"}  # also of pairs of cameras
     for key, table in tables.items():
         is_camera = isinstance(table, dict) and entries & table.keys()
         if key == "metadata" or (known and not is_camera):
             continue  # caliscope's settings stand beside its cameras
         where = f"{path}: {key}" if tables is content else f"{path}: cameras.{key}"
         if not isinstance(table, dict):
-            raise calibration_error(where, "a table for each camera", _shorten(table))
+            raise calibration_error(where, "a table for each camera", describe_value(table))
         yield where, str(table.get("name", f"cam_{key}" if key.isdecimal() else key)), table
 
 
@@ -363,7 +351,7 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
     size = _read_numbers(table, where, keys.size, (2,))
     fisheye = table.get("fisheye", False)
     if fisheye not in (False, True):
-        raise calibration_error(f"{where}.fisheye", "true or false", _shorten(fisheye))
+        raise calibration_error(f"{where}.fisheye", "true or false", describe_value(fisheye))
     numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))
     distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, fisheye=bool(fisheye))
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
@@ -391,13 +379,12 @@ def _read_lens(
             f"{len(numbers)} numbers{', a lens model with more terms' * (len(numbers) > 5)}",
         )
     if len(numbers) == 4 and not fisheye and np.abs(numbers[2:]).max() > max_tangential:
-        raise InputError(
-            where,
-            expected=f"k1 k2 p1 p2 with p1 and p2 up to {max_tangential:g}",
-            found=str(numbers.tolist()),
-            todo="If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
-            "fisheye_model: 1 in others.",
+        expected = f"k1 k2 p1 p2 with p1 and p2 up to {max_tangential:g}"
+        todo = (
+            "If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
+            "fisheye_model: 1 in others."
         )
+        raise InputError(where, expected, str(numbers.tolist()), todo)
     return np.append(numbers, 0.0)[: len(names)], model
 
 
@@ -448,12 +435,9 @@ def _read_rotation(table: Mapping[str, Any], where: str, key: str) -> NDArray[np
         )
     angle = float(np.linalg.norm(given))
     if angle > 2.0 * np.pi + ROTATION_TOLERANCE:
-        raise InputError(
-            f"{where}.{key}",
-            expected="a Rodrigues vector in radians, no longer than 2 pi",
-            found=f"one of length {angle:g}",
-            todo="If these are degrees, multiply them by pi / 180.",
-        )
+        expected = "a Rodrigues vector in radians, no longer than 2 pi"
+        todo = "If these are degrees, multiply them by pi / 180."
+        raise InputError(f"{where}.{key}", expected, f"one of length {angle:g}", todo)
     from scipy.spatial.transform import Rotation  # late: it takes 0.1 s, and few rotations are read
 
     matrix: NDArray[np.float64] = Rotation.from_rotvec(given.ravel()).as_matrix()
@@ -465,15 +449,11 @@ def _read_numbers(
 ) -> NDArray[np.float64]:
     """Return entry `key` as float64; column and row vectors become flat."""
     if key not in table:
-        raise InputError(
-            f"{where}.{key}",
-            expected="a value",
-            found="nothing",
-            todo="Calibrate this camera, or take it out of the file.",
-        )
+        todo = "Calibrate this camera, or take it out of the file."
+        raise InputError(f"{where}.{key}", "a value", "nothing", todo)
     numbers = _plain_numbers(table[key])
     if numbers is None:
-        raise calibration_error(f"{where}.{key}", "numbers", _shorten(table[key]))
+        raise calibration_error(f"{where}.{key}", "numbers", describe_value(table[key]))
     if shape is not None and len(shape) == 1 and numbers.size == shape[0]:
         numbers = numbers.ravel()
     if shape is not None and numbers.shape != shape:
@@ -482,7 +462,7 @@ def _read_numbers(
         )
     if not np.all(np.abs(numbers) <= NUMBER_LIMIT):  # also NaN
         raise calibration_error(
-            f"{where}.{key}", f"finite numbers up to {NUMBER_LIMIT:g}", _shorten(table[key])
+            f"{where}.{key}", f"finite numbers up to {NUMBER_LIMIT:g}", describe_value(table[key])
         )
     return numbers
 

@@ -51,16 +51,6 @@ OPENCAP_NAME: Final = "cameraIntrinsicsExtrinsics"
 OPENCAP_KEYS: Final = Keys("imageSize", "intrinsicMat", "distortion", "rotation", "translation")
 
 
-STANDING: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-"""(3, 3) from a board whose y points down to a world with z up."""
-
-ON_ITS_HEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""(3, 3) from a board whose y points up."""
-
-LYING: Final = np.diag([1.0, -1.0, -1.0])
-"""(3, 3) from a board on the ground, whose z points into it."""
-
-
 Sizes: TypeAlias = Mapping[str, tuple[int, int]]
 """Width and height [px] by camera."""
 
@@ -214,12 +204,8 @@ def _form_of(path: Path) -> tuple[Form, tuple[Path, ...]]:
     todo = "Export the calibration in one of these forms."
     if suffix == ".cal":
         todo = "Open it in Motive 3.2 or later, and export it as .mcal."
-    raise InputError(
-        str(path),
-        expected="a calibration: " + _list_forms(),
-        found=f"a file that ends in {path.suffix!r}",
-        todo=todo,
-    )
+    expected = "a calibration: " + _list_forms()
+    raise InputError(str(path), expected, f"a file that ends in {path.suffix!r}", todo)
 
 
 def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
@@ -236,8 +222,14 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     upright = 0.75
     tables = {file: _read_pickle(file) for file in files}
     down = np.mean([_downward(file, table) for file, table in tables.items()], axis=0)
+    # (3, 3) from a board whose y points down to a world with z up.
+    from_standing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+    # (3, 3) from a board whose y points up.
+    from_turned = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    # (3, 3) from a board on the ground, whose z points into it.
+    from_lying = np.diag([1.0, -1.0, -1.0])
     cosine, axes = max(
-        ((down[1], STANDING), (-down[1], ON_ITS_HEAD), (down[2], LYING)),
+        ((down[1], from_standing), (-down[1], from_turned), (down[2], from_lying)),
         key=lambda place: float(place[0]),
     )
     if not cosine >= upright:
@@ -274,22 +266,17 @@ def _read_pickle(file: Path) -> dict[str, Any]:
     try:
         content = read_pickle(file)
     except (OSError, ValueError) as error:
-        raise InputError(
-            str(file),
-            expected="OpenCap's pickle of one camera: arrays alone",
-            found=say_failure(error),
-            todo="Give cameraIntrinsicsExtrinsics.pickle, as OpenCap wrote it. Nothing in this "
-            "file was run.",
-        ) from error
+        expected = "OpenCap's pickle of one camera: arrays alone"
+        todo = (
+            "Give cameraIntrinsicsExtrinsics.pickle, as OpenCap wrote it. Nothing in this "
+            "file was run."
+        )
+        raise InputError(str(file), expected, say_failure(error), todo) from error
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a dictionary", type(content).__name__)
     if "intrinsicMat" in content and "rotation" not in content:
-        raise InputError(
-            f"{file}: rotation",
-            expected="the pose of the camera",
-            found="a lens alone",
-            todo="Give cameraIntrinsicsExtrinsics.pickle, not cameraIntrinsics.pickle.",
-        )
+        todo = "Give cameraIntrinsicsExtrinsics.pickle, not cameraIntrinsics.pickle."
+        raise InputError(f"{file}: rotation", "the pose of the camera", "a lens alone", todo)
     table = {
         key: np.squeeze(value).tolist() if isinstance(value, np.ndarray) else value
         for key, value in content.items()
@@ -323,11 +310,10 @@ def _read_easymocap(
         for kind in ("intri", "extri")
     }
     if any(len(some) != 1 for some in by_kind.values()):
+        expected = "one intri.yml of lenses and one extri.yml of poses"
+        todo = "Put both into one folder, without others."
         raise InputError(
-            str(files[0].parent),
-            expected="one intri.yml of lenses and one extri.yml of poses",
-            found=", ".join(file.name for file in files),
-            todo="Put both into one folder, without others.",
+            str(files[0].parent), expected, ", ".join(file.name for file in files), todo
         )
     ((lens_file,), (pose_file,)) = by_kind["intri"], by_kind["extri"]
     lenses, poses = read_file_storage(lens_file), read_file_storage(pose_file)
@@ -345,13 +331,12 @@ def _read_easymocap(
         if known is not None and f"W_{name}" not in lenses:
             lenses |= {f"W_{name}": float(known[0]), f"H_{name}": float(known[1])}
         if f"W_{name}" not in lenses or f"H_{name}" not in lenses:
-            raise InputError(
-                f"{lens_file}: W_{name}",
-                expected=f"the image size of camera {name}",
-                found="none",
-                todo=f"Add its width and height in pixels: a line W_{name}: 1920 and a line "
-                f"H_{name}: 1080.",
+            expected = f"the image size of camera {name}"
+            todo = (
+                f"Add its width and height in pixels: a line W_{name}: 1920 and a line "
+                f"H_{name}: 1080."
             )
+            raise InputError(f"{lens_file}: W_{name}", expected, "none", todo)
         entries = {
             "W, H": [lenses[f"W_{name}"], lenses[f"H_{name}"]],
             f"K_{name}": lenses.get(f"K_{name}"),

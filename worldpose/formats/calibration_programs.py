@@ -26,8 +26,6 @@ from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml
 from worldpose.formats.lens_files import kalibr_tables
 from worldpose.formats.opencv_storage import read_file_storage
 
-Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""(3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y."""
 _JSON_BYTES: Final = 16 * SETTINGS_BYTES
 _CENTIMETRE: Final = 1e-2
 """[m]"""
@@ -69,6 +67,8 @@ def _read_panoptic(
     keys = Keys("resolution", "K", "distCoef", "R", "t")
     skewed = [_has_skew(table.get("K")) for table in cameras]
     found = []
+    # (3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y.
+    y_down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for index, table in enumerate(cameras):
         where = f"{path}: cameras[{index}]"
         name = str(table.get("name", ""))
@@ -76,7 +76,7 @@ def _read_panoptic(
             left_out[camera_id(name)] = "its pixels are skew (K[0][1]), which no lens model has"
             continue
         camera = read_camera_table(
-            where, name, table, keys=keys, unit_m=_CENTIMETRE, axes=Y_DOWN, where_pose=where
+            where, name, table, keys=keys, unit_m=_CENTIMETRE, axes=y_down, where_pose=where
         )
         found.append((where, camera))
     return index_by_name(path, found)
@@ -122,13 +122,11 @@ def _read_tables(
         left_out.update({camera_id(name): "it has no pose" for name in tables if name not in posed})
     elif len(posed) < len(tables) or not posed:
         lacking = next((name for name in tables if name not in posed), "no camera")
-        raise InputError(
-            f"{path}: {lacking}",
-            expected="the pose of the camera",
-            found="a lens alone",
-            todo="Calibrate the poses too; or write the lenses as TOML, import them (worldpose "
-            "import --lens), and click the poses.",
+        todo = (
+            "Calibrate the poses too; or import the lenses (worldpose import --lens FILE), "
+            "and click the poses."
         )
+        raise InputError(f"{path}: {lacking}", "the pose of the camera", "a lens alone", todo)
     cameras = []
     for name in posed:
         where = f"{path}: {name}"
@@ -166,12 +164,9 @@ def read_openpose_cameras(
     for file in files:
         given, where = read_file_storage(file), str(file)
         if camera_id(file.stem) not in sizes:
-            raise InputError(
-                where,
-                expected=f"the image size of camera {file.stem}, which OpenPose's files lack",
-                found="no video of that name",
-                todo="Import the calibration with --videos, or write it as TOML with a size.",
-            )
+            expected = f"the image size of camera {file.stem}, which OpenPose's files lack"
+            todo = "Import the calibration with --videos, or write it as TOML with a size."
+            raise InputError(where, expected, "no video of that name", todo)
         pose = np.asarray(given.get("CameraMatrix"))
         if pose.shape != (3, 4):
             raise calibration_error(f"{where}: CameraMatrix", "shape (3, 4)", f"{pose.shape}")

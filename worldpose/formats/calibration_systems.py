@@ -29,8 +29,6 @@ LENS_ERROR_PX: Final = 0.1
 """Maximum error of OpenCV's coefficients fitted to Vicon's lens, within the image [px]: a tenth of
 the error with which a detector finds a joint."""
 
-Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""(3, 3) from a world with y up to one with z up: x stays, y becomes minus z."""
 
 BACKWARD: Final = np.diag([1.0, -1.0, -1.0])
 """(3, 3) from camera axes x right, y up, z backward to OpenCV's."""
@@ -68,13 +66,11 @@ def read_calibration_xml(
         "calibrationProfile": _read_optitrack,
     }
     if root.tag not in readers:
-        raise InputError(
-            f"{path}: <{root.tag:.40}>",
-            expected="<calibration> of Qualisys, <Cameras> of Vicon, or <calibrationProfile> of "
-            "OptiTrack",
-            found=f"<{root.tag:.40}>",
-            todo="Export the calibration of the system again.",
+        expected = (
+            "<calibration> of Qualisys, <Cameras> of Vicon, or <calibrationProfile> of OptiTrack"
         )
+        todo = "Export the calibration of the system again."
+        raise InputError(f"{path}: <{root.tag:.40}>", expected, f"<{root.tag:.40}>", todo)
     return readers[root.tag](path, root, left_out)
 
 
@@ -119,7 +115,8 @@ def _read_qualisys(
         if element.get("active", "1") != "0"
     ]
     has_video = any("video" in element.get("model", "").lower() for _, element in active)
-    lacks = [_qualisys_lack(element, has_video) for _, element in active]
+    has_fov = any(element.find("fov_video") is not None for _, element in active)
+    lacks = [_qualisys_lack(element, has_video, has_fov) for _, element in active]
     if left_out is not None and not all(lacks):
         for (where, element), why in zip(active, lacks, strict=True):
             if why:
@@ -129,12 +126,12 @@ def _read_qualisys(
     return index_by_name(path, cameras)
 
 
-def _qualisys_lack(element: ET.Element, has_video: bool) -> str:
+def _qualisys_lack(element: ET.Element, has_video: bool, has_fov: bool) -> str:
     """Return why a camera makes no calibrated video; empty if it does."""
     model = element.get("model", "")
     if has_video and "video" not in model.lower():
         return f"it records markers ({model})"
-    if element.find("fov_video") is None:
+    if has_fov and element.find("fov_video") is None:
         return "it makes no video (no fov_video)"
     place = element.find("transform")
     axes = [] if place is None else [place.get(f"r{i}{j}", "") for i in "123" for j in "123"]
@@ -149,19 +146,31 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
     `<transform>`: x y z is the camera centre C [mm]; r11..r33 is A, row by row, whose rows are the
     camera's axes in the world: x right, y up, z backward. So R = diag(1, -1, -1) A, t = -R C.
 
-    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor; `<fov_video>` (px,
-    both ends included) is the part of the sensor in the video. The radial and tangential (in the
+    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor, or in px where the
+    sensor (`sensorMaxU`) is; `<fov_video>` (px, both ends included) is the part of the sensor in
+    the video, the whole one in files without it. The radial and tangential (in the
     file: tangental) coefficients act on the normalised image plane and have no unit, so that they
     need no conversion: only lengths on the sensor are in 1/64 px. (Pose2Sim's reader divides them
     by 64 as well, which nearly removes the distortion.) `viewrotation` rotates only the view in
     QTM; the function ignores it.
     """
-    parts = {tag: _child(where, element, tag) for tag in ("transform", "intrinsic", "fov_video")}
+    parts = {tag: _child(where, element, tag) for tag in ("transform", "intrinsic")}
+    fov = element.find("fov_video")
+    parts |= {} if fov is None else {"fov_video": fov}
 
     def read(tag: str, keys: Sequence[str]) -> NDArray[np.float64]:
         return _numbers(f"{where}.{tag}", parts[tag], keys)
 
-    left, top, right, bottom = read("fov_video", ("left", "top", "right", "bottom"))
+    largest_px = 16384  # more are no pixels of a sensor, but parts of them
+    unit = 1.0 / 64.0
+    if fov is None or parts["intrinsic"].get("sensorMaxU") is not None:
+        last = read("intrinsic", ("sensorMaxU", "sensorMaxV"))
+        unit = unit if last.max() > largest_px else 1.0
+        last = 2.0 * np.ceil(0.5 * unit * last) - 1.0  # sensors have even sides
+    if fov is None:
+        left, top, right, bottom = 0.0, 0.0, *last
+    else:
+        left, top, right, bottom = read("fov_video", ("left", "top", "right", "bottom"))
     skew = parts["intrinsic"].get("skew", "0")
     if _parse(f"{where}.intrinsic.skew", skew, 1)[0] != 0.0:
         raise calibration_error(f"{where}.intrinsic.skew", "0", repr(skew))
@@ -175,8 +184,8 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
         element.get("serial", ""),
         Optics(
             np.array([right - left + 1, bottom - top + 1]),
-            read("intrinsic", ("focalLengthU", "focalLengthV")) / 64.0,
-            read("intrinsic", ("centerPointU", "centerPointV")) / 64.0 - [left, top],
+            unit * read("intrinsic", ("focalLengthU", "focalLengthV")),
+            unit * read("intrinsic", ("centerPointU", "centerPointV")) - [left, top],
             np.array([k1, k2, p1, p2, k3]),
         ),
         rotation=rotation,
@@ -189,7 +198,7 @@ def _read_vicon(
 ) -> dict[str, CameraCalibration]:
     """Return the video cameras of an XCP file by device id; those for markers make no video."""
     elements: list[tuple[str, ET.Element]] = []
-    others = set()
+    others: dict[str, str] = {}
     for index, element in enumerate(root.iterfind("Camera")):
         where = f"{path}: Camera[{index}]"
         kind = f"{element.get('DISPLAY_TYPE', '')} {element.get('TYPE', '')}".lower()
@@ -197,20 +206,19 @@ def _read_vicon(
         if is_digital or "video" in kind or "vue" in kind:
             elements.append((where, element))
         else:
-            others.add(element.get("DISPLAY_TYPE", "?"))
+            others[element.get("DEVICEID", where)] = element.get("DISPLAY_TYPE", "?")
     posed = [each for each in elements if each[1].find("KeyFrames/KeyFrame") is not None]
     if left_out is not None and posed:
         names = {element.get("DEVICEID", where) for where, element in elements}
         names -= {element.get("DEVICEID", where) for where, element in posed}
+        left_out.update(dict.fromkeys(others, "it records markers"))
         left_out.update(dict.fromkeys(sorted(names), "it is not calibrated (no KeyFrame)"))
         elements = posed
     if others and not elements:
-        raise InputError(
-            str(path),
-            expected="a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)",
-            found=f"cameras for markers alone: {', '.join(sorted(others)):.80}",
-            todo="Calibrate the video cameras with the others, and export again.",
-        )
+        expected = "a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)"
+        todo = "Calibrate the video cameras with the others, and export again."
+        found = f"cameras for markers alone: {', '.join(sorted(set(others.values()))):.80}"
+        raise InputError(str(path), expected, found, todo)
     cameras = [(where, _read_vicon_camera(where, element, left_out)) for where, element in elements]
     return index_by_name(path, cameras)
 
@@ -228,11 +236,10 @@ def _read_vicon_camera(
     frames = element.findall("KeyFrames/KeyFrame")
     where = f"{where} {name}".rstrip()
     if len(frames) != 1:
+        found = str(len(frames)) if frames else "none: the camera is not calibrated"
+        todo = "Calibrate the camera, or take it out of the file."
         raise InputError(
-            f"{where}.KeyFrames",
-            expected="one KeyFrame, of a camera that does not move",
-            found=str(len(frames)) if frames else "none: the camera is not calibrated",
-            todo="Calibrate the camera, or take it out of the file.",
+            f"{where}.KeyFrames", "one KeyFrame, of a camera that does not move", found, todo
         )
     (frame,) = frames
     for holder, key, only in (
@@ -258,13 +265,7 @@ def _read_vicon_camera(
     if left_out is not None and error > 0.0:
         how = f"{optics.lens_model} coefficients follow Vicon's lens within {error:.2g} px"
         left_out.notes.append(f"camera {name}: {how}")
-    return build_camera(
-        where,
-        name,
-        optics,
-        rotation=rotation,
-        translation=-rotation @ center,
-    )
+    return build_camera(where, name, optics, rotation=rotation, translation=-rotation @ center)
 
 
 def _vicon_optics(
@@ -290,12 +291,9 @@ def _vicon_optics(
     if text is not None:
         model, _, rest = text.strip().partition(" ")
         if model != "Vicon3Parameter":
-            raise InputError(
-                f"{where}.VICON_RADIAL2",
-                expected="Vicon3Parameter, the center, and three coefficients",
-                found=f"{text!r:.60}",
-                todo="Calibrate with the three-parameter lens model.",
-            )
+            expected = "Vicon3Parameter, the center, and three coefficients"
+            todo = "Calibrate with the three-parameter lens model."
+            raise InputError(f"{where}.VICON_RADIAL2", expected, f"{text!r:.60}", todo)
         numbers = _parse(f"{where}.VICON_RADIAL2", rest, 5)
         about, terms = numbers[:2], numbers[2:]
     else:
@@ -357,6 +355,10 @@ def _read_optitrack(
         if element.get("Serial", "").startswith("C") or mode.get("VideoType") in ("1", "6"):
             filming.append(every[-1])
     chosen = filming or every
+    if left_out is not None:
+        others = [element.get("Serial", where) for where, element in every]
+        filmed = {element.get("Serial", where) for where, element in chosen}
+        left_out.update({name: "it records markers" for name in others if name not in filmed})
     return index_by_name(
         path, [(where, _read_optitrack_camera(where, element)) for where, element in chosen]
     )
@@ -388,7 +390,9 @@ def _read_optitrack_camera(where: str, element: ET.Element) -> CameraCalibration
     k1, k2, k3 = _numbers(optics, lens, ("k1", "k2", "k3"))
     p1, p2 = _numbers(optics, lens, ("TangentialX", "TangentialY"))
     axes = _numbers(pose, place, [f"OrientMatrix{index}" for index in range(9)]).reshape(3, 3)
-    rotation = BACKWARD @ axes.T @ Y_UP.T
+    # (3, 3) from a world with y up to one with z up: x stays, y becomes minus z.
+    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rotation = BACKWARD @ axes.T @ y_up.T
     return build_camera(
         where,
         name,
@@ -399,5 +403,5 @@ def _read_optitrack_camera(where: str, element: ET.Element) -> CameraCalibration
             np.array([k1, k2, p1, p2, k3]),
         ),
         rotation=rotation,
-        translation=-rotation @ (Y_UP @ _numbers(pose, place, "XYZ")),
+        translation=-rotation @ (y_up @ _numbers(pose, place, "XYZ")),
     )

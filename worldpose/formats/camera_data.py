@@ -33,8 +33,6 @@ COLUMNS: Final = (
     *("cx_px", "cy_px"),
 )
 """Columns of a table of camera data in a match folder, beside `frame`."""
-_LIMITS: Final = (360.0, 90.0, 180.0, 300.0, 300.0, 300.0, 1e6, 1e3, 1e3, 1e9, 1e5, 1e5)
-"""Largest absolute values of these columns."""
 COUNTS: Final = "zoom counts are no focal length: without --zoom-table, they are compared alone"
 """Note of data whose zoom is in counts."""
 
@@ -94,13 +92,15 @@ def read_camera_data(
         row = int(falls[0])
         found = f"{frame[row]}, then {frame[row + 1]}"
         raise _wrong(f"{path}: entry {row + 2}", "frames that rise, each once", found)
+    # Largest absolute values of these columns.
+    limits = (360.0, 90.0, 180.0, 300.0, 300.0, 300.0, 1e6, 1e3, 1e3, 1e9, 1e5, 1e5)
     with np.errstate(invalid="ignore"):
-        off = (np.abs(data.values) > _LIMITS) | (data.values[:, [6]] < 1.0) & (
+        off = (np.abs(data.values) > limits) | (data.values[:, [6]] < 1.0) & (
             np.arange(len(COLUMNS)) == 6
         )
     for row, column in np.argwhere(off)[:1]:
         where = f"{path}: entry {row + 1}: {COLUMNS[column]}"
-        expected = f"at most {_LIMITS[column]:g}" + (", at least 1" if column == 6 else "")
+        expected = f"at most {limits[column]:g}" + (", at least 1" if column == 6 else "")
         todo = "Correct it, or state the unit in the title, as in x_mm."
         raise _wrong(where, expected, f"{data.values[row, column]:.7g}", todo)
     return replace(data, frame=frame)
@@ -215,10 +215,7 @@ _TITLES: Final[Mapping[str, str]] = {
     **dict.fromkeys(("fov_v", "fovy", "fov_vertical", "vertical_fov"), "fov_y"),
 }
 """Other names of columns; `_deg` or `_rad` may follow those of angles, a unit of length x, y, z."""
-_KNOWN: Final = {
-    *("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y"),
-}
-_METRES: Final[Mapping[str, float]] = {"": 1.0} | {unit: each[0] for unit, each in UNITS.items()}
+_KNOWN: Final = {*("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y")}
 
 
 def _read_columns(
@@ -229,10 +226,11 @@ def _read_columns(
     rows, has_commas = read_cells(path, _BYTES, todo)
     columns: dict[str, Floats] = {}
     codes, left_out = [], []
+    metres = {"": 1.0} | {unit: each[0] for unit, each in UNITS.items()}
     for place, title in enumerate(rows[0][1] if rows else ()):
         text = re.sub(r"[^a-z0-9]+", "_", title.lower()).strip("_").removesuffix("_deg")
         axis = re.fullmatch(r"(?:pos_?|position_?)?([xyz])(?:_([a-z]+))?", text)
-        factor = _METRES.get(axis[2] or "", 0.0) if axis else 1.0
+        factor = metres.get(axis[2] or "", 0.0) if axis else 1.0
         if text.endswith("_rad"):
             text, factor = text.removesuffix("_rad"), float(np.degrees(1.0))
         name = f"{axis[1]}_m" if axis and factor else _TITLES.get(text, text)

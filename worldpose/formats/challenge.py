@@ -25,9 +25,6 @@ from worldpose.formats.tables import read_parquet
 from worldpose.geometry.cameras import Camera
 from worldpose.parsing import read_npy
 
-_FRAMES: Final = 8
-"""Frames whose surfaces are in memory at a time; 33 MB for 25 people."""
-
 
 @dataclass(frozen=True, eq=False)
 class ChallengeClip:
@@ -69,8 +66,10 @@ def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> 
     points = fold_keypoints(model, BODY25)
     joints = np.empty((frames, persons, len(BODY25), 3))
     boxes = np.empty((frames, persons, 4))
-    for start in range(0, frames, _FRAMES):
-        part = slice(start, min(start + _FRAMES, frames))
+    # Frames whose surfaces are in memory at a time; 33 MB for 25 people.
+    block_frames = 8
+    for start in range(0, frames, block_frames):
+        part = slice(start, min(start + block_frames, frames))
         some = poses[:, part]
         joints[part] = points(some).swapaxes(0, 1)
         boxes[part] = _boxes(camera[part], model.vertices(some).swapaxes(0, 1))
@@ -115,8 +114,6 @@ _COLUMNS: Final = ("sequence", "frame", "person", "joint", "x", "y", "z")
 """Columns of a submission's table, beside `row_id`."""
 PARQUET: Final = ".parquet"
 """Ending of a submission's table."""
-MAX_PERSONS: Final = 1000
-"""Largest number of persons in a submission's table [1]."""
 KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3)}
 """Arrays per clip, and their dimensions after frames and persons."""
 
@@ -336,7 +333,9 @@ def _read_table(path: Path, only: Collection[str] | None) -> dict[str, Floats]:
     """Read a submission's table (parquet) by clip."""
     table = read_parquet(path, _COLUMNS)
     index = np.stack([table[name] for name in _COLUMNS[1:4]], axis=1).astype(np.float64)
-    limits = np.array([FRAME_LIMIT, MAX_PERSONS, len(CHALLENGE15)])
+    # Largest number of persons in a submission's table [1].
+    max_persons = 1000
+    limits = np.array([FRAME_LIMIT, max_persons, len(CHALLENGE15)])
     off = (index != np.floor(index)) | (index < 0) | (index >= limits)
     if off.any():
         row, column = np.argwhere(off)[0].tolist()
@@ -409,10 +408,7 @@ def read_kit_array(path: Path, kind: str) -> Floats:
         isinstance(d, str) or n == d for n, d in zip(array.shape[2:], tail, strict=True)
     )
     if not fits:
-        raise InputError(
-            str(path),
-            expected=f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})",
-            found=f"{array.dtype} of shape {array.shape}",
-            todo="Write the file again.",
-        )
+        expected = f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})"
+        todo = "Write the file again."
+        raise InputError(str(path), expected, f"{array.dtype} of shape {array.shape}", todo)
     return array.astype(np.float64)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from data_contracts.records import FRAME_LIMIT
-from worldpose.errors import InputError
+from worldpose.errors import InputError, describe_value
 from worldpose.formats.archives import PACKED_BYTES, PACKED_RATIO
 from worldpose.formats.files import JsonItems
 from worldpose.formats.keypoint_sets import (
@@ -39,12 +39,10 @@ from worldpose.formats.keypoint_sets import (
 )
 from worldpose.formats.pose_forms import plain_entries
 
-BATCH: Final = 4096
+BATCH = 4096
 """Results per batch of Python objects."""
 
-_POINTS: Final = "x, y, confidence of each point"
 _COUNT_TODO: Final = "Export all points, and 0, 0, 0 where one is missing."
-_CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 0 is missing."
 _NUMBER_TODO: Final = (
     "Number the images from 0 in the order of the video, in image_id or file_name."
 )
@@ -74,27 +72,28 @@ def read_coco_results(path: Path) -> PeopleFile:
             pointless += without
         batches.append(_read_batch(path, results, first))
     if not items.has_list:
+        expected = (
+            "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
+            "results of MMPose or Ultralytics"
+        )
+        todo = "Export the poses as COCO keypoint results."
         raise InputError(
-            str(path),
-            expected="a list of COCO keypoint results, a COCO data set with `annotations`, or the "
-            "results of MMPose or Ultralytics",
-            found=_shorten(items.other or ", ".join(items.seen)),
-            todo="Export the poses as COCO keypoint results.",
+            str(path), expected, describe_value(items.other or ", ".join(items.seen)), todo
         )
     found = _join(path, batches)
     points = found.points
     if pointless and pointless == len(points):
+        expected = "keypoints of people"
+        todo = "Export the poses, not the boxes alone."
         raise InputError(
-            f"{path}: annotations",
-            expected="keypoints of people",
-            found=f"{pointless} annotations without keypoints",
-            todo="Export the poses, not the boxes alone.",
+            f"{path}: annotations", expected, f"{pointless} annotations without keypoints", todo
         )
     if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
     wrong_scale = (sure < 0) | (sure > MAX_CONFIDENCE)  # NaN is a missing point
-    _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", _CONFIDENCE_TODO)
+    confidence_todo = "Scale the detector's scores so that 1 is certain and 0 is missing."
+    _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", confidence_todo)
     names, where = _point_names(path, items.kept.get("categories")), f"{path}: categories"
     names = names or _model_names(items.kept.get("meta_info"))
     if names and len(names) != points.shape[1] and len(points):
@@ -147,7 +146,7 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
     for index, result in enumerate(items):
         if type(result) is not dict:
             expected = "a mapping with image_id and keypoints"
-            raise _result_error(path, index, "", expected, _shorten(result))
+            raise _result_error(path, index, "", expected, describe_value(result))
         batch.append(result)
         if len(batch) == BATCH:
             yield index + 1 - BATCH, batch
@@ -190,7 +189,7 @@ def _images(path: Path, results: list[dict[str, Any]], first: int) -> list[int |
     for index, image in enumerate(images, first):
         if not (type(image) is int and image >= 0) and not (type(image) is str and image):
             what = "the frame, a whole number from 0, or the name of an image"
-            raise _result_error(path, index, "image_id", what, _shorten(image), _NUMBER_TODO)
+            raise _result_error(path, index, "image_id", what, describe_value(image), _NUMBER_TODO)
     return images  # type: ignore[return-value] # checked
 
 
@@ -210,7 +209,7 @@ def _frames(path: Path, images: Sequence[int | str], listed: object) -> NDArray[
             what = "an id of `images`" if is_set else "a number in the name of the image"
             if frame is not None:
                 what = f"a frame from 0 to {FRAME_LIMIT}, in file_name where there are `images`"
-            found = _shorten(image if frame in (None, image) else f"{image}, frame {frame}")
+            found = describe_value(image if frame in (None, image) else f"{image}, frame {frame}")
             raise _result_error(path, index, "image_id", what, found, _NUMBER_TODO)
         frames[index] = frame
     return frames
@@ -227,7 +226,7 @@ def _listed_frames(path: Path, listed: Sequence[Any]) -> dict[int | str, int]:
             number = image["frame_id"]
         if number is None or type(image.get("id")) not in (int, str):
             expected = "an id, and the frame's number in file_name or frame_id"
-            raise _wrong(f"{path}: images[{index}]", expected, _shorten(name))
+            raise _wrong(f"{path}: images[{index}]", expected, describe_value(name))
         frames[image["id"]] = number
     _require_distinct(path, "images", frames, len(listed))
     return frames
@@ -290,17 +289,20 @@ def _table(
 def _find_error(
     path: Path, rows: list[Any], indices: Sequence[int], key: str, width: int
 ) -> InputError:
-    what = f"{width} numbers: {_POINTS}" if key == "keypoints" else f"{width} numbers"
+    expected = "x, y, confidence of each point"
+    what = f"{width} numbers: {expected}" if key == "keypoints" else f"{width} numbers"
     todo = _COUNT_TODO if key == "keypoints" else "Correct the file."
     for index, row in zip(indices, rows, strict=True):
         if type(row) is not list:
-            return _result_error(path, index, key, what, _shorten(row), todo)
+            return _result_error(path, index, key, what, describe_value(row), todo)
         if len(row) != width:
             return _result_error(path, index, key, what, f"{len(row)}", todo)
         for place, number in enumerate(row):
             fits = type(number) is float or (type(number) is int and number.bit_length() < 1024)
             if not fits:
-                return _result_error(path, index, f"{key}[{place}]", "a number", _shorten(number))
+                return _result_error(
+                    path, index, f"{key}[{place}]", "a number", describe_value(number)
+                )
     raise AssertionError("called for a table without a fault")
 
 
@@ -341,12 +343,7 @@ def _optional(
 
 
 def _result_error(
-    path: Path,
-    index: int,
-    place: str,
-    expected: str,
-    found: str,
-    todo: str = "Correct the file.",
+    path: Path, index: int, place: str, expected: str, found: str, todo: str = "Correct the file."
 ) -> InputError:
     where = f"{path}: result {index}" + (f", {place}" if place else "")
     return InputError(where, expected=expected, found=found, todo=todo)
@@ -355,12 +352,3 @@ def _result_error(
 def _wrong(where: str, expected: str, found: str) -> InputError:
     todo = _NUMBER_TODO if "images" in where else "Correct the file."
     return InputError(where, expected=expected, found=found, todo=todo)
-
-
-def _shorten(value: object) -> str:
-    if value is None:
-        return "nothing"
-    if isinstance(value, dict | list):
-        return f"a {'list' if isinstance(value, list) else 'mapping'} of {len(value)}"
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +30,6 @@ from worldpose.formats.keypoint_sets import (
 from worldpose.formats.pose_forms import plain_person
 from worldpose.parsing import read_cells
 
-KEYPOINTS_KEYS: Final = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
-"""Of OpenPose's version 1 and later, of its versions 0, and of other programs."""
-BOX_COLUMNS: Final = range(6, 11)
-"""Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9."""
-
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     """Return the people of one camera; `worldpose.formats.keypoint_sets` tells their points.
@@ -54,11 +49,10 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
         (one, file), (two, other) = list(sizes.items())[:2]
+        expected = "the same keypoints in all frames"
+        todo = "Use the files of one estimator, and remove older ones."
         raise InputError(
-            str(folder),
-            expected="the same keypoints in all frames",
-            found=f"{one} in {file.name}, {two} in {other.name}",
-            todo="Use the files of one estimator, and remove older ones.",
+            str(folder), expected, f"{one} in {file.name}, {two} in {other.name}", todo
         )
     empty = sum(people is None for people in read.values())
     found = [one for people in read.values() for one in people or ()]
@@ -78,27 +72,17 @@ def _frame_files(folder: Path) -> dict[int, Path]:
     files: dict[int, Path] = {}
     for name, file in there.items():
         if numbers.get(name, FRAME_LIMIT + 1) > FRAME_LIMIT:
-            raise InputError(
-                str(file),
-                expected=f"a frame number up to {FRAME_LIMIT} in the name",
-                found=name,
-                todo="Name it as cam01_000012.json, or move it elsewhere.",
-            )
+            expected = f"a frame number up to {FRAME_LIMIT} in the name"
+            todo = "Name it as cam01_000012.json, or move it elsewhere."
+            raise InputError(str(file), expected, name, todo)
         if numbers[name] in files:
-            raise InputError(
-                str(file),
-                expected="one file per frame",
-                found=f"{files[numbers[name]].name} with the same frame number",
-                todo="Keep the poses of one camera and one estimator in a folder.",
-            )
+            found = f"{files[numbers[name]].name} with the same frame number"
+            todo = "Keep the poses of one camera and one estimator in a folder."
+            raise InputError(str(file), "one file per frame", found, todo)
         files[numbers[name]] = file
     if not files:
-        raise InputError(
-            str(folder),
-            expected="a .json file for each frame",
-            found="none",
-            todo="Run pose estimation for this camera first.",
-        )
+        todo = "Run pose estimation for this camera first."
+        raise InputError(str(folder), "a .json file for each frame", "none", todo)
     return files
 
 
@@ -124,27 +108,27 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
 
 def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
     entries = plain_person(person) or (person if isinstance(person, dict) else {})
-    key = next((key for key in KEYPOINTS_KEYS if key in entries), KEYPOINTS_KEYS[0])
+    # Of OpenPose's version 1 and later, of its versions 0, and of other programs.
+    keypoints_keys = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
+    key = next((key for key in keypoints_keys if key in entries), keypoints_keys[0])
     numbers = entries.get(key)
     if (
         not isinstance(numbers, list)
         or len(numbers) not in {3 * size for size in SIZES}
         or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers)
     ):
+        found = f"{len(numbers)} entries" if isinstance(numbers, list) else f"{numbers!r:.40}"
+        todo = "Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet')."
         raise InputError(
-            f"{where}.{key}",
-            expected=f"x, y, confidence of each point, of {KNOWN_SETS} points",
-            found=f"{len(numbers)} entries" if isinstance(numbers, list) else f"{numbers!r:.40}",
-            todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
+            f"{where}.{key}", f"x, y, confidence of each point, of {KNOWN_SETS} points", found, todo
         )
     values = np.array(numbers, dtype=np.float64).reshape(-1, 3)
     off = (np.abs(values) > COORDINATE_LIMIT).any(axis=1) | (values[:, 2] > MAX_CONFIDENCE)
     if off.any():
+        expected = f"pixels up to {COORDINATE_LIMIT:g}, and confidences from 0 to 1"
+        todo = "Estimate the poses of this frame again."
         raise InputError(
-            f"{where}.{key}",
-            expected=f"pixels up to {COORDINATE_LIMIT:g}, and confidences from 0 to 1",
-            found=", ".join(f"{number:g}" for number in values[off][0]),
-            todo="Estimate the poses of this frame again.",
+            f"{where}.{key}", expected, ", ".join(f"{number:g}" for number in values[off][0]), todo
         )
     return values
 
@@ -220,11 +204,9 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
         if wrong.any():
             row = int(np.argmax(wrong))
             number, text = lines[row]
+            todo = "Correct the file, or write it again."
             raise InputError(
-                f"{file}: line {number}{': ' if key else ''}{key}",
-                expected=expected,
-                found=f"{text!r:.80}",
-                todo="Correct the file, or write it again.",
+                f"{file}: line {number}{': ' if key else ''}{key}", expected, f"{text!r:.80}", todo
             )
     changes = {
         "outside of the image, which are left out": int((kept & outside).sum()),
@@ -247,12 +229,8 @@ def _read_identified(file: Path, frames: int) -> GivenBoxes:
 
     boxes = read_kit_array(file, "boxes")
     if len(boxes) != frames:
-        raise InputError(
-            str(file),
-            expected=f"{frames} frames, as many as the video has",
-            found=f"{len(boxes)}",
-            todo="Give the boxes of this video.",
-        )
+        expected = f"{frames} frames, as many as the video has"
+        raise InputError(str(file), expected, f"{len(boxes)}", "Give the boxes of this video.")
     frame, person = np.nonzero(np.isfinite(boxes).all(-1))
     return GivenBoxes(frame, person, boxes[frame, person], np.ones(len(frame)))
 
@@ -263,12 +241,8 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     box_bytes = 1 << 28
 
     def wrong(where: str, expected: str, found: str) -> InputError:
-        return InputError(
-            where,
-            expected=expected,
-            found=found,
-            todo="Write lines of MOTChallenge: frame,id,left,top,width,height,confidence.",
-        )
+        todo = "Write lines of MOTChallenge: frame,id,left,top,width,height,confidence."
+        return InputError(where, expected, found, todo)
 
     cells, has_commas = read_cells(file, box_bytes, "Write lines of MOTChallenge.")
     if not cells:
@@ -276,11 +250,13 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     sign = "." if has_commas else ","
     lines = [(n, ",".join(cell.replace(",", sign) for cell in row)) for n, row in cells]
     count = lines[0][1].count(",") + 1
+    # Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9.
+    box_columns = range(6, 11)
     for number, each in lines:
-        if each.count(",") + 1 != count or count not in BOX_COLUMNS:
+        if each.count(",") + 1 != count or count not in box_columns:
             raise wrong(
                 f"{file}: line {number}",
-                f"{count if count in BOX_COLUMNS else '6 to 10'} numbers, separated by commas",
+                f"{count if count in box_columns else '6 to 10'} numbers, separated by commas",
                 f"{each!r:.80}",
             )
     try:

@@ -23,6 +23,15 @@ import yaml
 
 from worldpose.errors import InputError, say_failure
 
+ENTRY_LENGTH = 1 << 20
+"""Maximum characters of one entry; a person's keypoints have under a thousand."""
+
+CHUNK = 1 << 20
+"""Bytes per read."""
+
+EVENTS = 100_000
+"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
@@ -62,9 +71,6 @@ A full match has 0.1 MB; 5,000 calibrated cameras, as in the load test, take 2.0
 NESTING: Final = 32
 """Maximum levels of lists and mappings in YAML, of which match.yaml has four, and of elements in
 XML, of which annotations and calibrations have five."""
-
-EVENTS: Final = 100_000
-"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
@@ -109,12 +115,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     text = read_text(path, SETTINGS_BYTES)
     longest = max(map(len, text.splitlines()), default=0)
     if longest > toml_line:
-        raise InputError(
-            str(path),
-            expected=f"lines of at most {toml_line} characters",
-            found=f"one of {longest}",
-            todo="Break the line.",
-        )
+        expected = f"lines of at most {toml_line} characters"
+        raise InputError(str(path), expected, f"one of {longest}", "Break the line.")
     tables: dict[str, Any] = _parse(str(path), "TOML", tomllib.loads, text)
     return tables
 
@@ -128,27 +130,15 @@ def require_file(path: Path, limit: int | None = None) -> int:
     """
     try:
         if not path.is_file():
-            raise InputError(
-                str(path),
-                expected="a file",
-                found="something else" if path.exists() else "nothing",
-                todo="Put the file there, or correct the name.",
-            )
+            found = "something else" if path.exists() else "nothing"
+            raise InputError(str(path), "a file", found, "Put the file there, or correct the name.")
         size = path.stat().st_size
     except (OSError, ValueError) as error:
-        raise InputError(
-            str(path),
-            expected="a readable file",
-            found=say_failure(error),
-            todo="Check its name and rights.",
-        ) from error
+        todo = "Check its name and rights."
+        raise InputError(str(path), "a readable file", say_failure(error), todo) from error
     if limit is not None and size > limit:
-        raise InputError(
-            str(path),
-            expected=f"at most {limit} bytes",
-            found=f"{size} bytes",
-            todo="Check that the path names the file that you mean.",
-        )
+        todo = "Check that the path names the file that you mean."
+        raise InputError(str(path), f"at most {limit} bytes", f"{size} bytes", todo)
     return size
 
 
@@ -162,12 +152,8 @@ def read_text(path: Path, limit: int) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        raise InputError(
-            str(path),
-            expected="readable UTF-8 text",
-            found=say_failure(error),
-            todo="Save it as UTF-8.",
-        ) from error
+        todo = "Save it as UTF-8."
+        raise InputError(str(path), "readable UTF-8 text", say_failure(error), todo) from error
 
 
 def _parse(where: str, form: str, parse: Callable[[str], Any], text: str) -> Any:  # noqa: ANN401
@@ -176,16 +162,12 @@ def _parse(where: str, form: str, parse: Callable[[str], Any], text: str) -> Any
             raise ValueError("an empty file")
         return parse(text)
     except RecursionError as error:
-        raise InputError(
-            where, expected=form, found="nesting without end", todo="Write the file again."
-        ) from error
+        raise InputError(where, form, "nesting without end", "Write the file again.") from error
     # ValueError: json and tomllib, and numbers or dates that Python's constructors reject.
     # The others: PyYAML, where a tag such as !!int or !!bool precedes text of another type.
     except (yaml.YAMLError, ValueError, OverflowError, LookupError, AttributeError) as error:
         found = " ".join(str(error).replace('"<unicode string>", ', "").split())
-        raise InputError(
-            where, expected=form, found=found, todo="Correct the place that is named."
-        ) from error
+        raise InputError(where, form, found, "Correct the place that is named.") from error
 
 
 class _Loader(yaml.SafeLoader):
@@ -258,11 +240,6 @@ def parse_xml(content: bytes) -> ElementTree.Element:
         raise ValueError(f"no XML: {error}") from error
 
 
-CHUNK: Final = 1 << 20
-"""Bytes per read."""
-ENTRY_LENGTH: Final = 1 << 20
-"""Maximum characters of one entry; a person's keypoints have under a thousand."""
-
 _SPACE: Final = " \t\n\r"
 _DECODER: Final = json.JSONDecoder()
 
@@ -318,12 +295,8 @@ class JsonItems:
         except json.JSONDecodeError as error:
             raise self._wrong(f"{error.msg} (character {error.pos})") from error
         except UnicodeDecodeError as error:
-            raise InputError(
-                str(self.path),
-                expected="UTF-8 text",
-                found=say_failure(error),
-                todo="Save it as UTF-8.",
-            ) from error
+            todo = "Save it as UTF-8."
+            raise InputError(str(self.path), "UTF-8 text", say_failure(error), todo) from error
         except ValueError as error:  # a number with more digits than Python converts
             raise self._wrong(say_failure(error)) from error
         except OSError as error:

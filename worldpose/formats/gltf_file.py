@@ -23,10 +23,7 @@ from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 
-_KINDS: Final = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
-_TYPES: Final = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _VERTICES, _INDICES = 34962, 34963
-_SHORT: Final = 32767
 INFLUENCES: Final = 8
 """Joints of a vertex in two sets of four; viewers must read one set, and most read both."""
 FACING: Final = np.diag([1.0, -1.0, -1.0])
@@ -53,12 +50,8 @@ def people_with_bodies(path: Path, people: Sequence[AnimatedBody]) -> list[Anima
     """
     present = [person for person in people if person.poses.known.any()]
     if not present:
-        raise InputError(
-            str(path),
-            expected="a person with a fitted body",
-            found="none",
-            todo="Run the match up to body_fitting, or export joints: --format c3d or csv.",
-        )
+        todo = "Run the match up to body_fitting, or export joints: --format c3d or csv."
+        raise InputError(str(path), "a person with a fitted body", "none", todo)
     return present
 
 
@@ -125,18 +118,20 @@ class _File:
         """Append an array (rows, ...); return the index of its accessor.
 
         Args:
-            array: array of a type in `_KINDS`; 16-bit integers with a sign count as fractions.
+            array: array of a type in `kinds`; 16-bit integers with a sign count as fractions.
             target: use of the data, for vertices and indices.
             bounds: state the extreme values.
         """
         self.blob += b"\0" * (-len(self.blob) % 4)
         view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes}
         self.blob += np.ascontiguousarray(array).tobytes()
+        kinds = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+        types = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
         item = {
             "bufferView": self.add("bufferViews", view | ({"target": target} if target else {})),
-            "componentType": _KINDS[array.dtype.name],
+            "componentType": kinds[array.dtype.name],
             "count": len(array),
-            "type": _TYPES[array.shape[1:]],
+            "type": types[array.shape[1:]],
         }
         if array.dtype == np.int16:
             item["normalized"] = True
@@ -399,11 +394,7 @@ class _Writer:
             "NORMAL": self.file.accessor(up, _VERTICES),
         }
         shapes: list[dict[str, Any]] = [
-            {
-                "attributes": quad,
-                "indices": self.file.accessor(halves, _INDICES),
-                "material": lawn,
-            }
+            {"attributes": quad, "indices": self.file.accessor(halves, _INDICES), "material": lawn}
         ]
         vertices, triangles = paint_strips(markings)
         painted = {
@@ -456,11 +447,12 @@ def _quantize_rotations(rotations: Floats, parents: NDArray[np.int64]) -> NDArra
     """
     rounded = np.empty((*rotations.shape[:2], 4), np.int16)
     became = np.empty_like(rotations)
+    largest = 32767
     for joint, parent in enumerate(parents):
         before = became[:, parent] if joint else np.eye(3)
         turn = np.swapaxes(before, -1, -2) @ rotations[:, joint]
         unit = _continuous(Rotation.from_matrix(turn).as_quat())
-        rounded[:, joint] = np.round(unit * _SHORT)
+        rounded[:, joint] = np.round(unit * largest)
         became[:, joint] = before @ Rotation.from_quat(_unit(rounded[:, joint])).as_matrix()
     return rounded
 

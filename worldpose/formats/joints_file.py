@@ -17,15 +17,13 @@ from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 
-JOINTS: Final = len(COCO17)
-
 MEMBERS: Final = {
     "frames": Member(("frames",), "int"),
     "person_ids": Member(("persons",), "int"),
-    "joints": Member(("frames", "persons", JOINTS, 3), "float"),
-    "covariance": Member(("frames", "persons", JOINTS, 3, 3), "float", required=False),
-    "views": Member(("frames", "persons", JOINTS), "int", required=False),
-    "source": Member(("frames", "persons", JOINTS), "int", required=False),
+    "joints": Member(("frames", "persons", len(COCO17), 3), "float"),
+    "covariance": Member(("frames", "persons", len(COCO17), 3, 3), "float", required=False),
+    "views": Member(("frames", "persons", len(COCO17)), "int", required=False),
+    "source": Member(("frames", "persons", len(COCO17)), "int", required=False),
     "identity_certainty": Member(("frames", "persons"), "float", required=False),
     "points": Member(("points",), "text", required=False),
     "extra_joints": Member(("frames", "persons", "points", 3), "float", required=False),
@@ -177,7 +175,7 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
     joints = np.full((*shape, 3), np.nan)
     covariance = np.full((*shape, 3, 3), np.nan)
     views = np.zeros(shape, np.int64)
-    source = None if tracks.source is None else np.zeros((*shape[:2], JOINTS), np.int64)
+    source = None if tracks.source is None else np.zeros((*shape[:2], len(COCO17)), np.int64)
     if source is not None:
         source[rows] = tracks.source
     joints[rows] = markers.joints
@@ -203,16 +201,16 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
     if tracks.extra is not None:
         extra = ExtraTracks(
             tracks.extra.points,
-            joints[:, :, JOINTS:],
-            None if stated is None else stated[:, :, JOINTS:],
-            views[:, :, JOINTS:],
+            joints[:, :, len(COCO17) :],
+            None if stated is None else stated[:, :, len(COCO17) :],
+            views[:, :, len(COCO17) :],
         )
     return JointTracks(
         frames,
         tracks.person_ids,
-        joints[:, :, :JOINTS],
-        covariance=None if stated is None else stated[:, :, :JOINTS],
-        views=views[:, :, :JOINTS],
+        joints[:, :, : len(COCO17)],
+        covariance=None if stated is None else stated[:, :, : len(COCO17)],
+        views=views[:, :, : len(COCO17)],
         source=source,
         identity_certainty=certainty,
         extra=extra,
@@ -273,9 +271,8 @@ def read_joints(path: str | os.PathLike[str]) -> JointTracks:
             )
         return JointTracks(**arrays, extra=extra)
     except InputError as error:
-        raise InputError(
-            f"{path}: {error.where}", expected=error.expected, found=error.found, todo=error.todo
-        ) from error
+        todo = error.todo
+        raise InputError(f"{path}: {error.where}", error.expected, error.found, todo) from error
 
 
 POSE_MEMBERS: Final = {

@@ -42,14 +42,10 @@ from worldpose.formats.keypoint_sets import (
     PeopleFile,
 )
 
-_JOINTS: Final = len(COCO17)
-_BLOCK: Final = 4096
-"""Frames per block of checks, which limits their memory."""
-
 _MEMBERS: Final = {
     "frame": Member(("frames",), "int", dtype="<i8"),
-    "keypoints": Member(("frames", "detections", _JOINTS, 2), "float", dtype="<f4"),
-    "confidence": Member(("frames", "detections", _JOINTS), "float", dtype="<f4"),
+    "keypoints": Member(("frames", "detections", len(COCO17), 2), "float", dtype="<f4"),
+    "confidence": Member(("frames", "detections", len(COCO17)), "float", dtype="<f4"),
     "boxes": Member(("frames", "detections", 4), "float", dtype="<f4"),
     "score": Member(("frames", "detections"), "float", dtype="<f4"),
     "point": Member(("points",), "text", required=False),
@@ -60,8 +56,6 @@ _MEMBERS: Final = {
         ("frames", "detections", "points"), "float", required=False, dtype="<f4"
     ),
 }
-_EXTRA: Final = ("point", "extra_keypoints", "extra_confidence")
-"""Members of points besides COCO-17: all or none."""
 
 
 def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
@@ -85,21 +79,20 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
     """
     points_limit = 1000  # maximum number of these points
     require_file(path)
+    # Members of points besides COCO-17: all or none.
+    extra_members = ("point", "extra_keypoints", "extra_confidence")
     with open_npz(path) as file:
         infos, sizes = check_members(path, file, _MEMBERS)
-        extra = [name for name in _EXTRA if name in infos]
-        if extra and len(extra) < len(_EXTRA):
-            raise wrong(str(path), f"all of {', '.join(_EXTRA)}, or none", ", ".join(extra))
+        extra = [name for name in extra_members if name in infos]
+        if extra and len(extra) < len(extra_members):
+            raise wrong(str(path), f"all of {', '.join(extra_members)}, or none", ", ".join(extra))
         if extra and not 0 < sizes["points"] <= points_limit:
             found = str(sizes["points"])
             raise wrong(f"{path}: point", f"1 to {points_limit} names as text", found)
         if sizes["detections"] > PEOPLE_LIMIT:
-            raise InputError(
-                f"{path}: score",
-                expected=f"at most {PEOPLE_LIMIT} people per frame",
-                found=f"room for {sizes['detections']}",
-                todo="Keep the detections of each frame with the highest scores.",
-            )
+            expected = f"at most {PEOPLE_LIMIT} people per frame"
+            todo = "Keep the detections of each frame with the highest scores."
+            raise InputError(f"{path}: score", expected, f"room for {sizes['detections']}", todo)
         require_size(path, infos.values(), ARRAY_BYTES, PACKED_RATIO)
         arrays = {
             name: read_array(path, file, info, _MEMBERS[name]) for name, info in infos.items()
@@ -119,7 +112,9 @@ def _check_values(path: Path, people: KeypointDetections) -> None:
         raise wrong(f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}")
     if np.any(np.abs(people.frame) > FRAME_LIMIT):
         raise wrong(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
-    block = max(1, min(_BLOCK, block_people // max(1, people.score.shape[1])))
+    # Frames per block of checks, which limits their memory.
+    block_frames = 4096
+    block = max(1, min(block_frames, block_people // max(1, people.score.shape[1])))
     for start in range(0, len(people.frame), block):
         _check_block(path, start, people[start : start + block])
 
@@ -223,12 +218,9 @@ def select_ranges(
     if len(seen) and not any(((seen >= first) & (seen < first + n)).any() for first, n in ranges):
         wanted = [f"{first} to {first + count - 1}" for first, count in ranges]
         more = f" and {len(wanted) - 5} more ranges" if len(wanted) > 5 else ""
-        raise InputError(
-            str(path),
-            expected=f"people in frames {', '.join(wanted[:5])}{more}",
-            found=f"frames {seen[0]} to {seen[-1]}",
-            todo="Check the frame numbers, the camera's offset_frames and the clips.",
-        )
+        expected = f"people in frames {', '.join(wanted[:5])}{more}"
+        todo = "Check the frame numbers, the camera's offset_frames and the clips."
+        raise InputError(str(path), expected, f"frames {seen[0]} to {seen[-1]}", todo)
     return on_frames(path, people, ranges)
 
 
@@ -245,11 +237,10 @@ def on_frames(
     total = sum(count for _, count in ranges)
     farthest = max(abs(first) for first, _ in ranges)
     if total * frame_bytes > ARRAY_BYTES or farthest > FRAME_LIMIT:
+        expected = f"frame numbers up to {FRAME_LIMIT} and arrays up to {ARRAY_BYTES} bytes"
+        found = f"{total} frames from {ranges[0][0]} on, with up to {detections} people"
         raise InputError(
-            str(path),
-            expected=f"frame numbers up to {FRAME_LIMIT} and arrays up to {ARRAY_BYTES} bytes",
-            found=f"{total} frames from {ranges[0][0]} on, with up to {detections} people",
-            todo="Check the frame numbers; cut a long match into clips.",
+            str(path), expected, found, "Check the frame numbers; cut a long match into clips."
         )
     wanted = [np.arange(first, first + count, dtype=np.int64) for first, count in ranges]
     return people.reindex(np.concatenate(wanted))

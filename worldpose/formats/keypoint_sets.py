@@ -49,6 +49,8 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
 
     The numbers of names without such a place are their last ones. So they are if the last one is
     the same in all names and a single other one differs: that may be the camera's or the clip's.
+    No name has a frame if a number before it repeats and it does not rise with that number, as in
+    times of day or in pictures of several clips.
     """
     found: dict[str, list[int]] = {}
     for name in set(names):
@@ -63,6 +65,11 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
     chosen = min(distinct, key=lambda p: max(values[p]) - min(values[p]), default=1)
     if 1 not in differing and len(differing) == 1:
         chosen = 1
+    before = [numbers[-count:-chosen] for numbers in found.values()]
+    if 1 < len(set(map(tuple, before))) < len(found):
+        rising = [numbers[-chosen] for numbers in sorted(found.values(), key=lambda n: n[-count:])]
+        if rising != sorted(rising):  # a time, whose last number begins again each second
+            return {}
     return {name: numbers[-chosen] for name, numbers in found.items()}
 
 
@@ -128,8 +135,6 @@ MODELS: Final = {
 }
 """Pose2Sim's names of models and the sets that they give."""
 
-FACE: Final = 5
-"""Number of COCO-17's joints that belong to the face, the first ones."""
 _BONES: Final = {
     "thigh": ((11, 13), (12, 14)),
     "shank": ((13, 15), (14, 16)),
@@ -159,7 +164,9 @@ def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
     plain = [_plain(str(name)) for name in names]
     if "left_ankle" not in plain:  # Human3.6M calls them feet
         plain = [re.sub(r"^(left|right)_foot$", r"\1_ankle", name) for name in plain]
-    missing = [joint for joint in COCO17[FACE:] if joint not in plain]
+    # Number of COCO-17's joints that belong to the face, the first ones.
+    face_joints = 5
+    missing = [joint for joint in COCO17[face_joints:] if joint not in plain]
     if missing or any(plain.count(joint) > 1 for joint in (*COCO17, *FEET)):
         unknown = [str(n) for n, one in zip(names, plain, strict=True) if one not in COCO17]
         raise InputError(
@@ -222,12 +229,9 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     if size == len(COCO17):
         other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
         if other <= plausible and misfits[0] - other >= _MARGIN:
-            raise InputError(
-                where,
-                expected="the 17 joints in COCO's order",
-                found="thighs, shanks and arms as in the order of Human3.6M",
-                todo="Estimate poses with a model of COCO, or write COCO's joints.",
-            )
+            found = "thighs, shanks and arms as in the order of Human3.6M"
+            todo = "Estimate poses with a model of COCO, or write COCO's joints."
+            raise InputError(where, "the 17 joints in COCO's order", found, todo)
     misfit = misfits[orders.index(chosen)]
     is_doubtful = chosen.name == "MPI-15" or (named is None and (stated or "").strip() != "")
     if (len(points) and is_doubtful and not misfit <= plausible) or (
@@ -246,12 +250,9 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
 
 def unknown_size(where: str, size: int) -> InputError:
     """Return the error of a set of points that no known estimator has."""
-    return InputError(
-        where,
-        expected=f"x, y and confidence of each point, of {KNOWN_SETS} points",
-        found=f"{size} points",
-        todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
-    )
+    expected = f"x, y and confidence of each point, of {KNOWN_SETS} points"
+    todo = "Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet')."
+    return InputError(where, expected, f"{size} points", todo)
 
 
 def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> float:
@@ -396,17 +397,11 @@ def _require_room(
     most = int(count.max(initial=0))
     fullest = frame[np.argmax(count)] if len(count) else 0
     if most > PEOPLE_LIMIT:
-        raise InputError(
-            str(path),
-            expected=f"at most {PEOPLE_LIMIT} people per frame",
-            found=f"{most} in frame {fullest}",
-            todo="Check image_id, or keep the detections of each image with the highest scores.",
-        )
+        expected = f"at most {PEOPLE_LIMIT} people per frame"
+        todo = "Check image_id, or keep the detections of each image with the highest scores."
+        raise InputError(str(path), expected, f"{most} in frame {fullest}", todo)
     limit = min(limit, ARRAY_BYTES)
     if len(frame) * most * 4 * (3 * points + 5) > limit:
-        raise InputError(
-            str(path),
-            expected=f"frames and people that fit into {limit} bytes",
-            found=f"{most} people in frame {fullest}",
-            todo="Check image_id.",
-        )
+        expected = f"frames and people that fit into {limit} bytes"
+        todo = "Check image_id."
+        raise InputError(str(path), expected, f"{most} people in frame {fullest}", todo)

@@ -25,34 +25,33 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
-from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml, require_file
+from worldpose.formats.files import SETTINGS_BYTES, read_json, read_toml, read_yaml, require_file
 from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 
 MATRIX_NAMES: Final = (
-    *("camera_matrix", "cameraMatrix", "Camera_Matrix", "camMatrix", "mtx", "K", "matrix"),
-    *("Intrinsics", "intrinsicMat", "intrinsic_matrix", "intrinsics", "k"),
+    *("cameramatrix", "cammatrix", "mtx", "K", "matrix", "intrinsic", "intrinsics"),
+    *("intrinsicmat", "intrinsicmatrix", "k"),
 )
 DISTORTION_NAMES: Final = (
-    *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs"),
-    *("dist_coefs", "dist_coeff", "distCoef", "distCoeff", "dist", "distortions", "distortion"),
-    *("distortion_coeffs", "Distortion", "D", "d"),
+    *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
+    *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
 SIZE_NAMES: Final = (
-    *(("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height")),
-    *(("image_size",), ("size",), ("imageSize",), ("resolution",), ("img_size",), ("w", "h")),
+    *(("imagewidth", "imageheight"), ("width", "height"), ("imagesize",), ("size",)),
+    *(("resolution",), ("imgsize",), ("w", "h")),
 )
-MODEL_NAMES: Final = ("distortion_model", "lens_model", "model_type", "fisheye_model", "fisheye")
+MODEL_NAMES: Final = ("distortionmodel", "lensmodel", "modeltype", "fisheyemodel", "fisheye")
+"""Names of entries, longer ones without underscores and capitals."""
 FISHEYE_WORDS: Final = (
     *("1", "1.0", "true", "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye"),
 )
 OTHER_WORDS: Final = (
     *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
     *("rational_polynomial", "rational", "full_opencv"),
+    *("lensmodel_opencv4", "lensmodel_opencv5", "lensmodel_opencv8"),
 )
 """Values of `MODEL_NAMES`, in lower case."""
-ARRAY_BYTES: Final = 1 << 26
-"""Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
 
 
 def read_lenses(
@@ -62,7 +61,8 @@ def read_lenses(
 
     Args:
         files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
-            or JSON file, an npz file, or two npy files, one of them the 3 x 3 matrix.
+            or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3
+            matrix. Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too.
         camera: the camera of a file that names none; None = a TOML file with names.
         sizes: width and height of each camera's images [px]. A lens of a file with another size
             and the same shape of image is scaled.
@@ -73,20 +73,19 @@ def read_lenses(
             unknown or not named.
     """
     first = files[0]
-    if first.suffix.lower() == ".toml":
+    if first.suffix.lower() == ".toml" and any(
+        isinstance(each, dict) for each in read_toml(first).values()
+    ):
         return read_lens_toml(first, sizes, camera)
-    chain = _read_camchain(first)
-    if chain is not None:
-        if len(chain) == 1 and camera is not None:
-            chain = {camera: next(iter(chain.values()))}
-        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in chain.items()], sizes, camera)
+    named = _read_named(first)
+    if named is not None:
+        if len(named) == 1 and camera is not None:
+            named = {camera: next(iter(named.values()))}
+        return _lenses(first, [(f"{first}: {n}", n, t) for n, t in named.items()], sizes, camera)
     if camera is None:
-        raise InputError(
-            str(first),
-            expected="the camera of this lens",
-            found="a file without a name for it",
-            todo=f"Name it: --camera {next(iter(sizes), 'NAME')}.",
-        )
+        expected = "the camera of this lens"
+        todo = f"Name it: --camera {next(iter(sizes), 'NAME')}."
+        raise InputError(str(first), expected, "a file without a name for it", todo)
     if camera not in sizes:
         raise _unknown_camera(str(first), camera, sizes)
     given: dict[str, Any] = {}
@@ -177,20 +176,19 @@ def _read_file(file: Path) -> dict[str, Any]:
             return {"K" if array.shape == (3, 3) else "dist": array}
     except (OSError, ValueError, EOFError) as error:
         raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
+    # Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards.
+    max_bytes = 1 << 26
     if suffix == ".npz":
-        return dict(read_npz(file, ARRAY_BYTES))
-    if suffix in (".yml", ".yaml", ".json"):
+        return dict(read_npz(file, max_bytes))
+    if suffix in (".yml", ".yaml", ".json", ".toml"):
         return read_file_storage(file) if is_storage(file) else _read_mapping(file)
     if suffix in (".pkl", ".pickle"):
         return _read_pickled_lens(file)
     if suffix == ".xml":
         return read_file_storage(file)
-    raise InputError(
-        str(file),
-        expected="a lens file: .toml, .xml, .yml, .yaml, .json, .npy, .npz, or OpenCap's .pickle",
-        found=repr(file.suffix),
-        todo="Save the camera matrix and the distortion coefficients in one of these forms.",
-    )
+    expected = "a lens file: .toml, .xml, .yml, .yaml, .json, .npy, .npz, or OpenCap's .pickle"
+    todo = "Save the camera matrix and the distortion coefficients in one of these forms."
+    raise InputError(str(file), expected, repr(file.suffix), todo)
 
 
 def _read_pickled_lens(file: Path) -> dict[str, Any]:
@@ -210,12 +208,28 @@ def _read_pickled_lens(file: Path) -> dict[str, Any]:
     return given
 
 
-def _read_camchain(file: Path) -> dict[str, dict[str, Any]] | None:
-    """Return the tables of a Kalibr camchain by camera; None for another file."""
-    if file.suffix.lower() not in (".yml", ".yaml") or is_storage(file):
+def _read_named(file: Path) -> dict[str, dict[str, Any]] | None:
+    """Return the tables of a file with several cameras by name; None for another file.
+
+    It is a camchain of Kalibr, or JSON of multical or Panoptic Studio with `cameras`.
+    """
+    if file.suffix.lower() not in (".yml", ".yaml", ".json") or is_storage(file):
         return None
-    content = read_yaml(file)
-    return dict(kalibr_tables(file, content)) if is_kalibr(content) else None
+    content = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
+    if is_kalibr(content):
+        return dict(kalibr_tables(file, content))
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if isinstance(cameras, list):
+        cameras = {str(each.get("name")): each for each in cameras if isinstance(each, dict)}
+    if not isinstance(cameras, dict) or not all(isinstance(one, dict) for one in cameras.values()):
+        return None
+    ours = {"K": "matrix", "dist": "distortions", "distCoef": "distortions"}
+    ours |= {"image_size": "size", "resolution": "size"}
+    return {
+        str(name): {ours.get(key, key): value for key, value in table.items()}
+        | ({"fisheye": True} if table.get("model") == "fisheye" else {})
+        for name, table in cameras.items()
+    }
 
 
 def is_kalibr(content: object) -> bool:
@@ -280,42 +294,47 @@ def _chain(
 
 
 def _read_mapping(file: Path) -> dict[str, Any]:
-    """Return numbers, arrays and texts of plain JSON or YAML, as ROS's camera_calibration has.
+    """Return numbers, arrays and texts of plain JSON, YAML or TOML, as of ROS's camera_calibration.
 
     A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
 
     Raises:
         InputError: the file is no mapping, or a matrix has other sizes than it says.
     """
-    is_json = file.suffix.lower() == ".json"
-    content = read_json(file, SETTINGS_BYTES) if is_json else read_yaml(file)
+    suffix = file.suffix.lower()
+    content: Any = read_toml(file) if suffix == ".toml" else None
+    if content is None:
+        content = read_json(file) if suffix == ".json" else read_yaml(file)
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a mapping", type(content).__name__)
     found: dict[str, Any] = {}
     for name, value in content.items():
         if isinstance(value, dict) and {"rows", "cols", "data"} <= value.keys():
+            shape = value["rows"], value["cols"]
             try:
-                found[str(name)] = np.reshape(value["data"], (value["rows"], value["cols"]))
+                found[str(name)] = np.reshape(value["data"], shape)
             except (ValueError, TypeError) as error:
-                raise calibration_error(
-                    f"{file}: {name}", "rows x cols numbers", say_failure(error)
-                ) from error
+                expected, size = "{} x {} numbers".format(*shape), np.size(value["data"])
+                raise calibration_error(f"{file}: {name}", expected, f"{size}") from error
         elif isinstance(value, list | int | float | str):
             found[str(name)] = value
     return found
 
 
+def _key(given: Mapping[str, Any], names: Sequence[str]) -> str | None:
+    """Return the key with the first of these names that there is, in any spelling."""
+    plain = {key if len(key) == 1 else key.replace("_", "").lower(): key for key in given}
+    return next((plain[name] for name in names if name in plain), None)
+
+
 def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str) -> NDArray[Any]:
     """Return the entry with one of the usual names."""
-    for name in names:
-        if name in given:
-            return np.asarray(given[name])
-    raise InputError(
-        where,
-        expected=f"{what} ({', '.join(names)})",
-        found=", ".join(sorted(given)) or "nothing",
-        todo="Add it to the file, or give the file that has it: --lens may come twice.",
-    )
+    key = _key(given, names)
+    if key is not None:
+        return np.asarray(given[key])
+    expected = f"{what} ({', '.join(names)})"
+    todo = "Add it to the file, or give the file that has it: --lens may come twice."
+    raise InputError(where, expected, ", ".join(sorted(given)) or "nothing", todo)
 
 
 def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
@@ -324,20 +343,20 @@ def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
     Raises:
         InputError: it names another lens model than those of OpenCV.
     """
-    for key in MODEL_NAMES:
-        if key in given:
-            said = str(np.ravel(given[key])[0]).lower()
-            if said not in FISHEYE_WORDS + OTHER_WORDS:
-                words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
-                raise calibration_error(f"{where}: {key}", f"one of {words}", repr(said))
-            return said in FISHEYE_WORDS
-    return False
+    key = _key(given, MODEL_NAMES)
+    if key is None:
+        return False
+    said = str(np.ravel(given[key])[0]).lower()
+    if said not in FISHEYE_WORDS + OTHER_WORDS:
+        words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
+        raise calibration_error(f"{where}: {key}", f"one of {words}", repr(said))
+    return said in FISHEYE_WORDS
 
 
 def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
     """Return the image size in a file, or the camera's own if the file has none."""
     for names in SIZE_NAMES:
-        values = np.concatenate([np.ravel(given.get(name, ())) for name in names])
+        values = np.concatenate([np.ravel(given.get(_key(given, [n]) or "", ())) for n in names])
         if len(values) == 2:
             return int(values[0]), int(values[1])
     return otherwise
@@ -411,20 +430,15 @@ def _scale(where: str, size: Floats, own: tuple[int, int]) -> float:
     """Return pixels of the camera's image per pixel of the calibrated one."""
     scale = np.array(own) / size
     if abs(scale[0] - scale[1]) > 0.002 * scale[0]:
-        raise InputError(
-            f"{where}: size",
-            expected=f"{own[0]} x {own[1]} px, the camera's images, or the same shape",
-            found=f"{size[0]:g} x {size[1]:g}",
-            todo="Give a lens that was calibrated in images of the video's shape: a crop has "
-            "another principal point.",
+        expected = f"{own[0]} x {own[1]} px, the camera's images, or the same shape"
+        todo = (
+            "Give a lens that was calibrated in images of the video's shape: a crop has "
+            "another principal point."
         )
+        raise InputError(f"{where}: size", expected, f"{size[0]:g} x {size[1]:g}", todo)
     return float(scale[0])
 
 
 def _unknown_camera(where: str, name: str, sizes: Mapping[str, object]) -> InputError:
-    return InputError(
-        where,
-        expected=f"a static camera of match.yaml: {', '.join(sizes)}",
-        found=repr(name),
-        todo="Correct the name, or read one camera alone: --camera NAME.",
-    )
+    todo = "Correct the name, or read one camera alone: --camera NAME."
+    return InputError(where, f"a static camera of match.yaml: {', '.join(sizes)}", repr(name), todo)

@@ -35,7 +35,7 @@ def coco_dataset(
     number: NDArray[np.int64] | None = None,
     move: Callable[[Floats], Floats] | None = None,
 ) -> dict[str, Any]:
-    """Return the people of one static camera as a COCO keypoints data set.
+    """Return the people of one camera as a COCO keypoints data set.
 
     One image per frame: `id` is the camera's own frame number, `file_name` is <camera>/<frame with
     six digits>. One annotation per person with at least one joint in the image: `keypoints` are the
@@ -46,17 +46,18 @@ def coco_dataset(
 
     Args:
         camera_id: prefix of the image names.
-        camera: a single camera.
+        camera: a single camera, or (frames,) of a moving one; NaN where a frame has none.
         tracks: frames are match frames.
-        observed: (frames, persons, 17), the camera's observation of the joint was an inlier.
+        observed: (frames, persons, 17), the camera's observation of the joint was an inlier, or no
+            nearer person hides it in the moving camera.
         number: (frames,) the camera's own frame at each frame, not falling; of frames that it shows
             twice the first one counts. None = the match frames.
         move: returns pixels (frames, persons, 17, 2) where the camera shows them, if its view
             changes within the clip.
     """
-    width, height = (int(n) for n in camera.image_size)
+    width, height = (int(n) for n in camera.image_size.reshape(-1, 2)[0])
     frames, persons = tracks.joints.shape[:2]
-    pixels = camera.project(tracks.joints.reshape(-1, 3)).reshape(frames, persons, 17, 2)
+    pixels = camera.project(tracks.joints.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
     pixels = np.round(pixels if move is None else move(pixels), PIXEL_DECIMALS)
     within = (pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5)
     own_frames = (tracks.frames if number is None else number).tolist()
@@ -77,18 +78,13 @@ def coco_dataset(
     return {
         "info": {
             "description": f"3D joints reprojected into camera {camera_id}; (0, 0) is the centre "
-            "of the top-left pixel; v = 2: agrees with this camera's observation, v = 1: from "
-            "other cameras only, v = 0: no joint in the picture",
+            "of the top-left pixel; v = 2: agrees with this static camera's observation, or is not "
+            "hidden in the moving one, v = 1: other joints, v = 0: no joint in the picture",
             "version": "1.0",
         },
         "licenses": [],
         "images": [
-            {
-                "id": frame,
-                "file_name": f"{camera_id}/{frame:06d}",
-                "width": width,
-                "height": height,
-            }
+            {"id": frame, "file_name": f"{camera_id}/{frame:06d}", "width": width, "height": height}
             for frame in dict.fromkeys(own_frames)
         ],
         "annotations": annotations,
@@ -112,10 +108,52 @@ def _certainty(tracks: JointTracks, frame: int, person: int) -> dict[str, float]
     return {"identity_certainty": round(float(stated[frame, person]), 4)}
 
 
-def write_coco(path: Path, dataset: Mapping[str, Any]) -> None:
-    """Write a data set as JSON, whole or not at all."""
+def alphapose_results(
+    pixels: Floats,
+    visible: NDArray[np.bool_],
+    person_ids: NDArray[np.integer],
+    size: NDArray[np.integer],
+    number: NDArray[np.int64],
+) -> list[dict[str, Any]]:
+    """Return people in the images of a camera as results of AlphaPose in 26 points of Halpe.
+
+    Tools that lift 2D poses, such as MotionBERT, read this list: one entry per person and image,
+    by image, with the person as `idx`. A point has confidence 1 if nothing hides it, 0.5 if a
+    nearer person does, and 0 outside the image.
+
+    Args:
+        pixels: (frames, persons, 26, 2) [px]; NaN where missing.
+        visible: (frames, persons, 26), in the image and not hidden.
+        person_ids: (persons,).
+        size: (2,) of the image [px].
+        number: (frames,) the camera's own frame, as in `coco_dataset`.
+    """
+    within = np.all((pixels >= -0.5) & (pixels <= size - 0.5), axis=-1)
+    within &= (np.diff(number, prepend=-1) > 0)[:, None, None]
+    sure = np.where(within, np.where(visible, 1.0, 0.5), 0.0)
+    entries = []
+    for frame, person in np.argwhere(within.any(-1)).tolist():
+        here = within[frame, person]
+        low, high = (f(pixels[frame, person, here], axis=0) for f in (np.min, np.max))
+        points = np.column_stack([pixels[frame, person], sure[frame, person]])
+        points = np.round(np.where(here[:, None], points, 0.0), PIXEL_DECIMALS)
+        entries.append(
+            {
+                "image_id": f"{number[frame]}.jpg",
+                "category_id": 1,
+                "keypoints": points.ravel().tolist(),
+                "score": round(float(sure[frame, person].mean()), 4),
+                "box": np.round([*low, *(high - low)], PIXEL_DECIMALS).tolist(),
+                "idx": int(person_ids[person]),
+            }
+        )
+    return entries
+
+
+def write_json(path: Path, content: Mapping[str, Any] | list[dict[str, Any]]) -> None:
+    """Write labels as JSON, whole or not at all."""
     with whole_file(path) as draft:
-        draft.write_text(json.dumps(dataset, separators=(",", ":")) + "\n", encoding="utf-8")
+        draft.write_text(json.dumps(content, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
 def _labels(pixels: NDArray[np.float64], visible: NDArray[np.int64]) -> dict[str, Any]:
@@ -185,8 +223,6 @@ def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
 
 BVH_DECIMALS: Final = 6
 """Decimals of all numbers: a hundredth of a micrometre, and angles that move a hand by as much."""
-_LOCKED: Final = 1e-7
-"""Cosine of the middle angle below which the outer two have the same axis (gimbal lock) [1]."""
 
 
 def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float) -> None:
@@ -211,12 +247,9 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     centimetres = 100.0
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
     if not len(angles) or not np.isfinite([angles.sum(), poses.transl.sum()]).all():
-        raise InputError(
-            str(path),
-            expected="frames that all have a body",
-            found=f"{len(angles)} frames, some without" if len(angles) else "no frames",
-            todo="Write a file for each uninterrupted stretch.",
-        )
+        found = f"{len(angles)} frames, some without" if len(angles) else "no frames"
+        todo = "Write a file for each uninterrupted stretch."
+        raise InputError(str(path), "frames that all have a body", found, todo)
     betas = poses.betas[0]
     rest = model.joint_template + model.joint_directions @ betas
     turns = Rigid.from_rotvec(angles.reshape(len(angles), -1, 3), np.zeros(3)).rotation.copy()
@@ -271,7 +304,9 @@ def _numbers(vector: Floats) -> str:
 def zxy_angles(rotation: Floats) -> Floats:
     """Return angles (..., 3) [rad] with rotation = Rz(first) Rx(second) Ry(third)."""
     cosine = np.hypot(rotation[..., 2, 0], rotation[..., 2, 2])
-    locked = cosine < _LOCKED
+    # Cosine of the middle angle below which the outer two have the same axis (gimbal lock) [1].
+    locked_cosine = 1e-7
+    locked = cosine < locked_cosine
     about_z = np.where(
         locked,
         np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]),
@@ -281,15 +316,8 @@ def zxy_angles(rotation: Floats) -> Floats:
     return np.stack([about_z, np.arctan2(rotation[..., 2, 1], cosine), about_y], axis=-1)
 
 
-OPENSIM_AXES: Final = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-"""Rotation from the axes of the body model in T-pose (x left, y up, z forward) to those of
-OpenSim's bodies (x forward, y up, z right)."""
-LOWERED: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Rotation of the right arm from hanging, OpenSim's zero, to the T-pose: -90 degrees about x."""
 MIRROR: Final = np.diag([1.0, 1.0, -1.0])
 """Reflection in the body's sagittal plane: a left limb's angles are those of its mirror image."""
-MID_HIP_M: Final = np.array([-0.056276, -0.07849, 0.0])
-"""Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes."""
 OPENSIM_COORDINATES: Final = (
     *("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz"),
     *("hip_flexion_r", "hip_adduction_r", "hip_rotation_r", "knee_angle_r", "ankle_angle_r"),
@@ -317,10 +345,13 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
     out. The pelvis's place is such that the middle of the hips of the unscaled model is that of the
     body.
     """
-    rest = (model.joint_template + model.joint_directions @ poses.betas[0]) @ OPENSIM_AXES.T
+    # Rotation from the axes of the body model in T-pose (x left, y up, z forward) to those of
+    # OpenSim's bodies (x forward, y up, z right).
+    opensim_axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    rest = (model.joint_template + model.joint_directions @ poses.betas[0]) @ opensim_axes.T
     turns = model.articulate(poses).local_rotations
-    relative = OPENSIM_AXES @ turns @ OPENSIM_AXES.T
-    pelvis = Y_UP @ Rigid.from_rotvec(poses.global_orient, np.zeros(3)).rotation @ OPENSIM_AXES.T
+    relative = opensim_axes @ turns @ opensim_axes.T
+    pelvis = Y_UP @ Rigid.from_rotvec(poses.global_orient, np.zeros(3)).rotation @ opensim_axes.T
 
     def turn(*names: str) -> Floats:
         """Return the rotation of a chain of joints, from the first's parent to the last."""
@@ -330,11 +361,15 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
         return whole
 
     hips = model.joints(poses)[:, [_JOINT["left_hip"], _JOINT["right_hip"]]].mean(axis=1)
-    place = hips @ Y_UP.T - pelvis @ MID_HIP_M
+    # Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes.
+    mid_hip_m = np.array([-0.056276, -0.07849, 0.0])
+    place = hips @ Y_UP.T - pelvis @ mid_hip_m
     columns = {}
+    # Rotation of the right arm from hanging, OpenSim's zero, to the T-pose: -90 degrees about x.
+    lowered = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for side, mirror in (("right", np.eye(3)), ("left", MIRROR)):
-        arm = mirror @ turn(f"{side}_collar", f"{side}_shoulder") @ mirror @ LOWERED
-        elbow = LOWERED.T @ mirror @ turn(f"{side}_elbow") @ mirror @ LOWERED
+        arm = mirror @ turn(f"{side}_collar", f"{side}_shoulder") @ mirror @ lowered
+        elbow = lowered.T @ mirror @ turn(f"{side}_elbow") @ mirror @ lowered
         hip, knee, ankle = (
             mirror @ turn(f"{side}_{name}") @ mirror for name in ("hip", "knee", "ankle")
         )
@@ -376,12 +411,9 @@ def write_opensim_motion(
     """
     mot_decimals = 5  # decimals of degrees, metres and seconds
     if not len(coordinates) or not np.isfinite(coordinates).all():
-        raise InputError(
-            str(path),
-            expected="frames that all have a body",
-            found=f"{len(coordinates)} frames, some without" if len(coordinates) else "no frames",
-            todo="Write a file for each uninterrupted interval.",
-        )
+        found = f"{len(coordinates)} frames, some without" if len(coordinates) else "no frames"
+        todo = "Write a file for each uninterrupted interval."
+        raise InputError(str(path), "frames that all have a body", found, todo)
     rows = np.column_stack([times, coordinates])
     head = [
         "Coordinates",

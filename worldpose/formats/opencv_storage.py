@@ -19,10 +19,6 @@ from worldpose.errors import say_failure
 from worldpose.formats.calibration_files import calibration_error
 from worldpose.formats.files import SETTINGS_BYTES, parse_json, parse_xml, parse_yaml, read_text
 
-_TYPES: Final = {"u": "<u1", "c": "<i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
-_HEADER_BYTES: Final = 24
-"""Length of the text before base64 data, which repeats the type [byte]."""
-_WORDS: Final = {"Nan": "NaN", "Inf": "Infinity"}
 _QUOTE: Final = "\ue000"
 _TOKEN: Final = re.compile(r'"[^"]*"|[^\s"]+')
 
@@ -42,30 +38,29 @@ def read_file_storage(file: Path) -> dict[str, Any]:
     """
     where, text = str(file), read_text(file, SETTINGS_BYTES)
     begin = text.lstrip()[:1]
+    words = {"Nan": "NaN", "Inf": "Infinity"}
+    expected = "a file of OpenCV's FileStorage"
     if begin == "<":
         try:
             # OpenCV writes a quote within quotes so; read as one, it would end them.
             root = parse_xml(text.replace("&quot;", _QUOTE).encode())
         except ValueError as error:
-            raise calibration_error(where, _EXPECTED, say_failure(error)) from error
+            raise calibration_error(where, expected, say_failure(error)) from error
         content: Any = {each.tag: _read_element(each) for each in root}
     elif begin == "{":
         text = re.sub(r"(?<=\d\.)(?=[\s,\]}])", "0", text)  # OpenCV writes 1. and .Nan
-        content = parse_json(where, re.sub(r"\.(Nan|Inf)\b", lambda it: _WORDS[it[1]], text))
+        content = parse_json(where, re.sub(r"\.(Nan|Inf)\b", lambda it: words[it[1]], text))
     else:
         head, _, rest = text.partition("\n")
         plain = rest if head.startswith("%YAML") else text
         content = parse_yaml(where, plain.replace("!!opencv-", "!!map #"))
     if not isinstance(content, dict):
-        raise calibration_error(where, _EXPECTED, type(content).__name__)
+        raise calibration_error(where, expected, type(content).__name__)
     found = {str(name): _read_value(f"{where}: {name}", each) for name, each in content.items()}
     found = {name: value for name, value in found.items() if value is not None}
     if not found:
         raise calibration_error(where, "matrices of OpenCV's FileStorage", "none")
     return found
-
-
-_EXPECTED: Final = "a file of OpenCV's FileStorage"
 
 
 def _read_element(element: Element) -> Any:  # noqa: ANN401
@@ -114,6 +109,9 @@ def _is_plain(value: object) -> bool:
 
 def _read_matrix(where: str, table: dict[str, Any]) -> NDArray[np.float64]:
     """Return a matrix (rows, columns), or (rows, columns, channels), or one of more dimensions."""
+    types = {"u": "<u1", "c": "<i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
+    # Length of the text before base64 data, which repeats the type [byte].
+    header_bytes = 24
     try:
         kind = re.fullmatch(r"(\d{0,3})([ucwsifd])", str(table["dt"]))
         if kind is None:
@@ -127,7 +125,7 @@ def _read_matrix(where: str, table: dict[str, Any]) -> NDArray[np.float64]:
         if isinstance(data, str) and data.startswith("$base64$"):
             data = base64.b64decode(data.removeprefix("$base64$"))
         if isinstance(data, bytes):
-            numbers = np.frombuffer(data[_HEADER_BYTES:], _TYPES[kind[2]]).astype(np.float64)
+            numbers = np.frombuffer(data[header_bytes:], types[kind[2]]).astype(np.float64)
         else:
             items = data if isinstance(data, Sequence) and not isinstance(data, str) else [data]
             numbers = np.array([_number(each) for each in items], np.float64)

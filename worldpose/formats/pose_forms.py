@@ -36,22 +36,20 @@ def plain_entries(where: str, items: Iterable[Any]) -> Iterator[Any]:
             frame = content.get("frame_id")
             first = frame if first is None and type(frame) is int else first
             if type(frame) is not int or first not in (0, 1):
+                expected = "whole numbers that begin with 0 or 1, as MMPose counts the images"
+                todo = "Export the poses of the whole video."
                 raise InputError(
-                    f"{where}: entry {index}, frame_id",
-                    expected="whole numbers that begin with 0 or 1, as MMPose counts the images",
-                    found=repr(frame)[:40],
-                    todo="Export the poses of the whole video.",
+                    f"{where}: entry {index}, frame_id", expected, repr(frame)[:40], todo
                 )
             for person in content["instances"]:
                 yield _with_frame(where, index, person, frame - first)
         elif isinstance(content, dict) and "image_id" not in content and _is_other(content):
-            raise InputError(
-                f"{where}: entry {index}",
-                expected="the frame of each person",
-                found="people of one image",
-                todo="Put one file for each image, such as cam01_000012.json, into a folder that "
-                "is named after the camera.",
+            expected = "the frame of each person"
+            todo = (
+                "Put one file for each image, such as cam01_000012.json, into a folder that "
+                "is named after the camera."
             )
+            raise InputError(f"{where}: entry {index}", expected, "people of one image", todo)
         else:
             yield item if not _is_nested(content) else {**content, **_flat(content)}
 
@@ -81,12 +79,9 @@ def _parse(item: Any) -> Any:  # noqa: ANN401
 def _with_frame(where: str, index: int, person: Any, frame: int) -> dict[str, Any]:  # noqa: ANN401
     plain = plain_person(person)
     if plain is None:
-        raise InputError(
-            f"{where}: entry {index}",
-            expected="people with `keypoints`, as MMPose and Ultralytics write them",
-            found=f"{person!r:.60}",
-            todo="Export the results of a model of poses, not of boxes.",
-        )
+        expected = "people with `keypoints`, as MMPose and Ultralytics write them"
+        todo = "Export the results of a model of poses, not of boxes."
+        raise InputError(f"{where}: entry {index}", expected, f"{person!r:.60}", todo)
     return {"image_id": frame, **plain}
 
 

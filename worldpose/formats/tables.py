@@ -198,9 +198,6 @@ def people_table(positions: Positions, fps: float) -> pd.DataFrame:
     )
 
 
-_SIDES: Final = {"left": 15, "right": 16}
-
-
 def strides_table(tracks: JointTracks, fps: float) -> pd.DataFrame:
     """Return one row per stride: from one contact of a foot to the next of the same foot.
 
@@ -212,9 +209,10 @@ def strides_table(tracks: JointTracks, fps: float) -> pd.DataFrame:
     import pandas as pd  # late: it takes half a second
 
     rows = []
+    ankle_of = {"left": 15, "right": 16}
     for index, person in enumerate(tracks.person_ids.tolist()):
         hips = tracks.joints[:, index, 11:13, :2].mean(axis=1)
-        for side, joint in _SIDES.items():
+        for side, joint in ankle_of.items():
             ankle = tracks.joints[:, index, joint, :2]
             unseen = np.zeros(len(ankle), np.bool_)
             if tracks.views is not None:
@@ -262,9 +260,7 @@ def _strides(
     strides = []
     for run in find_runs(np.isfinite(ahead)):
         contacts, _ = find_peaks(
-            ahead[run],
-            distance=max(1, round(min_stride_s * fps)),
-            prominence=min_swing_m,
+            ahead[run], distance=max(1, round(min_stride_s * fps)), prominence=min_swing_m
         )
         for a, b in pairwise((contacts + run.start).tolist()):
             if _is_stride(float(frames[b] - frames[a]) / fps, ankle[b] - ankle[a]):
@@ -331,17 +327,12 @@ def read_parquet(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         table = parquet.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise InputError(
-            str(path), expected="a Parquet table", found=f"{error}", todo="Write it again."
-        ) from error
+        raise InputError(str(path), "a Parquet table", f"{error}", "Write it again.") from error
     missing = [name for name in columns if name not in table.column_names]
     if missing or not table.num_rows:
-        raise InputError(
-            str(path),
-            expected=f"rows with the columns {', '.join(columns)}",
-            found=f"{table.num_rows} rows with {', '.join(table.column_names)}",
-            todo="Write the file again.",
-        )
+        found = f"{table.num_rows} rows with {', '.join(table.column_names)}"
+        todo = "Write the file again."
+        raise InputError(str(path), f"rows with the columns {', '.join(columns)}", found, todo)
     return {name: table[name].to_numpy() for name in columns}
 
 
@@ -351,10 +342,7 @@ def _import_pyarrow(where: str, otherwise: str) -> tuple[Any, Any]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise UsageError(
-            where,
-            expected="worldpose with the extra tables, which reads and writes it",
-            found="none installed",
-            todo=f"Install it: pip install 'worldpose[tables]', or {otherwise}.",
-        ) from None
+        expected = "worldpose with the extra tables, which reads and writes it"
+        todo = f"Install it: pip install 'worldpose[tables]', or {otherwise}."
+        raise UsageError(where, expected, "none installed", todo) from None
     return pa, parquet

@@ -63,12 +63,9 @@ def write_usd(
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
     except ImportError as error:
-        raise UsageError(
-            "--format usd",
-            expected="worldpose with the extra usd",
-            found="no usd-core",
-            todo="Install it: pip install 'worldpose[usd]'.",
-        ) from error
+        expected = "worldpose with the extra usd"
+        todo = "Install it: pip install 'worldpose[usd]'."
+        raise UsageError("--format usd", expected, "no usd-core", todo) from error
     pxr = (Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt)
     with whole_file(path) as draft:
         stage = Usd.Stage.CreateNew(str(draft))

@@ -40,26 +40,17 @@ from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
 
-FORMAT: Final = "worldpose-viewer/1"
+MAX_FILE_BYTES = 400_000_000
+"""Largest file; browsers refuse texts of 512 MB, and this is more than ten minutes of a match."""
+
 JOINT_UNIT: Final = 1e-4
 """Resolution of the joints of people without a body, relative to one of them [m]."""
 SURFACE_UNIT: Final = 1e-4
 """Resolution of the body's surface [m]."""
-MISSING: Final = -32768
 _SHORT: Final = 32767
-INFLUENCES: Final = 4
-"""Joints that move one vertex."""
-COARSE_CELL_M, ROUGH_CELL_M = 0.08, 0.16
-"""Size of the cells in which the vertices of the two reduced surfaces merge [m]."""
-LINE_ERROR_M: Final = 0.01
-"""Largest deviation of a painted line, 12 cm wide, from its points [m]."""
 MIN_SPREAD_M, MAX_SPREAD_M = 1e-3, 1.0
 """Standard deviations that the smallest and the largest code stand for [m]."""
-MAX_FILE_BYTES: Final = 400_000_000
-"""Largest file; browsers refuse texts of 512 MB, and this is more than ten minutes of a match."""
 
-_DATA: Final = "<!--worldpose-data-->"
-_TITLE: Final = "<title>worldpose viewer</title>"
 _SCRIPT: Final = '<script type="application/octet-stream" data-clip="{}" data-part="{}">'
 _PART: Final = re.compile(_SCRIPT.format(r"(\d+)", r"(\w+)") + r"([^<]*)</script>")
 
@@ -155,8 +146,9 @@ def encode_scene(clip: ViewerClip) -> bytes:
     A surface is written of the open body only; another body model's has terms of its own.
     """
     bodies = clip.with_body.tolist()
+    file_format = "worldpose-viewer/1"
     header = {
-        "format": FORMAT,
+        "format": file_format,
         "clip": clip.clip,
         "fps": clip.fps,
         "first": int(clip.frames[0]) if len(clip.frames) else 0,
@@ -281,11 +273,10 @@ def write_viewer(
         InputError: nobody is in the clips, or the file would be too large.
     """
     if not any(clip.has_people for clip in clips):
+        expected = "a person with joints, a body or a place on the pitch"
+        todo = "Run the match to the end, and see with `worldpose status` what it found."
         raise InputError(
-            str(path),
-            expected="a person with joints, a body or a place on the pitch",
-            found="none in " + ", ".join(clip.clip for clip in clips),
-            todo="Run the match to the end, and see with `worldpose status` what it found.",
+            str(path), expected, "none in " + ", ".join(clip.clip for clip in clips), todo
         )
     size = 0
     with whole_file(path) as draft, draft.open("w", encoding="utf-8", newline="\n") as file:
@@ -298,11 +289,13 @@ def viewer_pieces(
     page: str, clips: Sequence[ViewerClip], videos: Mapping[str, Path]
 ) -> Iterator[str]:
     """Yield the text of a page with clips inside, as `write_viewer` writes it."""
-    before, _, after = page.partition(_DATA)
+    data_mark = "<!--worldpose-data-->"
+    before, _, after = page.partition(data_mark)
     title = escape(
         f"{clips[0].notes.get('match', 'worldpose')}: {', '.join(c.clip for c in clips)}"
     )
-    yield before.replace(_TITLE, f"<title>{title}</title>")
+    title_mark = "<title>worldpose viewer</title>"
+    yield before.replace(title_mark, f"<title>{title}</title>")
     for number, clip in enumerate(clips):
         for name, data in _parts(clip, videos.get(clip.clip)):
             yield f"{_SCRIPT.format(number, name)}{base64.b64encode(data).decode()}</script>\n"
@@ -327,13 +320,12 @@ def _parts(clip: ViewerClip, video: Path | None) -> Iterator[tuple[str, bytes]]:
 
 def _require_size(path: Path, size: int) -> None:
     if size > MAX_FILE_BYTES:
-        raise InputError(
-            str(path),
-            expected=f"at most {MAX_FILE_BYTES / 1e6:g} MB, which browsers open",
-            found="more",
-            todo="Cut the match into shorter clips, export a folder with a file per clip, or leave "
-            "out --video.",
+        expected = f"at most {MAX_FILE_BYTES / 1e6:g} MB, which browsers open"
+        todo = (
+            "Cut the match into shorter clips, export a folder with a file per clip, or leave "
+            "out --video."
         )
+        raise InputError(str(path), expected, "more", todo)
 
 
 def _pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -398,7 +390,8 @@ def _quantize_joints(joints: Floats) -> tuple[NDArray[np.int16], NDArray[np.floa
     away = np.where(known[..., None], joints - anchor[:, :, None].astype(np.float64), 0.0)
     away = np.nan_to_num(away)
     unit = max(JOINT_UNIT, float(np.abs(away).max()) / _SHORT)
-    whole = np.where(known[..., None], np.round(away / unit), MISSING).astype("<i2")
+    missing_code = -32768
+    whole = np.where(known[..., None], np.round(away / unit), missing_code).astype("<i2")
     return whole, anchor, unit
 
 
@@ -415,28 +408,34 @@ def _rest_arrays(clip: ViewerClip) -> Arrays:
     if not is_open_body(model.name):
         return arrays  # the surface of a licensed body stays on this machine
     surface = model.template + np.einsum("vcs,ps->pvc", model.shape_directions, betas)
-    order = np.argsort(-model.weights, axis=1)[:, :INFLUENCES]
+    # Joints that move one vertex.
+    influences = 4
+    order = np.argsort(-model.weights, axis=1)[:, :influences]
     shares = np.take_along_axis(model.weights, order, axis=1)
     shares /= shares.sum(axis=1, keepdims=True)
+    # Size of the cells in which the vertices of the two reduced surfaces merge [m].
+    coarse_cell_m, rough_cell_m = 0.08, 0.16
     return arrays | {
         "surface": np.round(surface / SURFACE_UNIT).astype("<i2"),
         "normals": _normals(model),
         "faces": model.faces.astype("<u2"),
-        "coarse_faces": _reduce_faces(model, COARSE_CELL_M).astype("<u2"),
-        "rough_faces": _reduce_faces(model, ROUGH_CELL_M).astype("<u2"),
+        "coarse_faces": _reduce_faces(model, coarse_cell_m).astype("<u2"),
+        "rough_faces": _reduce_faces(model, rough_cell_m).astype("<u2"),
         "influences": order.astype("u1"),
         "shares": np.round(255 * shares).astype("u1"),
     }
 
 
 def _simplify(line: Floats) -> Floats:
-    """Return a polyline (points, 3) without points that are within `LINE_ERROR_M` of the rest."""
+    """Return a polyline (points, 3) without points that are within a centimetre of the rest."""
     kept, first = [0], 0
+    # Largest deviation of a painted line, 12 cm wide, from its points [m].
+    line_error_m = 0.01
     for last in range(2, len(line)):
         along = line[last] - line[first]
         share = (line[first + 1 : last] - line[first]) @ along / max(along @ along, 1e-12)
         near = line[first] + np.clip(share, 0.0, 1.0)[:, None] * along
-        if np.linalg.norm(near - line[first + 1 : last], axis=-1).max() > LINE_ERROR_M:
+        if np.linalg.norm(near - line[first + 1 : last], axis=-1).max() > line_error_m:
             first = last - 1
             kept.append(first)
     return line[[*kept, len(line) - 1]]

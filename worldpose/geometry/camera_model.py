@@ -33,11 +33,6 @@ STEP: Final = 12
 """Parameters of a camera's step: rotation about its center [rad] and shift [m] in its own axes, the
 logarithm of the focal length, principal point [px], k1 k2 k3."""
 
-_OK = int(RayStatus.OK)
-_MISSING = int(RayStatus.MISSING)
-_BEHIND = int(RayStatus.BEHIND)
-_BEYOND_FOLD = int(RayStatus.BEYOND_FOLD)
-
 
 @inline_kernel
 def rotate(camera: CameraNumbers, wx: float, wy: float, wz: float) -> tuple[float, float, float]:
@@ -69,11 +64,11 @@ def view(
     """
     a, b = x / z, y / z
     xd, yd, dxx, dxy, dyy = distort(camera, a, b)
-    status = _OK
+    status = RayStatus.OK.value
     if not abs(x) + abs(y) + abs(z) < np.inf:
-        status = _MISSING
+        status = RayStatus.MISSING.value
     elif z <= 0.0:
-        status = _BEHIND
+        status = RayStatus.BEHIND.value
     else:
         fold = camera.fold
         one_to_one = a * a + b * b < fold * fold and abs(xd) + abs(yd) < np.inf
@@ -81,7 +76,7 @@ def view(
         if camera.p1 != 0.0 or camera.p2 != 0.0:
             one_to_one = one_to_one and dxx * dyy - dxy * dxy > 0.0
         if not one_to_one:
-            status = _BEYOND_FOLD
+            status = RayStatus.BEYOND_FOLD.value
     fx, fy = camera.fx, camera.fy
     gx, gy = fx * dxx / z, fx * dxy / z
     hx, hy = fy * dxy / z, fy * dyy / z
@@ -201,8 +196,8 @@ def project(cameras: Floats, points: Floats, image: Floats) -> None:
             status, u, v, _ = project_point(
                 camera, points[row, i, 0], points[row, i, 1], points[row, i, 2]
             )
-            image[row, i, 0] = u if status == _OK else np.nan
-            image[row, i, 1] = v if status == _OK else np.nan
+            image[row, i, 0] = u if status == RayStatus.OK.value else np.nan
+            image[row, i, 1] = v if status == RayStatus.OK.value else np.nan
 
 
 @compile_kernel
@@ -227,8 +222,8 @@ def project_with_jacobians(
                 camera, points[row, i, 0], points[row, i, 1], points[row, i, 2]
             )
             code, u, v, gx, gy, gz, hx, hy, hz = view(camera, x, y, z)
-            status[row, i] = code if finite else _MISSING
-            if status[row, i] != _OK:
+            status[row, i] = code if finite else RayStatus.MISSING.value
+            if status[row, i] != RayStatus.OK.value:
                 image[row, i] = np.nan
                 jacobian[row, i] = np.nan
                 continue
@@ -266,10 +261,12 @@ def normalize(cameras: Floats, image: Floats, plane: Floats, status: Image) -> N
         for i in range(image.shape[1]):
             xd = (image[row, i, 0] - camera.cx) / camera.fx
             yd = (image[row, i, 1] - camera.cy) / camera.fy
-            x, y, code = undistort(camera, xd, yd) if finite else (np.nan, np.nan, _MISSING)
+            x, y, code = (
+                undistort(camera, xd, yd) if finite else (np.nan, np.nan, RayStatus.MISSING.value)
+            )
             status[row, i] = code
-            plane[row, i, 0] = x if code == _OK else np.nan
-            plane[row, i, 1] = y if code == _OK else np.nan
+            plane[row, i, 0] = x if code == RayStatus.OK.value else np.nan
+            plane[row, i, 1] = y if code == RayStatus.OK.value else np.nan
 
 
 @compile_kernel

@@ -94,13 +94,6 @@ class CameraNumbers(NamedTuple):
     model: float
 
 
-_BROWN = int(LensModel.BROWN)
-_RATIONAL = int(LensModel.RATIONAL)
-_OK = int(RayStatus.OK)
-_MISSING = int(RayStatus.MISSING)
-_BEYOND_FOLD = int(RayStatus.BEYOND_FOLD)
-_NOT_CONVERGED = int(RayStatus.NOT_CONVERGED)
-
 # Radii beyond this belong to rays within a millionth of a radian of the camera's own plane.
 _MAX_RADIUS = 1e6
 _MAX_ITERATIONS = 100
@@ -183,7 +176,7 @@ def _write_folds(rows: Floats) -> None:
 @compile_kernel
 def fold_squared(camera: CameraNumbers) -> float:
     """Return the squared radius of the fold; infinite without one."""
-    if camera.model == _BROWN:
+    if camera.model == LensModel.BROWN.value:
         return _brown_fold_squared(camera.k1, camera.k2, camera.k3)
     # The first of a thousand rays, from the axis to its normal, that the lens does not keep in
     # order; then the interval before it is halved.
@@ -260,7 +253,7 @@ def radial(camera: CameraNumbers, s: float) -> tuple[float, float]:
 
     The derivative of the distorted radius r f by r is then the factor plus s times the second.
     """
-    if camera.model == _BROWN:
+    if camera.model == LensModel.BROWN.value:
         return _polynomial(s, camera.k1, camera.k2, camera.k3)
     return _radial_of_others(camera, s)
 
@@ -270,7 +263,7 @@ def _radial_of_others(camera: CameraNumbers, s: float) -> tuple[float, float]:
     # A function of its own, so that the compiler inlines the short way of Brown's model.
     k1, k2, k3 = camera.k1, camera.k2, camera.k3
     k4, k5, k6 = camera.k4, camera.k5, camera.k6
-    if camera.model == _RATIONAL:
+    if camera.model == LensModel.RATIONAL.value:
         top, by_top = _polynomial(s, k1, k2, k3)
         bottom, by_bottom = _polynomial(s, k4, k5, k6)
         return top / bottom, (by_top - top / bottom * by_bottom) / bottom
@@ -295,7 +288,7 @@ def by_coefficients(
     camera: CameraNumbers, s: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return the derivatives of the radial factor by k1 to k6."""
-    if camera.model == _BROWN:
+    if camera.model == LensModel.BROWN.value:
         return s, s * s, s * s * s, 0.0, 0.0, 0.0
     return _by_coefficients_of_others(camera, s)
 
@@ -304,7 +297,7 @@ def by_coefficients(
 def _by_coefficients_of_others(
     camera: CameraNumbers, s: float
 ) -> tuple[float, float, float, float, float, float]:
-    if camera.model == _RATIONAL:
+    if camera.model == LensModel.RATIONAL.value:
         bottom = _polynomial(s, camera.k4, camera.k5, camera.k6)[0]
         one = s / bottom
         lost = -radial(camera, s)[0] * one
@@ -349,7 +342,7 @@ def undistort(camera: CameraNumbers, xd: float, yd: float) -> tuple[float, float
     """Return the point of the plane z = 1 whose distorted image is (xd, yd), and a RayStatus."""
     radius_d = np.sqrt(xd * xd + yd * yd)
     if not radius_d < np.inf:
-        return np.nan, np.nan, _MISSING
+        return np.nan, np.nan, RayStatus.MISSING.value
     radius, status = _undistort_radius(camera, radius_d)
     factor = radius / radius_d if radius_d > 0.0 else 1.0
     x, y = xd * factor, yd * factor
@@ -357,8 +350,10 @@ def undistort(camera: CameraNumbers, xd: float, yd: float) -> tuple[float, float
         return x, y, status
     x, y, misfit, at_fold = _polish(camera, x, y, xd, yd)
     if misfit <= _MISFIT * (1.0 + radius_d):
-        return x, y, _OK
-    return x, y, _BEYOND_FOLD if at_fold or status == _BEYOND_FOLD else _NOT_CONVERGED
+        return x, y, RayStatus.OK.value
+    if at_fold or status == RayStatus.BEYOND_FOLD.value:
+        return x, y, RayStatus.BEYOND_FOLD.value
+    return x, y, RayStatus.NOT_CONVERGED.value
 
 
 @compile_kernel
@@ -369,7 +364,7 @@ def _undistort_radius(camera: CameraNumbers, radius_d: float) -> tuple[float, in
     """
     low, high = 0.0, camera.fold
     if high < np.inf and radius_d >= high * radial(camera, high * high)[0]:
-        return 0.99 * high, _BEYOND_FOLD
+        return 0.99 * high, RayStatus.BEYOND_FOLD.value
     radius = min(radius_d, high)
     misfit = np.inf
     for _ in range(_MAX_ITERATIONS):
@@ -378,7 +373,7 @@ def _undistort_radius(camera: CameraNumbers, radius_d: float) -> tuple[float, in
         misfit = radius * factor - radius_d
         # Rounding of the polynomial alone leaves two units.
         if abs(misfit) <= 4.5e-16 * radius_d:
-            return radius, _OK
+            return radius, RayStatus.OK.value
         if misfit > 0.0:
             high = radius
         else:
@@ -390,7 +385,8 @@ def _undistort_radius(camera: CameraNumbers, radius_d: float) -> tuple[float, in
         if following == radius:
             break
         radius = following
-    return radius, _OK if abs(misfit) <= _MISFIT * (1.0 + radius_d) else _NOT_CONVERGED
+    converged = abs(misfit) <= _MISFIT * (1.0 + radius_d)
+    return radius, RayStatus.OK.value if converged else RayStatus.NOT_CONVERGED.value
 
 
 @compile_kernel

@@ -25,7 +25,6 @@ from worldpose.geometry.rays import RayStatus
 Box = tuple[int, int, int, int]
 """Left, top, right, bottom [px]; right and bottom lie outside."""
 
-_OK = int(RayStatus.OK)
 SAMPLES = 4
 _DOWN = (-0.375, -0.125, 0.125, 0.375)
 """Positions of samples in a pixel [px]: on a rotated square, no two share a row or column."""
@@ -270,7 +269,7 @@ def _project(cameras: Floats, vertices: Singles, pixels: Singles, boxes: Floats)
         for v in range(vertices.shape[1]):
             at = vertices[p, v]
             status, x, y, depth = project_point(camera, float(at[0]), float(at[1]), float(at[2]))
-            if status != _OK:
+            if status != RayStatus.OK.value:
                 pixels[p, v] = np.nan
                 continue
             pixels[p, v, 0], pixels[p, v, 1], pixels[p, v, 2] = x, y, depth

@@ -99,12 +99,9 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
         key_frames = validate_record(KeyFrames, read_json(file), str(file))
         numbers = [key_frame.frame for key_frame in key_frames.key_frames]
         if numbers != sorted(set(numbers)):
-            raise InputError(
-                f"{file}: key_frames",
-                expected="every frame once, in rising order",
-                found=f"{numbers}",
-                todo="Sort them, and put all clicks of one frame into one entry.",
-            )
+            expected = "every frame once, in rising order"
+            todo = "Sort them, and put all clicks of one frame into one entry."
+            raise InputError(f"{file}: key_frames", expected, f"{numbers}", todo)
         for n, key_frame in enumerate(key_frames.key_frames):
             inside = f"key_frames[{n}].markings"
             _require_markings(str(file), inside, key_frame.markings, camera, template)
@@ -114,12 +111,9 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
 
 def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:
     if pitch is None:
-        raise InputError(
-            str(file),
-            expected="no clicked markings where match.yaml says `pitch: none`",
-            found="a file of them",
-            todo="Remove it, or take `pitch: none` out of match.yaml.",
-        )
+        expected = "no clicked markings where match.yaml says `pitch: none`"
+        todo = "Remove it, or take `pitch: none` out of match.yaml."
+        raise InputError(str(file), expected, "a file of them", todo)
     return PitchTemplate.from_spec(pitch)
 
 
@@ -128,12 +122,8 @@ def _require_markings(
 ) -> None:
     """Raise InputError for unknown markings, and for pixels outside the image."""
     if not (clicked.points or clicked.drawn):
-        raise InputError(
-            f"{file}: {within}" if within else file,
-            expected="points or drawn markings",
-            found="none",
-            todo="Click some.",
-        )
+        expected = "points or drawn markings"
+        raise InputError(f"{file}: {within}" if within else file, expected, "none", "Click some.")
     dot = f"{within}." if within else ""
     points = [
         (f"{dot}points[{n}]", point.name, (point.xy,)) for n, point in enumerate(clicked.points)
@@ -161,20 +151,16 @@ def _require_known(
     for place, name, _ in entries:
         if name not in known:
             close = get_close_matches(name, known, n=1)
-            raise InputError(
-                f"{file}: {place}.name",
-                expected=f"the name of {kind} of the pitch",
-                found=repr(name),
-                todo=f"Did you mean {close[0]!r}?" if close else f"Known: {', '.join(known)}.",
-            )
+            expected = f"the name of {kind} of the pitch"
+            todo = f"Did you mean {close[0]!r}?" if close else f"Known: {', '.join(known)}."
+            raise InputError(f"{file}: {place}.name", expected, repr(name), todo)
         if name in places:
-            raise InputError(
-                f"{file}: {place}.name",
-                expected="every name once",
-                found=f"{name!r} again, after {places[name]}",
-                todo="Which of the two is meant? Remove or rename the other; put all places along "
-                "one marking into one entry.",
+            found = f"{name!r} again, after {places[name]}"
+            todo = (
+                "Which of the two is meant? Remove or rename the other; put all places along "
+                "one marking into one entry."
             )
+            raise InputError(f"{file}: {place}.name", "every name once", found, todo)
         places[name] = place
 
 
@@ -185,9 +171,6 @@ def _require_inside(where: str, pixel: Pixel, camera: CameraSpec) -> None:
         for value, size in zip(pixel, (camera.width, camera.height), strict=True)
     )
     if not inside:
-        raise InputError(
-            where,
-            expected=f"a place in the image of {camera.width} x {camera.height} px",
-            found=f"{list(pixel)}",
-            todo="Remove it, or click it again in this camera's picture.",
-        )
+        expected = f"a place in the image of {camera.width} x {camera.height} px"
+        todo = "Remove it, or click it again in this camera's picture."
+        raise InputError(where, expected, f"{list(pixel)}", todo)

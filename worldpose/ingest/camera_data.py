@@ -65,12 +65,9 @@ def import_camera_data(
     images = image_clock(match.spec, view).images
     missing = int((~np.isin(images, data.frame)).sum())
     if missing == len(images):
-        raise InputError(
-            str(file),
-            expected=f"frames {images[0]} to {images[-1]} of the video of {view}",
-            found=f"frames {data.frame[0]} to {data.frame[-1]}",
-            todo="State the video's frame of the first row: --first-frame NUMBER.",
-        )
+        expected = f"frames {images[0]} to {images[-1]} of the video of {view}"
+        todo = "State the video's frame of the first row: --first-frame NUMBER."
+        raise InputError(str(file), expected, f"frames {data.frame[0]} to {data.frame[-1]}", todo)
     if missing:
         note = f"{missing} of {len(images)} images of {view} have no camera data"
         data = replace(data, notes=(*data.notes, note))

@@ -58,12 +58,9 @@ def find_videos(
         place = group[0].parent if inside else group[0]
         name = camera_id(place.stem if place.is_file() else place.name)
         if name in found:
-            raise InputError(
-                str(folder),
-                expected="one video of each camera",
-                found=f"{found[name].name} and {place.name}",
-                todo="Name each video after its camera.",
-            )
+            expected = "one video of each camera"
+            todo = "Name each video after its camera."
+            raise InputError(str(folder), expected, f"{found[name].name} and {place.name}", todo)
         found[name] = place
         if len(group) > 1:
             if workshop is None or not _is_whole(group):
@@ -270,9 +267,6 @@ def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
 
 def video_size_error(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:
     """Return the error of a video that has not the size of its calibration."""
-    return InputError(
-        str(file),
-        expected="{} x {} px, the size in the calibration".format(*camera.image_size),
-        found=f"{index.size[0]} x {index.size[1]}",
-        todo="Give the video that was calibrated, in its size: a crop has another principal point.",
-    )
+    expected = "{} x {} px, the size in the calibration".format(*camera.image_size)
+    todo = "Give the video that was calibrated, in its size: a crop has another principal point."
+    return InputError(str(file), expected, f"{index.size[0]} x {index.size[1]}", todo)

@@ -33,8 +33,6 @@ from worldpose.video.folder import index_video
 from worldpose.video.names import VIDEO_SUFFIXES
 from worldpose.video.pictures import FrameIndex
 
-CAMERA: Final = "broadcast"
-"""Name of the camera of an imported match."""
 Lift = Callable[[Floats, float], tuple[Floats, Floats]]
 """Returns the rotations of the pelvis (frames, 3) and of the other joints (frames, 69) [rad] of a
 body with COCO-17 joints (frames, 17, 3) [m] at a frame rate [1/s]."""
@@ -194,8 +192,10 @@ def _write_sequence(
     name, (wide, high) = sequence.name, sequence.index.size
     frames, persons = sequence.boxes.shape[:2]
     file = f"broadcast/{sequence.video.name}"
-    camera = CameraSpec(id=CAMERA, kind="broadcast", width=wide, height=high, video=file)
-    clip = ClipSpec(id=name, frame_count=frames, broadcast=CAMERA)
+    # Name of the camera of an imported match.
+    camera_name = "broadcast"
+    camera = CameraSpec(id=camera_name, kind="broadcast", width=wide, height=high, video=file)
+    clip = ClipSpec(id=name, frame_count=frames, broadcast=camera_name)
     spec = MatchSpec(match_id=name, fps=fps, cameras=(camera,), clips=(clip,))
     posed = np.isfinite(sequence.camera.cam_from_world.rotation).all((-1, -2)).sum()
     notes = [f"{name}: {persons} people, camera poses of {posed} of {frames} frames"]

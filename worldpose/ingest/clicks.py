@@ -34,8 +34,6 @@ from worldpose.pitch.template import PitchTemplate
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
-REPEATED_SUFFIX: Final = ".again"
-"""Suffix of the second click with one label."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +100,9 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
     spec = read_spec(folder)
     pitch = read_pitch(folder, spec)
     if pitch is None:
-        raise InputError(
-            f"{folder / 'match.yaml'}: pitch",
-            expected="a pitch, whose markings were clicked",
-            found="pitch: none",
-            todo="Remove the line `pitch: none`.",
-        )
+        expected = "a pitch, whose markings were clicked"
+        todo = "Remove the line `pitch: none`."
+        raise InputError(f"{folder / 'match.yaml'}: pitch", expected, "pitch: none", todo)
     by_owner = _assign_images(file, images, spec, owner)
     report = ImportedClicks()
     labels = _Labels(file, images, pitch, report)
@@ -132,12 +127,8 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         report.clicks[name] = sum(len(image.points) + len(image.lines) for image in own)
     for name in records:
         if (folder / name).exists():
-            raise InputError(
-                str(folder / name),
-                expected="no clicks there yet",
-                found="a file",
-                todo="Move it away, or correct single clicks on the pages.",
-            )
+            todo = "Move it away, or correct single clicks on the pages."
+            raise InputError(str(folder / name), "no clicks there yet", "a file", todo)
     if report.own_points:
         refuse_unread_pitch(folder)
         known = dict(pitch.points)
@@ -161,12 +152,8 @@ def _assign_images(
     if owner in views:
         return {owner: (views[owner].camera, list(images))}
     if owner is not None and owner not in static:
-        raise InputError(
-            "--camera",
-            expected=f"one of {', '.join([*static, *views])}",
-            found=repr(owner),
-            todo="Name a static camera, or a clip of the broadcast camera.",
-        )
+        todo = "Name a static camera, or a clip of the broadcast camera."
+        raise InputError("--camera", f"one of {', '.join([*static, *views])}", repr(owner), todo)
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
         named = IMAGE_NAME.search(image.name)
@@ -230,14 +217,16 @@ class _Labels:
         """Return the clicked markings of an image of a camera or clip."""
         points, seen = [], Counter[str]()
         first: dict[str, tuple[float, float]] = {}
+        # Suffix of the second click with one label.
+        repeated_suffix = ".again"
         for label, pixel in image.points:
             name = self._name(image, label)
             seen[name] += 1
             where = (float(pixel[0]), float(pixel[1]))
             if seen[name] > 1:
-                place, names = self._place(name), (name, name + REPEATED_SUFFIX)
+                place, names = self._place(name), (name, name + repeated_suffix)
                 if seen[name] > 2:
-                    names = (name, f"{name}{REPEATED_SUFFIX}{seen[name]}")
+                    names = (name, f"{name}{repeated_suffix}{seen[name]}")
                 self._report.repeated.append(
                     RepeatedClick(owner, image.name, label, names, (first[name], where))
                 )

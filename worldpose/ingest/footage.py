@@ -126,11 +126,10 @@ def read_unit(
         InputError: the match has no such unit, or no or invalid detections for it.
     """
     if unit_id not in match.detections:
+        expected = f"2D poses of {unit_id!r} ({unit_id}.json or {unit_id}.npz)"
+        found = f"those of {', '.join(match.detections) or 'none'}"
         raise InputError(
-            str(match.folder / "detections"),
-            expected=f"2D poses of {unit_id!r} ({unit_id}.json or {unit_id}.npz)",
-            found=f"those of {', '.join(match.detections) or 'none'}",
-            todo="Add the file, or correct the name.",
+            str(match.folder / "detections"), expected, found, "Add the file, or correct the name."
         )
     path = match.detections[unit_id]
     people = unit_frames(match.spec, unit_id).place(path, read_people(path).people)
@@ -189,12 +188,9 @@ def read_footage(
 
     index = index_video(path) if index is None else index
     if index.size != image_size:
-        raise InputError(
-            str(path),
-            expected=f"{image_size[0]} x {image_size[1]} px, the size in match.yaml",
-            found=f"{index.size[0]} x {index.size[1]} as shown",
-            todo="Correct width and height in match.yaml, or give the video in that size.",
-        )
+        expected = f"{image_size[0]} x {image_size[1]} px, the size in match.yaml"
+        todo = "Correct width and height in match.yaml, or give the video in that size."
+        raise InputError(str(path), expected, f"{index.size[0]} x {index.size[1]} as shown", todo)
     clock = index.on_clock(fps, str(path))
     wanted = [np.arange(first, first + count, dtype=np.int64) for _, first, count in clips]
     frame = np.unique(np.concatenate(wanted))
@@ -214,12 +210,9 @@ def no_images(
     """Return the error of a video that shows no frame of a clip (id, first, count)."""
     name, first, count = clip
     begin, end = frames.numbers(np.array([first, first + count - 1]))
-    return InputError(
-        f"{path}: clip {name}",
-        expected=f"frames {begin} to {end} of this video",
-        found=f"frames 0 to {footage.length - 1}",
-        todo="Check the clip's first_frame and the camera's offset_frames.",
-    )
+    expected = f"frames {begin} to {end} of this video"
+    todo = "Check the clip's first_frame and the camera's offset_frames."
+    return InputError(f"{path}: clip {name}", expected, f"frames 0 to {footage.length - 1}", todo)
 
 
 def footage_clips(spec: MatchSpec, unit_id: str) -> list[tuple[str, int, int]]:
@@ -276,20 +269,16 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     content = np.fromfile(path, dtype=np.uint8) if size <= still_bytes else np.empty(0, np.uint8)
     declared = declared_size(content)
     if declared is not None and declared != image_size:
+        found = f"{declared[0]} x {declared[1]} as shown, with the turn of its EXIF tag"
+        todo = "Export the still at the size of the video, or correct match.yaml."
         raise InputError(
-            str(path),
-            expected=f"{image_size[0]} x {image_size[1]} px, the size in match.yaml",
-            found=f"{declared[0]} x {declared[1]} as shown, with the turn of its EXIF tag",
-            todo="Export the still at the size of the video, or correct match.yaml.",
+            str(path), f"{image_size[0]} x {image_size[1]} px, the size in match.yaml", found, todo
         )
     image = decode_image(content)
     if image is None:
-        raise InputError(
-            str(path),
-            expected=f"an image of at most {still_bytes} bytes and {MAX_PIXELS} pixels",
-            found=f"{size} bytes that are none",
-            todo="Export the still again.",
-        )
+        expected = f"an image of at most {still_bytes} bytes and {MAX_PIXELS} pixels"
+        todo = "Export the still again."
+        raise InputError(str(path), expected, f"{size} bytes that are none", todo)
     return image
 
 

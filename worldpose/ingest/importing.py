@@ -161,6 +161,14 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
         counts = {name: getattr(found.changes, key) for name, found in read.items()}
         if total := sum(counts.values()):
             notes.append(f"{what}: {total} ({', '.join(name for name in counts if counts[name])})")
+    lacking = {
+        name: int((boxed & ~np.isfinite(found.people.confidence).any(axis=-1)).sum())
+        for name, found in read.items()
+        for boxed in [np.isfinite(found.people.boxes).all(axis=-1)]
+    }
+    if any(lacking.values()):
+        listed = ", ".join(f"{count} of {name}" for name, count in lacking.items() if count)
+        notes.append(f"warning: people have a box but no keypoint: {listed}")
     steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
@@ -221,12 +229,8 @@ def import_lenses(
     for name in lenses:
         if name in known or name in posed:
             place = LENS_FILE if name in known else given.name
-            raise InputError(
-                f"{folder / place}: {name}",
-                expected="no lens of this camera yet",
-                found="one",
-                todo="Remove it there first.",
-            )
+            todo = "Remove it there first."
+            raise InputError(f"{folder / place}: {name}", "no lens of this camera yet", "one", todo)
     with whole_file(target) as draft:
         write_lens_toml(draft, {**known, **lenses})
     return lenses
@@ -315,9 +319,7 @@ def find_people(folder: Path, people: Mapping[str, KeypointDetections]) -> tuple
     """Return the first frame with a person in any camera, and the one after the last."""
     seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
     if not seen:
-        raise InputError(
-            str(folder), expected="people", found="none in any frame", todo="Check the detector."
-        )
+        raise InputError(str(folder), "people", "none in any frame", "Check the detector.")
     return min(first for first, _ in seen), max(last + 1 for _, last in seen)
 
 
@@ -429,10 +431,7 @@ def _first_rate(files: Mapping[str, Path], indices: Mapping[str, FrameIndex]) ->
     """Return the rate of the first video that has one [1/s]; InputError if none has."""
     rates = [index.fps for index in indices.values() if np.isfinite(index.fps)]
     if not rates:
-        raise InputError(
-            str(next(iter(files.values()))),
-            expected="frames per second, which images and a single frame do not tell",
-            found="none",
-            todo="Add for example --fps 25.",
-        )
+        expected = "frames per second, which images and a single frame do not tell"
+        todo = "Add for example --fps 25."
+        raise InputError(str(next(iter(files.values()))), expected, "none", todo)
     return round(rates[0], 3)

@@ -142,13 +142,11 @@ def read_spec(folder: Path) -> MatchSpec:
 def _read_spec(folder: Path) -> MatchSpec:
     file = folder / "match.yaml"
     if folder.is_dir() and not file.exists():
-        raise InputError(
-            str(file),
-            expected="a file",
-            found="nothing",
-            todo="docs/reference/match_folder.md describes a match folder; worldpose import makes "
-            "one from a calibration.",
+        todo = (
+            "docs/reference/match_folder.md describes a match folder; worldpose import makes "
+            "one from a calibration."
         )
+        raise InputError(str(file), "a file", "nothing", todo)
     return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
@@ -205,11 +203,10 @@ def require_calibrated(match: MatchFolder) -> None:
                 "give one camera a side (near, far, left, right) in match.yaml, so that the images "
                 "are calibrated without clicks; or add the camera to calibration.toml"
             )
+        expected = "a given calibration or clicked markings of every static camera"
+        found = f"missing camera {', '.join(missing)}; there: {_list_names(known)}"
         raise InputError(
-            str(match.folder),
-            expected="a given calibration or clicked markings of every static camera",
-            found=f"missing camera {', '.join(missing)}; there: {_list_names(known)}",
-            todo=f"{needed}, or take it out of match.yaml.",
+            str(match.folder), expected, found, f"{needed}, or take it out of match.yaml."
         )
 
 
@@ -237,12 +234,8 @@ def _require_key_frames(match: MatchFolder) -> None:
             "give the broadcast camera a side (near, far, left, right) in match.yaml, so that key "
             "frames are proposed from its video."
         )
-    raise InputError(
-        str(match.folder),
-        expected="a clip with clicked key frames and a video, as there are no static cameras",
-        found=found,
-        todo=todo,
-    )
+    expected = "a clip with clicked key frames and a video, as there are no static cameras"
+    raise InputError(str(match.folder), expected, found, todo)
 
 
 def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]:
@@ -254,20 +247,16 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
     static = {camera.id: camera for camera in spec.static_cameras}
     extra = [name for name in calibrations if name not in static]
     if extra:
-        raise InputError(
-            str(file),
-            expected=f"static cameras of match.yaml: {_list_names(static)}",
-            found=f"also {', '.join(extra)}",
-            todo="Remove the further cameras, or correct their names.",
-        )
+        expected = f"static cameras of match.yaml: {_list_names(static)}"
+        todo = "Remove the further cameras, or correct their names."
+        raise InputError(str(file), expected, f"also {', '.join(extra)}", todo)
     for name, calibration in calibrations.items():
         size = (static[name].width, static[name].height)
         if calibration.image_size != size:
+            expected = f"{list(size)}, the width and height in match.yaml"
+            todo = "Calibrate at the size of the video, or correct match.yaml."
             raise InputError(
-                f"{file}: {name}.size",
-                expected=f"{list(size)}, the width and height in match.yaml",
-                found=str(list(calibration.image_size)),
-                todo="Calibrate at the size of the video, or correct match.yaml.",
+                f"{file}: {name}.size", expected, str(list(calibration.image_size)), todo
             )
     return calibrations
 
@@ -285,11 +274,10 @@ def _lenses(
     lenses = read_lens_toml(file, image_sizes(spec))
     both = [name for name in lenses if name in calibrations]
     if both:
+        found = "cameras that calibration.toml gives with their pose"
+        todo = "Remove them from one of the two files."
         raise InputError(
-            f"{file}: {', '.join(both)}",
-            expected="lenses of cameras without a given pose",
-            found="cameras that calibration.toml gives with their pose",
-            todo="Remove them from one of the two files.",
+            f"{file}: {', '.join(both)}", "lenses of cameras without a given pose", found, todo
         )
     return lenses
 
@@ -383,12 +371,9 @@ def _require_own_video(folder: Path, view: str, clip: ClipSpec) -> None:
     """Raise InputError for a video of the clip where each of its cameras has its own."""
     shared = f"broadcast/{clip.id}.mp4"
     if view != clip.id and find_file(folder, shared).exists():
-        raise InputError(
-            f"{folder / shared}",
-            expected=f"a video of each of the clip's broadcast cameras, as broadcast/{view}.mp4",
-            found="one video of the clip",
-            todo="Rename it after the camera that recorded it.",
-        )
+        expected = f"a video of each of the clip's broadcast cameras, as broadcast/{view}.mp4"
+        todo = "Rename it after the camera that recorded it."
+        raise InputError(f"{folder / shared}", expected, "one video of the clip", todo)
 
 
 def _require_one_view(folder: Path, spec: MatchSpec) -> None:
@@ -418,13 +403,12 @@ def _require_footage(
             )
     for name, view in spec.broadcast_views.items():
         if name not in detections and name not in videos:
-            raise InputError(
-                str(folder),
-                expected=f"footage of broadcast camera {view.camera.id} for clip {view.clip.id}",
-                found="none",
-                todo=f"Add broadcast/{name}.mp4 or detections/{name}.json (or .npz), or "
-                "take the camera out of `broadcast` of the clip.",
+            expected = f"footage of broadcast camera {view.camera.id} for clip {view.clip.id}"
+            todo = (
+                f"Add broadcast/{name}.mp4 or detections/{name}.json (or .npz), or "
+                "take the camera out of `broadcast` of the clip."
             )
+            raise InputError(str(folder), expected, "none", todo)
 
 
 def _another_video(folder: Path, camera_id: str) -> str:

@@ -18,10 +18,6 @@ from worldpose.ingest.validation import existing_file, validate_record
 from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 
-SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
-"""Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90."""
-OTHER_SIZES: Final = (0.6, 1.5)
-"""Allowed length and width of another game's pitch, relative to its template's [1]."""
 NO_PITCH: Final = "none"
 """Value of `pitch` in match.yaml for footage without a pitch."""
 
@@ -82,23 +78,26 @@ def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> N
     Raises:
         InputError: a number is out of bounds; the error names the key and the unit.
     """
-    for key in SIZES:
+    # Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90.
+    allowed = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
+    # Allowed length and width of another game's pitch, relative to its template's [1].
+    allowed_shares = (0.6, 1.5)
+    for key in allowed:
         value, nominal = content.get(key), float(getattr(usual, key))
         if not _is_number(value) or value <= 0:
             continue  # the contract says what is wrong with it
-        least, most = OTHER_SIZES[0] * nominal, OTHER_SIZES[1] * nominal
+        least, most = allowed_shares[0] * nominal, allowed_shares[1] * nominal
         if usual.template == "football":
-            least, most = SIZES[key]
+            least, most = allowed[key]
         if not least <= value <= most:
             units = [u for u, metres in OTHER_UNITS.items() if least <= value * metres <= most]
             guess = f", which looks like {units[0]}" if units else ""
-            raise InputError(
-                f"{file}: {key}",
-                expected=f"{least:g} to {most:g} metres",
-                found=f"{value:g}{guess}",
-                todo="Give all lengths and points in metres, name the game as template, or add "
-                '"any_size": true where the pitch is of another size.',
+            expected = f"{least:g} to {most:g} metres"
+            todo = (
+                "Give all lengths and points in metres, name the game as template, or add "
+                '"any_size": true where the pitch is of another size.'
             )
+            raise InputError(f"{file}: {key}", expected, f"{value:g}{guess}", todo)
 
 
 def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
@@ -157,9 +156,6 @@ def refuse_unread_pitch(folder: Path) -> None:
 
 
 def _two_pitches(folder: Path, named: str) -> InputError:
-    return InputError(
-        f"{folder / 'match.yaml'}: pitch",
-        expected=f"no `pitch: {named}` where pitch.json lies",
-        found="both",
-        todo="Take that line out if the world is the pitch's, or the file away.",
-    )
+    expected = f"no `pitch: {named}` where pitch.json lies"
+    todo = "Take that line out if the world is the pitch's, or the file away."
+    return InputError(f"{folder / 'match.yaml'}: pitch", expected, "both", todo)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
@@ -41,9 +41,6 @@ from worldpose.ingest.importing import (
 from worldpose.ingest.writing import write_match
 from worldpose.video.folder import index_video
 from worldpose.video.pictures import FrameIndex
-
-_SETTINGS: Final = ("frame_rate", "frame_range", "pose_model")
-"""Entries of Config.toml that hold."""
 
 
 def import_pose2sim(
@@ -84,12 +81,9 @@ def import_pose2sim(
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
     films = list(find_videos(project / "videos").values())
     if not places and not films:
-        raise InputError(
-            str(project),
-            expected=f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4",
-            found="neither",
-            todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
-        )
+        expected = f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4"
+        todo = "Run Pose2Sim.poseEstimation() first, or add the videos."
+        raise InputError(str(project), expected, "neither", todo)
     known = {file: index_video(file) for file in films}
     left_out = LeftOut()
     cameras: dict[str, CameraCalibration] = {}
@@ -176,12 +170,9 @@ def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:
 def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
     """Return the frame rate of the first video [1/s]; raise InputError without videos."""
     if not indices:
-        raise InputError(
-            f"{config}: project.frame_rate",
-            expected="frames per second, as there are no videos to take them from",
-            found="'auto'",
-            todo="Write for example frame_rate = 60, or give --fps.",
-        )
+        expected = "frames per second, as there are no videos to take them from"
+        todo = "Write for example frame_rate = 60, or give --fps."
+        raise InputError(f"{config}: project.frame_rate", expected, "'auto'", todo)
     return round(indices[0].fps, 3)
 
 
@@ -191,48 +182,36 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
     As in Pose2Sim, the file of the folder above gives what the trial's file lacks.
     """
     if not project.is_dir():
-        raise InputError(
-            str(project),
-            expected="the folder of a Pose2Sim trial",
-            found="a file" if project.exists() else "nothing",
-            todo="Give the folder that has videos/ or pose/, and Config.toml.",
-        )
+        expected = "the folder of a Pose2Sim trial"
+        todo = "Give the folder that has videos/ or pose/, and Config.toml."
+        raise InputError(str(project), expected, "a file" if project.exists() else "nothing", todo)
     files = [place / "Config.toml" for place in (project, project.resolve().parent)]
     given: dict[str, Any] = {}
+    # Entries of Config.toml that hold.
+    held_entries = ("frame_rate", "frame_range", "pose_model")
     for file in reversed(files):
         content = read_toml(file) if file.is_file() else {}
         for name in ("project", "pose"):
             table = content.get(name, {})
             if not isinstance(table, dict):
-                raise InputError(
-                    f"{file}: {name}",
-                    expected="a table",
-                    found=f"{table!r:.40}",
-                    todo="Correct it.",
-                )
-            given |= {key: (table[key], file) for key in _SETTINGS if key in table}
+                raise InputError(f"{file}: {name}", "a table", f"{table!r:.40}", "Correct it.")
+            given |= {key: (table[key], file) for key in held_entries if key in table}
     model, _ = given.get("pose_model", (None, files[0]))
     settings: dict[str, Any] = {"pose_model": model} if isinstance(model, str) else {}
     rate, place = given.get("frame_rate", ("auto", files[0]))
     if rate != "auto":
         if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:
-            raise InputError(
-                f"{place}: project.frame_rate",
-                expected="frames per second or 'auto'",
-                found=f"{rate!r:.40}",
-                todo="Write for example frame_rate = 60.",
-            )
+            expected = "frames per second or 'auto'"
+            todo = "Write for example frame_rate = 60."
+            raise InputError(f"{place}: project.frame_rate", expected, f"{rate!r:.40}", todo)
         settings["frame_rate"] = float(rate)
     span, place = given.get("frame_range", ("auto", files[0]))
     if span not in ("auto", "all", []):
         whole = isinstance(span, list) and [type(one) for one in span] == [int, int]
         if not whole or not 0 <= span[0] < span[1]:
-            raise InputError(
-                f"{place}: project.frame_range",
-                expected="'auto', 'all', or the first frame and the one after the last",
-                found=f"{span!r:.40}",
-                todo="Write for example frame_range = [10, 300].",
-            )
+            expected = "'auto', 'all', or the first frame and the one after the last"
+            todo = "Write for example frame_range = [10, 300]."
+            raise InputError(f"{place}: project.frame_range", expected, f"{span!r:.40}", todo)
         settings["frame_range"] = tuple(span)
     return settings, files[0]
 
@@ -253,12 +232,9 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
         found = calibrations_in(folder)
         written = [files[0] for form, files in found if form is TOML]
         if len(written) > 1:
-            raise InputError(
-                str(folder),
-                expected="one calibration *.toml",
-                found=", ".join(file.name for file in written),
-                todo="Move the others elsewhere.",
-            )
+            expected = "one calibration *.toml"
+            todo = "Move the others elsewhere."
+            raise InputError(str(folder), expected, ", ".join(file.name for file in written), todo)
         if written:
             return written[0]
         if found:
@@ -266,11 +242,10 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
             return files[0] if len(files) == 1 else folder
     if (project / "videos").is_dir():
         return None
+    expected = "calibration/Calib.toml or another form of calibration, or videos"
+    todo = "Run Pose2Sim.calibration() first."
     raise InputError(
-        str(project),
-        expected="calibration/Calib.toml or another form of calibration, or videos",
-        found=", ".join(map(str, folders)) or "no folder called calibration",
-        todo="Run Pose2Sim.calibration() first.",
+        str(project), expected, ", ".join(map(str, folders)) or "no folder called calibration", todo
     )
 
 
@@ -287,12 +262,9 @@ def _assign(
             notes.append(f"{calibration.name} lacks {', '.join(others)}")
         return {camera: named[camera] for camera in both}
     if len(places) != len(cameras):
-        raise InputError(
-            str(places[0].parent),
-            expected=f"one for each camera in {calibration.name}: {', '.join(cameras)}",
-            found=", ".join(place.name for place in places),
-            todo="Name them after the cameras.",
-        )
+        expected = f"one for each camera in {calibration.name}: {', '.join(cameras)}"
+        found = ", ".join(place.name for place in places)
+        raise InputError(str(places[0].parent), expected, found, "Name them after the cameras.")
     pairs = dict(zip(cameras, places, strict=True))
     listed = ", ".join(f"{place.name} is {camera}" for camera, place in pairs.items())
     notes.append(f"{places[0].parent.name}: in alphabetical order, {listed}")

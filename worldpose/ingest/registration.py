@@ -120,23 +120,15 @@ def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]
     try:
         before = (folder / path).stat()
         if before.st_size == 0:
-            raise InputError(
-                str(folder / path),
-                expected="a file with content",
-                found="0 bytes",
-                todo="Copy it again, or wait until it is written.",
-            )
+            todo = "Copy it again, or wait until it is written."
+            raise InputError(str(folder / path), "a file with content", "0 bytes", todo)
         sha256 = known.get((path, before.st_size, before.st_mtime_ns))
         if sha256 is None:
             with (folder / path).open("rb") as file:
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(
-            str(folder / path),
-            expected="a readable file",
-            found=say_failure(error),
-            todo="Check its rights, or wait until it is written.",
-        ) from error
+        todo = "Check its rights, or wait until it is written."
+        raise InputError(str(folder / path), "a readable file", say_failure(error), todo) from error
     return SourceFile(path=path, size=before.st_size, modified_ns=before.st_mtime_ns, sha256=sha256)
 
 
@@ -168,9 +160,5 @@ def require_settled(states: Mapping[Path, tuple[int, int]], what: str) -> None:
         except OSError:
             same = False
         if not same:
-            raise InputError(
-                str(path),
-                expected="a finished file",
-                found="one that is still being written",
-                todo=f"Wait until it is complete, then {what}.",
-            )
+            todo = f"Wait until it is complete, then {what}."
+            raise InputError(str(path), "a finished file", "one that is still being written", todo)

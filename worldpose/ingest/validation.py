@@ -7,21 +7,19 @@ from __future__ import annotations
 
 import json
 import unicodedata
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from data_contracts.records import Record
-from worldpose.errors import InputError, say_failure
+from worldpose.errors import InputError, describe_value, say_failure
 
 R = TypeVar("R", bound=Record)
-
-_NAME_RULE: Final = "up to 64 letters, digits and . _ - with a letter or digit first"
 
 
 def validate_record(model: type[R], data: object, file: str) -> R:
@@ -39,12 +37,8 @@ def validate_record(model: type[R], data: object, file: str) -> R:
     try:
         text = json.dumps(data)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            file,
-            expected="mappings, lists, text and numbers",
-            found=say_failure(error),
-            todo="Write plain values.",
-        ) from error
+        expected = "mappings, lists, text and numbers"
+        raise InputError(file, expected, say_failure(error), "Write plain values.") from error
     try:
         # Through JSON, so that strict rules hold (no "25" for 25) yet a list is a tuple.
         return model.model_validate_json(text, strict=True)
@@ -74,7 +68,8 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     place = _place(detail["loc"])
     expected = detail["msg"].removeprefix("Input should be ")
-    found, todo = _brief(value), "Correct this value."
+    found, todo = describe_value(value), "Correct this value."
+    name_rule = "up to 64 letters, digits and . _ - with a letter or digit first"
     if kind == "extra_forbidden":
         key = str(detail["loc"][-1])
         known = _known_keys(model, detail["loc"][:-1])
@@ -86,7 +81,7 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
     elif kind == "missing":
         expected, found, todo = "a value", "nothing", "Add this key."
     elif kind == "string_pattern_mismatch":
-        expected, todo = _NAME_RULE, "Rename it."
+        expected, todo = name_rule, "Rename it."
     elif kind == "string_type" and isinstance(value, bool):
         found = f"{value}: YAML reads no, off, yes, on, true and false as truth values"
         word = "yes" if value else "no"
@@ -106,9 +101,7 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
         todo = "Use the version of worldpose that this file was written for."
     if others:
         todo += f" ({others} more to correct in this file.)"
-    return InputError(
-        f"{file}: {place}" if place else file, expected=expected, found=found, todo=todo
-    )
+    return InputError(f"{file}: {place}" if place else file, expected, found, todo)
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
@@ -116,15 +109,6 @@ def _place(loc: tuple[int | str, ...]) -> str:
     return "".join(
         f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc
     ).removeprefix(".")
-
-
-def _brief(value: object) -> str:
-    if isinstance(value, Mapping):
-        return "a mapping"
-    if isinstance(value, list | tuple):
-        return f"a list of {len(value)}"
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _known_keys(model: type[Record], loc: tuple[int | str, ...]) -> list[str]:
@@ -146,12 +130,8 @@ def require_local(name: str, where: str) -> None:
     """
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     if not posix.parts or posix.is_absolute() or windows.anchor or ".." in posix.parts:
-        raise InputError(
-            where,
-            expected="a path inside the match folder, without ..",
-            found=repr(name),
-            todo="Move or copy the file into the match folder and name it from there.",
-        )
+        todo = "Move or copy the file into the match folder and name it from there."
+        raise InputError(where, "a path inside the match folder, without ..", repr(name), todo)
 
 
 @contextmanager
@@ -164,11 +144,10 @@ def reachable(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        expected = "a match folder that this user can read"
+        todo = "Mount its disk, or give this user permission to read it."
         raise InputError(
-            str(error.filename or folder),
-            expected="a match folder that this user can read",
-            found=say_failure(error),
-            todo="Mount its disk, or give this user permission to read it.",
+            str(error.filename or folder), expected, say_failure(error), todo
         ) from error
 
 
@@ -215,28 +194,18 @@ def existing_file(folder: Path, name: str, where: str, *, folders: bool = False)
         there = path.is_file() or (folders and path.is_dir() and any(path.iterdir()))
         inside = path.resolve().is_relative_to(folder.resolve())
     except PermissionError as error:
-        raise InputError(
-            where,
-            expected="a file that this user can read",
-            found=f"{name!r}: {error.strerror}",
-            todo="Give this user permission to read it.",
-        ) from error
+        expected = "a file that this user can read"
+        todo = "Give this user permission to read it."
+        raise InputError(where, expected, f"{name!r}: {error.strerror}", todo) from error
     except (OSError, RuntimeError, ValueError):  # a loop of links, a NUL in the name
         there = False
     if not there:
-        raise InputError(
-            where,
-            expected="a file, or a folder of images" if folders else "a file",
-            found=f"no {name!r}",
-            todo="Put it there, or correct the name.",
-        )
+        expected = "a file, or a folder of images" if folders else "a file"
+        raise InputError(where, expected, f"no {name!r}", "Put it there, or correct the name.")
     if not inside:
-        raise InputError(
-            where,
-            expected="a file inside the match folder",
-            found=f"{name!r}, a link that leads out of it",
-            todo="Copy the file into the match folder.",
-        )
+        expected = "a file inside the match folder"
+        todo = "Copy the file into the match folder."
+        raise InputError(where, expected, f"{name!r}, a link that leads out of it", todo)
     return path
 
 
@@ -269,18 +238,12 @@ def files_by_unit(
         if not is_of_kind and not alone:
             continue
         if not is_of_kind or file.stem not in known:
-            raise InputError(
-                str(file),
-                expected=f"{units}: {', '.join(known) or '(none)'}",
-                found=repr(file.name),
-                todo="Rename or remove the file, or correct match.yaml.",
-            )
+            expected = f"{units}: {', '.join(known) or '(none)'}"
+            todo = "Rename or remove the file, or correct match.yaml."
+            raise InputError(str(file), expected, repr(file.name), todo)
         if file.stem in found:
-            raise InputError(
-                str(file),
-                expected=f"one file for {file.stem}",
-                found=f"{found[file.stem].name} and {file.name}",
-                todo="Remove one of them.",
-            )
+            expected = f"one file for {file.stem}"
+            todo = "Remove one of them."
+            raise InputError(str(file), expected, f"{found[file.stem].name} and {file.name}", todo)
         found[file.stem] = existing_file(folder, f"{place}/{file.name}", str(folder))
     return found

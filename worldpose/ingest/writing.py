@@ -124,12 +124,9 @@ def write_match(
     except OSError as error:
         if error.errno not in FULL:
             raise
-        raise InputError(
-            str(folder),
-            expected="space for the match folder",
-            found=say_failure(error),
-            todo="Free some, or choose another place; nothing was written.",
-        ) from error
+        expected = "space for the match folder"
+        todo = "Free some, or choose another place; nothing was written."
+        raise InputError(str(folder), expected, say_failure(error), todo) from error
     sync_path(folder.parent)
 
 
@@ -138,12 +135,9 @@ def _require_known(spec: MatchSpec, names: list[str]) -> None:
     known = [*dict.fromkeys((*named, *spec.broadcast_views))]
     for name in names:
         if name not in known:
-            raise InputError(
-                f"match {spec.match_id}",
-                expected=f"data of its cameras and clips: {', '.join(known)}",
-                found=repr(name),
-                todo="Add the camera to the match, or leave its data out.",
-            )
+            expected = f"data of its cameras and clips: {', '.join(known)}"
+            todo = "Add the camera to the match, or leave its data out."
+            raise InputError(f"match {spec.match_id}", expected, repr(name), todo)
 
 
 def _still_name(spec: MatchSpec, camera_id: str) -> str:
@@ -154,12 +148,9 @@ def _make_parent(folder: Path) -> None:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            str(folder),
-            expected="a place where a folder can be made",
-            found=say_failure(error),
-            todo="Choose another place.",
-        ) from error
+        expected = "a place where a folder can be made"
+        todo = "Choose another place."
+        raise InputError(str(folder), expected, say_failure(error), todo) from error
 
 
 def _require_empty(folder: Path) -> None:
@@ -169,12 +160,8 @@ def _require_empty(folder: Path) -> None:
         found = "a folder with files in it"
     else:
         return
-    raise InputError(
-        str(folder),
-        expected="nothing, or an empty folder",
-        found=found,
-        todo="Choose another name, or remove it first; it was left as it was.",
-    )
+    todo = "Choose another name, or remove it first; it was left as it was."
+    raise InputError(str(folder), "nothing, or an empty folder", found, todo)
 
 
 def _yaml(spec: MatchSpec) -> str:
@@ -190,12 +177,9 @@ def _yaml(spec: MatchSpec) -> str:
 
 def _write_pitch(folder: Path, spec: MatchSpec, pitch: PitchSpec) -> None:
     if spec.pitch == NO_PITCH:
-        raise InputError(
-            "match.yaml: pitch",
-            expected="a pitch file's name, or nothing, where a pitch is given",
-            found=repr(NO_PITCH),
-            todo="Give no pitch, or take `pitch: none` out.",
-        )
+        expected = "a pitch file's name, or nothing, where a pitch is given"
+        todo = "Give no pitch, or take `pitch: none` out."
+        raise InputError("match.yaml: pitch", expected, repr(NO_PITCH), todo)
     path = folder / (spec.pitch or "pitch.json")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -234,12 +218,8 @@ def write_offsets(folder: Path, offsets: Mapping[str, ClockOffset]) -> None:
         before = ", " if camera.flow_style else "\n" + " " * column
         edits.append((at, at, f"{before}offset_frames: {number}"))
     if missing:
-        raise InputError(
-            str(file),
-            expected=f"the cameras {', '.join(missing)}",
-            found="others",
-            todo="Correct the names.",
-        )
+        todo = "Correct the names."
+        raise InputError(str(file), f"the cameras {', '.join(missing)}", "others", todo)
     for start, stop, number in sorted(edits, reverse=True):
         text = text[:start] + number + text[stop:]
     validate_record(MatchSpec, yaml.safe_load(text), str(file))
@@ -263,12 +243,9 @@ def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> d
     open_to = {name for name in match.videos if name not in match.detections}
     known = sorted(name for name in match.boxes if (boxes / f"{name}.txt").exists())
     if known:
-        raise InputError(
-            str(folder / "boxes" / f"{known[0]}.txt"),
-            expected=f"no boxes of {known[0]} yet",
-            found="a file",
-            todo="Remove it first.",
-        )
+        expected = f"no boxes of {known[0]} yet"
+        todo = "Remove it first."
+        raise InputError(str(folder / "boxes" / f"{known[0]}.txt"), expected, "a file", todo)
     asked = [file.stem for file in sorted(boxes.glob("*.txt"))]
     indices = {name: index_video(match.videos[name]) for name in asked if name in open_to}
     return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder, notes)

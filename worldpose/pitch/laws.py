@@ -99,13 +99,11 @@ class Markings:
             )
 
 
-_RING = (("left", "near"), ("right", "near"), ("right", "far"), ("left", "far"))
-
-
 def _spread(name: str) -> Iterator[tuple[float, float, Callable[[str], str]]]:
     """Yield the signs of x and y of every side and end that a name stands for, and the names."""
     seen = set()
-    for side, end in _RING:
+    corners = (("left", "near"), ("right", "near"), ("right", "far"), ("left", "far"))
+    for side, end in corners:
         named = functools.partial(str.format, side=side, end=end)
         if named(name) not in seen:
             seen.add(named(name))

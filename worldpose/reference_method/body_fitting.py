@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,17 +11,10 @@ from torch import Tensor
 from torch.func import jacrev
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17_HIPS, COCO17_RIGID_BONES, COCO17_TORSO
 from worldpose.body.differentiable import DifferentiableBody
 from worldpose.geometry.rigid import Rigid, align
 from worldpose.reference_method.cameras import TensorCameras
-
-TORSO: Final = (5, 6, 11, 12)
-"""Shoulders and hips of COCO-17, the keypoints of the root alignment."""
-HIPS: Final = (11, 12)
-BONES: Final = (
-    *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),
-)
-"""Bones of COCO-17 whose length no pose changes."""
 
 
 class Omega(NamedTuple):
@@ -59,7 +52,7 @@ def fit_shape(body: DifferentiableBody, joints: Floats) -> Floats:
         body: with the keypoints of COCO-17.
         joints: (frames, 17, 3) P [m]; NaN where missing.
     """
-    first, second = np.array(BONES).T
+    first, second = np.array(COCO17_RIGID_BONES).T
 
     def lengths(betas: Tensor) -> Tensor:
         still = (betas.new_zeros(size) for size in (3, 69, 3))
@@ -90,10 +83,10 @@ def align_root(body: DifferentiableBody, start: Omega, joints: Floats) -> Omega:
         joints: (frames, 17, 3) P [m], world. A frame with fewer than three of these keypoints takes
             the root of the nearest frame with them; one frame has them at least.
     """
-    torso = joints[:, TORSO]
+    torso = joints[:, COCO17_TORSO]
     usable = np.flatnonzero(np.isfinite(torso[..., 0]).sum(-1) >= 3)
     nearest = usable[np.abs(np.arange(len(joints))[:, None] - usable).argmin(axis=1)]
-    own = body.keypoints(*start)[:, TORSO].numpy()
+    own = body.keypoints(*start)[:, COCO17_TORSO].numpy()
     motion = align(own[nearest], torso[nearest], with_scale=False)
     # theta_r turns the body about its pelvis.
     pelvis = body.joints(*start)[:, 0].numpy()
@@ -113,8 +106,8 @@ def align_keypoints(cameras: TensorCameras, image: Tensor, joints: Tensor) -> Te
         image: (frames, cameras, 17, 2) p [px]; NaN where not seen.
         joints: (frames, 17, 3) P, triangulated [m], world; NaN where missing.
     """
-    middle = cameras.project(joints[:, HIPS].mean(1)[:, None])
-    return image - image[:, :, HIPS].mean(2, keepdim=True) + middle[:, :, None]
+    middle = cameras.project(joints[:, COCO17_HIPS].mean(1)[:, None])
+    return image - image[:, :, COCO17_HIPS].mean(2, keepdim=True) + middle[:, :, None]
 
 
 def data_energy(joints: Tensor, cameras: TensorCameras, aligned: Tensor) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import torch
 from torch import Tensor
 
@@ -11,20 +9,13 @@ from data_contracts.arrays import Floats, Integers
 from worldpose.geometry.cameras import Camera
 from worldpose.reference_method.cameras import TensorCameras
 
-FIELD_WEIGHT: Final = 1.0
-"""lambda_4."""
-PLAYER_WEIGHT: Final = 0.5
-"""lambda_5."""
-RATE: Final = 1e-3
-"""Adam's learning rate."""
-SCALE_PX: Final = 100.0
-"""Scale of the Geman-McClure function, that of SMPLify-X [px]; the paper gives none."""
-
 
 def robust(off: Tensor) -> Tensor:
     """Return Geman and McClure's rho(x) = x^2 / (1 + x^2 / c^2) (n,) of errors (n, 2) [px]."""
     squared = off.square().sum(-1)
-    return squared / (1.0 + squared / SCALE_PX**2)
+    # Scale of the Geman-McClure function, that of SMPLify-X [px]; the paper gives none.
+    scale_px = 100.0
+    return squared / (1.0 + squared / scale_px**2)
 
 
 def energy(cameras: TensorCameras, points: Tensor, image: Tensor, frame: Tensor) -> Tensor:
@@ -64,12 +55,18 @@ def refine(
     def values() -> Tensor:
         return torch.cat([part.expand(len(focal), -1) for part in moving], dim=1)
 
-    solver = torch.optim.Adam(moving, lr=RATE)
+    # Adam's learning rate.
+    rate = 1e-3
+    solver = torch.optim.Adam(moving, lr=rate)
     markings, people = (tuple(torch.tensor(each) for each in term) for term in (field, players))
+    # lambda_4.
+    field_weight = 1.0
+    # lambda_5.
+    player_weight = 0.5
     for _ in range(iterations):
         solver.zero_grad()
         moved = cameras.with_values(values())
-        total = FIELD_WEIGHT * energy(moved, *markings) + PLAYER_WEIGHT * energy(moved, *people)
+        total = field_weight * energy(moved, *markings) + player_weight * energy(moved, *people)
         total.backward()
         solver.step()
     return cameras.with_values(values().detach()).camera()

@@ -47,7 +47,7 @@ def reprojection_error(cameras: TensorCameras, points: Tensor, seen: Views) -> T
     return off.square().sum().nan_to_num(torch.inf)
 
 
-def adjust(
+def minimize_reprojection(
     cameras: TensorCameras,
     points: Tensor,
     seen: Views,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
 
 import cv2
 import numpy as np
@@ -16,12 +15,9 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.reference_method.cameras import K1_K2, TensorCameras
-from worldpose.reference_method.reprojection import Views, adjust
+from worldpose.reference_method.reprojection import Views, minimize_reprojection
 from worldpose.static_calibration.initialization import camera_from_homography, plane_from_image
 from worldpose.static_calibration.report import StaticCalibration
-
-NEAR_PX: Final = 15
-"""Edges farther than this from the projected markings are "uninteresting lines" [px]."""
 
 
 def camera_from_plane(points: Floats, image: Floats, image_size: tuple[int, int]) -> Camera:
@@ -69,7 +65,9 @@ def refine_on_points(start: Camera, points: Floats, image: Floats) -> Camera:
     cameras, every = TensorCameras.of(Camera.stack([start])), torch.arange(len(points))
     seen = Views(every, torch.zeros_like(every), torch.tensor(image))
     still = torch.zeros(len(points), dtype=torch.bool)
-    return adjust(cameras, torch.tensor(points), seen, still, K1_K2).cameras.camera()[0]
+    return minimize_reprojection(
+        cameras, torch.tensor(points), seen, still, K1_K2
+    ).cameras.camera()[0]
 
 
 def distance_map(picture: Image, camera: Camera, points: Floats) -> NDArray[np.float32]:
@@ -88,8 +86,10 @@ def distance_map(picture: Image, camera: Camera, points: Floats) -> NDArray[np.f
     near = np.zeros_like(grey)
     pixels = camera.project(points)
     inside = ((pixels >= 0.0) & (pixels <= camera.image_size - 1.0)).all(axis=-1)
+    # Edges farther than this from the projected markings are "uninteresting lines" [px].
+    near_px = 15
     for x, y in np.rint(pixels[inside]).astype(int).tolist():
-        cv2.circle(near, (x, y), NEAR_PX, 255, -1)
+        cv2.circle(near, (x, y), near_px, 255, -1)
     away = cv2.distanceTransform(255 - cv2.bitwise_and(edges, near), cv2.DIST_L2, 5)
     return np.asarray(away, dtype=np.float32)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import cv2
 import numpy as np
@@ -25,11 +24,6 @@ from worldpose.geometry.rasters import (
     resolve,
 )
 from worldpose.reports.drawing import WIDTH, draw_label, markings, person_color, picture_panels, png
-
-_SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
-"""Direction to the light, world: high, from the main camera's side."""
-_FACING: Final = 0.25
-"""Shares of ambient light, sunlight and light from the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +124,12 @@ def _light(
     a, b, c = (surface[faces[:, k]] for k in range(3))
     normals = _unit(corners @ np.cross(b - a, c - a))
     facing = np.einsum("vc,vc->v", normals, _unit(eye - surface))
-    sun = normals @ _unit(_SUN)
-    light = ambient + sunlit * np.maximum(sun, 0.0) + _FACING * np.maximum(facing, 0.0)
+    # Direction to the light, world: high, from the main camera's side.
+    to_sun = np.array([0.35, -0.45, 0.82], dtype=np.float32)
+    sun = normals @ _unit(to_sun)
+    # Shares of ambient light, sunlight and light from the camera.
+    shares = 0.25
+    light = ambient + sunlit * np.maximum(sun, 0.0) + shares * np.maximum(facing, 0.0)
     return np.asarray(light, dtype=np.float32)
 
 
@@ -139,9 +137,6 @@ def _unit(vectors: Singles) -> Singles:
     """Return vectors (..., 3) normalized to length 1."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, np.float32(1e-12)), dtype=np.float32)
-
-
-_GROUND: Final = (206, 217, 202)
 
 
 def plot_bodies(
@@ -212,7 +207,8 @@ def _background(
         return np.asarray(
             cv2.warpAffine(still, part, (width, height), flags=flags, borderMode=edge), np.uint8
         )
-    canvas: Image = np.full((height, width, 3), _GROUND, dtype=np.uint8)
+    ground = (206, 217, 202)
+    canvas: Image = np.full((height, width, 3), ground, dtype=np.uint8)
     for line in markings(pitch) if pitch is not None else ():
         pixels = camera.project(line)
         # Points far outside do not fit into 32 bits, and are not visible.

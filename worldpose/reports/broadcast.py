@@ -26,9 +26,6 @@ from worldpose.reports.drawing import (
     style,
 )
 
-_STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
-"""Indices into the covariance of a frame's step."""
-
 
 def plot_camera_course(
     frame: Integers,
@@ -48,8 +45,10 @@ def plot_camera_course(
     curves = _curves(camera)
     rough = {} if before is None else _curves(before)
     tilt = curves["tilt [deg]"]
+    # Indices into the covariance of a frame's step.
+    step = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
     with np.errstate(invalid="ignore"):
-        spread = {name: np.sqrt(covariance[:, k, k]) for name, k in _STEP.items()}
+        spread = {name: np.sqrt(covariance[:, k, k]) for name, k in step.items()}
         turned = np.degrees(spread["ry"]) / np.cos(np.radians(tilt))
     focal = camera.focal[:, 0]
     deviations = (

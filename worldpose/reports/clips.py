@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,13 +13,13 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Image
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import crowded_part
 from worldpose.reports.drawing import (
     GRASS,
-    HIPS,
     INK,
     LINE,
     PALE,
@@ -98,7 +98,7 @@ def plot_paths(
 
 def _ground(tracks: JointTracks) -> Floats:
     """Return mid-hips on the ground (frames, persons, 2) [m]."""
-    middle: Floats = tracks.joints[..., HIPS, :2].mean(axis=-2)
+    middle: Floats = tracks.joints[..., COCO17_HIPS, :2].mean(axis=-2)
     return middle
 
 
@@ -109,10 +109,6 @@ def _frame(points: Floats, margin: float) -> tuple[Floats, Floats]:
     half = np.maximum(half, [half[1] * 4.0 / 3.0, half[0] * 3.0 / 4.0])
     middle = 0.5 * (low + high)
     return middle - half, middle + half
-
-
-VIEW_LENGTH_M: Final = 130.0
-"""Length of a drawn field of view [m]: a little more than a pitch's length."""
 
 
 def plot_camera_view(
@@ -148,7 +144,7 @@ def plot_stadium(
     Shading shows the ground in each single camera's field of view, on and near the pitch if there
     is one: the more cameras see a place, the darker it is.
     """
-    hips = tracks.joints[0][:, HIPS, :2].mean(axis=1)
+    hips = tracks.joints[0][:, COCO17_HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
         places.append(pitch_corners(pitch))
@@ -192,7 +188,7 @@ def plot_stadium(
 
 
 def visible_ground(camera: Camera) -> Floats:
-    """Return corners (n, 2) [m] of the ground in a camera's field of view, to `VIEW_LENGTH_M`.
+    """Return corners (n, 2) [m] of the ground in a camera's field of view, to 130 m.
 
     The ground is the plane z = 0, world.
     """
@@ -204,19 +200,15 @@ def visible_ground(camera: Camera) -> Floats:
     directions = camera.unproject(border).directions
     directions = directions[np.isfinite(directions[:, 0])]
     flat = np.linalg.norm(directions[:, :2], axis=-1)
+    # Length of a drawn field of view [m]: a little more than a pitch's length.
+    view_length_m = 130.0
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -camera.center[2] / directions[:, 2] * flat
         # Rays that go up never meet the ground: clip them to the drawn length.
         distance = np.where(
-            (directions[:, 2] < 0.0) & (distance < VIEW_LENGTH_M), distance, VIEW_LENGTH_M
+            (directions[:, 2] < 0.0) & (distance < view_length_m), distance, view_length_m
         )
         return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])
-
-
-USED: Final = PALETTE[5]
-LEFT_OUT: Final = PALETTE[1]
-FLOOR: Final = "#f6f6f6"
-"""Colour of the ground without a pitch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,10 +258,14 @@ def plot_detections(
     if part is None:
         titles[0] += f": {int(there.sum())}"
         titles[1] += f": {int(found.sum())} people"
-    ground = GRASS if pitch is not None else FLOOR
+    # Colour of the ground without a pitch.
+    floor = "#f6f6f6"
+    ground = GRASS if pitch is not None else floor
     figure, (before, after) = picture_panels(titles, corner, side, still=still, ground=ground)
+    used = PALETTE[5]
+    left_out = PALETTE[1]
     for number in np.flatnonzero(there):
-        color = USED if number in detections.used else LEFT_OUT
+        color = used if number in detections.used else left_out
         _box(before, boxes[number], color)
         draw_skeleton(before, detections.keypoints[number], color)
     draw_markings(after, camera, pitch, LINE if still is None else TEMPLATE)

@@ -161,11 +161,6 @@ def _number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-BINS = 20
-"""Maximum bars of a histogram, of one round width."""
-_BAR = "#3d6fa3"
-
-
 def plot_statistics(statistics: DataSetStatistics) -> bytes:
     """Return a PNG with the histograms of trajectory lengths and of clip lengths."""
     ways = [way for clip in statistics.clips.values() for way in clip.trajectories_m]
@@ -191,15 +186,18 @@ def bin_edges(values: Sequence[float]) -> Floats:
     top = max(values, default=0.0)
     if top <= 0.0:
         return np.array([0.0, 1.0])
-    power = 10.0 ** np.floor(np.log10(top / BINS))
-    width = next(power * step for step in (1.0, 2.0, 5.0, 10.0) if power * step * BINS >= top)
+    # Maximum bars of a histogram, of one round width.
+    max_bars = 20
+    power = 10.0 ** np.floor(np.log10(top / max_bars))
+    width = next(power * step for step in (1.0, 2.0, 5.0, 10.0) if power * step * max_bars >= top)
     edges: Floats = np.arange(np.floor(top / width) + 2.0) * width
     return edges
 
 
 def _histogram(axes: Axes, values: Sequence[float], title: str, count: str) -> None:
     style(axes)
-    axes.hist(values, bins=bin_edges(values).tolist(), color=_BAR, edgecolor="white")
+    bar = "#3d6fa3"
+    axes.hist(values, bins=bin_edges(values).tolist(), color=bar, edgecolor="white")
     axes.set_xlabel(title, color=INK)
     axes.set_ylabel(count, color=INK)
     axes.grid(axis="y", color=PALE, linewidth=0.6)

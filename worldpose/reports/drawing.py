@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from worldpose.static_calibration.boards import LensFit
     from worldpose.triangulation.synchronization import Synchronization
 
-PLOTS: Final = (".svg", ".pdf", ".png")
-"""Forms of a plot."""
 PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
 """One colour per person, after Okabe and Ito: distinguishable with any colour vision."""
 
@@ -53,12 +51,6 @@ TEMPLATE: Final = "#ffd54a"
 HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 WIDTH: Final = 1540
 """Width of a figure [px]."""
-_TITLE: Final = 32
-"""Height of the titles above panels [px]."""
-_GAP: Final = 14
-"""Distance between panels [px]."""
-HIPS: Final = (11, 12)
-"""Indices of the hips in COCO-17; their middle is a person's position from above."""
 _kept: ContextVar[dict[bytes, Figure] | None] = ContextVar("kept", default=None)
 
 
@@ -148,13 +140,17 @@ def picture_panels(
     """
     dpi = 110  # resolution of a figure [px/in]
     (left, top), (across, down) = np.asarray(corner, float), np.asarray(side, float)
-    width = (WIDTH - _GAP * (len(titles) - 1)) / len(titles)
+    # Distance between panels [px].
+    gap = 14
+    width = (WIDTH - gap * (len(titles) - 1)) / len(titles)
     height = round(width * down / across)
-    whole = _TITLE + height + below
+    # Height of the titles above panels [px].
+    title_height = 32
+    whole = title_height + height + below
     figure = Figure(figsize=(WIDTH / dpi, whole / dpi), dpi=dpi, facecolor="white")
     panels = []
     for number, title in enumerate(titles):
-        start = number * (width + _GAP)
+        start = number * (width + gap)
         axes = figure.add_axes(
             (start / WIDTH, below / whole, width / WIDTH, height / whole),
             xlim=(left, left + across),
@@ -371,10 +367,12 @@ def _columns(names: Sequence[str], rows: ArrayLike) -> dict[str, list[float | No
 
 def require_plot(path: Path) -> None:
     """Raise UsageError unless a file name has the suffix of a plot."""
-    if path.suffix.lower() not in PLOTS:
+    # Forms of a plot.
+    forms = (".svg", ".pdf", ".png")
+    if path.suffix.lower() not in forms:
         raise UsageError(
             str(path),
-            expected=f"a file name that ends with {', '.join(PLOTS)}",
+            expected=f"a file name that ends with {', '.join(forms)}",
             found=repr(path.suffix),
             todo="Rename it.",
         )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from itertools import count
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 
 @dataclass(frozen=True)
@@ -229,9 +229,6 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return '<div class="table"><table>\n' + "\n".join(lines) + "\n</table></div>"
 
 
-LARGE: Final = 200_000
-"""Size of a PNG [byte] from which it counts as a photograph, not a plot."""
-
 SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 """Kind, content, and size (width, height) [px] of an image."""
 
@@ -243,7 +240,9 @@ def compress_image(png: bytes) -> SmallImage:
     effort = 2
     quality = 88  # webP quality that keeps lines of one pixel sharp
     size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
-    if len(png) < LARGE:
+    # Size of a PNG [byte] from which it counts as a photograph, not a plot.
+    photograph_bytes = 200_000
+    if len(png) < photograph_bytes:
         return "png", png, size
     from PIL import Image  # late: pages without large images do not need it
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +16,6 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import markings, person_color, rgb
-
-NAME: Final = "worldpose"
 
 
 def write_recording(
@@ -47,8 +45,9 @@ def write_recording(
             found="none installed",
             todo="Install it: pip install 'worldpose[rerun]'.",
         ) from None
+    application = "worldpose"
     with whole_file(path) as draft:
-        stream = rr.RecordingStream(NAME, recording_id=path.stem)
+        stream = rr.RecordingStream(application, recording_id=path.stem)
         stream.save(draft)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         lines = [] if pitch is None else markings(pitch)

@@ -29,7 +29,6 @@ from worldpose.reports.drawing import (
 )
 
 ACCEPTED: Final = "#0072b2"
-REFUSED: Final = "#d55e00"
 
 MAP_HEIGHT: Final = 790
 """Height of the map of expected errors in its figure [px]."""
@@ -115,8 +114,9 @@ def plot_calibration(
     if error_map is not None:
         _draw_error_map(figure, error_map, pitch)
     draw_markings(axes, camera, pitch, LINE if still is None else TEMPLATE)
+    refused = "#d55e00"
     for click in clicks:
-        sign, color = ("o", ACCEPTED) if click.inlier else ("x", REFUSED)
+        sign, color = ("o", ACCEPTED) if click.inlier else ("x", refused)
         axes.plot(
             *click.place,
             sign,
@@ -129,7 +129,7 @@ def plot_calibration(
         )
         if not click.inlier:
             x, y = click.place
-            draw_label(axes, click.name, (float(x), float(y)), (9, 7), REFUSED)
+            draw_label(axes, click.name, (float(x), float(y)), (9, 7), refused)
     return png(figure)
 
 

@@ -18,10 +18,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks, paint_bodies, zoom_camera
 from worldpose.reports.drawing import GRASS, INK, LINE, TEMPLATE, markings, person_color, rgb
 
-_PARTS: Final = 16
-"""Subpixel steps of line coordinates per pixel."""
-_MARGIN: Final = 0.1
-"""Margin around the image within which joints count as visible, in image widths [1]."""
 PIXELS_PER_M: Final = 10.0
 """Scale of the pitch from above [px/m]."""
 MARGIN_M: Final = 5.0
@@ -78,8 +74,10 @@ def _paint(
     embodied = set(bodies.person_ids[np.isfinite(poses.transl).all(axis=-1)].tolist())
     size = np.asarray(camera.image_size)
     pixels = camera.project(joints)
+    # Margin around the image within which joints count as visible, in image widths [1].
+    margin = 0.1
     with np.errstate(invalid="ignore"):
-        near = (pixels > -_MARGIN * size[0]) & (pixels < size + _MARGIN * size[0])
+        near = (pixels > -margin * size[0]) & (pixels < size + margin * size[0])
     seen = embodied & set(person_ids[near.all(axis=-1).any(axis=-1)].tolist())
     who = np.flatnonzero(np.isin(bodies.person_ids, list(seen)))
     if len(who):
@@ -96,9 +94,11 @@ def _draw(canvas: Image, pixels: Floats, color: tuple[int, int, int]) -> None:
         near = (np.abs(pixels) < far * canvas.shape[1]).all(axis=-1)
     begins = np.flatnonzero(near & ~np.append(False, near[:-1]))
     ends = np.flatnonzero(near & ~np.append(near[1:], False)) + 1
+    # Subpixel steps of line coordinates per pixel.
+    steps_per_pixel = 16
     for begin, end in zip(begins, ends, strict=True):
-        whole = np.rint(_PARTS * pixels[begin:end]).astype(np.int32)
-        shift = _PARTS.bit_length() - 1
+        whole = np.rint(steps_per_pixel * pixels[begin:end]).astype(np.int32)
+        shift = steps_per_pixel.bit_length() - 1
         cv2.polylines(canvas, [whole], False, color, 1, cv2.LINE_AA, shift)
 
 

@@ -265,11 +265,6 @@ def _span(rays: Rays) -> tuple[float, float] | None:
     return span if span[0] < span[1] else None
 
 
-MARGIN = 0.25
-"""Margin beyond the image for drawn markings, relative to its size [1]: far outside, unconstrained
-distortion may fold them back."""
-
-
 @dataclass(frozen=True, eq=False)
 class PitchDrawing:
     """A pitch with cached sample points for repeated drawing.
@@ -298,9 +293,12 @@ class PitchDrawing:
         """Return polylines (n, 2) [px] of every marking in or near the image, by name."""
         stacked = camera.project(np.concatenate(list(self.markings.values())))
         found, begin = {}, 0
+        # Margin beyond the image for drawn markings, relative to its size [1]: far outside,
+        # unconstrained distortion may fold them back.
+        margin = 0.25
         for name, points in self.markings.items():
             end = begin + len(points)
-            near = _is_in_or_near(stacked[begin:end], camera.image_size, MARGIN)
+            near = _is_in_or_near(stacked[begin:end], camera.image_size, margin)
             pieces = _runs(stacked[begin:end], near)
             begin = end
             if pieces:

@@ -31,12 +31,8 @@ from worldpose.store.paths import checked_name
 from worldpose.store.store import Store
 
 _ENTRY = re.compile(r"(\d{6,})\.json")
-READERS = 8
-"""Number of parallel readers: in object storage each entry is a separate request."""
 MOST_KEPT = 50
 """Journals that a process keeps, those read last."""
-BATCH = 64
-"""Entries that one reader fetches in a row."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +155,12 @@ def _contents(store: Store, match_id: str, numbers: Sequence[int]) -> list[tuple
     def read(some: Sequence[int]) -> list[tuple[int, bytes]]:
         return [(number, store.blobs.read(_path(match_id, number)) or b"") for number in some]
 
-    batches = [numbers[first : first + BATCH] for first in range(0, len(numbers), BATCH)]
-    with ThreadPoolExecutor(READERS) as pool:
+    # Entries that one reader fetches in a row.
+    batch_size = 64
+    batches = [numbers[first : first + batch_size] for first in range(0, len(numbers), batch_size)]
+    # Number of parallel readers: in object storage each entry is a separate request.
+    reader_count = 8
+    with ThreadPoolExecutor(reader_count) as pool:
         return [each for some in pool.map(read, batches) for each in some]
 
 

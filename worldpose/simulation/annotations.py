@@ -19,11 +19,6 @@ from worldpose.simulation.settings import CalibrationErrors, ClickSettings
 
 BORDER: Final = 4.0
 """Minimum distance of clicks from the image border [px]."""
-SHORT: Final = 60.0
-"""Markings with a shorter visible part are not drawn [px]."""
-FLAT: Final = 2.0
-"""Points that spread less than this across their common direction [m] are collinear. If all but one
-are, calibration is impossible, so the user must add others."""
 CONFUSED: Final = (
     ("near", "far"),
     ("front", "back"),
@@ -149,7 +144,10 @@ def _is_spread_out(places: Floats) -> bool:
         return False
     rest = np.array([np.delete(places[:, :2], one, axis=0) for one in range(len(places))])
     across = np.linalg.svd(rest - rest.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
-    return bool(across.min() > FLAT)
+    # Points that spread less than this across their common direction [m] are collinear. If all but
+    # one are, calibration is impossible, so the user must add others.
+    min_spread_m = 2.0
+    return bool(across.min() > min_spread_m)
 
 
 def _make_mistake(
@@ -195,9 +193,11 @@ def _draw_markings(
     pixels = camera.project(samples.points_world)
     visible = _are_visible(camera, samples.points_world, pixels, _person_boxes(camera, people))
     drawn = []
+    # Markings with a shorter visible part are not drawn [px].
+    min_length_px = 60.0
     for marking, name in enumerate(samples.names):
         seen = pixels[visible & (samples.marking == marking)]
-        if len(seen) < 2 or np.ptp(seen, axis=0).max() < SHORT:
+        if len(seen) < 2 or np.ptp(seen, axis=0).max() < min_length_px:
             continue
         # Clicks are at about even steps, wherever a sample is near.
         steps = np.linspace(0.0, len(seen) - 1.0, 8).round().astype(int)
@@ -211,10 +211,6 @@ def _place_click(camera: Camera, xy: Floats) -> tuple[float, float]:
     """Return a click in the image in annotation tools' precision, a hundredth of a pixel."""
     x, y = np.clip(xy, 0.0, camera.image_size - 1.0)
     return round(float(x), 2), round(float(y), 2)
-
-
-COMPARED_FRAMES: Final = 5
-"""Frames that a person compares for one key frame [1]."""
 
 
 def click_key_frames(
@@ -235,8 +231,10 @@ def click_key_frames(
     frames = len(people)
     drawing = settings.model_copy(update={"enough": len(pitch.points) + 1})
     picked: dict[int, Clicks] = {}
+    # Frames that a person compares for one key frame [1].
+    compared_frames = 5
     for middle in np.linspace(0.0, frames - 1.0, count):
-        around = middle + search_range * frames * np.linspace(-1.0, 1.0, COMPARED_FRAMES)
+        around = middle + search_range * frames * np.linspace(-1.0, 1.0, compared_frames)
         looks = {
             int(frame): click(
                 cameras[int(frame)],

@@ -30,8 +30,6 @@ STRIDES: Final = (
     (0.91, 1.0, 1.10, 1.26, 1.36, 1.43, 1.53, 1.68, 1.85, 2.2),
 )
 """Speeds [m/s] and strides per second at them: walkers up to 2 m/s, runners beyond."""
-STANDING_SPEED: Final = 0.25
-"""Slower people stand [m/s]."""
 
 
 def walk(
@@ -128,8 +126,10 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
 
 def _rest_samples(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
     """Return the intervals of samples, first and behind the last, in which a person stands."""
-    standing_time = 0.3  # A person who is slower than `STANDING_SPEED` for this time stands [s]
-    slow = np.concatenate([[False], pace < STANDING_SPEED, [False]])
+    standing_time = 0.3  # A person who is slower than `standing_speed` for this time stands [s]
+    # Slower people stand [m/s].
+    standing_speed = 0.25
+    slow = np.concatenate([[False], pace < standing_speed, [False]])
     begins, ends = np.flatnonzero(~slow[:-1] & slow[1:]), np.flatnonzero(slow[:-1] & ~slow[1:])
     long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= standing_time
     return [(int(a), int(b)) for a, b in zip(begins[long], ends[long], strict=True)]

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from data_contracts.arrays import Flags, Floats
-from data_contracts.conventions import COCO17, COCO17_SIGMAS
+from data_contracts.conventions import COCO17, COCO17_FLIP, COCO17_SPREAD, COCO17_TORSO
 from data_contracts.records import Record
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.body.occlusions import TRUNK, facing_axes, find_hiders
+from worldpose.body.occlusions import facing_axes, find_hiders
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
@@ -70,7 +70,7 @@ def project_bodies(
 
     pixels = project(joints)
     inside = (pixels >= -0.5) & (pixels <= camera.image_size.reshape(-1, 1, 1, 2) - 0.5)
-    middle = joints[..., TRUNK, :].mean(axis=-2)
+    middle = joints[..., COCO17_TORSO, :].mean(axis=-2)
     depth = camera.cam_from_world.apply(middle)[..., 2]
     focal = camera.focal.mean(axis=-1)[..., None]
     size = focal * heights / np.where(depth > 0.0, depth, np.nan)
@@ -85,15 +85,6 @@ def project_bodies(
     )
 
 
-DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
-"""Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
-MIRRORED: Final = np.array(
-    [
-        COCO17.index(name.replace("left", "*").replace("right", "left").replace("*", "right"))
-        for name in COCO17
-    ]
-)
-"""The same joint on the other side."""
 FLOOR: Final = 0.5
 """Added to white errors in squares [px]: the limit of a heatmap's grid."""
 POSTURES: Final = 12.0
@@ -126,7 +117,7 @@ class Detector:
     ) -> Detector:
         """Return a detector whose systematic errors are drawn."""
         joint_bias = rng.standard_normal((17, 3))
-        for joint, mirror in enumerate(MIRRORED):
+        for joint, mirror in enumerate(COCO17_FLIP):
             if _SIDE[joint] < 0.0:
                 joint_bias[joint] = joint_bias[mirror] * [1.0, -1.0, 1.0]
         joint_bias[_SIDE == 0.0, 1] = 0.0
@@ -188,7 +179,7 @@ class Detector:
         noise, fps = self.scenario.noise, self.scenario.fps
         pixels, size, hider = projections.keypoints, projections.size, projections.hider
         hidden, shape = hider >= 0, hider.shape
-        spread = size[..., None] * DIFFICULTY
+        spread = size[..., None] * np.array(COCO17_SPREAD)
         error = self._draw_errors(pixels, spread, rng)
         error *= (1.0 + hidden)[..., None]  # guessed from the rest of the body
         far = np.linalg.norm(error, axis=-1) / size[..., None]
@@ -224,7 +215,7 @@ class Detector:
         lost |= outside | (missed | overlapped | few)[..., None]
         swapped = _draw_bursts_by_size(noise.swapped, 0.15, small, fps, rng)
         for array in (keypoints, lost, confidence, thrown):
-            array[swapped] = array[swapped][:, MIRRORED]
+            array[swapped] = array[swapped][:, COCO17_FLIP]
         keypoints[lost], confidence[lost] = np.nan, np.nan
         return keypoints, confidence, thrown & ~lost, np.where(merges, hider.max(axis=-1), -1)
 

@@ -16,8 +16,6 @@ from worldpose.body.body_file import load_open_body
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.simulation.settings import PATTERNS, CrowdSettings, Pattern
 
-CELL: Final = 0.03
-"""Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px."""
 TEXEL: Final = 0.0125
 """Texel of a kit's textures [m]: a pixel of a person of 150 px."""
 LEFT, TOP, SIZE = -0.96, 0.68, 154
@@ -140,7 +138,9 @@ def _cluster_vertices(vertices: Floats, faces: Integers) -> tuple[Integers, Inte
     No cell crosses the middle of the body, so legs stay apart.
     """
     hand = 0.76  # fingers are beyond that x of the T-pose; they become one mitten [m]
-    size = np.where(np.abs(vertices[:, :1]) > hand, 2.0 * CELL, CELL)
+    # Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px.
+    cell_m = 0.03
+    size = np.where(np.abs(vertices[:, :1]) > hand, 2.0 * cell_m, cell_m)
     key = np.concatenate([np.floor(vertices / size), size], axis=1)
     _, cell = np.unique(key, axis=0, return_inverse=True)
     cell = cell.ravel()

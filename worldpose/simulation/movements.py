@@ -22,12 +22,8 @@ REACTION: Final = 0.25
 """Time constant of a wished change of velocity [s]."""
 KEEN: Final = 2.5
 """Maximum speed per metre to the target [1/s]."""
-FACING_SPEED: Final = 0.8
-"""Slower people face the ball and step aside or back [m/s]."""
 TOP_SPEED: Final = 9.2
 """[m/s]"""
-SMOOTHING: Final = 0.06
-"""Standard deviation of the smoothing of paths in time [s]: acceleration takes a moment."""
 
 Wish = Callable[[int, Floats, Floats], tuple[Floats, Floats, Floats]]
 """Targets (people, 2) [m], top speeds (people,) [m/s] and what people face (2,) or (people, 2) [m],
@@ -49,11 +45,13 @@ def _steer(
     position, velocity = start.copy(), np.zeros((count, 2))
     places, headings = np.empty((len(time), count, 2)), np.empty((len(time), count))
     heading = np.zeros(count)
+    # Slower people face the ball and step aside or back [m/s].
+    facing_speed = 0.8
     for i in range(len(time)):
         target, top, look = wish(i, position, velocity)
         change = _accelerate(position, velocity, target - position, top, space, heeds)
         velocity = velocity + change * STEP
-        fast = np.linalg.norm(velocity, axis=-1, keepdims=True) > FACING_SPEED
+        fast = np.linalg.norm(velocity, axis=-1, keepdims=True) > facing_speed
         facing = np.where(fast, velocity, look - position)
         turn = np.arctan2(facing[:, 1], facing[:, 0]) - heading
         turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
@@ -61,7 +59,9 @@ def _steer(
         heading = heading + (turn if i == 0 else rate * STEP)
         places[i], headings[i] = position, heading
         position = position + velocity * STEP
-    places = gaussian_filter1d(places, SMOOTHING / STEP, axis=0, mode="nearest")
+    # Standard deviation of the smoothing of paths in time [s]: acceleration takes a moment.
+    smoothing = 0.06
+    places = gaussian_filter1d(places, smoothing / STEP, axis=0, mode="nearest")
     speeds = np.linalg.norm(np.gradient(places, STEP, axis=0), axis=-1)
     return [GroundPath(time, places[:, n], headings[:, n], speeds[:, n]) for n in range(count)]
 
@@ -125,10 +125,6 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 
 
-GOALS: Final = 1.25
-"""Size of the area of goals [the people's area]: people come as far as its border."""
-
-
 def wander(
     crowd: CrowdSettings, duration: float, rngs: Sequence[np.random.Generator]
 ) -> list[GroundPath]:
@@ -146,13 +142,15 @@ def wander(
     most = 2 * round(time[-1] - time[0])
     starts, goals = np.empty((0, 2)), np.empty((count, most, 2))
     pace = np.empty((count, len(time)))
+    # Size of the area of goals [the people's area]: people come as far as its border.
+    goal_area = 1.25
     for person, rng in enumerate(rngs):
         drawn = center + half * rng.uniform(-1.0, 1.0, (50, 2))
         clear = np.linalg.norm(drawn[:, None] - starts, axis=-1).min(axis=1, initial=np.inf)
         # The first with room, else the best.
         start = drawn[[int(np.argmax(np.minimum(clear, start_space)))]]
         starts = np.concatenate([starts, start])
-        goals[person] = center + GOALS * half * rng.uniform(-1.0, 1.0, (most, 2))
+        goals[person] = center + goal_area * half * rng.uniform(-1.0, 1.0, (most, 2))
         period = rng.uniform(4.0, 9.0)
         angle = 2.0 * np.pi * (time[:, None] / (period, 0.6 * period) + rng.random(2))
         wave = 0.5 + 0.5 * np.sin(angle) @ np.array([0.65, 0.35])
@@ -165,12 +163,6 @@ def wander(
         return target, pace[:, sample], target
 
     return _steer(time, starts, wish, 1.5 * crowd.personal_space_m, np.tri(count, k=-1, dtype=bool))
-
-
-PACKS: Final = 3
-"""Groups of attackers who wait for the ball, an arm's length apart."""
-MARKED: Final = 0.35
-"""Distance at which a defender marks an attacker, towards the goal [m]: in contact."""
 
 
 def take_corner(
@@ -192,8 +184,10 @@ def take_corner(
     corner = np.array([goal[0], rng.choice([-1.0, 1.0]) * 34.0])
     attackers, markers = np.arange(0, count - 1, 2), np.arange(1, count - 1, 2)
 
-    packs = center + half * rng.uniform([-0.5, -0.6], [0.3, 0.6], (PACKS, 2)) * [out, 1.0]
-    homes = packs[rng.integers(PACKS, size=len(attackers))]
+    # Groups of attackers who wait for the ball, an arm's length apart.
+    pack_count = 3
+    packs = center + half * rng.uniform([-0.5, -0.6], [0.3, 0.6], (pack_count, 2)) * [out, 1.0]
+    homes = packs[rng.integers(pack_count, size=len(attackers))]
     homes = homes + 1.0 * rng.standard_normal(homes.shape)
     feints = feint * _draw_steps(time, len(attackers), rng)
     balls = np.arange(first_ball, time[-1], ball_every)
@@ -215,7 +209,9 @@ def take_corner(
             top[attackers] = 2.0
         marked = attackers[: len(markers)]
         toward = _unit(goal - position[marked])
-        target[markers] = position[marked] + MARKED * toward + REACTION * velocity[marked]
+        # Distance at which a defender marks an attacker, towards the goal [m]: in contact.
+        marking_distance = 0.35
+        target[markers] = position[marked] + marking_distance * toward + REACTION * velocity[marked]
         if count:
             target[count - 1] = goal - [out * 0.8, 0.0]
             target[count - 1, 1] += 0.15 * look[1] if abs(look[1]) < 10.0 else 0.0
@@ -279,12 +275,6 @@ FORMATION: Final = np.array(
     ]
 )
 """Places of a 4-3-3 that attacks towards positive x, while the ball is at the centre spot [m]."""
-FOLLOW: Final = np.array([0.60, 0.45])
-"""Formation shift along x and y relative to the ball's displacement [1]: teams stay compact."""
-KEEPER_FOLLOW: Final = np.array([0.12, 0.12])
-"""The same for goalkeepers, who stay near their goal [1]."""
-ROAM: Final = 8.0
-"""Drift of players from their place in the formation [m], standard deviation per axis."""
 
 
 def play(
@@ -351,13 +341,19 @@ def _draw_targets(
     shape = (len(time), len(side))
     # One knot per second, without the jitter of a random walk in between.
     knots = np.arange(time[0], time[-1] + 2.0)
-    roam = ROAM * drift((len(knots), shape[1], 2), roam_time, 1.0, rng)
+    # Drift of players from their place in the formation [m], standard deviation per axis.
+    drift_m = 8.0
+    roam = drift_m * drift((len(knots), shape[1], 2), roam_time, 1.0, rng)
     roam = interp1d(knots, roam, axis=0)(time)
     aims = rng.uniform([12.0, -10.0], [26.0, 10.0], (shape[1], 2))
     sprinting = np.zeros(shape, dtype=bool)
     for sample, person in np.argwhere(rng.random(shape) < STEP / sprint_every):
         sprinting[sample : sample + round(sprint_time / STEP), person] = True
     targets = np.empty((*shape, 2))
+    # Formation shift along x and y relative to the ball's displacement [1]: teams stay compact.
+    follow = np.array([0.60, 0.45])
+    # The same for goalkeepers, who stay near their goal [1].
+    keeper_follow = np.array([0.12, 0.12])
     for person in range(shape[1]):
         role, own = (person // 2) % len(FORMATION), roam[:, person]
         if person == players:
@@ -365,11 +361,11 @@ def _draw_targets(
         elif person > players:
             # An assistant keeps level with the last defender of the assistant's half.
             half = 1.0 if (person - players) % 2 else -1.0
-            targets[:, person, 0] = half * np.clip(25.0 + half * FOLLOW[0] * ball[:, 0], 0.0, 50.0)
+            targets[:, person, 0] = half * np.clip(25.0 + half * follow[0] * ball[:, 0], 0.0, 50.0)
             targets[:, person, 1] = half * 35.2
         elif person < 2:
-            targets[:, person] = side[person] * FORMATION[0] + KEEPER_FOLLOW * ball + 0.3 * own
+            targets[:, person] = side[person] * FORMATION[0] + keeper_follow * ball + 0.3 * own
         else:
             run = sprinting[:, person, None] * side[person] * aims[person]
-            targets[:, person] = side[person] * FORMATION[role] + FOLLOW * ball + own + run
+            targets[:, person] = side[person] * FORMATION[role] + follow * ball + own + run
     return np.clip(targets, [-51.0, -35.5], [51.0, 35.5]), np.where(sprinting, 3.0, 1.0)

@@ -28,7 +28,7 @@ class Clip:
     Attributes:
         time: (frames,) [s], from 0.
         points: (frames, 13, 3) [m], z up, above the ground, in the order of
-            `worldpose.simulation.recordings.NAMES`.
+            `worldpose.simulation.recordings.read_clip`.
     """
 
     time: Floats

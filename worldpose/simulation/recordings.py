@@ -60,13 +60,6 @@ def _smooth_path(clock: Floats, xy: Floats) -> GroundPath:
     return GroundPath(time, place, heading, speed)
 
 
-NAMES: Final = {**LIMBS, "head": ("head_end", "head")}
-"""Points of a clip by their names."""
-UNITS: Final = (1.0, 0.01, 0.0254, 0.001, 0.056444)
-"""Units of files [m]; the last is that of the CMU database."""
-ANKLE: Final = 0.08
-"""Height of the ankles above the floor in their lowest frames [m]."""
-
 _BONES: Final = ((6, 5), (12, 11), (5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14))
 """Pairs of joints: shoulders and hips from right to left, limbs outward ..."""
 
@@ -85,7 +78,9 @@ def read_clip(path: Path) -> Clip:
     usual_leg = 0.82  # length of thigh and shank together, which identifies the unit of a file [m]
     npz = path.suffix == ".npz"
     capture = read_capture(path, read_archive(path)) if npz else read_bvh(path)
-    points = capture.select(path, NAMES)
+    # Points of a clip by their names.
+    point_names = {**LIMBS, "head": ("head_end", "head")}
+    points = capture.select(path, point_names)
     length = _leg_length(points) if len(points) else 0.0
     if len(points) < 2 or length == 0.0:
         raise refuse(
@@ -98,11 +93,15 @@ def read_clip(path: Path) -> Clip:
     if np.argmax(np.abs(rise)) == 1:
         points = points[..., [2, 0, 1]]
     length = _leg_length(points)
-    points = points * min(UNITS, key=lambda metres: abs(np.log(length * metres / usual_leg)))
+    # Units of files [m]; the last is that of the CMU database.
+    file_units = (1.0, 0.01, 0.0254, 0.001, 0.056444)
+    points = points * min(file_units, key=lambda metres: abs(np.log(length * metres / usual_leg)))
     across = points[0, 6] - points[0, 7]
     points = points @ _about_z(np.arctan2(-across[0], across[1]))
     start = points[0, 6:8].mean(axis=0)
-    start[2] = np.percentile(points[:, 10:12, 2].min(axis=1), 2.0) - ANKLE
+    # Height of the ankles above the floor in their lowest frames [m].
+    ankle_height = 0.08
+    start[2] = np.percentile(points[:, 10:12, 2].min(axis=1), 2.0) - ankle_height
     time = np.arange(len(points), dtype=np.float64) / capture.fps
     return Clip(time, np.asarray(points - start, dtype=np.float64))
 

@@ -100,8 +100,6 @@ def shade_ground(
     cv2.multiply(image, cv2.merge([left] * 3), dst=image, scale=1.0 / 255.0)
 
 
-DIRECT: Final = 1.3
-"""Light on a surface that faces a light source, per share of light that its shadow takes [1]."""
 _SPARE: Final = 64
 """Additional rows and columns of noise, for another offset in every frame [px]."""
 
@@ -220,9 +218,11 @@ def _shade_surfaces(venue: Venue, surfaces: Surfaces) -> Singles:
     ambient = 0.58  # ambient light on an upright surface [1]
     normals, vertices = surfaces.normals, surfaces.vertices
     light = np.float32(ambient) + np.float32(from_above) * normals[..., 2]
+    # Light on a surface that faces a light source, per share of light that its shadow takes [1].
+    direct_light = 1.3
     for way in venue.lights:
         toward = (-way[:3] / np.linalg.norm(way[:3])).astype(np.float32)
-        direct = np.float32(DIRECT * way[3]) * np.maximum(normals @ toward, np.float32(0.0))
+        direct = np.float32(direct_light * way[3]) * np.maximum(normals @ toward, np.float32(0.0))
         if venue.shade > 0.0:
             y = vertices[..., 1]
             height = vertices[..., 2] + vertices[..., :2] ** 2 @ venue.bend.astype(np.float32)
@@ -276,7 +276,7 @@ def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SceneView:
     """A static camera before an empty stadium.
 
     Attributes:
@@ -294,17 +294,17 @@ class View:
 
 def open_view(
     camera: Camera, pitch: PitchTemplate, seed: int, settings: RenderingSettings | None = None
-) -> View:
+) -> SceneView:
     """Return a static camera's view of a stadium, about a second for 1920 x 1080.
 
     The seed is that of the stadium's look, the same for all its cameras, and of the sensor's noise.
     """
     venue = build_venue(pitch, seed, settings or RenderingSettings())
-    return View(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
+    return SceneView(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
 
 
 def render_frame(
-    view: View, cast: Cast, opened: Surfaces, closed: Surfaces | None = None, *, frame: int = 0
+    view: SceneView, cast: Cast, opened: Surfaces, closed: Surfaces | None = None, *, frame: int = 0
 ) -> RenderedFrame:
     """Return one image of people; the same arguments give the same bytes.
 
@@ -351,10 +351,6 @@ def _dress(betas: Floats, seed: int) -> Cast:
     return dress_people(betas, [("first", "second")[n % 2] for n in range(len(betas))], seed)
 
 
-_GRID: Final = 8
-"""Grid spacing of a frame's lens inversion [px]: between the nodes its error is 0.005 px."""
-_MARGIN: Final = 0.01
-"""Margin around the frames' field of view [rad]."""
 _FINER: Final = 1.15
 """Pixels of the panorama per pixel of the frame, along each axis."""
 
@@ -395,9 +391,11 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
         )
     pan, rise = _field_of_view(cameras)
     scale = _FINER * float(cameras.focal.max())
-    left, top = pan[0] - _MARGIN, rise[1] + _MARGIN
-    width = int(np.ceil((pan[1] + _MARGIN - left) * scale))
-    height = int(np.ceil((top - rise[0] + _MARGIN) * scale))
+    # Margin around the frames' field of view [rad].
+    margin_rad = 0.01
+    left, top = pan[0] - margin_rad, rise[1] + margin_rad
+    width = int(np.ceil((pan[1] + margin_rad - left) * scale))
+    height = int(np.ceil((top - rise[0] + margin_rad) * scale))
     columns, rows = grid_pixels(width, height)
     angle, up = left + (columns + 0.5) / scale, top - (rows + 0.5) / scale
     grid = np.stack([np.sin(angle), np.cos(angle), up], axis=-1)
@@ -448,11 +446,13 @@ def _field_of_view(cameras: Camera) -> tuple[tuple[float, float], tuple[float, f
 
 def _sample_panorama(panorama: Panorama, camera: Camera, width: int, height: int) -> Image:
     """Return a camera's image of a panorama (height, width, 3)."""
-    columns, rows = -(-width // _GRID) + 1, -(-height // _GRID) + 1
+    # Grid spacing of a frame's lens inversion [px]: between the nodes its error is 0.005 px.
+    grid_px = 8
+    columns, rows = -(-width // grid_px) + 1, -(-height // grid_px) + 1
     # With this offset, enlarging the grid puts its first entry on the first pixel.
-    u = np.arange(columns) * _GRID + 0.5 * (_GRID - 1.0)
-    v = np.arange(rows) * _GRID + 0.5 * (_GRID - 1.0)
-    u, v = np.concatenate([[u[0] - _GRID], u]), np.concatenate([[v[0] - _GRID], v])
+    u = np.arange(columns) * grid_px + 0.5 * (grid_px - 1.0)
+    v = np.arange(rows) * grid_px + 0.5 * (grid_px - 1.0)
+    u, v = np.concatenate([[u[0] - grid_px], u]), np.concatenate([[v[0] - grid_px], v])
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
     plane = camera.normalize(pixels.reshape(-1, 2))
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
@@ -467,9 +467,9 @@ def _sample_panorama(panorama: Panorama, camera: Camera, width: int, height: int
     # `pyrDown` keeps every second pixel: its pixel i is the finer level's 2 i.
     x, y = x + 0.5 - 0.5 / shrunk, y + 0.5 - 0.5 / shrunk
     grid = np.stack([x, y], axis=-1).astype(np.float32).reshape(len(v), len(u), 2)
-    size = (len(u) * _GRID, len(v) * _GRID)
+    size = (len(u) * grid_px, len(v) * grid_px)
     fine = cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)
-    fine = fine[_GRID : _GRID + height, _GRID : _GRID + width]
+    fine = fine[grid_px : grid_px + height, grid_px : grid_px + width]
     looked = cv2.remap(
         panorama.levels[level],
         fine[..., 0],

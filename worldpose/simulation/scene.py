@@ -25,9 +25,6 @@ from worldpose.simulation.paths import Clip, GroundPath, drift
 from worldpose.simulation.reference import CLIP_ID, Report
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
 
-GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
-"""Steps of this share of a turn spread any number of cameras, and an additional one moves none."""
-
 
 def place_camera(
     rig: RigSettings, index: int, target: Floats, pitch: PitchSpec, rng: np.random.Generator
@@ -65,7 +62,9 @@ def _place_in_ring(
 ) -> tuple[Floats, Floats, float]:
     """Return center and aim (3,) [m], world, and focal length [px]."""
     standard_person = 1.8  # body height for `RigSettings.person_height_px` [m]
-    azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
+    # Steps of this share of a turn spread any number of cameras, and an additional one moves none.
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    azimuth = 2.0 * np.pi * (index * golden + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
     way = np.array([np.cos(azimuth), np.sin(azimuth)])
     border = 0.5 * np.array([pitch.length, pitch.width])
     to_border = float(np.min((border - np.sign(way) * target[:2]) / np.abs(way)))
@@ -90,8 +89,6 @@ def look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
 
 CALM: Final = 0.02
 """Time step of the operator's motion [s]: one frame at 50 per second."""
-WARM_UP: Final = 1.5
-"""Time for which the operator follows the action before the first frame [s]."""
 
 
 def move_broadcast_camera(
@@ -109,7 +106,7 @@ def move_broadcast_camera(
     released clips: k1 0.1 to 1, k2 0.6 to 4.3.
 
     `times` (frames,) [s] are those of the camera's own images. `action` (samples, 2) [m], world, is
-    the place of the action at `action_times` (samples,) [s], from `WARM_UP` before the first frame
+    the place of the action at `action_times` (samples,) [s], from `warm_up` before the first frame
     to the last.
     """
     center = np.array(
@@ -121,7 +118,9 @@ def move_broadcast_camera(
     )
     lag = 0.5  # with which the operator follows the action: a reaction, and a damped head [s]
     sway = 4.0  # drift of the aim off the action along x: operators lead and trail play [m]
-    hand = np.arange(times[0] - WARM_UP, times[-1] + 2.0 * CALM, CALM)
+    # Time for which the operator follows the action before the first frame [s].
+    warm_up = 1.5
+    hand = np.arange(times[0] - warm_up, times[-1] + 2.0 * CALM, CALM)
     aim = np.stack([np.interp(hand, action_times, axis) for axis in action.T], axis=-1)
     aim[:, 0] += sway * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)
     aim[:, 0] += settings.sweep_m * np.sin(2.0 * np.pi * (hand / 8.0 + rng.random()))

@@ -20,9 +20,6 @@ from worldpose.body.keypoints import VERTEX_OF_POINT
 from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
 from worldpose.geometry.rigid import Rigid
 
-BUILD: Final = (-1.0, 0.5)
-"""Mean and standard deviation of the second beta [1]: wide shoulders, narrow hips, little fat."""
-
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -70,7 +67,9 @@ def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
     betas = np.zeros(model.shapes)
     tall = rng.uniform(height[0], height[1])
     betas[1:] = rng.standard_normal(model.shapes - 1)
-    betas[1] = BUILD[0] + BUILD[1] * betas[1]
+    # Mean and standard deviation of the second beta [1]: wide shoulders, narrow hips, little fat.
+    build = (-1.0, 0.5)
+    betas[1] = build[0] + build[1] * betas[1]
     rising = directions[-2, 1] - directions[-1, 1]
     middle = points[-2, 1] - points[-1, 1]
     betas[0] = (tall - middle - rising[1:] @ betas[1:]) / rising[0]
@@ -130,8 +129,6 @@ Ground = Callable[[Floats, Floats], Floats]
 BIAS: Final = 0.1
 """Weight of a limb's natural bend in its plane, relative to the sine of its actual bend [1]: nearly
 straight limbs keep their twist."""
-POINTED: Final = np.radians(10.0)
-"""Angle by which toes of a foot in the air point down from square with the shank [rad]."""
 
 _X, _Z = np.eye(3)[[0, 2]]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -278,7 +275,9 @@ def _rotate_foot(
     # of a lying person; above the second the foot is flat on it.
     treading = (0.25, 0.6)
     down = unit(shank)
-    hanging = np.cos(POINTED) * (turned @ _Z) + np.sin(POINTED) * down
+    # Angle by which toes of a foot in the air point down from square with the shank [rad].
+    pointed = np.radians(10.0)
+    hanging = np.cos(pointed) * (turned @ _Z) + np.sin(pointed) * down
     treads = _smooth((-down[:, 2] - treading[0]) / (treading[1] - treading[0]))
     free, clear = 4.0 * (1.0 - treads), np.maximum(clear, 0.0)
     ball = float(body.joints[10, 2] - body.joints[7, 2])

@@ -21,7 +21,6 @@ from worldpose.pitch.template import PitchTemplate
 LINE_WIDTH: Final = 0.12
 """Width of the painted markings, centred on the template's line [m] (Law 1)."""
 _LINE, _ARC, _SPOT = 0.0, 1.0, 2.0
-_HALF = 0.5 * LINE_WIDTH
 
 
 def paint_rows(pitch: PitchTemplate) -> Floats:
@@ -103,7 +102,8 @@ def paint_cover(paint: Floats, place: Floats) -> float:
     by a pixel to the right and one down, and by a metre of height.
     """
     bare = 1.0
-    reach = _HALF + 0.5 * (abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5]))
+    half = 0.5 * LINE_WIDTH
+    reach = half + 0.5 * (abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5]))
     for row in range(len(paint)):
         if paint[row, 0] == _LINE:
             ex, ey, length = paint[row, 3], paint[row, 4], paint[row, 5]
@@ -117,24 +117,24 @@ def paint_cover(paint: Floats, place: Floats) -> float:
                 ex * y - ey * x,
                 ex * place[3] - ey * place[2],
                 ex * place[5] - ey * place[4],
-                -_HALF,
-                _HALF,
+                -half,
+                half,
             )
             if cover > 0.0:
                 cover *= _share(
                     ex * x + ey * y,
                     ex * place[2] + ey * place[3],
                     ex * place[4] + ey * place[5],
-                    -_HALF,
-                    length + _HALF,
+                    -half,
+                    length + half,
                 )
             bare *= 1.0 - cover
             continue
         x = place[0] + paint[row, 6] * place[6] - paint[row, 1]
         y = place[1] + paint[row, 6] * place[7] - paint[row, 2]
         radius = x * x + y * y
-        inner = paint[row, 3] - _HALF if paint[row, 0] == _ARC else -1.0
-        outer = paint[row, 3] + _HALF if paint[row, 0] == _ARC else paint[row, 3]
+        inner = paint[row, 3] - half if paint[row, 0] == _ARC else -1.0
+        outer = paint[row, 3] + half if paint[row, 0] == _ARC else paint[row, 3]
         if radius > (outer + reach) ** 2 or radius < max(inner - reach, 0.0) ** 2:
             continue
         radius = np.sqrt(radius)
@@ -202,10 +202,6 @@ BOARD_SETBACK: Final = (5.0, 4.0)
 """Distance of the boards from the goal lines and from the touch lines [m]."""
 BOARD_HEIGHT: Final = 0.95
 """[m]"""
-_PANEL = 7.0
-_LETTER = 0.42
-_ROW = 0.45
-_SEAT = 0.52
 
 
 @compile_kernel
@@ -220,7 +216,8 @@ def _hash(i: int, j: int, k: int) -> float:
 @compile_kernel
 def _board(along: float, up: float, side: int, look: int) -> tuple[float, float, float]:
     """Return the colour of a board: panels in strong colours with rows of letter-like blocks."""
-    panel = int(np.floor(along / _PANEL))
+    panel_m = 7.0
+    panel = int(np.floor(along / panel_m))
     hue = _hash(panel, side, look)
     if hue < 0.25:
         base = (0.85, 0.86, 0.88)
@@ -232,11 +229,12 @@ def _board(along: float, up: float, side: int, look: int) -> tuple[float, float,
         base = (0.04, 0.05, 0.05)
     else:
         base = (0.85, 0.68, 0.05)
-    at = along - panel * _PANEL
+    at = along - panel * panel_m
     if up < 0.04 or up > BOARD_HEIGHT - 0.03:
         return 0.30, 0.30, 0.31
-    if 0.25 < up < 0.75 and 0.8 < at < _PANEL - 0.8:
-        letter, part = int(np.floor(at / _LETTER)), (at / _LETTER) % 1.0
+    letter_m = 0.42
+    if 0.25 < up < 0.75 and 0.8 < at < panel_m - 0.8:
+        letter, part = int(np.floor(at / letter_m)), (at / letter_m) % 1.0
         row, column = int((up - 0.25) / 0.5 * 3.0), int(part * 4.0)
         if column < 3 and _hash(letter, 4 * row + column, panel + 7 * side + look) < 0.62:
             if base[0] + base[1] > 1.2:
@@ -252,9 +250,11 @@ def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, 
     Head, hair and shoulders in some jacket, a part of each block in the colours of one club: a
     person detector finds them and a filter must drop them.
     """
-    row, seat = int(z / _ROW), int(along / _SEAT)
-    x, up = along - (seat + 0.5) * _SEAT, z - row * _ROW
-    low = 0.45 + 0.55 * up / _ROW
+    row_m = 0.45
+    seat_m = 0.52
+    row, seat = int(z / row_m), int(along / seat_m)
+    x, up = along - (seat + 0.5) * seat_m, z - row * row_m
+    low = 0.45 + 0.55 * up / row_m
     kind = _hash(row, seat, look)
     if kind < 0.15 or up > 0.41:
         empty = abs(x) < 0.21 and up < 0.34

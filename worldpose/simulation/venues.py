@@ -145,12 +145,6 @@ def _paint_turf(paint: Floats, table: Floats, place: Floats, scene: Floats, colo
         color[2] += cover * (white - color[2])
 
 
-POST: Final = 0.06
-"""Radius of posts and crossbar [m] (Law 1: at most 12 cm across)."""
-_CORNERS: Final = 8
-"""Corners of a tube's cross section."""
-
-
 @dataclass(frozen=True, eq=False)
 class Prop:
     """An object with one surface.
@@ -179,15 +173,19 @@ def goals(pitch: PitchTemplate) -> Prop:
     aside = np.cross(way, np.where(np.abs(way[:, 2:]) > 0.9, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     above = np.cross(way, aside)
-    turn = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
+    # Corners of a tube's cross section.
+    corner_count = 8
+    turn = 2.0 * np.pi * np.arange(corner_count) / corner_count
     out = np.cos(turn)[:, None] * aside[:, None] + np.sin(turn)[:, None] * above[:, None]
-    vertices = tubes[:, :, None] + POST * out[:, None]
+    # Radius of posts and crossbar [m] (Law 1: at most 12 cm across).
+    radius = 0.06
+    vertices = tubes[:, :, None] + radius * out[:, None]
     normals = np.broadcast_to(out[:, None], vertices.shape)
-    k = np.arange(_CORNERS)
-    n = (k + 1) % _CORNERS
-    corners = ((k, n, n + _CORNERS), (k, n + _CORNERS, k + _CORNERS))
+    k = np.arange(corner_count)
+    n = (k + 1) % corner_count
+    corners = ((k, n, n + corner_count), (k, n + corner_count, k + corner_count))
     halves = [np.stack(half, axis=1) for half in corners]
-    faces = np.concatenate(halves) + 2 * _CORNERS * np.arange(len(tubes))[:, None, None]
+    faces = np.concatenate(halves) + 2 * corner_count * np.arange(len(tubes))[:, None, None]
     return Prop(
         faces=faces.reshape(-1, 3).astype(np.int32),
         backs=np.zeros(faces.shape[0] * faces.shape[1], dtype=np.bool_),
@@ -202,8 +200,6 @@ def goals(pitch: PitchTemplate) -> Prop:
 
 FOG_COLOR: Final = np.array([0.74, 0.76, 0.78])
 """RGB; a little blue."""
-SKY_COLOR: Final = np.array([0.66, 0.74, 0.84])
-"""RGB by day; by night it is black."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,8 +282,10 @@ def paint_venue(venue: Venue, grid: Floats, origin: Floats, size: tuple[int, int
     scene = [pitch.length, pitch.width, *venue.bend, settings.stripes, settings.paint]
     rows = SceneRows(paint_rows(pitch), venue.table, np.array(scene), venue.half, venue.look)
     paint_scene(grid, origin, rows, color, ground, distance)
+    # RGB by day; by night it is black.
+    sky_color = np.array([0.66, 0.74, 0.84])
     if settings.light == "sun":
-        color[np.isinf(distance)] = SKY_COLOR
+        color[np.isinf(distance)] = sky_color
     if venue.shade > 0.0:
         dark = np.float32(venue.shade) * venue.in_shadow(ground[..., 1])
         color *= (np.float32(1.0) - dark)[..., None]

@@ -24,8 +24,6 @@ from worldpose.static_calibration.residuals import (
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
-_KEPT: Final = [6, 7, 22, 23, 24]
-"""Columns of p1, p2, k4, k5 and k6, which no fit changes."""
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
 _DAMPING: Final = Damping(start=1e-4, decrease=10.0, lowest=1e-9, highest=1e8)
@@ -201,10 +199,12 @@ def _with_model(rows: Floats, problem: CameraProblem) -> Floats:
     else:
         rows[others, 4], rows[others, 5] = k1 - 1.0 / 3.0, k2 - k1 + 1.0 / 5.0
     rows[others, 25] = problem.lens_model
+    # Columns of p1, p2, k4, k5 and k6, which no fit changes.
+    kept_columns = [6, 7, 22, 23, 24]
     if problem.lens is not None:
         known = Camera.from_lens(problem.lens).numbers
         rows[others, 4:9] = known[4:9]
-        rows[:, _KEPT] = known[_KEPT]
+        rows[:, kept_columns] = known[kept_columns]
     return rows
 
 

@@ -25,8 +25,6 @@ from worldpose.static_calibration.ground_error import pitch_places
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
-_CHOICES: Final = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
-"""Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's."""
 _MIN_CLICKS: Final = 10
 """Minimum number of clicked points that choose a lens model [1]: twenty residuals for twelve
 parameters and the noise."""
@@ -53,7 +51,9 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
     loss, worth_it, start = 3.0, 0.9, found.fit.row[None]
     cost = fit_cameras(as_stated, start, click_loss=loss).cost[0]
     lowest = own - CLEAR_GAIN
-    for model, coefficients in _CHOICES:
+    # Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's.
+    candidates = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
+    for model, coefficients in candidates:
         free = np.arange(STEP) < STEP - 3 + coefficients
         prior = as_stated.prior.copy()
         if model == LensModel.FISHEYE:

@@ -168,7 +168,6 @@ def _read(grey: Image, place: Floats, normal: Floats, curvature: float, profile:
 
 _BLUR: Final = 0.75
 """Standard deviation of a bar's edges [px]: of a sharp lens, 0.7, and of a pixel's own size."""
-_ROOT_2, _ROOT_2PI = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
 
 
 @compile_kernel
@@ -266,6 +265,7 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
     normal, right = np.empty((4, 4)), np.empty(4)
     row = np.empty(4)
     variance = np.inf
+    root_2, root_2pi = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
     # Gauss-Newton steps; the search before is accurate to half a pixel.
     for fitting in range(5):
         normal[:] = 0.0
@@ -273,13 +273,13 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
         squares = 0.0
         for j in range(count):
             low, high = (across[j] - shift + half) / _BLUR, (across[j] - shift - half) / _BLUR
-            rise = 0.5 + 0.5 * math.erf(low / _ROOT_2)
-            fall = 0.5 + 0.5 * math.erf(high / _ROOT_2)
+            rise = 0.5 + 0.5 * math.erf(low / root_2)
+            fall = 0.5 + 0.5 * math.erf(high / root_2)
             row[0], row[1], row[2] = 1.0 - rise, rise - fall, fall
             # The first step solves for the levels, later steps also for the offset.
             up, down = level[1] - level[0], level[1] - level[2]
             row[3] = down * math.exp(-0.5 * high * high) - up * math.exp(-0.5 * low * low)
-            row[3] /= _BLUR * _ROOT_2PI
+            row[3] /= _BLUR * root_2pi
             rest = values[j] - level[0] * row[0] - level[1] * row[1] - level[2] * row[2]
             squares += rest * rest
             for a in range(4):

@@ -36,7 +36,6 @@ from worldpose.geometry.optimize.losses import cauchy_loss, cauchy_weight
 PRIORS: Final = 9
 """Rows of the prior: focal, cx, cy, k1, k2, k3, height, distance, roll."""
 
-_BROWN = int(LensModel.BROWN)
 _LOST_RESIDUAL: Final = 1e3
 """Residual [px] of points that the camera cannot image: larger than any true residual."""
 
@@ -192,7 +191,7 @@ def nearest_on_markings(
     max_radius = 1.5  # beyond, Brown's polynomials may fold a marking back into the image
     camera = load_camera(c.reshape(1, WIDTH), 0)
     cap = fold_squared(camera)
-    if camera.model == _BROWN:
+    if camera.model == LensModel.BROWN.value:
         cap = min((max_radius * reach / camera.fx) ** 2, cap)
     image = np.empty((len(samples), 2))
     for i in range(len(samples)):

@@ -107,7 +107,7 @@ def decide_sides(
     camera whose side is stated are decided. All have people at the same times (frames,) [s].
     """
     names = tuple(seen)
-    views = [_View(seen[name], _seen_cells(seen[name].camera, pitch)) for name in names]
+    views = [_SideView(seen[name], _seen_cells(seen[name].camera, pitch)) for name in names]
     evidence = np.zeros((len(names), len(names)))
     for a in range(len(names)):
         for b in range(a + 1, len(names)):
@@ -186,26 +186,26 @@ def compare_sides(
     likeliest share of people that both cameras detect; it is 0 or more, since people that only one
     camera found decide nothing. Both cameras have the same times (frames,) [s].
     """
-    views = (_View(each, _seen_cells(each.camera, pitch)) for each in (first, second))
+    views = (_SideView(each, _seen_cells(each.camera, pitch)) for each in (first, second))
     return _compare(next(views), next(views), pitch, seconds)
 
 
-class _View(NamedTuple):
+class _SideView(NamedTuple):
     """People of one camera, and which cells of the pitch it sees, row by row."""
 
     people: SeenPeople
     cells: Flags
 
-    def turn(self) -> _View:
+    def turn(self) -> _SideView:
         """Return the view after half a turn: covariances stay, and cells come in reverse."""
         camera = self.people.camera
         turned = None if camera is None else turn_camera(camera)
         people = replace(self.people, camera=turned, xy=-self.people.xy)
-        return _View(people, self.cells[::-1])
+        return _SideView(people, self.cells[::-1])
 
 
 def _compare(
-    first: _View, second: _View, pitch: PitchTemplate, seconds: Floats
+    first: _SideView, second: _SideView, pitch: PitchTemplate, seconds: Floats
 ) -> tuple[float, float]:
     """Return what `compare_sides` returns."""
     frames = max(1, len(seconds))

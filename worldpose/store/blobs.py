@@ -1,4 +1,4 @@
-"""Files of a project: their interface, the implementation for a local folder, and verified reads.
+"""Files of a project: their interface, and the implementation for a local folder.
 
 The implementation for object storage is `worldpose.store.objects`.
 """
@@ -20,10 +20,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
-from data_contracts.run import StoredFile
-from worldpose.errors import CorruptionError, StoreError
-from worldpose.store.documents import digest
-from worldpose.store.paths import STAGING, ResultId, checked_path
+from worldpose.errors import StoreError
+from worldpose.store.paths import STAGING, checked_path
 
 COMMIT_POINTS = (
     "before_write",
@@ -153,51 +151,6 @@ def storage_errors(path: str) -> Iterator[None]:
         raise StoreError(
             f"{path}: {error.strerror or error}{place}. {todo}. Published results are unchanged."
         ) from error
-
-
-def read_published(blobs: Blobs, result: ResultId, file: StoredFile) -> bytes:
-    """Return the bytes of one file after verifying that they are the published ones.
-
-    Raises:
-        CorruptionError: the file is missing or its bytes have changed.
-    """
-    path = f"{result.path}/{file.path}"
-    data = blobs.read(path)
-    there = None if data is None else (len(data), digest(data))
-    _require_published(blobs, path, file, there)
-    assert data is not None
-    return data
-
-
-def _require_published(
-    blobs: Blobs, path: str, file: StoredFile, there: tuple[int, str] | None
-) -> None:
-    """Raise CorruptionError unless size and SHA-256 of the bytes there are the published ones."""
-    if there is None:
-        raise corruption_error(blobs, path, "the file is missing")
-    size, sha256 = there
-    if size != file.size:
-        raise corruption_error(blobs, path, f"the file has {size} bytes, not {file.size}")
-    if sha256 != file.sha256:
-        raise corruption_error(blobs, path, "its SHA-256 differs from the one in the manifest")
-
-
-def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
-    """Verify that the bytes of one file are the published ones, without holding them in memory.
-
-    Raises:
-        CorruptionError: as `read_published`.
-    """
-    path = f"{result.path}/{file.path}"
-    _require_published(blobs, path, file, blobs.digest(path))
-
-
-def corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
-    """Return the error of a published file that is not as it was."""
-    return CorruptionError(
-        f"{blobs.url}/{path} has changed since its publication: {found}. Run "
-        "`worldpose verify --repair` to find and repair all damage."
-    )
 
 
 _WITHOUT_LINKS: Final = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)

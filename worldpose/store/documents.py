@@ -2,7 +2,7 @@
 
 Equal values have equal canonical bytes, so they have equal digests. A sealed document is one line
 of canonical JSON whose field `checksum` is the digest of the rest; `unseal` refuses any other
-bytes, even a changed space.
+bytes, even a changed space. Files of results are verified against their manifest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from typing import Any, Final, TypeVar
 from pydantic import ValidationError
 
 from data_contracts.records import CONTRACT_VERSION, Record
+from data_contracts.run import StoredFile
 from worldpose.errors import CorruptionError, InputError
+from worldpose.store.blobs import Blobs
+from worldpose.store.paths import ResultId
 
 _CONTAINERS: Final = (dict, list, tuple)
 
@@ -67,8 +70,6 @@ def digest(data: bytes | memoryview) -> str:
 
 R = TypeVar("R", bound=Record)
 
-_OTHER_FIELDS: Final = {"extra_forbidden": "the unknown field", "missing": "no field"}
-"""pydantic's error types of records with other fields, and what they found."""
 _SEAL: Final = re.compile(rb'\{"checksum":"([0-9a-f]{64})",')
 """Start of a document with no key before `checksum`."""
 
@@ -123,13 +124,15 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
         )
     if "checksum" in kind.model_fields:
         fields["checksum"] = checksum
+    # pydantic's error types of records with other fields, and what they found.
+    other_fields = {"extra_forbidden": "the unknown field", "missing": "no field"}
     try:
         return kind.model_validate_json(json.dumps(fields))
     except ValidationError as error:
         found = {
-            f"{_OTHER_FIELDS[each['type']]} {'.'.join(map(str, each['loc']))}"
+            f"{other_fields[each['type']]} {'.'.join(map(str, each['loc']))}"
             for each in error.errors()
-            if each["type"] in _OTHER_FIELDS
+            if each["type"] in other_fields
         }
         if len(found) == error.error_count():
             raise InputError(
@@ -166,3 +169,48 @@ def _content_after_seal(data: bytes) -> bytes | None:
 
 def _dump_fields(record: Record) -> dict[str, Any]:
     return record.model_dump(mode="json", exclude={"checksum"})
+
+
+def read_published(blobs: Blobs, result: ResultId, file: StoredFile) -> bytes:
+    """Return the bytes of one file after verifying that they are the published ones.
+
+    Raises:
+        CorruptionError: the file is missing or its bytes have changed.
+    """
+    path = f"{result.path}/{file.path}"
+    data = blobs.read(path)
+    there = None if data is None else (len(data), digest(data))
+    _require_published(blobs, path, file, there)
+    assert data is not None
+    return data
+
+
+def _require_published(
+    blobs: Blobs, path: str, file: StoredFile, there: tuple[int, str] | None
+) -> None:
+    """Raise CorruptionError unless size and SHA-256 of the bytes there are the published ones."""
+    if there is None:
+        raise corruption_error(blobs, path, "the file is missing")
+    size, sha256 = there
+    if size != file.size:
+        raise corruption_error(blobs, path, f"the file has {size} bytes, not {file.size}")
+    if sha256 != file.sha256:
+        raise corruption_error(blobs, path, "its SHA-256 differs from the one in the manifest")
+
+
+def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
+    """Verify that the bytes of one file are the published ones, without holding them in memory.
+
+    Raises:
+        CorruptionError: as `read_published`.
+    """
+    path = f"{result.path}/{file.path}"
+    _require_published(blobs, path, file, blobs.digest(path))
+
+
+def corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
+    """Return the error of a published file that is not as it was."""
+    return CorruptionError(
+        f"{blobs.url}/{path} has changed since its publication: {found}. Run "
+        "`worldpose verify --repair` to find and repair all damage."
+    )

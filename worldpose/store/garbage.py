@@ -64,7 +64,6 @@ def plan_gc(
             must be unpinned first.
         older_than: the age below which results and leftovers are kept.
 
-
     Raises:
         InputError: `forget` names a missing or pinned run, or `keep_last` is below 1.
     """
@@ -100,13 +99,15 @@ def plan_gc(
         for entry in store.blobs.staged_entries()
         if entry.modified <= before and not active  # staging does not tell its match
     )
-    held = tuple(
+    return GcPlan(tuple(garbage), (*map(_describe_active, active), *damaged.values()), known)
+
+
+def _describe_active(run: Reservation) -> str:
+    return (
         f"Match {run.match_id} is skipped: run {run.run_id} (process {run.pid} on {run.host}), "
         f"started at {run.started_at:%Y-%m-%d %H:%M} UTC, may still be active. If it is dead, "
         f"forget {run.match_id}/{run.run_id}."
-        for run in active
     )
-    return GcPlan(tuple(garbage), (*held, *damaged.values()), known)
 
 
 def collect(store: Store, plan: GcPlan) -> int:

@@ -35,8 +35,8 @@ from data_contracts.arrays import CHUNK_BYTES, ArrayLayout, GroupLayout
 from data_contracts.conventions import CONVENTIONS
 from data_contracts.run import ResultManifest, StoredFile
 from worldpose.errors import InputError, InternalError
-from worldpose.store.blobs import Blobs, LocalBlobs, corruption_error, read_published
-from worldpose.store.documents import canonical_json
+from worldpose.store.blobs import Blobs, LocalBlobs
+from worldpose.store.documents import canonical_json, corruption_error, read_published
 from worldpose.store.paths import ResultId
 
 Arrays = Mapping[str, NDArray[Any]]

@@ -11,8 +11,8 @@ from data_contracts.pin import Pin
 from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store.blobs import Entry, verify_published
-from worldpose.store.documents import read_checksum, unseal
+from worldpose.store.blobs import Entry
+from worldpose.store.documents import read_checksum, unseal, verify_published
 from worldpose.store.paths import (
     DAMAGED,
     MANIFEST,

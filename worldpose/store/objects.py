@@ -30,8 +30,6 @@ except ImportError as error:
 
 LISTINGS = 100
 """Paths of which each folder is listed alone."""
-UPLOADS = 8
-"""Concurrent uploads per result; the result exists only after the last."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +197,9 @@ class ObjectBlobs:
         if self.exists(f"{prefix}/{manifest_name}"):
             return False
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
-        with storage_errors(str(folder)), ThreadPoolExecutor(UPLOADS) as uploads:
+        # Concurrent uploads per result; the result exists only after the last.
+        parallel_uploads = 8
+        with storage_errors(str(folder)), ThreadPoolExecutor(parallel_uploads) as uploads:
             names = [f"{prefix}/{path.relative_to(folder).as_posix()}" for path in paths]
             for _ in uploads.map(self._put_same, names, paths):
                 pass_commit_point("during_publish")

@@ -14,7 +14,6 @@ from worldpose.store.documents import canonical_json, digest
 
 STORE_FORMAT = "3"
 """Increased when the same arrays are written as other bytes."""
-NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs")
 
 
 @functools.cache
@@ -24,7 +23,16 @@ def libraries() -> dict[str, str]:
         "python": f"{sys.version_info.major}.{sys.version_info.minor}",
         "store": STORE_FORMAT,
     }
-    for name in NUMERIC_LIBRARIES:
+    numeric_libraries = (
+        "numpy",
+        "scipy",
+        "numba",
+        "opencv-python-headless",
+        "av",
+        "zarr",
+        "numcodecs",
+    )
+    for name in numeric_libraries:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

@@ -29,8 +29,6 @@ MAX_KILLS: Final = 3
 """Number of kills after which a run stays failed and needs an operator."""
 MAX_SERVICE_DEATHS: Final = 10
 """Ends with the whole service that do not count as kills; a run may be to blame for them."""
-READERS: Final = 8
-"""Number of parallel readers: in object storage each state is a separate request."""
 _FILE: Final = re.compile(r"(queue/.+)\.(\d{4,})\.json")
 
 LOG = logging.getLogger("worldpose.operations")
@@ -52,7 +50,9 @@ class RunQueue:
                 last[found[1]] = entry.path
         known = dict(self._known)  # other threads replace it
         unread = [path for path in last.values() if path not in known]
-        with ThreadPoolExecutor(READERS) as readers:
+        # Number of parallel readers: in object storage each state is a separate request.
+        reader_count = 8
+        with ThreadPoolExecutor(reader_count) as readers:
             known |= zip(unread, readers.map(self._read, unread), strict=True)
         current = {path: known[path] for path in last.values()}
         self._known = current if folder == "queue" else known

@@ -28,8 +28,8 @@ from worldpose.errors import (
     NondeterminismError,
     StoreError,
 )
-from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point, verify_published
-from worldpose.store.documents import seal, unseal
+from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point
+from worldpose.store.documents import seal, unseal, verify_published
 from worldpose.store.paths import (
     MANIFEST,
     PROJECT,

@@ -8,9 +8,6 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Integers
 
-MIN_SECONDS = 1.0
-"""Shorter absences are occlusions, which the joints are filled over [s]."""
-
 
 def measure_absences(
     present: Flags, frame: Integers, people: Sequence[int], fps: float
@@ -32,18 +29,20 @@ def measure_absences(
         return {"absent_share": float(len(frame) > 0)}
     gaps: list[tuple[int, dict[str, float]]] = []
     missing = total = 0
+    # Shorter absences are occlusions, which the joints are filled over [s].
+    min_seconds = 1.0
     for column, number in enumerate(people):
         rows = np.flatnonzero(present[:, column])
         total += int(rows[-1] - rows[0] + 1) if len(rows) else 0
         steps = np.diff(rows)
-        for at in np.flatnonzero(steps - 1 >= MIN_SECONDS * fps):
+        for at in np.flatnonzero(steps - 1 >= min_seconds * fps):
             missing += int(steps[at] - 1)
             ends = _frames(frame, rows[at] + 1, rows[at + 1] - 1)
             gaps.append((int(steps[at] - 1), ends | {"absent_person": number}))
     anyone = np.flatnonzero(present.any(axis=1))
     edges = np.concatenate([[-1], anyone, [len(frame)]])
     empty = np.diff(edges) - 1
-    for at in np.flatnonzero(empty >= MIN_SECONDS * fps):
+    for at in np.flatnonzero(empty >= min_seconds * fps):
         ends = _frames(frame, edges[at] + 1, edges[at + 1] - 1)
         gaps.append((int(empty[at]) * present.shape[1], ends))
     share = max(1.0 - len(anyone) / len(frame), missing / max(1, total))

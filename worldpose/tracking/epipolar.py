@@ -170,15 +170,9 @@ def associate(
     origins, rays = centers[camera], directions[camera, detection]
     low, high = settings.body_heights_m
     extent = 0.5 * (high - low) if ground else math.inf
-    distances = pair_distances(
-        origins,
-        rays,
-        camera,
-        footprints(origins, rays, (0.5 * (low + high), extent)),
-        settings.min_joints,
-        math.sin(settings.min_angle_rad),
-        gate,
-    )
+    places = footprints(origins, rays, (0.5 * (low + high), extent))
+    least = settings.min_joints, math.sin(settings.min_angle_rad)
+    distances = pair_distances(origins, rays, camera, places, *least, gate)
     first, second = np.nonzero(distances < np.inf)
     order = np.argsort(distances[first, second], kind="stable")
     free = np.where(usable[..., None], weights, 0.0)

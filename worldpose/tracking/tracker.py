@@ -24,10 +24,6 @@ from worldpose.tracking.person import Person
 from worldpose.tracking.plane.feet import PIXEL_SHARE, PIXEL_STD
 from worldpose.tracking.settings import TrackingSettings
 
-JOINTS = len(COCO17)
-ADULT_HEIGHT, MIDDLE_HEIGHT = 1.75, 1.0
-"""Height of an adult, and of the middle of a body, over the pitch [m]."""
-
 
 class TrackingReport(Record):
     """Summary of a tracking run."""
@@ -208,16 +204,18 @@ def pixel_weights(cameras: Camera, covariance: Floats) -> Floats:
     weights = np.empty((len(covariance), rows, columns))
     # Distance of a person in a pixel whose ray does not meet that height before [m].
     farthest = 150.0
+    # Height of an adult, and of the middle of a body, over the pitch [m].
+    adult_height, middle_height = 1.75, 1.0
     for c in range(len(covariance)):
         camera = cameras[c]
         rays = camera.unproject((grid / cells * camera.image_size).reshape(-1, 2))
         with np.errstate(divide="ignore", invalid="ignore"):
-            along = (MIDDLE_HEIGHT - rays.origins[:, 2]) / rays.directions[:, 2]
+            along = (middle_height - rays.origins[:, 2]) / rays.directions[:, 2]
         along = np.where((along > 0.0) & (along < farthest), along, farthest)
         _, by_step = project_with_jacobian(camera, rays.origins + along[:, None] * rays.directions)
         # The mean over both axes of the image.
         moved = 0.5 * np.einsum("nij,jk,nik->n", by_step, covariance[c], by_step)
-        own = (PIXEL_STD + PIXEL_SHARE * ADULT_HEIGHT * camera.focal.mean() / along) ** 2
+        own = (PIXEL_STD + PIXEL_SHARE * adult_height * camera.focal.mean() / along) ** 2
         variance = own + np.where(np.isfinite(moved), moved, 0.0)
         weights[c] = (PIXEL_STD**2 / variance).reshape(rows, columns)
     return weights
@@ -240,7 +238,7 @@ def _build_result(
     cameras = len(tracker.centers)
     index = np.full((frames, cameras, len(chains)), -1, dtype=np.int16)
     distance = np.full(index.shape, np.nan, dtype=np.float32)
-    joints = np.full((frames, len(chains), JOINTS, 3), np.nan, dtype=np.float32)
+    joints = np.full((frames, len(chains), len(COCO17), 3), np.nan, dtype=np.float32)
     tracks = []
     for n, chain in enumerate(chains):
         for person in chain:

@@ -104,23 +104,10 @@ def estimate_clocks(
             return sum_equations(MovingJoints.find(rig, shift_in_time(part, late), fps, loose))
 
         sums = PersonSums.join(list(map_in_threads(sum_up, seen)))
-        information, score = sums.information, sums.score
         # A common offset moves people along their path and changes no residual.
-        inverse = np.linalg.inv(information.sum(axis=0) + np.eye(count) / unknown**2)
-        step = inverse @ score.sum(axis=0)
-        # Cameras without information are not part of the mean.
-        telling = np.diagonal(information.sum(axis=0)) > 1.0 / unknown**2
-        centered = inverse - telling @ inverse / max(1, telling.sum())
-        # Intervals of a person are independent, frames are not: the error is the scatter of
-        # interval scores. Each interval has influenced the solution, hence the division
-        # (jackknife).
-        own = np.diagonal(information, axis1=1, axis2=2)
-        share = np.minimum(own / np.maximum(own.sum(axis=0), 1e-12), 0.5)
-        left = ((score - information @ step) / (1.0 - share)) @ centered.T
-        stated = np.einsum("cd,de,ce->c", centered, information.sum(axis=0), centered)
-        alike = sums.common_score()
-        error = np.sqrt(np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2)
-        error = np.minimum(error, unknown)
+        inverse = np.linalg.inv(sums.information.sum(axis=0) + np.eye(count) / unknown**2)
+        step = inverse @ sums.score.sum(axis=0)
+        error = np.minimum(_standard_error(sums, step, inverse, unknown), unknown)
         known = error < settings.max_clock_error_frames
         late = np.where(known, late + step, 0.0)
         if known.any():
@@ -129,6 +116,23 @@ def estimate_clocks(
             break
     determined = error < settings.max_clock_error_frames
     return CameraClocks(np.where(determined, late, np.nan), error, determined)
+
+
+def _standard_error(sums: PersonSums, step: Floats, inverse: Floats, unknown: float) -> Floats:
+    """Return the standard error (cameras,) [frame] of a step, the solution of summed equations."""
+    information = sums.information
+    # Cameras without information are not part of the mean.
+    telling = np.diagonal(information.sum(axis=0)) > 1.0 / unknown**2
+    centered = inverse - telling @ inverse / max(1, telling.sum())
+    # Intervals of a person are independent, frames are not: the error is the scatter of interval
+    # scores. Each interval has influenced the solution, hence the division (jackknife).
+    own = np.diagonal(information, axis1=1, axis2=2)
+    share = np.minimum(own / np.maximum(own.sum(axis=0), 1e-12), 0.5)
+    left = ((sums.score - information @ step) / (1.0 - share)) @ centered.T
+    stated = np.einsum("cd,de,ce->c", centered, information.sum(axis=0), centered)
+    alike = sums.common_score()
+    variance = np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2
+    return np.asarray(np.sqrt(variance))
 
 
 def choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,7 @@ from worldpose.triangulation.results import (
     ExtraJoints,
     Reconstruction,
     Triangulation,
+    add_margins,
     concatenate_frames,
 )
 from worldpose.triangulation.settings import TriangulationSettings
@@ -192,7 +193,7 @@ def reconstruct_chunks(
         smooth = smooth_joints(
             cameras,
             read(slice(first, last)),
-            _add_margins(before, here, after, margin),
+            add_margins(before, here, after, margin),
             fps,
             settings,
             model.motion,
@@ -439,29 +440,6 @@ def _join_halves(
     for part in parts:
         own = [next(found) for half in halves if part.start <= half.start < max(part.stop, 1)]
         yield own[0] if len(own) == 1 else concatenate_frames(own)
-
-
-def _add_margins(
-    before: Triangulation | None, here: Triangulation, after: Triangulation | None, margin: int
-) -> Triangulation:
-    """Return the triangulation of a chunk with `margin` frames on either side."""
-
-    def join(name: str) -> NDArray[Any]:
-        parts = [getattr(before, name)[-margin:]] if before is not None and margin else []
-        parts.append(getattr(here, name))
-        if after is not None:
-            parts.append(getattr(after, name)[:margin])
-        return np.concatenate(parts)
-
-    return replace(
-        here,
-        joints=join("joints"),
-        covariance=join("covariance"),
-        lasting_covariance=join("lasting_covariance"),
-        bias_variance=join("bias_variance"),
-        exchanged=join("exchanged"),
-        offsets=join("offsets"),
-    )
 
 
 def check_shapes(

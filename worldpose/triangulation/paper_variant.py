@@ -8,13 +8,12 @@ import numpy as np
 import torch
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.reference_method.cameras import TensorCameras
 from worldpose.reference_method.reprojection import triangulate, triangulate_about_mid_hip
 from worldpose.triangulation.results import Smoothing, Triangulation
-
-_HIPS = (11, 12)
 
 
 def replace_joints(
@@ -53,8 +52,8 @@ def place_joints(
     image = torch.tensor(keypoints).flatten(0, 1)
     tensors, first = TensorCameras.of(cameras), torch.tensor(start.reshape(-1, 17, 3))
     if about_mid_hip:
-        hips = image[:, _HIPS].mean(1)
-        middle = triangulate(tensors, hips, first[:, _HIPS].mean(1))
+        hips = image[:, COCO17_HIPS].mean(1)
+        middle = triangulate(tensors, hips, first[:, COCO17_HIPS].mean(1))
         joints = triangulate_about_mid_hip(tensors, image, first, hips, middle)
     else:
         joints = triangulate(tensors, image.flatten(0, 1), first.flatten(0, 1))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17_HIPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import camera_model
@@ -34,10 +34,6 @@ from worldpose.triangulation.residuals import (
 )
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solve import SolvedJoints, solve_joints, take_step
-
-RADIAL = [0, 1, 4]
-"""k1, k2, k3 among the five coefficients."""
-HIPS = [COCO17.index("left_hip"), COCO17.index("right_hip")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +78,8 @@ def stated_errors(
     pose = cameras.cam_from_world
     shape = (len(joints), len(cameras.focal), joints.shape[1])
     variance, scale = np.zeros(shape), np.zeros(shape)
+    # k1, k2, k3 among the five coefficients.
+    radial = [0, 1, 4]
     for camera in range(shape[1]):
         depth = places @ pose.rotation[camera, 2] + pose.translation[camera, 2]
         # A missing camera sees no person.
@@ -93,7 +91,7 @@ def stated_errors(
             continue
         seen = cameras[camera].project_with_jacobians(places[before])
         by_focal = (seen.d_intrinsics[..., :2] * cameras.focal[camera]).sum(-1, keepdims=True)
-        steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., RADIAL])
+        steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., radial])
         jacobian = np.concatenate(steps, axis=-1)
         spread = ((jacobian @ camera_covariance[camera]) * jacobian).sum(axis=(-2, -1)) / 2.0
         variance[:, camera][before] = np.where(np.isfinite(spread), spread, 0.0)
@@ -184,8 +182,9 @@ def estimate_midhip_shift(
         (frames, cameras, persons, 3) [px].
     """
     index = detections.detection_index
-    middle = detections.keypoints[..., HIPS, :].mean(axis=-2, keepdims=True, dtype=np.float64)
-    sure = detections.confidence[..., HIPS].min(axis=-1, keepdims=True)
+    hips = detections.keypoints[..., COCO17_HIPS, :]
+    middle = hips.mean(axis=-2, keepdims=True, dtype=np.float64)
+    sure = detections.confidence[..., COCO17_HIPS].min(axis=-1, keepdims=True)
     precision = NoiseModel.nominal(1).precision(sure)
     observed = Observations.of(rig, middle, precision, index)
     joints = solve_joints(observed, settings).joints[:, :, 0]

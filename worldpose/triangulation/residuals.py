@@ -45,9 +45,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel, distort, distort_brown, load_camera, undistort
 from worldpose.geometry.rays import RayStatus
 
-_BROWN = int(LensModel.BROWN)
-_OK = int(RayStatus.OK)
-
 LANES: Final = 64
 """Joints per tile: 16 cameras x 64 joints fit the L2 cache of a processor core."""
 
@@ -267,7 +264,7 @@ def _linearize(tile: Tile, cameras: Floats, camera: int) -> None:
         a[:], b[:], scale[:], precision[:] = 0.0, 0.0, 0.0, 0.0
         tile["extra"][:] = 0.0
         return
-    c, is_brown = cameras[camera], cameras[camera, 25] == _BROWN
+    c, is_brown = cameras[camera], cameras[camera, 25] == LensModel.BROWN.value
     # Undistorted x and y, the derivatives of the distortion, and whether they are exact.
     plane = np.empty((6, LANES))
     over_u, over_v = 1.0 / c[0], 1.0 / c[1]
@@ -294,7 +291,7 @@ def _linearize(tile: Tile, cameras: Floats, camera: int) -> None:
         if plane[5, j] == 0.0 or not is_brown:
             numbers = load_camera(cameras, camera)
             x, y, status = undistort(numbers, (a[0, j] - c[2]) / c[0], (b[0, j] - c[3]) / c[1])
-            if status != _OK:
+            if status != RayStatus.OK.value:
                 x = y = precision[j] = 0.0
             _, _, dxx, dxy, dyy = distort(numbers, x, y)
             plane[0, j], plane[1, j] = x, y

@@ -175,6 +175,29 @@ def concatenate_frames(parts: Sequence[Triangulation]) -> Triangulation:
     )
 
 
+def add_margins(
+    before: Triangulation | None, here: Triangulation, after: Triangulation | None, margin: int
+) -> Triangulation:
+    """Return the triangulation of a chunk with `margin` frames on either side."""
+
+    def join(name: str) -> NDArray[Any]:
+        parts = [getattr(before, name)[-margin:]] if before is not None and margin else []
+        parts.append(getattr(here, name))
+        if after is not None:
+            parts.append(getattr(after, name)[:margin])
+        return np.concatenate(parts)
+
+    return replace(
+        here,
+        joints=join("joints"),
+        covariance=join("covariance"),
+        lasting_covariance=join("lasting_covariance"),
+        bias_variance=join("bias_variance"),
+        exchanged=join("exchanged"),
+        offsets=join("offsets"),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class MotionModel:
     """Motion prior of smoothing.

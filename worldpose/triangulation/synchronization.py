@@ -41,8 +41,6 @@ from worldpose.triangulation.settings import TriangulationSettings
 MAX_SPAN: Final = 30
 """Largest distance from the best to another likely shift [frame]: the people's motion leads from
 there to the right one."""
-COLUMNS: Final = 5
-"""Unknowns of a camera: clock, rotation, logarithm of the focal length."""
 PRIOR: Final = (*(1.0 / 0.003**2,) * 3, 1.0 / 0.005**2)
 """Information on rotation [1/rad^2] and on the logarithm of the focal length [1]: calibrations are
 expected to be within 3 mrad and 0.5 %."""
@@ -239,6 +237,8 @@ def _estimate_fractions(
     # Length of an interval [s]; a person's errors within an interval count as one.
     length = max(3, round(0.5 * fps))
     unknown_clock = 10.0  # Standard deviation of a clock offset beyond whole frames [frame].
+    # Unknowns of a camera: clock, rotation, logarithm of the focal length.
+    unknowns = 5
     for gate in GATES:
         loose = settings.model_copy(update={"max_deviation": gate})
         common = shift_in_time(people, late)
@@ -256,7 +256,7 @@ def _estimate_fractions(
         prior = np.tile([1.0 / unknown_clock**2, *PRIOR], count)
         inverse = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
         step = inverse @ score.sum(axis=0)
-        clock = slice(None, None, COLUMNS)
+        clock = slice(None, None, unknowns)
         # A common offset moves people along their path and changes no residual.
         told = np.diagonal(information.sum(axis=0))[clock] > 1.0 / unknown_clock**2
         rows = inverse[clock] - told @ inverse[clock] / max(1, told.sum())

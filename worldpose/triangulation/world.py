@@ -394,6 +394,11 @@ def place_cameras(
             told += said
             batch = Camera.stack([Camera.from_calibration(each) for each in cameras.values()])
             people = find_people(batch, stacked, fps) if said else None
+        if people is None and np.isfinite(stacked.confidence).any():
+            told.append(
+                "warning: no people agree in the images of two cameras, so that nothing confirms "
+                "the calibration: is it of these cameras, as they stood?"
+            )
     scale, unit = _find_scale(calibration, batch, people, stated.unit_m)
     up, turned, doubt = _find_up(batch, people, stated.up)
     notes = [*told, doubt] if doubt else told

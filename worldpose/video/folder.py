@@ -56,10 +56,12 @@ def declared_size(content: Image) -> tuple[int, int] | None:
     """
     from PIL import Image as Pillow  # late: few commands open an image
 
+    # EXIF tag of the way in which an image is shown.
+    orientation_tag = 0x0112
     try:
         with Pillow.open(io.BytesIO(content.tobytes()), formats=FORMATS) as image:
             width, height = image.size
-            turned = image.getexif().get(ORIENTATION) in (5, 6, 7, 8)
+            turned = image.getexif().get(orientation_tag) in (5, 6, 7, 8)
     except Exception:  # Pillow documents no closed list for damaged files
         return None
     return (height, width) if turned else (width, height)
@@ -67,8 +69,6 @@ def declared_size(content: Image) -> tuple[int, int] | None:
 
 FORMATS: Final = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 """Pillow's names of the kinds of images that are read."""
-ORIENTATION: Final = 0x0112
-"""EXIF tag of the way in which an image is shown."""
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".dpx")
 
 

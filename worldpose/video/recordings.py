@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import av
 import numpy as np
@@ -80,17 +79,15 @@ def describe_video(path: Path, index: FrameIndex) -> list[str]:
             "done if the camera was progressive."
         )
     length = float(index.times[-1]) if index.time_base is not None else 0.0
+    copy_again = "If it was cut off, or is still being copied, give the whole file."
     if duration is not None and length < 0.98 * duration - 0.5:
         notes.append(
             f"{path.name}: its frames end at {length:.2f} s, but it states {duration:.2f} s. "
-            + _COPY_AGAIN
+            + copy_again
         )
     elif _ends_within_packet(path):
-        notes.append(f"{path.name}: it ends within a packet. " + _COPY_AGAIN)
+        notes.append(f"{path.name}: it ends within a packet. " + copy_again)
     return notes
-
-
-_COPY_AGAIN: Final = "If it was cut off, or is still being copied, give the whole file."
 
 
 def _ends_within_packet(path: Path) -> bool:

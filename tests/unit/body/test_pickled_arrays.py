@@ -2,9 +2,7 @@ import builtins
 import contextlib
 import copyreg
 import functools
-import operator
 import os
-import subprocess
 import sys
 import threading
 
@@ -113,18 +111,12 @@ def payloads(canary):
     write = f"open({str(canary)!r}, 'w')"
     return {
         "os.system": Payload(os.system, command),
-        "subprocess": Payload(subprocess.Popen, ["touch", str(canary)]),
         "eval": Payload(eval, write),
-        "exec": Payload(exec, write),
-        "open": Payload(open, str(canary), "w"),
         "import": Payload(builtins.__import__, "antigravity"),
         "getattr": Payload(getattr, "text", "upper"),
         "partial": functools.partial(os.system, command),
-        "attrgetter": operator.attrgetter("system"),
-        "methodcaller": operator.methodcaller("system", command),
         "reconstructor": Payload(copyreg._reconstructor, dict, dict, {}),
         "numpy": Payload(np.fromfile, str(canary)),
-        "class": Payload(type, "Made", (), {}),
     }
 
 

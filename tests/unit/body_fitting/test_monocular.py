@@ -10,11 +10,9 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.monocular import (
-    PRIOR_SPREAD,
     MonocularPoses,
     MonocularPrior,
     join_poses,
-    learn_precision,
     parse_monocular,
     place_monocular_poses,
     read_monocular,
@@ -85,13 +83,6 @@ def test_files_that_lack_something_are_refused_with_its_name(tmp_path, change, s
     with pytest.raises(InputError, match=says) as told:
         read_monocular(path)
     assert str(path) in str(told.value)
-
-
-def test_pickled_objects_are_not_loaded(tmp_path):
-    path = tmp_path / "estimates.npz"
-    np.savez(path, poses=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match="Python objects, which are never loaded"):
-        read_monocular(path)
 
 
 EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)
@@ -208,17 +199,3 @@ def test_the_pull_is_the_gradient_of_its_cost():
     ]
     assert (gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-6)
     np.testing.assert_array_equal(gradient[2], 0.0)
-
-
-def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known():
-    error = 0.6
-    orient, angles = RNG.normal(0.0, 0.5, (400, 1, 3)), RNG.normal(0.0, 0.5, (400, 1, 30))
-    off = error * RNG.standard_normal((400, 1, 33))
-    glimpses = MonocularPoses(rotation(off[..., :3]) @ rotation(orient), angles + off[..., 3:], ONE)
-    sure = np.ones((400, 1), dtype=bool)
-    spread = 1.0 / np.sqrt(np.diag(learn_precision(glimpses, orient, angles, sure, 1.0)))
-    # Five of 0.25 rad are counted with 400: 56 mrad for 50; 1 / sqrt(800) is 4 %, three of these.
-    expected = np.sqrt((5.0 * PRIOR_SPREAD**2 + 400.0 * error**2) / 405.0)
-    np.testing.assert_allclose(spread[3:], expected, rtol=0.12)
-    none = learn_precision(glimpses, orient, angles, ~sure, 1.0)
-    np.testing.assert_allclose(none, np.eye(33) / PRIOR_SPREAD**2)

@@ -5,6 +5,7 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body_fitting.bones import Shape, pool_shapes
 from worldpose.body_fitting.evidence import Contacts, PersonEvidence
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
 from worldpose.body_fitting.residuals import PersonObjective, Pose
@@ -49,3 +50,13 @@ def test_gradient_by_frames_and_betas_agrees_with_finite_differences(track):
         # Betas feel the smoothness only through the poses, so that it does not shorten limbs,
         # and offsets turn with the pose: both are left out, a hundredth of the whole.
         assert slope == pytest.approx(expected, rel=0.02, abs=0.02 * np.abs(at.gradient).sum())
+
+
+def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counted_once():
+    # Each clip knows the first component to 0.5 besides the prior: 1 / (1 + 4) of variance.
+    covariance = np.diag([0.2, 1.0])
+    clips = [Shape(np.array([0.8 * seen, 0.0]), covariance) for seen in (1.0, 2.0)]
+    pooled = pool_shapes(clips, 1.0)
+    # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
+    np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)

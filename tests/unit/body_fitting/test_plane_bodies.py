@@ -108,11 +108,15 @@ def centred(clip, joints):
     return np.linalg.norm(off - off.mean(axis=2, keepdims=True), axis=-1)
 
 
-def test_fitted_bodies_are_nearer_to_the_truth_than_placed_ones():
+@pytest.fixture(scope="module")
+def fits():
+    clips = [Clip(seed) for seed in range(4)]
+    return [(clip, clip.fit()) for clip in clips]
+
+
+def test_fitted_bodies_are_nearer_to_the_truth_than_placed_ones(fits):
     placed, fitted, around = [], [], []
-    for seed in range(4):
-        clip = Clip(seed)
-        bodies = clip.fit()
+    for clip, bodies in fits:
         assert bodies.missing == (None, None)
         assert np.isfinite(bodies.fit.joints).all()
         placed.append(clip.errors(bodies.placed))
@@ -124,11 +128,10 @@ def test_fitted_bodies_are_nearer_to_the_truth_than_placed_ones():
     assert after < 0.07
 
 
-def test_regions_hold_the_truth_and_are_long_in_depth():
+def test_regions_hold_the_truth_and_are_long_in_depth(fits):
     inside, ratios = [], []
-    for seed in range(4, 8):
-        clip = Clip(seed)
-        fit = clip.fit().fit
+    for clip, bodies in fits:
+        fit = bodies.fit
         off = fit.joints - clip.truth
         square = (off * np.linalg.solve(fit.covariance, off[..., None])[..., 0]).sum(axis=-1)
         inside.append(square < chdtri(3, 0.05))

@@ -5,16 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import turning_clip as clip
-from scipy.optimize import least_squares
 
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
-from worldpose.broadcast_calibration.pitch_errors import PitchErrors
-from worldpose.broadcast_calibration.priors import build_prior, lens_walk
-from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings, BroadcastPrior
+from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.residuals import linearize
+from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import solve
 from worldpose.errors import DegenerateError
-from worldpose.pitch.template import PitchTemplate
 
 SMOOTH = np.array([np.inf] * 3 + [1e-4])
 
@@ -50,34 +48,6 @@ def test_exact_evidence_gives_the_exact_camera():
     assert np.median(bearing_error(found, true)) < 1e-5
 
 
-def test_scipy_finds_no_lower_cost():
-    rng = np.random.default_rng(3)
-    true = clip.moving(5)
-    problem = replace(
-        problem_of(true, rng), smoothness=np.full(4, np.inf), weights=TermWeights(flow=0.0)
-    )
-    start = off(true, rng)
-    found = solve(start, problem, 60)
-    points, prior = problem.points, problem.prior
-
-    def residuals(x):
-        camera = start.take_step(x[:35].reshape(5, 7), x[35:40])
-        pixels = np.empty_like(points.image)
-        for frame in range(5):
-            mine = points.frame == frame
-            pixels[mine] = camera.camera[frame].project(points.world[mine])
-        white = np.einsum("nij,nj->ni", points.whitening, pixels - points.image)[:, 0]
-        lens = (camera.distortion - prior.distortion) / prior.distortion_std
-        zoom = (np.log(camera.focal) - prior.log_focal) / prior.log_focal_std
-        place = np.sqrt(np.diag(prior.center_information)) * (camera.center - prior.center)
-        middle = (camera.principal_point - prior.principal_point) / prior.principal_std
-        return np.concatenate([white, lens.ravel(), zoom, place, middle])
-
-    peer = least_squares(residuals, np.zeros(40), x_scale="jac", xtol=1e-12, ftol=1e-12)
-    # Both end within a relative 1e-7 of a minimum.
-    assert found.cost <= peer.cost * (1.0 + 1e-6)
-
-
 def test_a_frame_with_neither_evidence_nor_prior_is_named_as_undetermined():
     true = clip.moving(4)
     prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
@@ -85,28 +55,42 @@ def test_a_frame_with_neither_evidence_nor_prior_is_named_as_undetermined():
         solve(true, ClipProblem(PointEvidence.none(), FlowEvidence.none(), prior), 5)
 
 
-def test_the_distortion_changes_with_the_zoom_alone():
-    rng = np.random.default_rng(8)
-    true = clip.moving(12)
-    still = replace(true, focal=np.full(12, true.focal[0]))
-    prior = build_prior(BroadcastPrior(), still.focal, still.image_size)
-    lens = np.repeat(prior.distortion[:1], 12, axis=0)
-    still = replace(still, distortion=lens)
-    zoomed = replace(still, focal=still.focal * np.exp(np.linspace(0.0, 1.0, 12)))
-    for one, walk in ((still, 1e-3), (zoomed, np.sqrt(1.0 / 11.0))):
-        np.testing.assert_allclose(lens_walk(one.focal) * np.sqrt(12), walk, rtol=1e-3)
-    free = problem_of(still, rng, noise=1.0)
-    held = solve(still, replace(free, lens_walk=lens_walk(still.focal)), 30).camera
-    loose = solve(still, free, 30).camera
-    assert np.ptp(held.distortion, axis=0).max() < 0.01 * np.ptp(loose.distortion, axis=0).max()
-
-
-def test_markings_stay_within_their_spread_and_the_shown_spread_is_told():
-    errors = PitchErrors.of(PitchTemplate.standard(), BroadcastCalibrationSettings())
-    point, sure = np.arange(4), np.zeros((4, 3))
-    far = errors.learn_paint(np.full((4, 3), 10.0), sure, point)
-    # (6 + 12 * 10^2) / (6 + 12) squared deviations of 0.03 m.
-    assert far.shown_m == pytest.approx(0.03 * np.sqrt(67.0))
-    assert far.paint_m == 0.03
-    near = errors.learn_paint(np.zeros((4, 3)), sure, point)
-    assert near.paint_m == pytest.approx(0.03 * np.sqrt(1.0 / 3.0))
+def test_the_gradient_is_the_slope_of_the_cost():
+    rng = np.random.default_rng(4)
+    true = clip.moving(6)
+    points, flow = clip.ground_points(true, rng, each=8), clip.followed_points(true, rng, each=8)
+    # On nothing, one point, two points, or one twice, as arcs do.
+    ends = rng.integers(-1, 4, (len(points), 2))
+    shares = 0.01 * rng.uniform(0.2, 1.0, ends.shape)
+    by_size = 0.01 * rng.standard_normal((len(points), 2, 3))
+    by_size[:, 1, :2] = 0.0  # the end fall moves places along z alone
+    known = {"ends": ends, "shares": shares, "by_size": by_size}
+    robust = replace(points, loss=np.full(len(points), 3.0), **known)
+    problem = ClipProblem(
+        robust,
+        flow,
+        replace(
+            build_prior(BroadcastPrior(), true.focal, true.image_size),
+            rotation=true.rotation,
+            rotation_std=np.array([np.inf, *[2e-3] * 5]),
+        ),
+        TermWeights(field=1.3, player=0.4, flow=0.7),
+        smoothness=np.array([np.inf] * 3 + [1e-3]),
+        lens_walk=np.linspace(0.1, 0.3, 5),
+        flow_loss=2.0,
+    )
+    camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
+    beside = 0.3 * rng.standard_normal((problem.paint_count, 3))
+    here = linearize(camera, beside, problem)
+    step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
+    paint = rng.standard_normal(beside.shape)
+    size = 1e-8
+    ahead, behind = (
+        linearize(camera.take_step(by * step, by * shared), beside + by * paint, problem).cost
+        for by in (size, -size)
+    )
+    slope = float(
+        (here.system.right * step).sum() + here.system.right_corner @ [*shared, *paint.ravel()]
+    )
+    # Differences of a cost of 1e3 known to 1e-13, over 2e-8; the slope is 1e5.
+    assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)

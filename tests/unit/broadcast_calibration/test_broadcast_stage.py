@@ -102,9 +102,7 @@ def folder(tmp_path_factory):
         write_video(goal, clip.film_empty_pitch(true.camera, 5), FPS)
         shutil.copy(goal, goal.with_name("shot.mp4"))
         write_video(
-            goal.with_name("both.fast.mp4"),
-            clip.film_empty_pitch(true.camera, 5),
-            1.2 * FPS,
+            goal.with_name("both.fast.mp4"), clip.film_empty_pitch(true.camera, 5), 1.2 * FPS
         )
 
     path = tmp_path_factory.mktemp("matches") / "stage"

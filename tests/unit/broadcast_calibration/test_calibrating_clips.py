@@ -83,41 +83,6 @@ def test_two_key_frames_give_every_frame(calibrated, true):
     assert np.percentile(errors, 95.0) < 1.5
 
 
-def test_a_weight_of_four_halves_the_stated_unevenness_of_the_lens(calibrated, pictures, true):
-    keys = [clicks(true, 3), clicks(true, 12)]
-    given = BroadcastClip(keys, lambda: iter(pictures), FPS, smooth_weight=4.0)
-    even = calibrate_broadcast(clip.PITCH, given, SETTINGS)
-    one, four = calibrated.report.weights, even.report.weights
-    assert four.smooth_log_focal == pytest.approx(0.5 * one.smooth_log_focal)
-    bends = [np.abs(np.diff(np.log(c.camera.focal), n=2)).mean() for c in (calibrated, even)]
-    assert bends[1] < bends[0]
-
-
-def test_proposed_key_frames_start_the_fit_and_do_not_bias_it(true, pictures):
-    keys = []
-    for frame in (3, 12):
-        drawn = clicks(true, frame).markings.model_dump()["drawn"]
-        for marking in drawn:
-            marking["xy"] = [(x, y + 3.0) for x, y in marking["xy"]]
-        markings = ClickedMarkings.model_validate({"drawn": drawn})
-        keys.append(KeyFrame(frame=frame, markings=markings))
-    errors = {
-        proposed: np.median(
-            place_errors(
-                calibrate_broadcast(
-                    clip.PITCH,
-                    BroadcastClip(keys, lambda: iter(pictures), FPS, proposed=proposed),
-                    SETTINGS,
-                ).camera,
-                true,
-            )
-        )
-        for proposed in (False, True)
-    }
-    assert errors[True] < 0.7
-    assert errors[True] < errors[False]
-
-
 def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):
     keys = [clicks(true, 3, renamed="penalty_mark_left"), clicks(true, 12)]
     found = calibrate_broadcast(
@@ -249,16 +214,3 @@ def test_key_frames_overrule_camera_data_that_contradict_them(calibrated, true, 
     (told,) = [each for each in found.report.reasons if "are no prior: pan [deg]" in each]
     assert float(told.rpartition(" ")[2]) == pytest.approx(20.0, abs=0.2)
     np.testing.assert_allclose(found.camera.focal, calibrated.camera.focal, rtol=1e-9)
-
-
-def test_camera_data_hold_the_angles_where_nothing_else_does(true, bare):
-    """Without paint, two key frames say little; the data say the rest."""
-    given, keys = camera_data(true, pan_off=0.05), [clicks(true, 3), clicks(true, 12)]
-    alone, held = (
-        calibrate_broadcast(
-            clip.PITCH, BroadcastClip(keys, lambda: iter(bare), FPS, given=each), SETTINGS
-        )
-        for each in (None, given)
-    )
-    off = [np.abs(found.camera.center - true.center).max() for found in (alone, held)]
-    assert off[1] < min(off[0], 1.0)

@@ -1,27 +1,20 @@
 """Followed points, what they say of the camera, and which are no part of the image."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import turning_clip as clip
 
+from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.tracking import (
     Followed,
     chain,
-    follow,
     modified_z_scores,
     turn,
 )
-
-
-def test_a_shifted_picture_is_followed_by_its_shift():
-    # Structure at the size of a tracking window.
-    coarse = np.random.default_rng(1).uniform(0.0, 255.0, (40, 60))
-    picture = np.kron(coarse, np.ones((8, 8))).astype(np.uint8)
-    moved = np.roll(picture, (-2, 3), axis=(0, 1))
-    (pair,) = follow([picture, moved], None, 200)
-    assert len(pair.start) > 60
-    # Whole pixels: what is left is the tracker's tolerance.
-    assert np.abs(pair.end - pair.start - [3.0, -2.0]).max() < 0.05
-    assert pair.inlier_share > 0.9
+from worldpose.broadcast_calibration.uncertainty import pool_centers
+from worldpose.ingest.clock import ImageClock, rows_at
 
 
 def pairs_of(camera, rng):
@@ -58,3 +51,62 @@ def test_a_chain_meets_its_key_frames_and_says_what_it_missed():
     assert links.determined.all()
     # 21 steps of about a hundredth of a pixel.
     assert 0.0 < links.drift[0] < 0.3
+
+
+FRAMES, FPS = 120, 50.0
+
+
+def people(late, speed, rng, noise=1.0):
+    """Eight people who run to and fro along x; the feed shows them `late` frames on."""
+    camera = clip.moving(FRAMES)
+    start = np.stack([np.linspace(-6.0, 8.0, 8), np.tile([-6.0, -2.0, 4.0, 8.0], 2)], axis=-1)
+    phase = rng.uniform(0.0, 6.0, 8)
+
+    def joints(frames):
+        time = frames[:, None] / FPS
+        x = start[:, 0] + speed / 2.0 * np.sin(2.0 * time + phase)
+        places = np.stack([x, np.broadcast_to(start[:, 1], x.shape), 0.0 * x], axis=-1)
+        return places[:, :, None] + clip.SHAPE
+
+    frames = np.arange(FRAMES, dtype=float)
+    seen = camera.camera.project(joints(frames + late).reshape(FRAMES, -1, 3))
+    seen = seen.reshape(FRAMES, 8, 17, 2) + noise * rng.standard_normal((FRAMES, 8, 17, 2))
+    given = joints(frames) + 0.01 * rng.standard_normal((FRAMES, 8, 17, 3))
+    return camera, People(given, seen, FPS)
+
+
+@pytest.mark.parametrize(("rate", "late"), [(2.0, 0.5), (2.0, -3.0), (1.2, 1.4)])
+def test_the_offset_of_a_faster_camera_is_in_match_frames(rate, late):
+    rng, frames = np.random.default_rng(2), np.arange(int(FRAMES / rate))
+    clock = ImageClock.of(frames, 0.0, rate, 0.0)
+    camera, exact = people(late * rate, 5.0, rng)
+    # What static cameras of this lower rate triangulate, with the noise of single frames.
+    joints = exact.joints[(frames * rate).astype(int)] if rate == 2.0 else None
+    if joints is None:
+        joints = rows_at(exact.joints, frames * rate)
+    joints = joints + 0.04 * rng.standard_normal(joints.shape)
+    moving = People.in_images(joints, exact.keypoints[clock.number], FPS / rate, clock)
+    images = np.arange(len(clock.images))
+    moving = replace(moving, keypoints=exact.keypoints[images])
+    found = estimate_feed_offset(camera.frames(images), moving, reach=10.0)
+    assert found.determined
+    assert (found.frames, found.rate) == pytest.approx((late, rate), abs=0.15)
+
+
+def test_clips_that_agree_give_their_weighted_mean():
+    wide, narrow = 4.0 * np.eye(3), np.eye(3)
+    pooled = pool_centers(
+        [np.array([0.0, -70.0, 15.0]), np.array([1.0, -70.0, 15.0])], [wide, narrow]
+    )
+    assert pooled.agree
+    # Weights of 1/4 and 1.
+    np.testing.assert_allclose(pooled.center, [0.8, -70.0, 15.0])
+    np.testing.assert_allclose(pooled.covariance, 0.8 * np.eye(3))
+
+
+def test_clips_of_two_places_are_not_pooled():
+    pooled = pool_centers([np.zeros(3), np.array([10.0, 0.0, 0.0])], [np.eye(3), np.eye(3)])
+    assert not pooled.agree
+    assert np.isnan(pooled.center).all()
+    # Half of ten to either side.
+    np.testing.assert_allclose(pooled.distance, [5.0, 5.0])

@@ -1,33 +1,13 @@
 import numpy as np
 import pytest
-from camera_builders import look_at_camera
+from rigs import rig
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.residuals import AdjustmentProblem
-from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import PARAMETERS, step_camera
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
-
-
-def rig(count, rng):
-    """Cameras around the origin, 50 m away."""
-    angles = 2.0 * np.pi * np.arange(count) / count + 0.3
-    focal = rng.uniform(1800.0, 2400.0, count)
-    middle = np.array([959.5, 539.5]) + rng.normal(0.0, 5.0, (count, 2))
-    lens = (-0.08, 0.02, 0.0, 0.0, 0.0)
-    return Camera.stack(
-        [
-            look_at_camera(
-                *((50.0 * np.cos(angle), 50.0 * np.sin(angle), 15.0), (0.0, 0.0, 1.0), focal[n]),
-                middle=middle[n],
-                lens=lens,
-                roll=0.01,
-            )
-            for n, angle in enumerate(angles)
-        ]
-    )
 
 
 @pytest.fixture

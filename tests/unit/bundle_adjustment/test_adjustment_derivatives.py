@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab import ring
+from rigs import rig
 
 from worldpose.bundle_adjustment.uncertainty import relative_covariance, similarity_steps
 from worldpose.geometry.camera_model import STEP
@@ -50,7 +50,7 @@ def rng():
 
 @pytest.mark.parametrize("parameter", range(7))
 def test_steps_are_the_derivatives_of_cameras_that_follow(rng, parameter):
-    cameras, points = ring(3, rng), rng.normal(0.0, 0.5, (10, 3))
+    cameras, points = rig(3, rng), rng.normal(0.0, 0.5, (10, 3))
     small = np.zeros(7)
     small[parameter] = 1e-6
     away = points - ORIGIN
@@ -61,7 +61,7 @@ def test_steps_are_the_derivatives_of_cameras_that_follow(rng, parameter):
 
 
 def test_what_cameras_err_by_in_common_is_taken_apart(rng):
-    cameras, points = ring(4, rng), rng.normal(0.0, 0.5, (40, 3)) + ORIGIN
+    cameras, points = rig(4, rng), rng.normal(0.0, 0.5, (40, 3)) + ORIGIN
     by_step = np.stack([project_with_jacobian(camera, points)[1] for camera in cameras])
     information = np.einsum("cnai,cnaj->cij", by_step, by_step)
     steps = similarity_steps(cameras, ORIGIN).reshape(48, 7)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab import errors
+from rigs import errors
 
 from worldpose.bundle_adjustment.clip import Clicks
 from worldpose.bundle_adjustment.estimate import adjust_cameras

@@ -12,7 +12,7 @@ from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.formats.challenge import challenge_truth, write_challenge, write_submission
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
-from worldpose.formats.motion_capture import coco_dataset, write_coco
+from worldpose.formats.motion_capture import coco_dataset, write_json
 from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -82,7 +82,7 @@ def written(model, poses, cameras, main_camera, tmp_path_factory):
             calibration = camera.to_calibration(name)
             write_static_camera(folder / kind / "cameras" / f"{name}.npz", calibration)
         dataset = coco_dataset(name, camera, tracks, np.ones(joints.shape[:3], bool))
-        write_coco(folder / "static" / f"{name}.json", dataset)
+        write_json(folder / "static" / f"{name}.json", dataset)
     write_joints(folder / "static" / "joints.npz", tracks)
     for kind in ("plain", "challenge"):
         write_moving_camera(folder / kind / "cameras" / "A_1.npz", main_camera)

@@ -3,12 +3,7 @@
 import numpy as np
 from camera_builders import look_at_camera
 
-from worldpose.detection.bundled_detector import BundledDetector
-from worldpose.detection.bundled_nets import PeopleNet
-from worldpose.detection.enlargement import (
-    expect_parts,
-    find_small,
-)
+from worldpose.detection.enlargement import expect_parts, find_small
 from worldpose.detection.interfaces import People
 from worldpose.pitch.template import PitchTemplate
 
@@ -60,30 +55,3 @@ def test_a_calibrated_camera_tells_where_people_are_small():
         box = np.array([middle[0] - 4, head[1], middle[0] + 4, feet[1]])
         found = any(len(tile.to_frame(seen(tile, box)).scores) for tile in tiles)
         assert found == wanted
-
-
-class SizesSeen(BundledDetector):
-    """Records the sizes of the images that the net sees; finds a person of a given height."""
-
-    def __init__(self, height):
-        super().__init__(PeopleNet())
-        self.height, self.shapes = height, []
-
-    def _detect(self, views):
-        images = [view() for view in views]
-        self.shapes += [image.shape[:2] for image in images]
-        corners = np.array([500.0, 300.0, 560.0, 300.0 + self.height])
-        return [people(corners * (len(image) / SHAPE[0])) for image in images]
-
-
-def test_the_detector_looks_at_the_size_that_suits_the_people():
-    image = np.zeros(SHAPE, dtype=np.uint8)
-    for height, last in ((60.0, (1080, 1920)), (150.0, (540, 960)), (260.0, (270, 480))):
-        detector = SizesSeen(height)
-        (found,) = detector.detect([image])
-        assert detector.shapes == [(540, 960), last]
-        np.testing.assert_allclose(found.boxes, [[500.0, 300.0, 560.0, 300.0 + height]], atol=2.0)
-    # A calibrated camera tells the sizes: there is no second look.
-    detector = SizesSeen(150.0)
-    detector.detect_parts([image], [])
-    assert detector.shapes == [(1080, 1920)]

@@ -13,14 +13,8 @@ from worldpose.detection.bundled_nets import (
     load_weights,
     save_weights,
 )
-from worldpose.detection.bundled_pose import (
-    BundledPoseEstimator,
-)
-from worldpose.detection.models import (
-    BUNDLED_WEIGHTS,
-    load_bundled_detector,
-    load_bundled_pose,
-)
+from worldpose.detection.bundled_pose import BundledPoseEstimator
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
 from worldpose.detection.net_inference import QuantizedNet
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou

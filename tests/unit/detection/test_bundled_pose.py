@@ -5,11 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
-from worldpose.detection.bundled_pose import (
-    CropEstimates,
-    assign_joints,
-    find_occluded_people,
-)
+from worldpose.detection.bundled_pose import CropEstimates, assign_joints, find_occluded_people
 from worldpose.detection.interfaces import People
 from worldpose.detection.net_inference import run_together
 from worldpose.detection.settings import DetectionSettings

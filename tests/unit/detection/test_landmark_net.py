@@ -14,11 +14,7 @@ from worldpose.body.keypoints import LANDMARKS
 from worldpose.detection.bundled_nets import CELL, load_weights
 from worldpose.detection.crops import CROP
 from worldpose.detection.interfaces import People
-from worldpose.detection.landmark_net import (
-    POINTS,
-    LandmarkEstimator,
-    LandmarkNet,
-)
+from worldpose.detection.landmark_net import POINTS, LandmarkEstimator, LandmarkNet
 from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks
 from worldpose.detection.net_inference import QuantizedNet
 from worldpose.detection.pipeline import PeopleFinder

@@ -13,7 +13,7 @@ from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, Seen, load_weights
 from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.crops import CROP
-from worldpose.detection.models import BUNDLED_WEIGHTS, load_detectors, load_pose
+from worldpose.detection.models import BUNDLED_WEIGHTS
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet
 from worldpose.detection.pipeline import detect_people
 from worldpose.detection.settings import DetectionSettings
@@ -68,14 +68,6 @@ def test_torch_alone_finds_the_same_people_as_opencv(still):
         known = before.confidence > 0.5
         apart = np.linalg.norm(before.keypoints - after.keypoints, axis=-1)[known]
         assert known.sum() > 30 and np.quantile(apart, 0.95) < 0.1 * zoom
-
-
-def test_units_of_a_process_share_their_nets():
-    settings = DetectionSettings()
-    assert load_pose(settings) is load_pose(settings)
-    assert load_detectors(settings)[0] is load_detectors(settings)[0]
-    other = DetectionSettings(detector=f"embedded:{BUNDLED_WEIGHTS[0]}")
-    assert load_detectors(settings)[0] is not load_detectors(other)[0]
 
 
 class Small(torch.nn.Module):

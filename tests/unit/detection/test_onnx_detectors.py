@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from worldpose.detection.models import load_detectors
-from worldpose.detection.onnx_detectors import (
-    FORMS,
-    _class_names,
-    _person_classes,
-    recognize_form,
-)
+from worldpose.detection.onnx_detectors import FORMS, _class_names, _person_classes, recognize_form
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 

@@ -39,44 +39,12 @@ def rt_detr_v2(transformers):
     return transformers.RTDetrV2ForObjectDetection(config)
 
 
-def d_fine(transformers):
-    backbone = transformers.HGNetV2Config(
-        stem_channels=[3, 8, 16],
-        stage_in_channels=[16, 16, 32, 32],
-        stage_mid_channels=[8, 8, 16, 16],
-        stage_out_channels=[16, 32, 32, 48],
-        stage_num_blocks=[1, 1, 1, 1],
-        stage_numb_of_layers=[1, 1, 1, 1],
-        hidden_sizes=[16, 32, 32, 48],
-        depths=[1, 1, 1, 1],
-        embedding_size=16,
-        out_features=["stage2", "stage3", "stage4"],
-    )
-    config = transformers.DFineConfig(
-        backbone_config=backbone,
-        encoder_in_channels=[32, 32, 48],
-        encoder_hidden_dim=32,
-        encoder_ffn_dim=32,
-        d_model=32,
-        num_queries=20,
-        decoder_in_channels=[32, 32, 32],
-        decoder_ffn_dim=32,
-        decoder_layers=2,
-        decoder_attention_heads=2,
-        encoder_attention_heads=2,
-        decoder_n_points=[2, 2, 2],
-        num_labels=1,
-    )
-    return transformers.DFineForObjectDetection(config)
-
-
-@pytest.mark.parametrize("make", [rt_detr_v2, d_fine])
-def test_a_saved_detector_finds_boxes_in_the_picture(tmp_path, make):
+def test_a_saved_detector_finds_boxes_in_the_picture(tmp_path):
     transformers = pytest.importorskip("transformers")
     import torch
 
     torch.manual_seed(0)
-    make(transformers).eval().save_pretrained(tmp_path)
+    rt_detr_v2(transformers).eval().save_pretrained(tmp_path)
     transformers.RTDetrImageProcessorPil(
         size={"height": 96, "width": 128}, do_resize=True
     ).save_pretrained(tmp_path)

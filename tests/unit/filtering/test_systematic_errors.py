@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from planted_errors import plant
 
-from data_contracts.conventions import COCO17
 from worldpose.filtering.judging import Residuals
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.systematic_errors import (
@@ -85,20 +84,3 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     assert np.nanmean(beside(right.detections.keypoints)) < 0.4 * np.nanmean(
         beside(suspects.subtract(exact).detections.keypoints)
     )
-
-
-def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
-    suspects = scene.suspects
-    frame, camera, person = np.argwhere(suspects.detections.detection_index >= 0)[0]
-    exchanged = suspects.exchanged.copy()
-    exchanged[frame, camera, person, 2] = True  # the legs
-    suspects = replace(suspects, exchanged=exchanged)
-    shift = np.full((*suspects.detections.detection_index.shape, 17, 2), np.nan)
-    shift[frame, camera, person] = np.arange(34.0).reshape(17, 2)
-    found = suspects.assign_to_detections(shift)
-    own = found[frame, camera, suspects.detections.detection_index[frame, camera, person]]
-    left, right = COCO17.index("left_hip"), COCO17.index("right_hip")
-    np.testing.assert_array_equal(own[left], [2.0 * right, 2.0 * right + 1.0])
-    assert np.count_nonzero(found.any(axis=(-1, -2))) == 1
-    kept = suspects.subtract(shift).detections.keypoints
-    np.testing.assert_allclose(kept, suspects.detections.keypoints - found)

@@ -40,11 +40,6 @@ def test_our_own_tracks_are_read_back(tmp_path):
     assert found.person.tolist() == [1, 5, 10] * 2 + [1, 10] + [1, 5, 10] * 2
 
 
-@pytest.mark.parametrize("end", ["", ",0.5", ",0.5,-1", ",0.5,-1,-1,-1"])
-def test_six_to_ten_numbers_are_read(read, end):
-    assert read(f"1,1,10,10,5,5{end}\n").score.tolist() == [0.5 if end else 1.0]
-
-
 def test_boxes_outside_and_confidences_above_one_are_counted(read):
     found = read("1,1,10,10,5,5,1.26\n1,2,700,10,5,5,1\n2,1,630,10,20,5,1\n2,9,-9,1,5,5,0\n")
     assert (found.person.tolist(), found.score.tolist()) == ([1, 1], [1.0, 1.0])

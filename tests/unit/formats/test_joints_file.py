@@ -1,11 +1,20 @@
+import io
 import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
-from worldpose.formats.joints_file import JointTracks, read_joints, write_joints
+from worldpose.formats.archives import read_npz
+from worldpose.formats.joints_file import (
+    JointTracks,
+    read_joints,
+    read_poses,
+    write_joints,
+    write_poses,
+)
 
 
 @pytest.fixture
@@ -90,18 +99,100 @@ def test_what_does_not_fit_is_named(tmp_path, changes, message):
     assert str(tmp_path / "bad.npz") in str(caught.value)
 
 
-def test_a_header_that_claims_more_than_the_file_holds_allocates_nothing(tmp_path):
-    path = tmp_path / "bomb.npz"
-    np.savez(path, **arrays())
-    with zipfile.ZipFile(path) as file:
-        members = {name: file.read(name) for name in file.namelist()}
-    # The same length of header, but 3 billion frames.
-    few, many = b"(3,), }" + 8 * b" ", b"(3000000000,),}"
-    assert few in members["frames.npy"]
-    members["frames.npy"] = members["frames.npy"].replace(few, many)
-    with zipfile.ZipFile(path, "w") as file:
+@pytest.fixture
+def poses():
+    rng = np.random.default_rng(0)
+    transl = rng.uniform(-50.0, 50.0, (3, 5, 3))
+    transl[1, 2] = np.nan
+    return BodyParameters(
+        rng.standard_normal((3, 1, 10)),
+        rng.standard_normal((3, 5, 3)),
+        rng.standard_normal((3, 5, 69)),
+        transl,
+    )
+
+
+def test_poses_come_back_in_single_precision(poses, tmp_path):
+    write_poses(tmp_path / "clip.npz", poses, "open-neutral/2")
+    back, body_model = read_poses(tmp_path / "clip.npz")
+    assert body_model == "open-neutral/2"
+    for name in ("betas", "global_orient", "body_pose", "transl"):
+        np.testing.assert_array_equal(
+            getattr(back, name), getattr(poses, name).astype(np.float32).astype(np.float64)
+        )
+    with np.load(tmp_path / "clip.npz") as file:
+        assert {name: file[name].shape for name in file.files} == {
+            "betas": (3, 10),
+            "global_orient": (3, 5, 3),
+            "body_pose": (3, 5, 69),
+            "transl": (3, 5, 3),
+            "body_model": (1,),
+        }
+
+
+def test_a_file_without_an_array_is_refused(tmp_path):
+    np.savez(tmp_path / "half.npz", betas=np.zeros((1, 10)))
+    with pytest.raises(InputError, match=r"half\.npz"):
+        read_poses(tmp_path / "half.npz")
+
+
+def written(path, **members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, content in members.items():
-            file.writestr(name, content)
-    message = r"frames.npy: expected \d+ bytes for its shape \(3000000000,\), found \d+ bytes"
-    with pytest.raises(InputError, match=message):
-        read_joints(path)
+            if not isinstance(content, bytes):
+                form = io.BytesIO()
+                np.lib.format.write_array(form, content, version=(1, 0))
+                content = form.getvalue()
+            file.writestr(f"{name}.npy", content)
+    return path
+
+
+def header(text):
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (
+            header("{'descr': '<f4', 'fortran_order': False, 'shape': (10, 10**12), }\n"),
+            "npy array",
+        ),
+        (header("{'descr': '<f4', 'fortran_order': False, 'shape': (10, 100), }\n"), "4073 bytes"),
+        (header("[" * 3000 + "]" * 3000), "npy array"),
+        (header("__import__('os').system('id')\n"), "npy array"),
+        (header("{'descr': '<z9', 'fortran_order': False, 'shape': (1,), }\n"), "z9"),
+        (header("{'descr': [('x', '<f4')], 'fortran_order': False, 'shape': (1,)}\n"), "plain"),
+        (b"", "npy array"),
+    ],
+)
+def test_a_member_that_lies_is_named(tmp_path, content, told):
+    path = written(tmp_path / "a.npz", score=content)
+    with pytest.raises(InputError, match=told) as caught:
+        read_npz(path, 10**6)
+    assert caught.value.where == f"{path}: score.npy"
+    assert len(str(caught.value)) < 600
+
+
+def test_arrays_beyond_the_limit_are_not_unpacked(tmp_path):
+    path = written(tmp_path / "a.npz", score=np.zeros(1000))
+    with pytest.raises(InputError, match="at most 7000 bytes of arrays, found 8128 bytes"):
+        read_npz(path, 7000)
+
+
+def test_a_packed_size_that_is_more_than_the_file_does_not_excuse_a_bomb(tmp_path):
+    path = written(tmp_path / "a.npz", a=np.zeros((1 << 20, 9)))
+    with pytest.raises(InputError, match="packed at most 200 to 1"):
+        read_npz(path, 1 << 30)
+    content = bytearray(path.read_bytes())
+    directory = content.rindex(b"PK\x01\x02")
+    content[directory + 20 : directory + 24] = (1 << 30).to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="packed at most 200 to 1"):
+        read_npz(path, 1 << 30)
+
+
+def test_no_archive_is_refused(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match="expected a whole npz file"):
+        read_npz(tmp_path / "a.npz", 1000)

@@ -8,7 +8,6 @@ import pytest
 from data_contracts.conventions import COCO17, FEET
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
-from worldpose.formats import coco_results
 from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
@@ -222,6 +221,11 @@ def test_many_people_of_no_known_order_are_refused(tmp_path):
         (["cam1_000012_480.png", "cam1_000013_520.png"], [12, 13]),  # a time [ms]
         (["12_480_7.png", "13_520_7.png"], [12, 13]),
         (["cam000012.png", "cam000013.png"], [12, 13]),
+        # Times of day, and two clips in one folder, number no frames.
+        (["T_04_17.73.png", "T_04_17.98.png", "T_04_18.21.png"], [None] * 3),
+        (["take1_10.png", "take1_11.png", "take2_5.png"], [None] * 3),
+        (["0004_000100.png", "0004_000101.png"], [100, 101]),
+        (["cam1_frame_12.jpg", "cam1_frame_13.jpg"], [12, 13]),
     ],
 )
 def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
@@ -255,27 +259,11 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
         read_coco_results(path)
 
 
-def test_annotations_without_points_take_the_set_of_the_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(coco_results, "BATCH", 2)
-    path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}], BODY_25B)
-    content = json.loads(path.read_text())
-    balls = [{"image_id": 3, "bbox": [1, 2, 3, 4]}] * 2
-    path.write_text(json.dumps(content | {"annotations": balls + content["annotations"]}))
-    assert_body(read_coco_results(path).people)
-
-
-def test_points_may_be_lists_of_three(tmp_path):
-    nested = np.reshape(points(COCO17), (17, 3)).tolist()
-    (tmp_path / "a.json").write_text(json.dumps([{"image_id": 4, "keypoints": nested}]))
-    assert_body(read_coco_results(tmp_path / "a.json").people)
-
-
-@pytest.mark.parametrize(
-    "name", ["12.png", "a/frame000012.PNG", "cam2_0012_1080p.jpg", "f_12_jpg.rf.3fa9b7.jpg"]
-)
-def test_the_frame_is_the_last_number_and_no_part_of_a_word(tmp_path, name):
-    found = read_coco_results(data_set(tmp_path / "a.json", [{"id": 7, "file_name": name}]))
-    assert (found.kind, found.people.frame.tolist()) == ("COCO-17", [12])
+def test_people_with_a_box_alone_are_told(tmp_path):
+    result = {"image_id": 3, "category_id": 1, "keypoints": [0] * 51, "bbox": [1, 2, 30, 40]}
+    (tmp_path / "a.json").write_text(json.dumps([result, result]))
+    found = {"a": read_people(tmp_path / "a.json")}
+    assert "warning: people have a box but no keypoint: 2 of a" in describe_changes(found)
 
 
 def test_alphapose_numbers_its_images_by_their_names(tmp_path):

@@ -8,7 +8,6 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
-from worldpose.formats.opencv_storage import read_file_storage
 
 MATRIX = np.array([[1400.0, 0.0, 970.0], [0.0, 1404.0, 530.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([[-0.31, 0.12, 0.001, -0.002, -0.03]])
@@ -56,7 +55,14 @@ def write_plain_json(folder):
     return [folder / "lens.json"]
 
 
+def write_flat_toml(folder):
+    text = f"resolution = [1920, 1080]\ncameraMatrix = {MATRIX.tolist()}\n"
+    (folder / "lens.toml").write_text(text + f"distCoeffs = {DISTORTION[0].tolist()}\n")
+    return [folder / "lens.toml"]
+
+
 WRITERS = {
+    "flat toml": write_flat_toml,
     "xml": lambda folder: write_opencv(folder / "lens.xml"),
     "yml": lambda folder: write_opencv(folder / "lens.yml", image_width=1920, image_height=1080),
     "json": lambda folder: write_opencv(folder / "lens.json"),
@@ -95,38 +101,6 @@ def test_deep_nesting_is_refused_before_a_parser_ends_the_process(name, tmp_path
         read_lenses([tmp_path / name], "left", SIZES)
 
 
-@pytest.mark.parametrize("flag", [0, cv2.FILE_STORAGE_WRITE_BASE64])
-@pytest.mark.parametrize("form", ["xml", "yml", "json"])
-def test_what_opencv_writes_is_read_as_it_was_written(form, flag, tmp_path):
-    file = tmp_path / f"all.{form}"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE | flag)
-    wrote = {
-        "K": MATRIX * 1e-7,
-        "corners": np.arange(12, dtype=np.float32).reshape(2, 3, 2),
-        "flags": np.arange(6, dtype=np.uint8).reshape(2, 3),
-        "odd": np.array([[np.nan, np.inf, -np.inf]]),
-        "count": 3.0,
-        "tiny": 1e-300,
-        "model": "plumb_bob",
-        "about": 'a "b" c',
-    }
-    for name, value in wrote.items():
-        storage.write(name, value)
-    storage.startWriteStruct("names", cv2.FileNode_SEQ)
-    for name in ("1", 'cam "a"', "02"):
-        storage.write("", name)
-    storage.endWriteStruct()
-    storage.release()
-    found = read_file_storage(file)
-    assert found.pop("names") == ["1", 'cam "a"', "02"]
-    assert found.keys() == wrote.keys()
-    for name, value in wrote.items():
-        if isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(found[name], value)
-        else:
-            assert found[name] == value
-
-
 def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):
     files = write_opencv(tmp_path / "lens.yml", image_width=1920, image_height=1080)
     small = read_lenses(files, "right", SIZES)["right"]
@@ -136,6 +110,20 @@ def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):
     assert small.distortion == tuple(DISTORTION[0].tolist())
     with pytest.raises(InputError, match=r"expected 1440 x 1080 px.*found 1920 x 1080"):
         read_lenses(files, "right", {"right": (1440, 1080)})
+
+
+@pytest.mark.parametrize("form", ["multical", "panoptic"])
+def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
+    table = {"K": MATRIX.tolist(), "dist": DISTORTION.tolist(), "image_size": [1920, 1080]}
+    cameras = {"left": table, "right": table}
+    if form == "panoptic":
+        renamed = {"K": table["K"], "distCoef": DISTORTION[0].tolist(), "resolution": [1920, 1080]}
+        cameras = [{"name": name, **renamed} for name in cameras]
+    (tmp_path / "rig.json").write_text(json.dumps({"cameras": cameras}))
+    found = read_lenses([tmp_path / "rig.json"], None, SIZES)
+    assert found["left"].focal_px == pytest.approx(1402.0)
+    assert found["right"].distortion == tuple(DISTORTION[0].tolist())
+    assert [*read_lenses([tmp_path / "rig.json"], "left", SIZES)] == ["left"]
 
 
 @pytest.mark.parametrize("names", ["KDhw", "kd"])

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -161,20 +160,6 @@ def test_matrix_that_is_no_rotation_is_refused(rotation, found):
         Camera.from_calibration(calibration(rotation=rotation.tolist()))
 
 
-def test_cameras_from_matrices_project_as_opencv_does():
-    matrix = np.array([[1200.0, 0.0, 900.0], [0.0, 1210.0, 500.0], [0.0, 0.0, 1.0]])
-    distortion = np.array([0.1, -0.05, 0.001, -0.002, 0.01])
-    vectors = [np.array([0.1, -0.2, 0.3]), np.array([-0.3, 0.1, 0.0])]
-    rotations = np.stack([cv2.Rodrigues(vector)[0] for vector in vectors])
-    shifts = np.array([[0.1, 0.2, 9.0], [-0.3, 0.0, 7.0]])
-    points = np.array([[0.5, -0.2, 0.4], [-1.0, 0.3, 1.0]])
-    cameras = Camera.from_matrices(matrix, distortion, rotations, shifts, (1920, 1080))
-    assert cameras.batch_shape == (2,)
-    for camera, vector, shift in zip(cameras.project(points), vectors, shifts, strict=True):
-        expected = cv2.projectPoints(points, vector, shift, matrix, distortion)[0][:, 0]
-        np.testing.assert_allclose(camera, expected, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("matrix", "rotation", "where"),
     [
@@ -186,12 +171,6 @@ def test_cameras_from_matrices_project_as_opencv_does():
 def test_matrices_that_no_camera_has_are_refused(matrix, rotation, where):
     with pytest.raises(InputError, match=f"from_matrices: {where}"):
         Camera.from_matrices(matrix, np.zeros(5), rotation, np.zeros(3), (1920, 1080))
-
-
-def test_missing_point_has_no_image():
-    found = simple_camera().project_with_jacobians([[np.nan, 0.0, 1.0], [0.0, np.inf, 1.0]])
-    assert found.status.tolist() == [RayStatus.MISSING, RayStatus.MISSING]
-    assert np.isnan(found.points_image).all()
 
 
 @pytest.mark.parametrize(

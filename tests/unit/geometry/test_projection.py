@@ -1,7 +1,5 @@
 import cv2
 import numpy as np
-import pytest
-from camera_builders import plain_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -141,16 +139,3 @@ def test_pixel_to_ray_to_pixel_returns(camera, seed):
     np.testing.assert_allclose(camera.project(points)[rays.valid], pixels[rays.valid], atol=1e-9)
     assert np.isnan(rays.directions[~rays.valid]).all()
     assert np.isin(rays.status, [RayStatus.OK, RayStatus.BEYOND_FOLD]).all()
-
-
-@pytest.mark.parametrize(
-    ("focal", "k1", "k2"), [(2400.0, 0.08, -1.06), (2400.0, 0.99, 4.29), (7100.0, 0.99, -1.06)]
-)
-def test_strong_broadcast_lenses_are_inverted_over_the_whole_image(focal, k1, k2):
-    camera = plain_camera(focal, (960.0, 540.0), Rigid.identity(), lens=(k1, k2, 0.0, 0.0, 0.0))
-    u, v = np.meshgrid(np.linspace(-0.5, 1919.5, 97), np.linspace(-0.5, 1079.5, 55))
-    pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
-    rays = camera.unproject(pixels)
-    assert rays.valid.all()
-    np.testing.assert_allclose(camera.project(rays.directions), pixels, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=-1), 1.0, atol=1e-15)

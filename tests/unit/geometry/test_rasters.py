@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from worldpose.geometry.boxes import box_areas, box_iou
 from worldpose.geometry.rasters import Samples, Surface, cover_triangles, draw_triangles, resolve
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
@@ -45,3 +46,16 @@ def test_half_a_pixel_has_half_its_samples_and_mixes_with_what_is_behind():
     np.testing.assert_array_equal(picture[..., 0], expected)
     assert seen.tolist() == [2]
     assert np.flatnonzero(persons == 0).tolist() == [4]
+
+
+def test_intersection_over_union_of_every_pair():
+    # Two squares of 4 that share 2: 2 of 6.
+    found = box_iou(np.array([[0.0, 0, 2, 2]]), np.array([[1.0, 0, 3, 2], [5, 5, 6, 6]]))
+    np.testing.assert_allclose(found, [[1 / 3, 0.0]])
+
+
+def test_boxes_without_area_and_missing_boxes_share_nothing():
+    flat, reversed_box = [1.0, 1, 1, 1], [2.0, 2, 0, 0]
+    boxes = np.array([flat, reversed_box, [np.nan] * 4, [0.0, 0, 2, 2]])
+    assert box_iou(boxes, boxes).tolist() == np.diag([0.0, 0, 0, 1]).tolist()
+    assert box_areas(boxes[[0, 1, 3]]).tolist() == [0.0, 0.0, 4.0]

@@ -62,11 +62,3 @@ def test_large_world_coordinates_keep_their_digits():
     # As ten metres apart without the shift; solving in grid coordinates would lose 1e-5 m.
     np.testing.assert_allclose(intersect_rays(rays_through(origins, target))[0], target, rtol=0.0,
                                atol=1e-8)  # fmt: skip
-
-
-def test_normal_matrix_of_rays_along_x_and_y():
-    rays = rays_through([[-5.0, 0.0, 0.0], [0.0, -5.0, 0.0]], [0.0, 0.0, 0.0])
-    # x is seen by the second ray, y by the first, z by both.
-    np.testing.assert_allclose(
-        intersect_rays(rays, [1.0, 10.0])[1], np.diag([10.0, 1.0, 11.0]), atol=1e-14
-    )

@@ -54,13 +54,6 @@ def test_tiny_rotations_keep_their_digits(size):
     np.testing.assert_allclose(found, rotvec, rtol=ROUNDING, atol=0.0)
 
 
-def test_tangent_update_rotates_before_it_translates():
-    start = Rigid(np.eye(3), [1.0, 0.0, 0.0])
-    # x = 1 in frame b turns to y = 1, then moves 5 along z.
-    moved = start.retract([0.0, 0.0, np.pi / 2, 0.0, 0.0, 5.0]).apply([[0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(moved, [[0.0, 1.0, 5.0]], atol=ROUNDING)
-
-
 @given(rotvecs, vectors, vectors)
 def test_tangent_update_has_the_documented_derivative(rotvec, translation, point):
     transform = Rigid.from_rotvec(rotvec, translation)

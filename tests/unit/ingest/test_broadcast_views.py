@@ -1,14 +1,11 @@
 """Broadcast cameras of a clip: their names, their files, and the images at match frames."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import yaml
 from pydantic import ValidationError
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.results import run_cameras
 from worldpose.errors import InputError
 from worldpose.ingest.clock import ImageClock, rows_at
 from worldpose.ingest.footage import footage_size, image_clock, unit_frames
@@ -71,12 +68,6 @@ def test_each_view_has_its_own_size_rate_and_offset():
     assert clock.images.tolist() == [12, 13, 14, 15, 16, 17, 18]
     np.testing.assert_allclose(clock.frame_row, (clock.images - 12.4) / 1.2)
     assert clock.frame_of(np.array([11, 12, 13, 14, 99])).tolist() == [0, 0, 0, 1, 5]
-
-
-def test_an_offset_of_the_match_rate_is_rounded_and_its_rest_is_lateness():
-    spec = match("main", 12.25)
-    assert unit_frames(spec, "goal").offset == -88
-    assert image_clock(spec, "goal").late.tolist() == [-0.25] * 6
 
 
 @pytest.mark.parametrize("rate", [1.0, 1.1988, 0.5, 2.0])
@@ -145,15 +136,7 @@ def test_several_broadcast_cameras_need_static_ones(two):
         read_match(two)
 
 
-def test_an_image_between_match_frames_is_drawn_with_the_nearest_that_has_a_camera():
-    clock = ImageClock.of(np.arange(10), 0.0, 2.4, 0.0)
-    assert clock.number[:4].tolist() == [0, 2, 5, 7]
-    assert [clock.nearest_frame(number) for number in (0, 4, 5, 6, 7)] == [0, 2, 2, 2, 3]
-
-
-def test_a_static_camera_may_be_named_broadcast(monkeypatch):
-    monkeypatch.setattr(run_cameras, "broadcast_views", lambda run, clip: ["goal"])
-    monkeypatch.setattr(run_cameras, "camera_in_frames", lambda run, view, frames: view)
-    find = partial(run_cameras.moving_cameras, None, "goal", np.arange(3))
-    assert find(["cam1"]) == {"broadcast": "goal"}
-    assert find(["cam1", "broadcast"]) == {"goal": "goal"}
+def test_an_offset_of_the_match_rate_is_rounded_and_its_rest_is_lateness():
+    spec = match("main", 12.25)
+    assert unit_frames(spec, "goal").offset == -88
+    assert image_clock(spec, "goal").late.tolist() == [-0.25] * 6

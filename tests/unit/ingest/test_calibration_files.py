@@ -221,6 +221,28 @@ def test_qualisys_video_that_shows_a_part_of_the_sensor_moves_the_centre(read):
     assert camera.principal_point_px == (640.0, 500.0)
 
 
+def test_qualisys_files_of_older_versions_have_pixels_and_the_whole_sensor(read):
+    whole = QUALISYS.replace('<fov_video left="0" top="0" right="1919" bottom="1079"/>', "")
+    pixels = whole
+    for parts, px in (("122879", "1920"), ("69119", "1080"), ("64000", "1000"), ("70400", "1100")):
+        pixels = pixels.replace(f'"{parts}"', f'"{px}"')
+    pixels = pixels.replace('"61440"', '"960"').replace('"34560"', '"540"')
+    expected = read(QUALISYS, "rig.qca.txt")
+    assert read(whole, "rig.qca.txt") == expected
+    assert read(pixels, "rig.qca.txt") == expected
+
+
+def test_poses_of_pairs_beside_the_cameras_are_no_cameras(read):
+    pair = "\n[stereo_1_2]\nrotation = [0.1, 0.2, 0.3]\ntranslation = [1.0, 0.0, 0.0]\n"
+    assert read(ANIPOSE + pair) == read(ANIPOSE)
+
+
+def test_poses_that_are_all_null_are_told_to_be_lenses(refusal):
+    without = CALISCOPE.replace("[[0.1], [0.2], [3.0]]", '"null"')
+    without = without.replace("[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]", '"null"')
+    assert "a lens alone" in refusal(without).found
+
+
 @pytest.mark.parametrize(
     ("old", "new", "place"),
     [
@@ -231,7 +253,6 @@ def test_qualisys_video_that_shows_a_part_of_the_sensor_moves_the_centre(read):
         ('focalLengthU="64000"', 'focalLengthU="-1"', "camera[0]: focal length"),
         ('skew="0.000"', 'skew="1.5"', "camera[0].intrinsic.skew"),
         ('serial="26580"', 'serial=""', "camera[0]: name"),
-        ('<fov_video left="0" top="0" right="1919" bottom="1079"/>', "", "camera[0]"),
         ('<camera active="1"', '<camera active="0"', "rig.qca.txt"),
         ("</calibration>", "", "rig.qca.txt"),
         ("<calibration", "<!DOCTYPE a [<!ENTITY b 'c'>]><calibration", "rig.qca.txt"),

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.formats import coco_results, files
+from worldpose.formats import files
 from worldpose.formats.coco_results import read_coco_results
 
 
@@ -120,24 +120,6 @@ def test_what_does_not_fit_is_refused_with_its_place(refusal, content, place, wo
     assert words in str(error)
 
 
-def test_crowd_that_would_fill_the_memory_is_refused(read, refusal, monkeypatch):
-    # One frame with many people pads every other frame: 4000 frames x 200 people.
-    nose = [5.0, 5.0, 0.5, *[0.0] * 48]
-    results = [{"image_id": n, "keypoints": nose} for n in (*range(4000), *[0] * 199)]
-    assert read(results[:10]).keypoints.shape == (10, 1, 17, 2)
-    monkeypatch.setattr("worldpose.formats.keypoint_sets.ARRAY_BYTES", 100 << 20)
-    assert "200 people in frame 0" in refusal(results).found
-
-
-def test_results_of_several_batches_keep_their_places(read, refusal, monkeypatch):
-    monkeypatch.setattr(coco_results, "BATCH", 3)
-    results = [person(frame, score=0.1 * frame + 0.1) for frame in range(8)]
-    np.testing.assert_allclose(read(results).score[:, 0], 0.1 * np.arange(1, 9), rtol=1e-6)
-    for index, wrong in ((4, person(keypoints=[1.0] * 3)), (5, person(score=-1)), (7, 3)):
-        error = refusal([*results[:index], wrong, *results[index + 1 :]])
-        assert f"result {index}" in error.where
-
-
 @pytest.mark.parametrize("entry", ["{}", "[0]", '{"image_id":0,"keypoints":[]}', '""', "0"])
 def test_a_large_file_of_small_entries_takes_little_memory(tmp_path, entry):
     """26 MB of them took 770 MB: Python's objects are many times their text."""
@@ -166,24 +148,6 @@ def test_what_is_no_json_is_said_so(tmp_path, content):
     with pytest.raises(InputError) as caught:
         list(files.JsonItems(path, "annotations", 1 << 20))
     assert (caught.value.where, caught.value.expected) == (str(path), "JSON")
-
-
-def test_an_entry_without_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "ENTRY_LENGTH", 1000)
-    monkeypatch.setattr(files, "CHUNK", 100)
-    path = tmp_path / "cam1.json"
-    path.write_text("[" + "[1, 2], " * 10 + "[" + "1, " * 5000)
-    with pytest.raises(InputError, match="longer than 1000 characters"):
-        list(files.JsonItems(path, "annotations", 1 << 20))
-
-
-def test_bytes_that_are_no_text_are_said_so(tmp_path):
-    path = tmp_path / "cam1.json"
-    path.write_bytes(b'[{"image_id": "\xff"}]')
-    with pytest.raises(InputError, match="Save it as UTF-8"):
-        read_coco_results(path)
-    path.write_text(json.dumps([person()]), encoding="utf-8-sig")
-    assert len(read_coco_results(path).people.frame) == 1
 
 
 @settings(max_examples=100)

@@ -2,17 +2,13 @@
 
 import numpy as np
 import pytest
-import xarray as xr
 from test_pose2sim_import import person, write_frame
 
 from data_contracts.conventions import FEET
-from data_contracts.ingest import INGEST
 from data_contracts.keypoints import KeypointDetections
-from tasks.clip_inputs import StoredFeedback, open_detections
 from worldpose.errors import InputError
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
-from worldpose.store.groups import checked_arrays, checked_attributes
 
 PLACES = {
     25: (19, 20, 21, 22, 23, 24),
@@ -39,13 +35,6 @@ def people(frames=3, detections=2, points=FEET, seed=0):
     )
 
 
-def same(one, two):
-    assert one.points == two.points
-    assert one.arrays().keys() == two.arrays().keys()
-    for name, array in one.arrays().items():
-        np.testing.assert_array_equal(array, two.arrays()[name])
-
-
 @pytest.mark.parametrize(("size", "places"), PLACES.items())
 def test_every_set_with_feet_gives_them_in_one_order(tmp_path, size, places):
     values, _ = person(size, 3)
@@ -62,37 +51,6 @@ def test_every_set_with_feet_gives_them_in_one_order(tmp_path, size, places):
     # Box and score are those of COCO-17, as without feet.
     body = found.keypoints[0, 0]
     np.testing.assert_array_equal(found.boxes[0, 0], [*body.min(axis=0), *body.max(axis=0)])
-
-
-def stored(given):
-    """Return detections as the store gives them."""
-    arrays = checked_arrays(INGEST, given.arrays(), {"frame": given.frame})
-    labels = checked_attributes(
-        INGEST, arrays, {"camera_id": "a", "video": None, "left_out": None, **given.labels()}
-    )
-    dims = {name: INGEST.layout(name).dims for name in arrays}
-    data = xr.Dataset({name: (dims[name], array) for name, array in arrays.items()})
-    return data.assign_coords(point=labels["point"]) if "point" in labels else data
-
-
-def test_a_store_keeps_them_and_labels_them():
-    given = people()
-    same(KeypointDetections.from_arrays(stored(given)), given)
-    plain = given.with_points(())
-    assert "extra_keypoints" not in stored(plain)
-    same(KeypointDetections.from_arrays(stored(plain)), plain)
-
-
-def test_a_clip_aligns_the_points_of_its_cameras():
-    one, two, plain = people(), people(points=FEET[:3], seed=1), people(seed=2).with_points(())
-    clips = [stored(each) for each in (one, two, plain)]
-    opened = open_detections(clips, one.frame, StoredFeedback(clips))
-    assert opened.points == FEET
-    read = opened[:].extra_keypoints
-    np.testing.assert_array_equal(read[:, 0], one.extra_keypoints)
-    np.testing.assert_array_equal(read[:, 1, :, :3], two.extra_keypoints)
-    assert np.isnan(read[:, 1, :, 3:]).all() and np.isnan(read[:, 2]).all()
-    assert open_detections(clips[2:], plain.frame, StoredFeedback(clips[2:])).points == ()
 
 
 def broken(given, fault):

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from flows.review.repeated_clicks import explain_repeated
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats.annotations.marked_images import read_marked_images
 from worldpose.ingest.annotations import read_clicked_markings
+from worldpose.ingest.camera_data import import_camera_data, read_given_camera
 from worldpose.ingest.clicks import import_clicks
-from worldpose.ingest.match_folder import read_spec
+from worldpose.ingest.match_folder import read_match, read_spec
 from worldpose.ingest.pitch_file import read_pitch
 
 SIZE = (1920, 1080)
@@ -103,23 +104,6 @@ def test_every_form_gives_the_same_clicks(tmp_path, write):
     assert len(drawn) == len(lines)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        {"image": "https://store/east.png?signature=a.b/c&expires=1"},
-        {"image": "/data/local-files/?d=stills/east.png"},
-        {"project": "a match", "image": "east.png"},
-    ],
-)
-def test_an_image_is_named_in_an_address_and_beside_other_texts(tmp_path, data):
-    file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
-    tasks = json.loads(file.read_text())
-    tasks[0]["data"] = data
-    file.write_text(json.dumps(tasks))
-    import_clicks(file, match(tmp_path / "m"))
-    assert clicked(tmp_path / "m")[0].keys() == CLICKS.keys()
-
-
 @pytest.mark.parametrize("angle", [0, 90, 180, 270])
 @pytest.mark.parametrize("kind", ["polygonlabels", "vectorlabels"])
 def test_a_picture_that_the_annotator_turned_is_turned_back(tmp_path, angle, kind):
@@ -174,16 +158,6 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
         np.testing.assert_allclose(points[name], pixel, atol=1e-9)
 
 
-@pytest.mark.parametrize("spell", [str.upper, "{} ".format, lambda name: name.replace("_", " ")])
-def test_labels_are_known_in_any_case_and_with_spaces(tmp_path, spell):
-    clicks = [(spell(name), pixel) for name, pixel in CLICKS.items()]
-    lines = [(spell("touch_line_near"), LINE)]
-    import_clicks(cvat(tmp_path / "clicks", clicks, lines), match(tmp_path / "m"))
-    points, (drawn,) = clicked(tmp_path / "m")
-    assert points.keys() == CLICKS.keys()
-    assert drawn.name == "touch_line_near"
-
-
 def test_lines_of_soccernet_are_clicks_in_its_json_and_by_its_names(tmp_path):
     shares = [{"x": x / SIZE[0], "y": y / SIZE[1]} for x, y in LINE]
     outside = [{"x": 1.2, "y": 0.5}]
@@ -225,6 +199,33 @@ def test_key_frames_of_tracks_are_clicks_at_their_frames(tmp_path, start, first)
     ((label, pixel),) = images[0].points
     np.testing.assert_allclose(pixel, CLICKS[label])
     np.testing.assert_allclose(images[0].lines[0][1], [(100.0, 200.0), (300.0, 250.5)])
+
+
+def test_clicks_in_utf16_are_read_and_text_of_another_kind_is_refused(tmp_path):
+    path = cvat(tmp_path / "clicks.xml", list(CLICKS.items()))
+    text = path.read_text().replace("utf-8", "utf-16")
+    path.write_text(text, encoding="utf-16")
+    assert dict(read_marked_images(path)[0].points).keys() == CLICKS.keys()
+    path.write_text("label;x;y\ncorner_left_near;400;900\n", encoding="utf-16")
+    with pytest.raises(InputError, match="found neither XML nor JSON"):
+        read_marked_images(path)
+
+
+def test_points_of_a_skeleton_have_key_frames_of_their_own(tmp_path):
+    """CVAT marks a skeleton as key frame at its first frame alone."""
+    points = "".join(
+        f'<skeleton frame="{n}" keyframe="{int(n == 0)}">'
+        f'<points label="a" keyframe="{int(n in (0, 5))}" points="{10.5 + n},20.5"/>'
+        f'<points label="b" keyframe="{int(n in (0, 7))}" points="{30.5 + n},40.5"/></skeleton>'
+        for n in range(9)
+    )
+    (tmp_path / "clicks.xml").write_text(
+        "<annotations><meta><task><original_size><width>1920</width><height>1080</height>"
+        f'</original_size></task></meta><track id="0" label="body">{points}</track></annotations>'
+    )
+    images = read_marked_images(tmp_path / "clicks.xml")
+    found = [(each.name[-1], label, *at) for each in images for label, at in each.points]
+    assert found == [("0", "a", 10, 20), ("0", "b", 30, 40), ("5", "a", 15, 20), ("7", "b", 37, 40)]
 
 
 def test_lines_of_game_states_are_key_frames_from_the_first_image(tmp_path):
@@ -274,18 +275,6 @@ def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, 
     pitch = json.loads((folder / "pitch.json").read_text())
     assert pitch["points"]["at_5.50_34.00"] == [5.5, 34.0, -0.2]  # the crown falls to the line
     assert read_pitch(folder, read_spec(folder)).points.keys() == report.own_points.keys()
-
-
-def test_images_of_a_clip_become_key_frames(tmp_path):
-    folder = match(tmp_path / "m")
-    file = cvat(tmp_path / "c.xml", CLICKS.items(), name="frame_000084.png")
-    text = file.read_text().replace("</annotations>", "")
-    other = cvat(tmp_path / "d.xml", CLICKS.items(), name="frame_000009.png").read_text()
-    file.write_text(text + other.replace("<annotations>", ""))
-    report = import_clicks(file, folder, "goal")
-    assert report.clicks == {"goal": 4}
-    written = json.loads((folder / report.files[0]).read_text())
-    assert [each["frame"] for each in written["key_frames"]] == [9, 84]
 
 
 @pytest.mark.parametrize(
@@ -344,3 +333,50 @@ def test_real_cvat_clicks_with_places_become_a_match(tmp_path):
     own = read_pitch(folder, read_spec(folder)).points
     assert not [name for name in own if name.startswith("at_") and "34.00" in name]  # all stripes
     assert {"corner_left_far", "goal_area_left_far_front"} <= clicked(folder, "east")[0].keys()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    match = tmp_path / "m"
+    (match / "broadcast").mkdir(parents=True)
+    for clip in ("goal", "shot"):
+        (match / "broadcast" / f"{clip}.mp4").write_bytes(b"not opened here")
+    (match / "match.yaml").write_text(
+        "contract: 1\nmatch_id: m\nfps: 25\n"
+        "cameras: [{id: main, width: 1920, height: 1080, kind: broadcast}]\n"
+        "clips:\n"
+        "  - {id: goal, first_frame: 0, frame_count: 3, broadcast: main,"
+        " broadcast_offset_frames: 10}\n"
+        "  - {id: shot, first_frame: 9, frame_count: 3, broadcast: main}\n"
+    )
+    return match
+
+
+def test_camera_data_are_written_for_the_frames_of_the_video(folder, tmp_path):
+    table = tmp_path / "viz.csv"
+    table.write_text("pan,tilt,fov,x_mm,y,z\n1,-9,90,500,-70,15\n2,-9,90,500,-70,15\n")
+    target, data = import_camera_data(table, folder, "goal", first=11)
+    assert data.frame.tolist() == [11, 12]
+    assert "1 of 3 images of goal have no camera data" in data.notes
+    assert target == folder / "estimates" / "goal.csv"
+    match = read_match(folder)
+    assert match.camera_data == {"goal": target}
+    assert match.calibrated_views == ("goal",)
+    again = read_given_camera(match, "goal", target)
+    assert again.frame.tolist() == [11, 12]
+    assert again.values[0, :7].tolist() == [1, -9, pytest.approx(float("nan"), nan_ok=True)] + [
+        *(0.5, -70, 15, 960)
+    ]
+    with pytest.raises(UsageError, match="Remove it first"):
+        import_camera_data(table, folder, "goal")
+
+
+@pytest.mark.parametrize(
+    ("view", "words"), [("goal", "frames 10 to 12 .*--first-frame"), (None, "Name one"), ("x", "x")]
+)
+def test_data_of_other_frames_or_clips_are_refused(folder, tmp_path, view, words):
+    table = tmp_path / "viz.csv"
+    table.write_text("pan,tilt\n1,-9\n2,-9\n")
+    with pytest.raises(InputError, match=words):
+        import_camera_data(table, folder, view)
+    assert not (folder / "estimates").exists()

@@ -1,11 +1,16 @@
-import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats import keypoint_files
-from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.formats.keypoint_files import (
+    read_keypoint_arrays,
+    read_observations,
+    read_people,
+    select_ranges,
+    write_keypoint_arrays,
+)
 
 
 @pytest.fixture
@@ -58,16 +63,6 @@ def test_truncated_file_is_refused(path, make_people, refusal, kept):
     assert "a whole npz file" in refusal().expected
 
 
-def test_flipped_bit_is_noticed(path, make_people, refusal):
-    people = make_people()
-    write_keypoint_arrays(path, people)
-    content = bytearray(path.read_bytes())
-    content[content.find(people.boxes.tobytes())] ^= 1
-    path.write_bytes(bytes(content))
-    assert "CRC" in refusal().found
-    assert refusal().where == f"{path}: boxes.npy"
-
-
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
@@ -107,14 +102,34 @@ def test_missing_and_further_members_are_refused(path, make_people, refusal):
     assert "score" in refusal().expected
 
 
-def test_a_repeated_member_is_refused(path, make_people, refusal):
-    write_keypoint_arrays(path, make_people())
-    with zipfile.ZipFile(path, "a") as file, pytest.warns(UserWarning, match="Duplicate"):
-        file.writestr("frame.npy", b"")
-    assert "the members" in refusal().expected
+@pytest.fixture
+def npz(tmp_path, make_people):
+    """Frames 10, 11 and 14 with two people each."""
+    path = tmp_path / "cam1.npz"
+    people = replace(make_people(), frame=np.array([10, 11, 14]))
+    write_keypoint_arrays(path, people)
+    return path, people
 
 
-def test_arrays_beyond_the_limit_are_refused(path, make_people, refusal, monkeypatch):
-    write_keypoint_arrays(path, make_people())
-    monkeypatch.setattr(keypoint_files, "ARRAY_BYTES", 1000)
-    assert refusal().expected == "at most 1000 bytes of arrays"
+def test_without_a_range_the_file_is_dense_from_its_first_to_its_last_frame(npz):
+    path, people = npz
+    read = read_observations(path)
+    np.testing.assert_array_equal(read.frame, [10, 11, 12, 13, 14])
+    np.testing.assert_array_equal(read.keypoints[[0, 1, 4]], people.keypoints)
+    assert np.all(np.isnan(read.keypoints[2:4]))
+    assert np.all(np.isnan(read.score[2:4]))
+
+
+def test_a_range_leaves_out_and_pads(npz):
+    path, people = npz
+    read = select_ranges(path, read_people(path).people, [(11, 6)])
+    np.testing.assert_array_equal(read.frame, np.arange(11, 17))
+    np.testing.assert_array_equal(read.boxes[[0, 3]], people.boxes[1:])
+    assert np.all(np.isnan(read.boxes[[1, 2, 4, 5]]))
+
+
+@pytest.mark.parametrize("first_frame", [0, 15, 2**40, -(10**30)])
+def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
+    with pytest.raises(InputError, match="found frames 10 to 14") as caught:
+        select_ranges(npz[0], read_people(npz[0]).people, [(first_frame, 5)])
+    assert "offset_frames" in caught.value.todo

@@ -114,15 +114,6 @@ def test_endings_of_videos_and_poses_are_found_in_any_case(tmp_path, source, mak
     assert len(run(source, tmp_path / "m").cameras) == 2
 
 
-def test_a_file_of_another_ending_is_named(tmp_path, make_camera):
-    calibration = calibrate(tmp_path, make_camera, ["one"])
-    (tmp_path / "videos").mkdir()
-    (tmp_path / "videos" / "one.txt").write_text("none")
-    for given in (calibration, None):
-        with pytest.raises(InputError, match=r"found one\.txt"):
-            import_videos(given, tmp_path / "videos", tmp_path / "m")
-
-
 @pytest.mark.parametrize("form", ["NFC", "NFD"])
 def test_names_with_accents_and_spaces_become_ids_in_either_form(tmp_path, make_camera, form):
     names = ["S\u00fcdtrib\u00fcne", "Camera 1"]
@@ -132,18 +123,6 @@ def test_names_with_accents_and_spaces_become_ids_in_either_form(tmp_path, make_
     spec, _ = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
     assert [camera.id for camera in spec.cameras] == ["Sudtribune", "Camera-1"]
     assert set(read_match(tmp_path / "m").videos) == {"Sudtribune", "Camera-1"}
-
-
-def test_a_calibration_may_name_cameras_as_chapters(tmp_path, make_camera):
-    names = ["GX010017", "GX020017"]
-    for name in names:
-        film(tmp_path / "videos" / f"{name}.MP4")
-    calibration = calibrate(tmp_path, make_camera, names)
-    spec, _ = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
-    assert [camera.id for camera in spec.cameras] == names
-    calibration = calibrate(tmp_path, make_camera, names[:1])
-    with pytest.raises(InputError, match="chapters of one recording"):
-        import_videos(calibration, tmp_path / "videos", tmp_path / "n")
 
 
 def test_a_calibration_is_scaled_to_videos_of_its_shape_and_no_others(tmp_path, make_camera):
@@ -162,28 +141,6 @@ def test_a_calibration_is_scaled_to_videos_of_its_shape_and_no_others(tmp_path, 
     calibration.write_text(text.replace("[128, 96]", "[128, 90]"))
     with pytest.raises(InputError, match="128 x 90 px, the size in the calibration"):
         import_videos(calibration, tmp_path / "videos", tmp_path / "n")
-
-
-def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
-    tmp_path, make_camera
-):
-    names = ["one", "two", "three"]
-    cameras = read_calibration(calibrate(tmp_path, make_camera, names))
-    folder = tmp_path / "easymocap"
-    folder.mkdir()
-    write_easymocap(folder, list(cameras.values()))
-    lens, pose = folder / "intri.yml", folder / "extri.yml"
-    lens.write_text("".join(re.findall(r"^(?![WH]_).*\n", lens.read_text(), re.MULTILINE)))
-    pose.write_text(
-        re.sub(r"(R|Rot|T)_three: .*?(?=^\S|\Z)", "", pose.read_text(), flags=re.M | re.S)
-    )
-    with pytest.raises(InputError, match="the image size of camera one"):
-        read_calibration(folder)
-    for name in names:
-        film(tmp_path / "videos" / f"{name}.mp4")
-    spec, notes = import_videos(folder, tmp_path / "videos", tmp_path / "m")
-    assert [(camera.id, camera.width) for camera in spec.cameras] == [("one", 64), ("two", 64)]
-    assert notes == ["camera three is left out: it has no pose"]
 
 
 @pytest.mark.parametrize("nothing", ['"null"', "[nan, nan, nan]"])
@@ -229,3 +186,25 @@ def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):
         "the clip has 7 frames; videos end earlier: two after 3",
         "the clip ends after 7 frames, the last that two videos show; one has 9",
     ]
+
+
+def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
+    tmp_path, make_camera
+):
+    names = ["one", "two", "three"]
+    cameras = read_calibration(calibrate(tmp_path, make_camera, names))
+    folder = tmp_path / "easymocap"
+    folder.mkdir()
+    write_easymocap(folder, list(cameras.values()))
+    lens, pose = folder / "intri.yml", folder / "extri.yml"
+    lens.write_text("".join(re.findall(r"^(?![WH]_).*\n", lens.read_text(), re.MULTILINE)))
+    pose.write_text(
+        re.sub(r"(R|Rot|T)_three: .*?(?=^\S|\Z)", "", pose.read_text(), flags=re.M | re.S)
+    )
+    with pytest.raises(InputError, match="the image size of camera one"):
+        read_calibration(folder)
+    for name in names:
+        film(tmp_path / "videos" / f"{name}.mp4")
+    spec, notes = import_videos(folder, tmp_path / "videos", tmp_path / "m")
+    assert [(camera.id, camera.width) for camera in spec.cameras] == [("one", 64), ("two", 64)]
+    assert notes == ["camera three is left out: it has no pose"]

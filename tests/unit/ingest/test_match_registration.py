@@ -1,12 +1,15 @@
 import hashlib
 import os
-import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
-import yaml
+from pydantic import ValidationError
 
+from data_contracts.match import CameraSpec
 from worldpose.errors import InputError
-from worldpose.ingest import registration
+from worldpose.ingest.clock import camera_frames, remaining_offset, simplest_offset
+from worldpose.ingest.footage import UnitFrames
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.registration import register_match
 
@@ -39,15 +42,9 @@ def register(folder, previous=None):
 def test_every_file_of_the_match_is_registered_with_its_digest(folder):
     registered = register(folder)
     assert [file.path for file in registered.files] == [
-        "annotations/pitch/cam1.json",
-        "calibration.toml",
-        "detections/cam1.npz",
-        "detections/cam2.npz",
-        "detections/goal.npz",
-        "match.yaml",
-        "pitch.json",
-        "stills/cam1.png",
-        "videos/cam1.mp4",
+        *("annotations/pitch/cam1.json", "calibration.toml", "detections/cam1.npz"),
+        *("detections/cam2.npz", "detections/goal.npz", "match.yaml", "pitch.json"),
+        *("stills/cam1.png", "videos/cam1.mp4"),
     ]
     for file in registered.files:
         content = (folder / file.path).read_bytes()
@@ -80,21 +77,6 @@ def test_identity_is_of_videos_detections_and_pitch(folder, name, same):
     assert (after.files != before.files) is (name in registered)
 
 
-def test_a_folder_of_images_is_registered_image_by_image(folder):
-    (folder / "images").mkdir()
-    for i in range(3):
-        (folder / "images" / f"{i}.png").write_bytes(bytes([i]))
-    content = yaml.safe_load((folder / "match.yaml").read_text())
-    content["cameras"][1]["video"] = "images"
-    (folder / "match.yaml").write_text(yaml.safe_dump(content))
-    paths = [file.path for file in register(folder).files]
-    assert [path for path in paths if path.startswith("images")] == [
-        "images/0.png",
-        "images/1.png",
-        "images/2.png",
-    ]
-
-
 def test_unchanged_files_are_not_read_again(folder, monkeypatch):
     first = register(folder)
 
@@ -125,30 +107,58 @@ def test_a_file_that_changes_while_it_is_read_is_refused(folder, monkeypatch):
         register(folder)
 
 
-@pytest.mark.parametrize("hidden", ["videos/cam1.mp4", "pitch.json"])
-def test_a_time_in_the_future_does_not_skip_the_second_look(folder, monkeypatch, hidden):
-    # A camera's clock may run ahead: its file must not hide that another one is being written.
-    video = folder / "videos" / "cam1.mp4"
-    video.write_bytes(b"the first half")
-    ahead = time.time() + 3600.0
-    os.utime(folder / hidden, (ahead, ahead))
-    waits = []
-
-    def write_more(seconds):
-        waits.append(seconds)
-        video.write_bytes(b"the first half and the second")
-
-    monkeypatch.setattr(time, "sleep", write_more)
-    with pytest.raises(InputError, match="still being written"):
-        register(folder)
-    assert len(waits) == 1
-    assert 0 < waits[0] <= registration.SETTLE_SECONDS
+FRAME = np.arange(8)
 
 
-def test_a_file_that_vanishes_is_refused(folder, monkeypatch):
-    match = read_match(folder)
-    (folder / "videos" / "cam1.mp4").unlink()
-    (folder / "videos" / "cam1.mp4").symlink_to("nowhere")
-    monkeypatch.setattr(registration, "_files_under", lambda folder, root: ["videos/cam1.mp4"])
-    with pytest.raises(InputError, match="a readable file"):
-        register_match(match, None)
+@pytest.mark.parametrize(
+    ("offset", "rate", "shown"),
+    [
+        (3, 1.0, [3, 4, 5, 6, 7, 8, 9, 10]),
+        (((3, 0), (4, -2)), 1.0, [0, 1, 2, 3, 2, 3, 4, 5]),  # two frames lost after frame 3
+        (((0, 0), (4, 2)), 1.0, [0, 2, 3, 5, 6, 7, 8, 9]),  # fast until frame 4
+        (0, 0.5, [0, 1, 1, 2, 2, 3, 3, 4]),
+    ],
+)
+def test_a_match_frame_has_its_nearest_camera_frame(offset, rate, shown):
+    assert camera_frames(FRAME, offset, rate).tolist() == shown
+
+
+def test_the_rest_is_how_much_later_the_camera_frame_is():
+    # Exact frames are 0, 1.5, 3, 4.5, 6 at a rate of 1.5 frames per match frame.
+    assert remaining_offset(FRAME[:5], 0, 1.5) == pytest.approx([0, 1 / 3, 0, 1 / 3, 0])
+
+
+def test_people_of_a_fast_camera_lie_on_match_frames(make_people, tmp_path):
+    people = make_people(0, 12)
+    frames = UnitFrames(0, 8, ((0, 0), (4, 2)), ((0, 2), (4, 4)))
+    placed = frames.place(tmp_path, replace(people, frame=np.arange(12)))
+    np.testing.assert_array_equal(placed.frame, [0, 1, 4, 5, 6, 7])
+    np.testing.assert_array_equal(placed.keypoints, people.keypoints[[0, 2, 6, 7, 8, 9]])
+
+
+@pytest.mark.parametrize(
+    ("offset", "kind", "told"),
+    [
+        (0.5, "static", r"in pairs as \[\[0, 0.5\]\]"),
+        (((3, 1), (3, 2)), "static", "rising match frames"),
+        ((), "static", "rising match frames"),
+        (((0, 1), (9, 2)), "broadcast", "broadcast_offset_frames"),
+        (7.0, "broadcast", "broadcast_offset_frames"),
+    ],
+)
+def test_an_offset_that_cannot_be_read_is_refused(offset, kind, told):
+    with pytest.raises(ValidationError, match=told):
+        CameraSpec(id="a", width=9, height=9, kind=kind, offset_frames=offset)
+
+
+@pytest.mark.parametrize(
+    ("frame", "exact", "written"),
+    [
+        ([0], [-0.4], 0),
+        ([0, 74, 75], [0.1, 0.1, -4.9], ((74, 0.0), (75, -5.0))),
+        ([0, 999], [0.0, -5.674], ((0, 0.0), (999, -5.67))),
+        ([5, 30, 31, 90], [2.0, 2.0, 0.0, 3.0], ((5, 2.0), (30, 2.0), (31, 0.0), (90, 3.0))),
+    ],
+)
+def test_offsets_are_written_as_simply_as_they_are(frame, exact, written):
+    assert simplest_offset(np.array(frame), np.array(exact)) == written

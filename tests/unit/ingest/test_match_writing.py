@@ -1,5 +1,3 @@
-import os
-
 import pytest
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
@@ -54,14 +52,6 @@ def test_a_written_match_is_read_as_it_was(tmp_path, one, make_people, make_came
     ]
 
 
-def test_a_place_below_a_file_is_refused(tmp_path, one, make_people):
-    (tmp_path / "file").write_bytes(b"precious")
-    with pytest.raises(InputError, match="a place where a folder can be made"):
-        write_match(
-            tmp_path / "file" / "m", one, calibrations={}, observations={"cam1": make_people()}
-        )
-
-
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
 def test_what_is_there_is_left_as_it_was(tmp_path, one, make_people, kind):
     target = tmp_path / "m"
@@ -99,42 +89,6 @@ def test_data_of_unknown_cameras_are_refused(tmp_path, one, make_people, make_ca
         )
     with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
         write_match(tmp_path / "m", one, calibrations={name: make_camera()}, observations=people)
-
-
-def test_a_pitch_goes_where_match_yaml_says_and_nowhere_else(tmp_path, one, make_people):
-    def write(pitch):
-        spec = one.model_copy(update={"pitch": pitch})
-        write_match(
-            tmp_path / "m",
-            spec,
-            calibrations={},
-            observations={"cam1": make_people()},
-            pitch=PitchSpec(width=64.0),
-        )
-
-    with pytest.raises(InputError, match="inside the match folder"):
-        write("../pitch.json")
-    with pytest.raises(InputError, match="a pitch is given"):
-        write("none")
-    assert list(tmp_path.iterdir()) == []
-    write("survey/pitch.json")
-    assert read_match(tmp_path / "m").pitch == PitchSpec(width=64.0)
-
-
-def test_everything_is_synced_before_the_folder_appears(tmp_path, one, make_people, monkeypatch):
-    synced = []
-    fsync = os.fsync
-
-    def watch(descriptor):
-        synced.append((os.fstat(descriptor).st_ino, (tmp_path / "m").exists()))
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", watch)
-    write_match(tmp_path / "m", one, calibrations={}, observations={"cam1": make_people()})
-    before = {inode for inode, there in synced if not there}
-    content = [tmp_path / "m", *(tmp_path / "m").rglob("*")]
-    assert {path.stat().st_ino for path in content} <= before
-    assert synced[-1] == (tmp_path.stat().st_ino, True)
 
 
 def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):

@@ -11,7 +11,6 @@ from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
-from worldpose.formats.calibration_unit import scaled
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import read_match
@@ -102,26 +101,6 @@ def test_a_resized_video_scales_the_calibration(trial, tmp_path):
     )
 
 
-def halve(calibration, cameras, people, fps):
-    """Place cameras whose people agree in images of half the size."""
-    return {name: scaled(each, 0.5, (544, 960)) for name, each in cameras.items()}, ["halved"]
-
-
-def test_the_match_has_the_size_to_which_people_scale_the_calibration(trial, tmp_path):
-    spec, notes = import_pose2sim(trial, tmp_path / "m", place=halve)
-    assert [(each.width, each.height) for each in spec.cameras] == [(544, 960)] * 2
-    assert read_match(tmp_path / "m").spec == spec
-    assert notes[0] == "halved"
-    assert "keypoints are outside of the images" in str(notes), "judged at the new size"
-
-
-def test_people_do_not_scale_a_calibration_away_from_its_videos(trial, tmp_path):
-    film(trial, (1088, 1920))
-    with pytest.raises(InputError, match=r"pose: .* 1088 x 1920 in cam01, found .* 544 x 960 px"):
-        import_pose2sim(trial, tmp_path / "m", place=halve)
-    assert not (tmp_path / "m").exists()
-
-
 XCP = """<Cameras><Camera DEVICEID="{}" ISDV="1" SENSOR_SIZE="1088 1920"><KeyFrames>
 <KeyFrame FOCAL_LENGTH="1500" ORIENTATION="0 0 0 1" POSITION="{} 0 0" PRINCIPAL_POINT="540 960"
  VICON_RADIAL="0 0"/></KeyFrames></Camera>{}</Cameras>"""
@@ -161,82 +140,75 @@ def test_a_cropped_video_is_refused(trial, tmp_path, size, bars):
     assert not (tmp_path / "m").exists()
 
 
-def spoil(trial, what):
-    poses, config = trial / "pose" / "cam01_json", trial / "Config.toml"
-    calibration = trial / "calibration" / "Calib.toml"
-    frame = poses / "cam01_000010.json"
-    match what:
-        case "no folder":
-            shutil.rmtree(trial)
-        case "no calibration":
-            calibration.unlink()
-        case "two calibrations":
-            shutil.copy(calibration, calibration.with_name("Calib_old.toml"))
-        case "no poses":
-            shutil.rmtree(trial / "pose")
-        case "a camera too few":
-            shutil.rmtree(poses)
-        case "no frames":
-            [file.unlink() for file in poses.iterdir()]
-        case "not JSON":
-            frame.write_text("{")
-        case "no people":
-            frame.write_text('{"persons": []}')
-        case "other keypoints":
-            frame.write_text('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}')
-        case "text":
-            numbers = ["x"] * 78
-            frame.write_text(json.dumps({"people": [{"pose_keypoints_2d": numbers}]}))
-        case "infinite":
-            frame.write_text(json.dumps({"people": [{"pose_keypoints_2d": [np.inf] * 78}]}))
-        case "mixed keypoints":
-            write_frame(poses, 11, [person(25, 0)[0]])
-        case "no number":
-            frame.rename(poses / "first.json")
-        case "two estimators":
-            shutil.copy(frame, poses / "again_10.json")
-        case "rate":
-            config.write_text("[project]\nframe_rate = 'fast'\n")
-        case "no rate":
-            config.unlink()
-        case "range":
-            config.write_text("[project]\nframe_rate = 60\nframe_range = [30, 10]\n")
-        case "not TOML":
-            config.write_text("[project\n")
-        case "a list":
-            config.write_text("project = [1]\n")
-        case "nobody":
-            for file in trial.rglob("*.json"):
-                file.write_text('{"people": []}')
+def people_of(*values):
+    return json.dumps({"people": [{"pose_keypoints_2d": [*values]}]})
 
 
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("no folder", r"trial: expected the folder of a Pose2Sim trial, found nothing"),
-        ("no calibration", r"expected calibration/Calib.toml .*Run Pose2Sim.calibration"),
-        ("two calibrations", r"calibration: expected one calibration \*.toml, found Calib.toml, C"),
-        ("no poses", r"trial: expected pose/<camera>_json .* or videos.*found neither"),
-        ("a camera too few", r"pose: expected one for each camera in Calib.toml: cam01, cam02, fo"),
-        ("no frames", r"cam01_json: expected a .json file for each frame, found none"),
-        ("not JSON", r"cam01_000010.json: expected JSON"),
-        ("no people", r"cam01_000010.json: people: expected a list of at most 1000 people"),
-        ("other keypoints", r"people\[0\].pose_keypoints_2d: expected x, y.*26 \(HALPE-26\).*fo"),
-        ("text", r"cam01_000010.json: people\[0\].pose_keypoints_2d: expected .* found 78 entries"),
-        ("infinite", r"people\[0\].pose_keypoints_2d: expected pixels up to .*found inf"),
-        ("mixed keypoints", r"cam01_json: expected the same keypoints in all frames, found 26 in"),
-        ("no number", r"first.json: expected a frame number .* Name it as cam01_000012.json"),
-        ("two estimators", r"expected one file per frame, found again_10.json with the same"),
-        ("rate", r"Config.toml: project.frame_rate: expected frames per second or 'auto', found"),
-        ("no rate", r"Config.toml: project.frame_rate: expected frames per second, as there are n"),
-        ("range", r"Config.toml: project.frame_range: expected .* found \[30, 10\]"),
-        ("not TOML", r"Config.toml: expected TOML"),
-        ("a list", r"Config.toml: project: expected a table, found \[1\]"),
-        ("nobody", r"pose: expected people, found none in any frame"),
-    ],
-)
-def test_a_bad_trial_is_refused_with_one_error(trial, tmp_path, what, message):
-    spoil(trial, what)
+POSES, CONFIG, CALIBRATION = "pose/cam01_json", "Config.toml", "calibration/Calib.toml"
+FRAME = f"{POSES}/cam01_000010.json"
+SPOILT = [
+    ("", None, r"trial: expected the folder of a Pose2Sim trial, found nothing"),
+    (CALIBRATION, None, r"expected calibration/Calib.toml .*Run Pose2Sim.calibration"),
+    (
+        CALIBRATION,
+        lambda file: shutil.copy(file, file.with_name("Calib_old.toml")),
+        r"calibration: expected one calibration \*.toml, found Calib.toml, C",
+    ),
+    ("pose", None, r"trial: expected pose/<camera>_json .* or videos.*found neither"),
+    (POSES, None, r"pose: expected one for each camera in Calib.toml: cam01, cam02, fo"),
+    (
+        POSES,
+        lambda folder: [file.unlink() for file in folder.iterdir()],
+        r"cam01_json: expected a .json file for each frame, found none",
+    ),
+    (FRAME, "{", r"cam01_000010.json: expected JSON"),
+    (
+        FRAME,
+        '{"persons": []}',
+        r"cam01_000010.json: people: expected a list of at most 1000 people",
+    ),
+    (FRAME, people_of(1, 2, 0.5), r"keypoints_2d: expected x, y.*26 \(HALPE-26\).*fo"),
+    (FRAME, people_of(*["x"] * 78), r"people\[0\].pose_keypoints_2d: .* found 78 entries"),
+    (FRAME, people_of(*[np.inf] * 78), r"keypoints_2d: expected pixels up to .*found inf"),
+    (
+        POSES,
+        lambda folder: write_frame(folder, 11, [person(25, 0)[0]]),
+        r"cam01_json: expected the same keypoints in all frames, found 26 in",
+    ),
+    (
+        FRAME,
+        lambda file: file.rename(file.with_name("first.json")),
+        r"first.json: expected a frame number .* Name it as cam01_000012.json",
+    ),
+    (
+        FRAME,
+        lambda file: shutil.copy(file, file.with_name("again_10.json")),
+        r"expected one file per frame, found again_10.json with the same",
+    ),
+    (CONFIG, "[project]\nframe_rate = 'fast'\n", r"frame_rate: expected .* or 'auto', found"),
+    (CONFIG, None, r"Config.toml: project.frame_rate: expected frames per second, as there are n"),
+    (
+        CONFIG,
+        "[project]\nframe_rate = 60\nframe_range = [30, 10]\n",
+        r"Config.toml: project.frame_range: expected .* found \[30, 10\]",
+    ),
+    (CONFIG, "[project\n", r"Config.toml: expected TOML"),
+    (CONFIG, "project = [1]\n", r"Config.toml: project: expected a table, found \[1\]"),
+    (
+        "pose",
+        lambda folder: [file.write_text('{"people": []}') for file in folder.rglob("*.json")],
+        r"pose: expected people, found none in any frame",
+    ),
+]
+
+
+@pytest.mark.parametrize(("place", "change", "message"), SPOILT)
+def test_a_bad_trial_is_refused_with_one_error(trial, tmp_path, place, change, message):
+    spoilt = trial / place
+    if change is None:
+        shutil.rmtree(spoilt) if spoilt.is_dir() else spoilt.unlink()
+    else:
+        change(spoilt) if callable(change) else spoilt.write_text(change)
     with pytest.raises(InputError, match=message) as caught:
         import_pose2sim(trial, tmp_path / "m")
     assert caught.value.todo

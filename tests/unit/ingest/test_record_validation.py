@@ -52,7 +52,7 @@ FIRST = "match.yaml: cameras[0]"
         (match(contract=2), "match.yaml: contract", "1", "2", "version of worldpose"),
         (match(cameras={"a": 1}), "match.yaml: cameras", "a valid array", "a mapping", "Correct"),
         (match(cameras=[camera(kind="fixed")]), f"{FIRST}.kind", "'broadcast'", "'fixed'", ""),
-        (match(cameras=[camera(id=None)]), f"{FIRST}.id", "a valid string", "None", "Correct"),
+        (match(cameras=[camera(id=None)]), f"{FIRST}.id", "a valid string", "nothing", "Correct"),
         (
             match(cameras=[camera(), camera(widht=1)]),
             "match.yaml: cameras[1].widht",
@@ -69,7 +69,7 @@ FIRST = "match.yaml: cameras[0]"
             "named",
         ),
         (match(cameras=[]), "match.yaml: cameras", "at least 1", "0", "Correct"),
-        ([1], "match.yaml", "a mapping", "a list of 1", "Correct"),
+        ([1], "match.yaml", "a mapping", "[1]", "Correct"),
     ],
 )
 def test_refusal_names_key_expected_found_and_what_to_do(data, where, expected, found, todo):

@@ -142,11 +142,3 @@ def test_a_survey_of_round_areas_gives_another_size_back(template, size):
     names = tuple(name for name in true.points if not name.endswith(("_top", "_bottom")))
     fit = fit_survey(Survey("hall.csv", names, true.positions(names), template))
     assert (fit.pitch.length, fit.pitch.width) == pytest.approx(size, abs=0.002)
-
-
-def test_no_point_stays_without_its_marking():
-    assert not [
-        name for name in pitch("volleyball", attack_line_distance=0).points if "att" in name
-    ]
-    names = pitch("basketball", restricted_area_depth=0, basket_distance=0).points
-    assert not [name for name in names if "free_throw" in name or "three_point" in name]

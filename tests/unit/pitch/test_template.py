@@ -50,17 +50,6 @@ def test_points_are_where_law_1_puts_them(flat, name, place):
     np.testing.assert_allclose(flat.points[name], place, atol=ROUNDING)
 
 
-def test_template_is_symmetric_about_both_axes(standard):
-    mirrored = {"left": "right", "near": "far"}
-    for name, place in standard.points.items():
-        for axis, (one, other) in enumerate(mirrored.items()):
-            words = [
-                other if word == one else one if word == other else word for word in name.split("_")
-            ]
-            twin = standard.points["_".join(words)]
-            np.testing.assert_allclose(twin, place * np.where(np.arange(3) == axis, -1.0, 1.0))
-
-
 def test_penalty_arcs_begin_and_end_on_the_line_of_the_area(standard):
     for side, inward in (("left", 1.0), ("right", -1.0)):
         arc = marking(standard, f"penalty_arc_{side}")
@@ -158,3 +147,36 @@ def test_edges_of_mowing_stripes_have_names_on_either_half_and_no_paint(standard
     first = PitchTemplate.from_spec(PitchSpec(stripes={"spacing": 10.0, "first": 2.5}))
     assert [float(first.points[f"stripe_left_{n}_far"][0]) for n in (1, 5)] == [-50.0, -10.0]
     assert "stripe_left_6" not in first.unpainted  # the halfway line has its own name
+
+
+def test_surface_falls_to_touch_lines_and_goal_lines():
+    pitch = PitchTemplate.from_spec(PitchSpec(crown=0.2, end_fall=0.4))
+    assert float(pitch.height(0.0, 0.0)) == 0.0
+    assert float(pitch.height(52.5, 0.0)) == pytest.approx(-0.4)
+    assert float(pitch.height(0.0, -34.0)) == pytest.approx(-0.2)
+    assert pitch.points["corner_left_far"][2] == pytest.approx(-0.6)
+    line = pitch.marking_points("touch_line_near", 0.5)
+    assert line[:, 2] == pytest.approx(pitch.height(line[:, 0], line[:, 1]))
+
+
+def test_another_surface_moves_all_but_surveyed_heights():
+    points = {
+        "corner_left_far": (-52.5, 34.0, -0.3),
+        "mast": (-60.0, 0.0),
+        "corner_left_near": (-52.5, -34.0),
+    }
+    spec = PitchSpec(crown=0.2, points=points)
+    moved = PitchTemplate.from_spec(spec).with_surface([0.1, 0.3])
+    made = PitchTemplate.from_spec(spec.model_copy(update={"crown": 0.1, "end_fall": 0.3}))
+    for name, place in made.points.items():
+        assert moved.points[name] == pytest.approx(place, abs=1e-12)
+    assert moved.points["corner_left_far"][2] == -0.3
+    assert moved.by_surface(["corner_left_far", "corner_left_near"]).tolist() == [[0, 0], [-1, -1]]
+
+
+def test_derivatives_of_samples_are_those_of_their_heights():
+    pitch = PitchTemplate.from_spec(PitchSpec(points={"corner_right_near": (52.5, -34.0, -0.1)}))
+    change = np.array([-0.05, 0.25])
+    other = pitch.with_surface(pitch.surface + change)
+    here, there = (each.sample_lines(1.0).points_world[:, 2] for each in (pitch, other))
+    assert there - here == pytest.approx(pitch.samples_by_surface(1.0) @ change, abs=1e-12)

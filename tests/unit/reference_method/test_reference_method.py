@@ -7,6 +7,7 @@ torch = pytest.importorskip("torch")
 
 from camera_builders import look_at_camera  # noqa: E402
 
+from data_contracts.conventions import COCO17_RIGID_BONES  # noqa: E402
 from worldpose.body.body_file import find_body  # noqa: E402
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
 from worldpose.body.keypoints import SKELETONS, fold_keypoints  # noqa: E402
@@ -17,7 +18,7 @@ from worldpose.reference_method import body_fitting, broadcast_calibration  # no
 from worldpose.reference_method.cameras import K1_K2, TensorCameras  # noqa: E402
 from worldpose.reference_method.reprojection import (  # noqa: E402
     Views,
-    adjust,
+    minimize_reprojection,
     reprojection_error,
     triangulate,
     triangulate_about_mid_hip,
@@ -177,7 +178,9 @@ def test_adjustment_finds_the_cameras_of_exact_markings_and_people(cameras, with
     moving = torch.arange(len(points)) >= len(marks)
     start = torch.tensor(points + 0.05 * moving.numpy()[:, None])
     assert reprojection_error(tensors.with_values(tensors.values + off), start, seen) > 1e3
-    found = adjust(tensors.with_values(tensors.values + off), start, seen, moving, K1_K2)
+    found = minimize_reprojection(
+        tensors.with_values(tensors.values + off), start, seen, moving, K1_K2
+    )
     assert found.cost < 1e-6
     np.testing.assert_allclose(found.points, points, atol=1e-4)
     np.testing.assert_allclose(found.cameras.camera().center, cameras.center, atol=1e-3)
@@ -189,7 +192,7 @@ def test_shape_by_bone_lengths_is_that_of_an_exact_body_whatever_a_few_frames_sa
     betas = torch.tensor(body_fitting.fit_shape(body, joints))
     still = torch.zeros(75, dtype=torch.float64).split((3, 69, 3))
     found, true = (body.keypoints(b, *still) for b in (betas, moving_person(body).betas))
-    for first, second in body_fitting.BONES:
+    for first, second in COCO17_RIGID_BONES:
         lengths = [torch.linalg.vector_norm(k[first] - k[second]) for k in (found, true)]
         np.testing.assert_allclose(*lengths, atol=0.002)
 

@@ -8,14 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from worldpose.geometry.cameras import Camera
-from worldpose.reports.drawing import (
-    WIDTH,
-    figure_data,
-    note_undrawn_distortion,
-    picture_panels,
-    png,
-    write_figure,
-)
+from worldpose.reports.drawing import figure_data, note_undrawn_distortion, write_figure
 
 
 @pytest.fixture
@@ -68,33 +61,6 @@ def test_files_are_equal_for_equal_figures_and_text_stays_text(figure, tmp_path)
     shown = json.loads(data.read_text())
     assert shown["caption"] == "two clocks, cam00 ± 1"
     assert shown["panels"] == figure_data(figure)
-
-
-def coded_places(height, width):
-    """An image whose colours tell the place: red from the left, green from the top."""
-    image = np.full((height, width, 3), 90, dtype=np.uint8)
-    image[..., 0] = np.linspace(0, 255, width)
-    image[..., 1] = np.linspace(0, 255, height)[:, None]
-    return image
-
-
-def drawn(figure):
-    pixels = cv2.imdecode(np.frombuffer(png(figure), np.uint8), cv2.IMREAD_COLOR)
-    return pixels[..., ::-1].astype(int)
-
-
-@pytest.mark.parametrize("across", [3080.0, 308.0])
-def test_a_picture_is_shown_at_its_places_in_every_size(across):
-    side = across * np.array([1.0, 900.0 / 1540.0])
-    corner = np.zeros(2) if across > 3000.0 else np.array([700.0, 400.0])
-    still = coded_places(1800, 3080)
-    shown = drawn(picture_panels(["whole"], corner - 0.5, side, still=still)[0])
-    top = shown.shape[0] - 900
-    assert shown.shape[1] == WIDTH
-    assert 0 < top < 60
-    for x, y in [(20, 30), (770, 450), (1500, 880)]:
-        u, v = (corner + (np.array([x, y]) + 0.5) * across / WIDTH).astype(int)
-        np.testing.assert_allclose(shown[top + y, x], still[v, u], atol=2)
 
 
 def test_distortion_that_a_view_lacks_is_stated():

@@ -13,7 +13,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.rigid import Rigid
-from worldpose.reports.rerun_recording import split_at_gaps, write_recording
+from worldpose.reports.rerun_recording import write_recording
 
 
 def scene():
@@ -26,12 +26,6 @@ def scene():
         Rigid(np.tile(rotation, (4, 1, 1)), np.tile([0.0, 2.0, 70.0], (4, 1))),
     )
     return JointTracks(np.arange(40, 44), np.array([3, 8]), joints), camera
-
-
-def test_a_line_that_leaves_the_image_has_no_chord():
-    line = np.arange(14.0).reshape(7, 2)
-    line[[0, 3, 4], 1] = np.nan
-    assert [part[:, 0].tolist() for part in split_at_gaps(line)] == [[2.0, 4.0], [10.0, 12.0]]
 
 
 def test_recording_has_people_markings_and_cameras(tmp_path):

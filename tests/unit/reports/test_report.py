@@ -5,19 +5,11 @@ from datetime import timedelta
 from html import unescape
 from html.parser import HTMLParser
 
-import cv2
-import numpy as np
 from run_records import AT, run_record
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.run import UnitFailure
-from worldpose.reports.html_page import (
-    CaptionedImage,
-    EmbeddedPage,
-    LinkedFile,
-    Section,
-    compress_image,
-)
+from worldpose.reports.html_page import CaptionedImage, EmbeddedPage, LinkedFile, Section
 from worldpose.reports.run_report import CAMERA_MEANINGS, MEANINGS, report_page, score_rows
 
 PNG = base64.b64decode(
@@ -138,15 +130,3 @@ def test_an_embedded_page_brings_the_one_script_that_the_page_may_run():
     (frame,) = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)"></iframe>', text)
     assert [unescape(each) for each in frame] == [block.title, block.html]
     assert Page(text).open == []
-
-
-def test_photographs_are_made_smaller_and_curves_stay_as_they_are():
-    rng = np.random.default_rng(0)
-    photograph = rng.integers(0, 255, (400, 300, 3)).astype(np.uint8)
-    large = cv2.imencode(".png", photograph)[1].tobytes()
-    kind, content, size = compress_image(large)
-    assert (kind, size) == ("webp", (300, 400))
-    assert len(content) < len(large) / 2
-    shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    assert shown.shape == photograph.shape
-    assert compress_image(PNG) == ("png", PNG, (1, 1))

@@ -119,34 +119,6 @@ def say_ten(url, writer):
         say(store, "m", lambda _, number=number: [correction(f"{writer}.{number}")])
 
 
-def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch):
-    say(store, "m", lambda _: [correction("a")])
-
-    def fail(_):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("worldpose.store.blobs.os.fsync", fail)
-        with pytest.raises(StoreError, match="No space left"):
-            say(store, "m", lambda _: [correction("b")])
-    assert said(read_journal(store, "m")) == ["a"]
-
-
-def test_an_entry_is_on_the_disk_before_it_is_acknowledged(store, monkeypatch):
-    """Its bytes and its name: the file is synced, then linked, then its folder is synced."""
-    import os
-
-    steps = []
-    sync, link = os.fsync, os.link
-    monkeypatch.setattr("worldpose.store.blobs.os.fsync", lambda f: (steps.append("sync"), sync(f)))
-    monkeypatch.setattr(
-        "worldpose.store.blobs.os.link", lambda a, b: (steps.append("link"), link(a, b))
-    )
-    say(store, "m", lambda _: [correction("a")])
-    assert "sync" in steps[: steps.index("link")]
-    assert steps[-1] == "sync"
-
-
 def test_the_journal_is_the_same_in_object_storage(bucket):
     store = Store.create(f"{bucket}/{uuid.uuid4().hex}")
     say(store, "m", lambda _: [correction("a")])
@@ -175,3 +147,16 @@ def test_the_last_verdict_on_the_same_bytes_counts(store):
     records = tuple(read_journal(store, "m").records)
     assert last_decision(records, "tracking/clip", one).verdict == "approve"
     assert list(requests_by_id(records)) == ["q1", "q2"]
+
+
+def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch):
+    say(store, "m", lambda _: [correction("a")])
+
+    def fail(_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("worldpose.store.blobs.os.fsync", fail)
+        with pytest.raises(StoreError, match="No space left"):
+            say(store, "m", lambda _: [correction("b")])
+    assert said(read_journal(store, "m")) == ["a"]

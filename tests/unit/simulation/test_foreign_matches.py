@@ -34,24 +34,6 @@ def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
     assert bodies == {"worldpose.body.occlusions"}
 
 
-def content(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
-def test_the_same_seed_writes_the_same_bytes_and_another_seed_others(tmp_path):
-    for name, seed in (("a", 4), ("b", 4), ("c", 5)):
-        simulate_foreign_match(MIXED, seed, tmp_path / name, duration=0.3, cameras=3, people=2)
-    assert content(tmp_path / "a") == content(tmp_path / "b")
-    assert (
-        content(tmp_path / "a")["reference/joints.npz"]
-        != content(tmp_path / "c")["reference/joints.npz"]
-    )
-
-
 @pytest.mark.parametrize("name", FOREIGN_SCENARIOS)
 def test_every_scenario_makes_a_match_that_the_factory_takes(tmp_path, name):
     scenario = FOREIGN_SCENARIOS[name]

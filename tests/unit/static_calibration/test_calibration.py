@@ -1,10 +1,13 @@
 import clicking_people as people
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.static_calibration.estimate import calibrate_camera
+from worldpose.static_calibration.initialization import camera_from_homography
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 PITCH, SIZE = people.PITCH, people.SIZE
@@ -113,21 +116,19 @@ def test_a_wrong_click_is_found_and_no_other():
     assert others <= 1
 
 
-def test_the_expected_ground_error_is_that_of_repeated_clicks():
-    camera, _ = people.seat(4)
-    seen = people.visible(camera)
-    rng = np.random.default_rng(0)
-    place = PITCH.positions([next(iter(seen))])
-    errors, expected = [], []
-    for _ in range(40):
-        noisy = {name: xy + rng.standard_normal(2) for name, xy in seen.items()}
-        result = of(people.points(noisy))
-        errors.append(people.ground_errors(result.estimate.camera, camera, place)[0])
-        known = result.report.ground_error
-        row = np.argmin(np.abs(known.y - place[0, 1]))
-        column = np.argmin(np.abs(known.x - place[0, 0]))
-        expected.append(known.expected[row, column])
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    # 40 draws of two dimensions tell an rms to 1 / sqrt(2 x 80) = 8 %; the prior is wider than
-    # the truth lies off the grid, up to 1.4 m from the nearest grid place.
-    assert rms == pytest.approx(np.median(expected), rel=0.3)
+@given(
+    focal=st.floats(900, 6000),
+    x=st.floats(-40, 40),
+    height=st.floats(8, 40),
+    aim=st.floats(-40, 40),
+    roll=st.floats(-0.05, 0.05),
+)
+def test_the_camera_in_an_exact_homography_is_found(focal, x, height, aim, roll):
+    camera = people.pinhole((x, -70.0, height), (aim, 3.0, 0.0), focal, people.SIZE, roll=roll)
+    pose = camera.cam_from_world
+    middle = camera.principal_point
+    k = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
+    homography = -3.0 * k @ np.column_stack([pose.rotation[:, :2], pose.translation])
+    found = camera_from_homography(homography, people.SIZE, middle, (300.0, 20000.0))
+    np.testing.assert_allclose(found.focal, focal, rtol=1e-6)
+    np.testing.assert_allclose(found.center, camera.center, rtol=1e-5, atol=1e-5)

@@ -7,7 +7,6 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.click_outliers import fit_given_inliers, held_out_error
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.fit import build_problem, compute_residuals
@@ -65,29 +64,3 @@ def test_a_pitch_in_yards_is_told_from_wrong_clicks():
     for _, clicked, _ in cameras(3, 12, noise=1.0, first=2500):
         with pytest.raises(InputError, match=r"fit 105\.0 x 68\.0 m.*in yards"):
             calibrated(clicked, pitch=pitch)
-
-
-def test_held_out_error_of_markings_is_that_of_the_dense_press_formula():
-    (camera, clicked, rng), *_ = cameras(1, 12, noise=1.0, focal=(0.6, 0.7))
-    drawn = {}
-    for name in ("touch_line_near", "touch_line_far", "halfway_line"):
-        places = rig.PITCH.marking_points(name, 0.2)
-        pixels = rig.project(camera, places)[rig.seen(camera, places)]
-        pixels = pixels[np.linspace(0, len(pixels) - 1, 40).astype(int)]
-        drawn[name] = pixels + 1.5 * rng.standard_normal(pixels.shape)
-    evidence = gather_evidence(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
-    problem = build_problem(evidence, rig.SIZE, StaticCalibrationSettings())
-    start = calibrated(clicked, drawn).estimate.camera.numbers
-    fit = fit_given_inliers(problem, start, np.ones(12, dtype=bool), np.ones(3, dtype=bool))
-    rows, on = compute_residuals(problem, fit.row), evidence.drawn_marking
-    units = [(rows.click[i], rows.by_click[i], problem.click_noise[[i, i]]) for i in range(12)]
-    for k in range(3):
-        units.append((rows.drawn[on == k], rows.by_drawn[on == k], problem.drawn_noise[on == k]))
-    left = []
-    for residual, by_step, sigma in units:
-        share = by_step @ fit.tangent_covariance @ by_step.T / np.outer(sigma, sigma)
-        left.extend(sigma * np.linalg.solve(np.eye(len(sigma)) - share, residual / sigma))
-    assert fit.noise_scale == 1.0
-    assert held_out_error(problem, fit) == pytest.approx(
-        np.sqrt(np.mean(np.square(left))), rel=1e-6
-    )

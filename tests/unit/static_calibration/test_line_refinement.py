@@ -83,13 +83,6 @@ def test_start_pixels_off_comes_to_a_fraction_of_one():
         assert found.rms < 0.25
 
 
-def test_start_tens_of_pixels_off_is_caught():
-    first = start(0, factor=5.0)
-    assert line_error(first) > 10.0
-    found = refine_on_lines(first, PITCH, picture(), survey_error=EXACT)
-    assert line_error(found.estimate) < 0.25
-
-
 def test_people_standing_on_a_line_move_nothing():
     first = start(5)
     without = refine_on_lines(first, PITCH, picture(), survey_error=EXACT)

@@ -9,7 +9,6 @@ from clicking_people import paint_of, pinhole
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration.from_paint.paint import restore_colors
 from worldpose.static_calibration.from_paint.proposal import (
     calibrate_proposal,
     calibrate_without_clicks,
@@ -64,15 +63,6 @@ def test_a_purple_cast_hides_no_pitch():
     cast = np.clip(still() * np.array([1.4, 0.5, 1.4]), 0, 255).astype(np.uint8)
     found = calibrate_without_clicks(PITCH, cast, side="near")
     assert np.median(misplaced(found.estimate.camera, camera())) < 0.05
-
-
-def test_restored_paint_is_white_and_grass_is_not():
-    dull = np.full((40, 40, 3), (60, 70, 55), np.uint8)
-    dull[10:12] = dull[30:32] = (160, 130, 170)
-    restored = restore_colors(dull)
-    # The darkest channel counts as 0.7 * 55 = 38.5, paint as 245.
-    assert restored[10, 0].tolist() == [245, 245, 245]
-    assert restored[0, 0].tolist() == [43, 84, 31]
 
 
 def test_a_proposal_whose_markings_are_not_in_the_image_is_refused(proposal):

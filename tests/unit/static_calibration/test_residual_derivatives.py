@@ -15,11 +15,7 @@ from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.static_calibration.line_samples import PaintNoise, project_lines, sample_markings
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.static_calibration.residuals import (
-    click_residuals,
-    drawn_residuals,
-    prior_residuals,
-)
+from worldpose.static_calibration.residuals import click_residuals, drawn_residuals, prior_residuals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 SETTINGS = StaticCalibrationSettings()

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import errno
+import os
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from obstore.store import MemoryStore
+from store_samples import place, run_once
 
 from worldpose.errors import StoreError
+from worldpose.store import blobs as folder_module
 from worldpose.store import objects
+from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
 
@@ -46,6 +52,91 @@ def test_of_many_that_put_one_new_file_one_succeeds(store: Store) -> None:
             )
         assert sum(done) == 1
         assert store.blobs.read(f"race/{number}") == str(done.index(True)).encode() * 1000
+
+
+def failing(code: int) -> Callable[..., Any]:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    return fail
+
+
+@pytest.fixture(params=[errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
+def without_links(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What exFAT, SMB and FUSE answer to link()."""
+    monkeypatch.setattr(os, "link", failing(request.param))
+
+
+@pytest.fixture
+def losing_replies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Execute every link and rename twice, as NFS does when the first reply is lost."""
+    link, rename = os.link, Path.rename
+
+    def link_twice(source: Any, target: Any) -> None:
+        link(source, target)
+        link(source, target)
+
+    def rename_twice(source: Path, target: Any) -> Path:
+        rename(source, target)
+        return rename(source, target)
+
+    monkeypatch.setattr(os, "link", link_twice)
+    monkeypatch.setattr(Path, "rename", rename_twice)
+
+
+@pytest.mark.usefixtures("losing_replies")
+def test_a_lost_reply_to_the_rename_of_a_result_is_success(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    assert run_once(store) == "0001"
+    assert store.has(*place())
+    assert verify(store) == ()
+
+
+@pytest.mark.usefixtures("without_links")
+def test_without_hard_links_a_file_is_still_created_whole_and_once(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    with ThreadPoolExecutor(8) as pool:
+        contents = [f"{number} ".encode() * 10_000 for number in range(16)]
+        done = list(pool.map(lambda data: store.blobs.put_new("a/b.json", data), contents))
+    assert sum(done) == 1
+    assert store.blobs.read("a/b.json") == contents[done.index(True)]
+    assert store.blobs.staged_entries() == []
+    run_once(store)
+    assert verify(store) == ()
+
+
+@pytest.mark.usefixtures("without_links")
+def test_a_disk_with_neither_links_nor_exclusive_renames_is_refused_with_the_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> int:
+        folder_module.ctypes.set_errno(errno.EINVAL)
+        return -1
+
+    class Library:
+        renameat2 = staticmethod(fail)
+
+    monkeypatch.setattr(folder_module.ctypes, "CDLL", lambda *_, **__: Library)
+    with pytest.raises(StoreError, match="neither hard links") as caught:
+        Store.create(tmp_path / "project")
+    assert "permission to it" not in str(caught.value)
+    assert "ext4" in str(caught.value)
+
+
+def test_a_disk_that_syncs_no_folders_is_fine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync = os.fsync
+
+    def only_files(descriptor: int) -> None:
+        if Path(f"/proc/self/fd/{descriptor}").is_dir():
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", only_files)
+    store = Store.create(tmp_path / "project")
+    run_once(store)
+    assert verify(store) == ()
 
 
 def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(

@@ -113,15 +113,17 @@ def test_every_file_and_folder_is_on_disk_before_the_rename(
 
 
 @pytest.mark.parametrize("point", ["after_write", "during_publish", "before_commit"])
-def test_interruption_by_hand_leaves_no_staging(store: Store, tmp_path: Path, point: str) -> None:
+def test_interruption_by_hand_leaves_no_staging(
+    folder_store: Store, tmp_path: Path, point: str
+) -> None:
     def interrupt(name: str) -> None:
         if name == point:
             raise KeyboardInterrupt
 
     install_fault_hook(interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run_once(store)
+        run_once(folder_store)
     install_fault_hook(None)
-    check_never_half(store)
-    assert store.blobs.staged_entries() == []
+    check_never_half(folder_store)
+    assert folder_store.blobs.staged_entries() == []
     assert [path for path in tmp_path.iterdir() if path.name.startswith("worldpose-")] == []

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,9 @@ from hypothesis import strategies as st
 from store_samples import sample_recipe, sample_record
 
 from data_contracts.run import RunRecord
-from data_contracts.work import Recipe
 from worldpose.errors import CorruptionError, InputError
-from worldpose.store.documents import canonical_json, digest, seal, unseal
+from worldpose.store.documents import canonical_json, seal, unseal
+from worldpose.store.recipes import recipe_differences, recipe_key
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]))
 NUMBERS = st.integers() | st.floats(allow_nan=False, allow_infinity=False)
@@ -93,8 +94,28 @@ def test_other_json_is_corruption(data: bytes) -> None:
         unseal(RunRecord, data, "the place")
 
 
-def test_document_of_a_later_contract_is_refused_as_such() -> None:
-    fields = {"contract": 7, "something": "new"}
-    sealed = {**fields, "checksum": digest(canonical_json(fields))}
-    with pytest.raises(InputError, match="found contract 7"):
-        unseal(Recipe, canonical_json(sealed) + b"\n", "the place")
+def describe(old, new):
+    return [str(each) for each in recipe_differences(old, new)]
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"unit": "late"}, "unit: tracking/clip -> tracking/late"),
+        ({"match_id": "semi"}, "match: final -> semi"),
+        ({"sources": {"pitch": "f" * 64}}, "source pitch: aaaaaaaaaaaa... -> ffffffffffff..."),
+        ({"sources": {}}, "source pitch: aaaaaaaaaaaa... -> absent"),
+        ({"inputs": {"ingest/left": "e" * 32}}, "input ingest/left: absent -> eeeeeeeeeeee..."),
+        ({"settings": {"gate": {"max_distance": 0.7}}}, "setting gate.max_distance: 0.5 -> 0.7"),
+        ({"settings": {"gate": {"max_distance": None}}}, "setting gate.max_distance: 0.5 -> null"),
+        (
+            {"code": {"worldpose.tracking": "c" * 64}},
+            "module worldpose.tracking: bbbbbbbbbbbb... -> cccccccccccc...",
+        ),
+        ({"libraries": {"numpy": "2.5.0"}}, "library numpy: 2.4.0 -> 2.5.0"),
+    ],
+)
+def test_every_change_has_its_own_line_and_its_own_key(change: dict[str, Any], line: str) -> None:
+    changed = sample_recipe(**change)
+    assert describe(sample_recipe(), changed) == [line]
+    assert recipe_key(changed) != recipe_key(sample_recipe())

@@ -4,14 +4,7 @@ from datetime import timedelta
 from typing import Any
 
 import pytest
-from store_samples import (
-    place,
-    publish,
-    run_once,
-    sample_arrays,
-    sample_coordinates,
-    sample_recipe,
-)
+from store_samples import place, publish, run_once, sample_recipe
 
 from worldpose.errors import StoreError
 from worldpose.store import groups
@@ -41,7 +34,8 @@ def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) ->
     assert verify(store) == ()
 
 
-def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
+def test_match_with_a_run_at_work_is_left_alone(folder_store: Store) -> None:
+    store = folder_store
     publish(store)
     other = sample_recipe(match_id="semi")
     publish(store, other)
@@ -57,25 +51,6 @@ def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
     assert store.unfinished_runs("final") == ()
 
 
-def test_nothing_is_taken_from_a_result_that_is_being_written(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder_store.reserve_run("final")
-    written = []
-
-    def collected(*given: Any) -> Any:
-        written.append(given)
-        collect(folder_store, plan_gc(folder_store, older_than=NOW))
-        return array_parts(*given)
-
-    monkeypatch.setattr(groups, "array_parts", collected)
-    publish(folder_store)
-    # Once when its values are checked, and once when it is written.
-    assert len(written) == 2 * (len(sample_arrays()) + len(sample_coordinates()))
-    data = folder_store.open_result(*place(), verify=True)
-    assert (data["views"].values == 0).all()
-
-
 def test_result_of_which_something_was_removed_is_not_published(
     folder_store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,20 +64,6 @@ def test_result_of_which_something_was_removed_is_not_published(
         publish(folder_store)
     assert not folder_store.has(*place())
     assert folder_store.blobs.staged_entries() == []
-
-
-def test_forgotten_runs_go_with_what_only_they_reach(folder_store: Store) -> None:
-    for unit in ("one", "two", "three"):
-        run_once(folder_store, sample_recipe("shared"), sample_recipe(unit))
-    plan = plan_gc(folder_store, older_than=NOW, forget=["final/0001"])
-    assert [item.path for item in plan.garbage] == [
-        "runs/final/0001.json",
-        ResultId(*place(sample_recipe("one"))).path,
-    ]
-    collect(folder_store, plan_gc(folder_store, older_than=NOW, keep_last=1))
-    assert folder_store.runs("final") == ("0003",)
-    assert {result.unit for result in folder_store.results()} == {"shared", "three"}
-    assert verify(folder_store) == ()
 
 
 @pytest.mark.parametrize("damaged", ["run", "manifest", "pin", "reservation"])
@@ -129,8 +90,9 @@ def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(
 
 
 def test_interrupted_collection_is_finished_by_the_next(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    folder_store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    store = folder_store
     run_once(store, sample_recipe("one"), sample_recipe("two"))
     run_once(store, sample_recipe("three"))
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from store_samples import ATTRIBUTES, LAYOUT, all_sample_arrays, sample_coordinates
 
-from data_contracts.arrays import ArrayLayout, GroupLayout, array_layout
+from data_contracts.arrays import ArrayLayout, GroupLayout
 from worldpose.errors import InternalError
 from worldpose.store.groups import write_group
 
@@ -43,48 +43,6 @@ def test_equal_arrays_give_equal_files(tmp_path: Path) -> None:
     assert contents(tmp_path / "two") == one
 
 
-@pytest.fixture
-def long_layout(monkeypatch: pytest.MonkeyPatch) -> GroupLayout:
-    """One float array, cut along its second dimension: 100 rows are 50 chunks and four files."""
-    monkeypatch.setattr("data_contracts.arrays.CHUNK_BYTES", 2 * 3 * 8)
-    monkeypatch.setattr("data_contracts.arrays.SHARD_CHUNKS", 16)
-    array = array_layout("x", "(a, *b) float64 [1], missing nan", "x")
-    return GroupLayout(stage="any", about="any", arrays=(array,))
-
-
-def test_array_of_many_files_reads_as_one_that_zarr_wrote(
-    tmp_path: Path, long_layout: GroupLayout
-) -> None:
-    values = np.random.default_rng(0).normal(size=(3, 101))
-    values[1, ::7] = np.nan
-    count = write_group(tmp_path / "ours", long_layout, {"x": values}, {}, {})
-    group = zarr.open_group(tmp_path / "ours", mode="r")
-    stored = group["x"]
-    assert isinstance(stored, zarr.Array)
-    assert (stored.chunks, stored.shards) == ((3, 2), (3, 26))
-    files = sorted(contents(tmp_path / "ours"))
-    assert files == [*(f"x/c/0/{number}" for number in range(4)), "x/zarr.json", "zarr.json"]
-    assert count == len(files)
-    np.testing.assert_array_equal(stored[...], values)
-    for first, last in ((0, 1), (25, 27), (51, 80), (100, 101)):
-        np.testing.assert_array_equal(stored[:, first:last], values[:, first:last])  # type: ignore[index]
-    theirs = zarr.create_array(
-        tmp_path / "theirs",
-        shape=values.shape,
-        chunks=(3, 2),
-        shards=(3, 26),
-        dtype="f8",
-        fill_value=np.nan,
-        compressors=stored.compressors,
-    )
-    theirs[...] = values
-    for number in range(4):
-        ours = (tmp_path / "ours" / "x" / "c" / "0" / str(number)).read_bytes()
-        # Zarr also writes the chunks of the last file that lie beyond the array.
-        if number < 3:
-            assert ours == (tmp_path / "theirs" / "c" / "0" / str(number)).read_bytes()
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -95,10 +53,7 @@ def test_array_of_many_files_reads_as_one_that_zarr_wrote(
         ({"inliers": np.zeros((40, 4), bool)}, "dimension person: expected size 3"),
         ({"joints": np.full((40, 3, 3), np.inf)}, r"joints\[0, 0, 0\]: expected finite numbers or"),
         ({"height": np.array(np.nan, np.float32)}, r"height\[\]: expected finite numbers only"),
-        (
-            {"detection_index": np.full((40, 2), -2, np.int16)},
-            "or -1 for missing, found -2; 80",
-        ),
+        ({"detection_index": np.full((40, 2), -2, np.int16)}, "or -1 for missing, found -2; 80"),
         ({"unplanned": np.zeros(3)}, "unknown: unplanned"),
     ],
 )
@@ -129,8 +84,7 @@ def test_attribute_that_breaks_the_layout_is_refused(
 
 @settings(max_examples=15)
 @given(
-    st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]),
-    st.data(),
+    st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]), st.data()
 )
 def test_any_array_of_any_shape_comes_back(dtype: Any, data: st.DataObject) -> None:
     import tempfile

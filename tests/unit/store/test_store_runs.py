@@ -1,25 +1,25 @@
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import pytest
-from store_samples import (
-    PROCESSES,
-    run_once,
-    run_process,
-    sample_recipe,
-)
+from store_samples import PROCESSES, run_once, run_process, sample_recipe
 
 from data_contracts.pin import Pin
 from worldpose.errors import InputError, StoreError
+from worldpose.store.documents import canonical_json, digest
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import verify
 from worldpose.store.runs import list_pins, may_be_running, pin_run, unpin_run
 from worldpose.store.store import Store, open_run
 
 
-def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
+def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store: Store) -> None:
+    store = folder_store
     run_once(store)
     assert store.reserve_run("final") == "0002"
     assert store.run("final").run_id == "0001"
@@ -28,26 +28,6 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
     assert may_be_running(unfinished)
     with pytest.raises(InputError, match="an unfinished run"):
         store.run("final", "0002")
-
-
-def test_number_that_another_run_took_and_finished_is_not_given_again(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = type(store.blobs).put_new
-    is_first = True
-
-    def put_new(self: object, path: str, data: bytes) -> bool:
-        nonlocal is_first
-        if is_first and path.endswith(".open.json"):
-            # Between our look at the runs and our reservation, another process does a whole run.
-            is_first = False
-            run_once(store, sample_recipe())
-        return real(self, path, data)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(type(store.blobs), "put_new", put_new)
-    assert store.reserve_run("final") == "0002"
-    assert store.runs("final") == ("0001",)
-    assert [run.run_id for run in store.unfinished_runs("final")] == ["0002"]
 
 
 def reserve_some(url: str, outcome: object) -> None:
@@ -120,13 +100,40 @@ def test_a_name_is_one_run_s_for_good(two_runs: Store) -> None:
         unpin_run(two_runs.blobs, "final", "other")
 
 
-def test_a_changed_pin_is_found(two_runs: Store) -> None:
-    pin_run(two_runs.blobs, pin("paper"))
-    assert verify(two_runs) == ()
-    path = "pins/final/paper.json"
-    data = two_runs.blobs.read(path)
-    assert data is not None
-    two_runs.blobs.put(path, data.replace(b"0001", b"0002"))
-    (finding,) = verify(two_runs)
-    assert finding.path == path
-    assert "checksum" in finding.problem
+def rewrite(store: Store, path: str, change: Callable[[dict[str, Any]], None]) -> None:
+    """A document as another version would have sealed it."""
+    fields = json.loads(store.blobs.read(path) or b"")
+    del fields["checksum"]
+    change(fields)
+    sealed = {**fields, "checksum": digest(canonical_json(fields))}
+    store.blobs.put(path, canonical_json(sealed) + b"\n")
+
+
+def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_store: Store) -> None:
+    run_once(folder_store)
+    rewrite(folder_store, "project.json", lambda fields: fields.update(store_format="0"))
+    with pytest.raises(InputError, match=r"store_format.*expected '3', found '0'") as refused:
+        Store.open(folder_store.url)
+    assert "Use the version of worldpose that made the project" in str(refused.value)
+    with pytest.raises(InputError, match="store_format"):
+        Store.create(folder_store.url)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda fields: fields.update(mood="good"), "the unknown field mood"),
+        (lambda fields: fields.pop("usability"), "no field usability"),
+    ],
+)
+def test_a_run_that_another_version_recorded_is_refused_as_such(
+    folder_store: Store, change: Callable[[dict[str, Any]], None], found: str
+) -> None:
+    run_once(folder_store)
+    rewrite(folder_store, "runs/final/0001.json", change)
+    with pytest.raises(InputError, match=f"found {found}: another version") as refused:
+        folder_store.run("final")
+    assert "worldpose run FOLDER --project NEW" in str(refused.value)
+    # It is not damaged, but it is said.
+    (finding,) = verify(folder_store)
+    assert "another version" in finding.problem

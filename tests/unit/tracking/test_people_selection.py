@@ -1,10 +1,16 @@
 """Bystanders, shadows and surplus people are dropped, judged by whole people."""
 
+import itertools
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from worldpose.tracking.absences import measure_absences
 from worldpose.tracking.people_selection import drop_bystanders, drop_shadows, merge_duplicates
 from worldpose.tracking.person import Person, Sighting
+from worldpose.tracking.ray_matching import match_optimally
 
 FRAMES, FULL_PITCH = 20, (105.0, 68.0)
 BODY = np.stack([np.zeros(17), np.zeros(17), np.linspace(0.0, 1.7, 17)], axis=1)
@@ -63,13 +69,6 @@ def test_seven_tenths_of_the_time_decide(near, left):
     assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, way)) == left
 
 
-def person(number, first, last, evidence):
-    nothing = Sighting(np.empty(0, int), np.empty(0), np.empty((0, 3)))
-    someone = Person(number, np.empty((0, 3)), last, evidence=evidence)
-    someone.sightings.update({first: nothing, last: nothing})
-    return someone
-
-
 FPS, PITCH = 50.0, (20.0, 20.0)
 
 
@@ -105,3 +104,56 @@ def test_a_track_at_another_in_seven_tenths_of_its_frames_is_the_same_person(nea
     people, merged = merge_duplicates([first, second], distance=0.2)
     assert [person.number for person in people] == left
     assert merged == 2 - len(left)
+
+
+FRAME = np.arange(100, 200)
+
+
+def clip(**absent):
+    """Two people in 100 frames, 25 per second; rows in which one is not seen."""
+    present = np.ones((100, 2), dtype=bool)
+    for name, (first, last) in absent.items():
+        present[first : last + 1, {"one": [0], "two": [1], "both": [0, 1]}[name]] = False
+    return present
+
+
+@pytest.mark.parametrize(
+    ("absent", "share", "longest"),
+    [
+        ({}, 0.0, ()),
+        ({"one": (40, 63)}, 0.0, ()),  # under a second
+        ({"one": (40, 64)}, 25 / 200, (140, 164, 7)),
+        ({"one": (60, 99)}, 0.0, ()),  # left for good
+        ({"both": (75, 99)}, 0.25, (175, 199)),
+        ({"both": (0, 49), "two": (60, 89)}, 0.5, (100, 149)),
+        ({"both": (0, 24), "two": (40, 95)}, 56 / 150, (140, 195, 9)),
+    ],
+)
+def test_absences(absent, share, longest):
+    names = ("absent_from_frame", "absent_to_frame", "absent_person")
+    expected = {"absent_share": pytest.approx(share), **dict(zip(names, longest, strict=False))}
+    assert measure_absences(clip(**absent), FRAME, [7, 9], 25.0) == expected
+
+
+def test_a_clip_without_people_misses_them_all():
+    assert measure_absences(np.zeros((100, 0), bool), FRAME, [], 25.0) == {"absent_share": 1.0}
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=50)
+def test_optimal_matching_has_the_largest_gain_of_all(seed):
+    rng = np.random.default_rng(seed)
+    affinity = -rng.uniform(0, 1, (1, 3, 4))
+    affinity[rng.random(affinity.shape) < 0.3] = -np.inf
+    index = match_optimally(affinity, -0.8)[0]
+
+    def gain(places):
+        return sum(-0.8 if d < 0 else affinity[0, p, d] for p, d in enumerate(places))
+
+    every = (
+        choice
+        for choice in itertools.product(range(-1, 4), repeat=3)
+        if len({d for d in choice if d >= 0}) == sum(d >= 0 for d in choice)
+    )
+    # Sums of three numbers of size 1.
+    assert gain(index.tolist()) == pytest.approx(max(map(gain, every)), abs=1e-12)

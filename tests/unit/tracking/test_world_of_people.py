@@ -149,33 +149,6 @@ def test_a_calibration_of_larger_images_is_scaled_to_those_of_the_people(ring, p
         np.testing.assert_allclose(found[name].principal_point_px, camera.principal_point_px)
 
 
-@pytest.mark.parametrize("also", [1.0 / 3.0, 0.5])
-def test_cameras_of_different_sizes_are_scaled_if_people_agree_at_one_size(ring, also):
-    true = records(ring(2))
-    size = np.array(true["c0"].image_size)
-    focal = true["c0"].focal_px[0]
-    true["c1"] = scaled(true["c1"], 0.5, tuple((size // 2).tolist()))
-    large = {n: scaled(c, 3.0, tuple(3 * s for s in c.image_size)) for n, c in true.items()}
-    # People all over the larger image, and one joint of 17 x 20 beyond its border.
-    points = np.random.default_rng(3).uniform(0.0, 1.0, (20, 2, 1, 17, 2)) * size
-    points[:, 1] /= 2.0
-    points[0, 0, 0, 0] = size + 40.0
-    seen = KeypointDetections.from_keypoints(points, np.ones(points.shape[:-1]))
-    wanted = 3.0 * focal * np.array([1.0 / 3.0, also])
-
-    def agree(batch):
-        return bool(np.isclose(batch.focal[0, 0], wanted).any())
-
-    found, notes = reinterpret_calibration(CALIBRATION, large, seen, agree)
-    if also == 0.5:
-        assert found == large
-        assert "but do if scaled by 0.33333 and 0.50000" in notes[0]
-    else:
-        assert [found[name].image_size for name in true] == [c.image_size for c in true.values()]
-        both = " and ".join("{} x {}".format(*c.image_size) for c in true.values())
-        assert f"scaled by 0.33333, to images of {both} px: of the usual ratios" in notes[0]
-
-
 def test_exchanged_sides_are_told(ring, people, seen):
     true = ring(4)
     joints = walk(people)
@@ -184,21 +157,6 @@ def test_exchanged_sides_are_told(ring, people, seen):
     assert People.of(joints[:, :, sides], FPS).ahead == 0.0
     (*_, notes) = placed(true, true, poses(*seen(true, joints[:, :, sides])))
     assert "left and right are exchanged in all 2D poses" in notes[1]
-
-
-def test_a_lens_that_folds_in_the_middle_is_refused_and_at_the_corners_told(ring):
-    def given(k1):
-        return records(replace(ring(4), distortion=np.tile([k1, *[0.0] * 7], (4, 1))))
-
-    # r (1 + k1 r^2) grows up to r = 1 / sqrt(-3 k1), where it is two thirds of that.
-    corner = float(np.hypot(*(ring(4)[0].image_size / 2)) / ring(4)[0].focal[0])
-    with pytest.raises(InputError, match=r"c0: distortion: expected a lens whose image radii grow"):
-        place_cameras(
-            CALIBRATION, given(-((2.0 / (3.0 * 0.5 * corner)) ** 2) / 3.0), {}, FPS, NOTHING
-        )
-    folds = given(-((2.0 / (3.0 * 0.98 * corner)) ** 2) / 3.0)
-    _, (_, warning, *_) = place_cameras(CALIBRATION, folds, {}, FPS, NOTHING)
-    assert "c0: the lens folds within the image" in warning
 
 
 def test_people_who_lie_before_cameras_that_stand_turn_no_world(ring, people, seen):
@@ -216,6 +174,16 @@ def test_a_run_names_the_axis_of_a_turned_world(ring, people):
     (said,) = doubt_world(turned, People.of(walk(people) @ LYING.T, FPS))
     assert "the upright axis of people is y, not z: 100% of 120 poses" in said
     assert "--up y" in said
+
+
+def test_cameras_on_whom_no_people_agree_are_told(ring, people, seen):
+    others = {}
+    for n, (name, camera) in enumerate(records(ring(4)).items()):
+        turn = Rotation.from_euler("z", 40 + 20 * n, degrees=True).as_matrix() @ camera.rotation
+        others[name] = camera.model_copy(update={"rotation": tuple(map(tuple, turn.tolist()))})
+    keypoints = poses(*seen(ring(4), walk(people)))
+    _, notes = place_cameras(CALIBRATION, others, keypoints, FPS, NOTHING)
+    assert any("no people agree in the images of two cameras" in note for note in notes)
 
 
 def test_without_people_cameras_alone_decide(ring):
@@ -254,3 +222,45 @@ def test_statures_that_no_adults_have(statures, said):
 def test_options_that_state_nothing(unit, up):
     with pytest.raises(UsageError, match=f"found {unit} and {up}"):
         read_stated_world(unit, up)
+
+
+def test_a_lens_that_folds_in_the_middle_is_refused_and_at_the_corners_told(ring):
+    def given(k1):
+        return records(replace(ring(4), distortion=np.tile([k1, *[0.0] * 7], (4, 1))))
+
+    # r (1 + k1 r^2) grows up to r = 1 / sqrt(-3 k1), where it is two thirds of that.
+    corner = float(np.hypot(*(ring(4)[0].image_size / 2)) / ring(4)[0].focal[0])
+    with pytest.raises(InputError, match=r"c0: distortion: expected a lens whose image radii grow"):
+        place_cameras(
+            CALIBRATION, given(-((2.0 / (3.0 * 0.5 * corner)) ** 2) / 3.0), {}, FPS, NOTHING
+        )
+    folds = given(-((2.0 / (3.0 * 0.98 * corner)) ** 2) / 3.0)
+    _, (_, warning, *_) = place_cameras(CALIBRATION, folds, {}, FPS, NOTHING)
+    assert "c0: the lens folds within the image" in warning
+
+
+@pytest.mark.parametrize("also", [1.0 / 3.0, 0.5])
+def test_cameras_of_different_sizes_are_scaled_if_people_agree_at_one_size(ring, also):
+    true = records(ring(2))
+    size = np.array(true["c0"].image_size)
+    focal = true["c0"].focal_px[0]
+    true["c1"] = scaled(true["c1"], 0.5, tuple((size // 2).tolist()))
+    large = {n: scaled(c, 3.0, tuple(3 * s for s in c.image_size)) for n, c in true.items()}
+    # People all over the larger image, and one joint of 17 x 20 beyond its border.
+    points = np.random.default_rng(3).uniform(0.0, 1.0, (20, 2, 1, 17, 2)) * size
+    points[:, 1] /= 2.0
+    points[0, 0, 0, 0] = size + 40.0
+    seen = KeypointDetections.from_keypoints(points, np.ones(points.shape[:-1]))
+    wanted = 3.0 * focal * np.array([1.0 / 3.0, also])
+
+    def agree(batch):
+        return bool(np.isclose(batch.focal[0, 0], wanted).any())
+
+    found, notes = reinterpret_calibration(CALIBRATION, large, seen, agree)
+    if also == 0.5:
+        assert found == large
+        assert "but do if scaled by 0.33333 and 0.50000" in notes[0]
+    else:
+        assert [found[name].image_size for name in true] == [c.image_size for c in true.values()]
+        both = " and ".join("{} x {}".format(*c.image_size) for c in true.values())
+        assert f"scaled by 0.33333, to images of {both} px: of the usual ratios" in notes[0]

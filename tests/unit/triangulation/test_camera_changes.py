@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,13 +13,7 @@ from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.changes import find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.camera_changes import (
-    correct_views,
-    describe_change,
-    explain_changes,
-    move_on,
-    triangulate_views,
-)
+from worldpose.triangulation.camera_changes import correct_views, explain_changes, triangulate_views
 from worldpose.triangulation.clock_courses import add_slow_drifts, trace_clocks
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
@@ -104,10 +97,6 @@ def fast(pixels, *_, rate=1.02):
     low = at.astype(int)
     share = (at - low)[:, None, None, None]
     return (1.0 - share) * pixels[low] + share * pixels[low + 1]
-
-
-def test_healthy_cameras_do_not_change(cameras):
-    assert explain(cameras, view(cameras, lambda pixels, *_: pixels)) is None
 
 
 CENTER = np.array([950.0, 545.0])
@@ -216,21 +205,6 @@ def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
 
 
-def test_an_end_that_does_not_know_a_camera_gives_no_drift(cameras, monkeypatch):
-    """The median of known offsets, which is each end's zero, jumps from 6.5 to 3 frames."""
-    ends = [([-6.5, -3.5, 3.5, 5.5], (0, 1, 2, 3)), ([-3.0, 0.0, 7.0, np.nan], (0, 1, 2))]
-
-    def synchronize(*_, **__):
-        late, group = ends.pop(0)
-        std = np.where(np.isfinite(late), 0.01, np.inf)
-        return SimpleNamespace(late=np.array(late), std=std, groups=(group,))
-
-    monkeypatch.setattr("worldpose.triangulation.clock_courses.synchronize", synchronize)
-    given = [[(0, offset)] for offset in (0.0, 3.0, 10.0, 12.0)]
-    people = view(cameras, late)
-    assert add_slow_drifts(given, cameras, people, FPS, max_offset_s=0.4) == given
-
-
 CAMERA = Camera.from_matrices(
     [[1500.0, 0.0, 950.0], [0.0, 1500.0, 545.0], [0.0, 0.0, 1.0]],
     [-0.2, 0.05, 0.0, 0.0, 0.0],
@@ -261,33 +235,6 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     shift = corrected - pixels
     np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
     assert not shift[:, 0].any()
-
-
-def test_a_changed_view_shows_what_is_taken_back_again():
-    moving = {"zoom": 0.03, "roll_rad": 0.01, "frame": None}
-    known, frame = [KNOCK.model_copy(update=moving)], np.arange(10, 15)
-    pixels = np.random.default_rng(1).uniform(0.0, 100.0, (5, 3, 17, 2))
-    shown = move_on(pixels, frame, CAMERA, known)
-    back = correct_views(shown[:, None], frame, {"b": CAMERA}, known)
-    np.testing.assert_allclose(back[:, 0], pixels, atol=1e-9)
-    assert np.linalg.norm(shown - pixels, axis=-1)[3].mean() > 1.0
-    np.testing.assert_allclose(shown[4], pixels[4], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({}, "camera b moves at frame 12, by 3 px"),
-        ({"kind": "clock", "late_frames": 4.9}, "changes by -4.9 frames at frame 12: its recorder"),
-        ({"kind": "clock", "late_frames": 0.02, "frame": None}, "its clock runs 0.67% fast"),
-        (
-            {"is_explained": False, "is_left_out": True},
-            "no single step or drift explains; its views are left out",
-        ),
-    ],
-)
-def test_a_change_is_told_with_camera_and_frame(change, said):
-    assert said in describe_change(KNOCK.model_copy(update=change))
 
 
 def test_cameras_that_all_sway_agree_with_nobody(cameras):

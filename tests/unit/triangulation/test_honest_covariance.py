@@ -6,7 +6,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.triangulation.clocks import estimate_clocks
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -96,28 +95,3 @@ def test_regions_hold_the_truth_of_one_clip():
     # 136 joints, not independent: five standard errors below and everything above.
     assert number > 100
     assert share > 0.86
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "fewest"), [("match", 60), ("penalty-box", 12), ("corner-kick", 60)]
-)
-def test_95_percent_of_clocks_lie_within_two_standard_errors(name, fewest):
-    scenario, settings = SCENARIOS[name], TriangulationSettings()
-    rig = scenario.rig.model_copy(update={"clock_std_frames": 0.7})
-    scenario = scenario.model_copy(update={"duration": 3.0, "broadcast": (), "rig": rig})
-    deviations = []
-    for seed in range(20, 30):
-        scene = simulate_scene(scenario, seed)
-        cameras, arrays, _ = arrays_of(scene, scenario.crowd.people)
-        found = estimate_clocks(cameras, as_detections(*arrays), scenario.fps, settings)
-        true = np.array(list(scene.clocks.values()))[found.determined]
-        error = found.late[found.determined] - true + true.mean()
-        deviations.append(error / found.standard_error[found.determined])
-    deviations = np.concatenate(deviations)
-    # In a penalty box people stand. Cameras of a clip share its people: some 30 independent ones of
-    # 60, sampling error 4 %.
-    assert len(deviations) > fewest
-    sampling_error = np.sqrt(0.05 * 0.95 / (0.5 * len(deviations)))
-    assert (np.abs(deviations) < 1.96).mean() >= 0.95 - 2.0 * sampling_error
-    assert np.sqrt((deviations**2).mean()) < 1.3

@@ -9,9 +9,7 @@ from worldpose.triangulation.residuals import (
     add_data,
     clear,
     read_tile,
-    write_leverages,
 )
-from worldpose.triangulation.solve import find_consensus
 
 POINT = np.array([0.7, -1.1, 1.3])
 NOISE = (2.0, 0.0)
@@ -57,24 +55,3 @@ def test_normal_equations_are_the_gradient_of_half_the_weighted_cost(views):
         behind, _ = cost_and_right(POINT - step * np.eye(3)[axis])
         # Central differences of a cost of about 10 with third derivatives of order 1e3.
         assert right[axis] == pytest.approx(-(ahead - behind) / (2 * step), rel=1e-5, abs=1e-3)
-
-
-def test_leverages_of_all_views_sum_to_three(views):
-    camera, image = views
-    rig, buffers = buffers_of(camera, image)
-    find_consensus(rig, (10.0, 0.0), 12.0, buffers)
-    for tile, depth in zip(buffers.tiles, rig.depths, strict=True):
-        write_leverages(tile, depth, (10.0, 0.0), buffers.state[0])
-    # Three unknowns; the matrix is that before a last step of under a micrometre.
-    assert buffers.tiles["leverage"][:, 0].sum() == pytest.approx(3.0, rel=1e-6)
-
-
-def test_lane_without_observations_leaves_the_others_alone(ring):
-    camera = ring(4)
-    rig, buffers = buffers_of(camera, camera.project(POINT[None])[:, 0])
-    for name in ("a", "b", "precision"):
-        buffers.tiles[name][..., 5] = 0.0
-    find_consensus(rig, NOISE, 12.0, buffers)
-    points = buffers.state["point"][0]
-    assert np.isnan(points[:, 5]).all()
-    np.testing.assert_allclose(np.delete(points, 5, axis=1).T - POINT, 0.0, atol=1e-9)

@@ -50,22 +50,6 @@ def numbers_read(path, start=0, stop=None):
         ]
 
 
-def test_pictures_that_predict_from_later_ones_come_in_the_order_shown(tmp_path):
-    path = encode(tmp_path / "b.mp4", 40 * np.arange(30))
-    with av.open(str(path)) as container:
-        stamps = [packet.pts for packet in container.demux(video=0) if packet.size]
-    assert stamps != sorted(stamps)  # stored in another order: there are B-frames
-    assert numbers_read(path, 13, 22) == [(n, n) for n in range(13, 22)]
-
-
-def test_a_dropped_picture_leaves_its_frame_empty_and_shifts_none(tmp_path):
-    shown = np.delete(np.arange(30), [11, 12])
-    index = index_video(encode(tmp_path / "dropped.mkv", 40 * shown))
-    expected = np.full(30, -1)
-    expected[shown] = np.arange(28)
-    assert index.on_clock(25.0, "dropped").tolist() == expected.tolist()
-
-
 @pytest.mark.parametrize(
     ("matrix", "said"),
     [
@@ -174,9 +158,3 @@ def test_a_list_of_other_files_is_no_video(tmp_path):
     (tmp_path / "video.mp4").write_text("ffconcat version 1.0\nfile other.mov\n")
     with pytest.raises(InputError, match="a list of other files"):
         index_video(tmp_path / "video.mp4")
-
-
-def test_a_video_of_another_rate_is_refused(tmp_path):
-    index = index_video(encode(tmp_path / "slow.mp4", 80 * np.arange(20)))
-    with pytest.raises(InputError, match="25 frames per second"):
-        index.on_clock(25.0, "slow")

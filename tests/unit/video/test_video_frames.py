@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.video.files import VideoReader, cut_video, index_frames, write_video
+from worldpose.video.files import VideoReader, index_frames, write_video
 from worldpose.video.pictures import FrameIndex
 
 SIZE = (48, 64)
@@ -23,13 +23,6 @@ def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
     assert write_video(path, numbered(55), 25.0, quality=5) == 55
     return path
-
-
-def test_the_same_pictures_give_the_same_bytes(tmp_path):
-    paths = [tmp_path / "one.mp4", tmp_path / "two.mp4"]
-    for path in paths:
-        write_video(path, numbered(5), 50.0)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
 def test_frames_beyond_the_end_are_refused(clip):
@@ -137,14 +130,6 @@ def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
         mixed = np.random.default_rng(0).permutation(40).tolist()
         for number in [0, 20, 39, *range(39, -1, -3), *mixed[:15]]:
             assert number_in(video.frame(number)) == number
-
-
-def test_a_stretch_cut_out_of_a_transport_stream_is_whole(tmp_path):
-    path, out = tmp_path / "clip.ts", tmp_path / "cut.ts"
-    write_blocks(path, "h264")
-    place = cut_video(path, 23, 28, out)
-    with VideoReader(out) as video:
-        assert [number_in(video.frame(place + n)) for n in range(5)] == [23, 24, 25, 26, 27]
 
 
 @pytest.mark.parametrize(

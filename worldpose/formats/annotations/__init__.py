@@ -15,6 +15,7 @@ from worldpose.formats.annotations.annotated_images import (
     ContentError,
     coco_bytes,
     decode_file,
+    first_character,
     read_coco,
 )
 from worldpose.formats.annotations.programs import (
@@ -49,7 +50,7 @@ def format_suffix(form: Format) -> str:
 
 def detect_format(content: bytes) -> Format:
     """Detect the format of a file from its first characters: XML, a list of tasks, or an object."""
-    begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
+    begin = first_character(content)
     return "cvat" if begin == b"<" else "label-studio" if begin == b"[" else "coco"
 
 

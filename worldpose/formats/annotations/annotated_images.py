@@ -62,6 +62,11 @@ def decode_file(
     raise InputError(str(path), expected=expected, found=found[:300], todo=todo)
 
 
+def first_character(content: bytes) -> bytes:
+    """Return the first character of a text in UTF-8 or UTF-16, which tells XML from JSON."""
+    return content.lstrip(b"\xef\xbb\xbf\xff\xfe\0 \t\r\n")[:1]
+
+
 @dataclass(frozen=True, eq=False)
 class AnnotatedPerson:
     """One person in one image.

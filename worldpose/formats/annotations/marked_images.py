@@ -25,6 +25,7 @@ from worldpose.formats.annotations.annotated_images import (
     ContentError,
     Given,
     decode_file,
+    first_character,
 )
 from worldpose.formats.annotations.programs import Answer, read_xml
 
@@ -70,10 +71,12 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
     max_bytes = 1 << 26  # maximum file size [bytes]
 
     def decode(content: bytes) -> list[MarkedImage]:
-        begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
-        decoders = {b"<": _read_cvat, b"[": _read_label_studio}
+        decoders = {b"<": _read_cvat, b"[": _read_label_studio, b"{": _read_coco}
+        begin = first_character(content)
+        if begin not in decoders:
+            raise ContentError("neither XML nor JSON")
         try:
-            found = list(decoders.get(begin, _read_coco)(content))
+            found = list(decoders[begin](content))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ContentError(f"no JSON: {error}") from error
         images = [image for image in found if image.points or image.lines]
@@ -135,12 +138,14 @@ def _read_tracks(root: Element) -> Iterator[MarkedImage]:
     found: dict[int, list[tuple[str, Element]]] = {}
     for track in root.iter("track"):
         for shape in track:
-            if shape.get("keyframe", "1") != "1" or shape.get("outside") == "1":
+            is_key = shape.get("keyframe", "1")  # the points of a skeleton have their own
+            parts = list(shape) if shape.tag == "skeleton" else [shape]
+            parts = [part for part in parts if part.get("keyframe", is_key) == "1"]
+            if not parts or shape.get("outside") == "1":
                 continue
             text = shape.get("frame", "")
             if not text.isdecimal() or len(text) > 9:
                 raise ContentError(f"track {track.get('id')}: frame {text[:40]!r}")
-            parts = list(shape) if shape.tag == "skeleton" else [shape]
             labels = [part.get("label", track.get("label", "")) for part in parts]
             found.setdefault(int(text), []).extend(zip(labels, parts, strict=True))
     first = root.findtext(".//start_frame") or "0"
@@ -282,9 +287,8 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
                 continue
             labels = names.get(each.category_id, ())
             if len(each.keypoints) != 3 * len(labels):
-                raise ContentError(
-                    f"{image.file_name}: {len(each.keypoints)} numbers for {len(labels)} keypoints"
-                )
+                what = f"{len(labels)} keypoints of category {each.category_id}"
+                raise ContentError(f"{image.file_name}: {len(each.keypoints)} numbers for {what}")
             for label, (x, y, visible) in zip(
                 labels, np.reshape(each.keypoints, (-1, 3)).tolist(), strict=True
             ):

@@ -44,8 +44,6 @@ def read_xml(content: bytes) -> Element:
 
 BOX: Final = "person"
 """Label of boxes; must differ from the label of skeletons."""
-SKELETON: Final = "pose"
-"""Label of skeletons, whose points are the 17 joints of COCO."""
 
 
 def cvat_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
@@ -86,7 +84,9 @@ def _write(image: Element, group: int, person: AnnotatedPerson) -> None:
     corners = zip(("xtl", "ytl", "xbr", "ybr"), (person.box + CORNER).tolist(), strict=True)
     shape = {name: str(value) for name, value in corners}
     box = SubElement(image, "box", {"label": BOX, "occluded": "0", **shape, **common})
-    skeleton = SubElement(image, "skeleton", {"label": SKELETON, **common})
+    # Label of skeletons, whose points are the 17 joints of COCO.
+    skeleton_label = "pose"
+    skeleton = SubElement(image, "skeleton", {"label": skeleton_label, **common})
     middle = (person.box[:2] + person.box[2:]) / 2  # position of missing keypoints
     for joint, xy, visible in zip(COCO17, person.keypoints, person.visible, strict=True):
         x, y = ((xy if visible else middle) + CORNER).tolist()
@@ -218,8 +218,6 @@ def _number(text: str) -> float:
 
 HIDDEN: Final = "hidden"
 """Note at an occluded keypoint: Label Studio has no field for that."""
-POINT: Final = 0.3
-"""Displayed size of a keypoint [% of the image width]."""
 
 
 class _Value(Given):
@@ -275,11 +273,7 @@ def label_studio_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
     """Write Label Studio tasks, with the detections as predictions."""
     tasks = [
         {
-            "data": {
-                "image": picture.name,
-                "width": picture.size[0],
-                "height": picture.size[1],
-            },
+            "data": {"image": picture.name, "width": picture.size[0], "height": picture.size[1]},
             "predictions": [{"model_version": "worldpose", "result": _result(picture)}],
         }
         for picture in pictures
@@ -309,6 +303,8 @@ def _result(picture: AnnotatedImage) -> list[dict[str, Any]]:
         "original_height": height,
         "image_rotation": 0,
     }
+    # Displayed size of a keypoint [% of the image width].
+    point_size = 0.3
     for number, person in enumerate(picture.people):
         (x, y), (wide, high) = (
             ((person.box[:2] + CORNER) * percent).tolist(),
@@ -342,7 +338,7 @@ def _result(picture: AnnotatedImage) -> list[dict[str, Any]]:
                     "from_name": "joint",
                     **common,
                     "parentID": f"person{number}",
-                    "value": {"x": x, "y": y, "width": POINT, "keypointlabels": [joint]},
+                    "value": {"x": x, "y": y, "width": point_size, "keypointlabels": [joint]},
                     **({"meta": {"text": [HIDDEN]}} if visible == 1 else {}),
                 }
             )

@@ -69,10 +69,6 @@ def find_method(name: str) -> Method:
         UsageError: no method has this name.
     """
     if name not in METHODS:
-        raise UsageError(
-            f"--method {name}",
-            expected=f"one of {', '.join(METHODS)}",
-            found=repr(name),
-            todo="Name the method as NAME=PATH.",
-        )
+        todo = "Name the method as NAME=PATH."
+        raise UsageError(f"--method {name}", f"one of {', '.join(METHODS)}", repr(name), todo)
     return METHODS[name]

@@ -16,9 +16,9 @@ from data_contracts.arrays import Floats
 from worldpose.body.model import BodyModel
 from worldpose.formats.baselines.result import (
     MethodResult,
+    MethodTrack,
     Part,
     Person,
-    Track,
     boxes_around,
     format_error,
     merge_people,
@@ -57,7 +57,7 @@ def read_hybrik(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResul
     return merge_people("camera", people, {"shape": used})
 
 
-def _read_people(content: Part) -> dict[int, tuple[Track, Floats]]:
+def _read_people(content: Part) -> dict[int, tuple[MethodTrack, Floats]]:
     rows = {}
     for number, person in content.by_person():
         frames = person["frames"].frames()
@@ -69,7 +69,7 @@ def _read_people(content: Part) -> dict[int, tuple[Track, Floats]]:
     return rows
 
 
-def _read_person(content: Part) -> tuple[Track, Floats]:
+def _read_person(content: Part) -> tuple[MethodTrack, Floats]:
     images = content["img_path"]
     names = [str(name) for name in images.value]
     numbers = [int(found[1]) - 1 for n in names if (found := re.search(r"(\d+)\.\w+$", n))]
@@ -80,10 +80,10 @@ def _read_person(content: Part) -> tuple[Track, Floats]:
     return track, content["bbox"].floats(len(frames), 4)
 
 
-def _build_track(frames: NDArray[np.int64], turns: Part, betas: Part, place: Part) -> Track:
+def _build_track(frames: NDArray[np.int64], turns: Part, betas: Part, place: Part) -> MethodTrack:
     count = len(frames)
     vectors = rotation_vectors(turns.floats(count, 216).reshape(-1, 24, 3, 3))
-    return Track(
+    return MethodTrack(
         frames=frames,
         global_orient=vectors[:, 0],
         body_pose=vectors[:, 1:].reshape(-1, 69),
@@ -127,7 +127,7 @@ def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRes
             np.array(part) for part in zip(*(found[frame] for frame in sorted(found)), strict=True)
         )
         vectors = rotation_vectors(turns)
-        track = Track(frames, vectors[:, 0], vectors[:, 1:].reshape(-1, 69), place, betas)
+        track = MethodTrack(frames, vectors[:, 0], vectors[:, 1:].reshape(-1, 69), place, betas)
         joints, used = pose_track(track, model, "smpl")
         people.append(Person(number, frames, joints, boxes))
     return merge_people("camera", people, {"shape": used})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,6 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pickles import read_pickle
-
-Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Rotation of world points to axes with y down, the ground orientation of SLAHMR."""
 
 
 def write_tracks(path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
@@ -72,15 +69,16 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
     """
     missing = np.flatnonzero(np.isnan(camera.numbers).any(-1))
     if len(missing):
+        found = f"none in {len(missing)} of {len(camera.focal)}, the first {missing[0]}"
+        todo = "Calibrate the camera there, or shorten the clip."
         raise InputError(
-            str(path),
-            expected="a camera in every frame: the method knows no gaps",
-            found=f"none in {len(missing)} of {len(camera.focal)}, the first {missing[0]}",
-            todo="Calibrate the camera there, or shorten the clip.",
+            str(path), "a camera in every frame: the method knows no gaps", found, todo
         )
     pose = camera.cam_from_world
     transforms = np.tile(np.eye(4), (len(camera.focal), 1, 1))
-    transforms[:, :3, :3] = pose.rotation @ Y_DOWN.T
+    # Rotation of world points to axes with y down, the ground orientation of SLAHMR.
+    y_down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    transforms[:, :3, :3] = pose.rotation @ y_down.T
     transforms[:, :3, 3] = pose.translation
     width, height = camera.image_size.reshape(-1, 2)[0]
     write_archive(
@@ -109,9 +107,6 @@ betas are not used here."""
 Place = Literal["transl", "pelvis", "mid_hip"]
 """Reference point of a position: `transl` is added to SMPL's joints; the others are points."""
 
-_CHUNK: Final = 4096
-"""Bodies posed per chunk: 50 MB."""
-
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
@@ -129,7 +124,7 @@ class MethodResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class MethodTrack:
     """Bodies of one person in some frames."""
 
     frames: NDArray[np.int64]
@@ -147,7 +142,7 @@ class Track:
 
 
 def pose_track(
-    track: Track, model: BodyModel, shape: Shape, place: Place = "transl"
+    track: MethodTrack, model: BodyModel, shape: Shape, place: Place = "transl"
 ) -> tuple[Floats, str]:
     """Return the joints (frames, 17, 3) [m] of one person, and the source of its shape.
 
@@ -173,8 +168,10 @@ def pose_track(
     names = (*COCO17, "mid_hip")
     keypoints = fold_keypoints(model, names)
     points = np.empty((count, len(names), 3))
-    for start in range(0, count, _CHUNK):
-        part = slice(start, start + _CHUNK)
+    # Bodies posed per chunk: 50 MB.
+    chunk_bodies = 4096
+    for start in range(0, count, chunk_bodies):
+        part = slice(start, start + chunk_bodies)
         points[part] = keypoints(
             BodyParameters(betas[part], track.global_orient[part], pose[part], shift[part])
         )
@@ -213,12 +210,8 @@ def merge_people(
         InputError: there are no people.
     """
     if not people:
-        raise InputError(
-            "results of a method",
-            expected="at least one person",
-            found="no people",
-            todo="Check that this is the result for the clip, or run the method again.",
-        )
+        todo = "Check that this is the result for the clip, or run the method again."
+        raise InputError("results of a method", "at least one person", "no people", todo)
     frames = np.unique(np.concatenate([person.frames for person in people]))
     joints = np.full((len(frames), len(people), len(COCO17), 3), np.nan)
     around = np.full((len(frames), len(people), 4), np.nan)
@@ -311,12 +304,8 @@ def _take_rows(values: Floats, own: NDArray[np.int64], wanted: NDArray[np.int64]
 
 def format_error(where: object, expected: str, found: str) -> InputError:
     """Return the error about one place of a method's file."""
-    return InputError(
-        str(where),
-        expected=expected,
-        found=found,
-        todo="Give the file that the method's own code wrote, or name another method.",
-    )
+    todo = "Give the file that the method's own code wrote, or name another method."
+    return InputError(str(where), expected, found, todo)
 
 
 def read_pickled(path: Path) -> Part:
@@ -339,12 +328,9 @@ def read_pickled(path: Path) -> Part:
 
 
 def _reading_error(path: Path, found: str) -> InputError:
-    return InputError(
-        str(path),
-        expected="results of a method: arrays in a pickle, joblib, numpy or torch file",
-        found=found,
-        todo="Give the file that the method's own code wrote. Nothing in this file was run.",
-    )
+    expected = "results of a method: arrays in a pickle, joblib, numpy or torch file"
+    todo = "Give the file that the method's own code wrote. Nothing in this file was run."
+    return InputError(str(path), expected, found, todo)
 
 
 @dataclass(frozen=True)

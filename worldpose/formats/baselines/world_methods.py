@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,9 @@ from worldpose.body.model import BodyModel
 from worldpose.formats.archives import read_npz
 from worldpose.formats.baselines.result import (
     MethodResult,
+    MethodTrack,
     Part,
     Person,
-    Track,
     boxes_around,
     format_error,
     merge_people,
@@ -56,7 +55,7 @@ def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
         exists = person["exist_frames"].floats(None) > 0.5
         count = len(exists)
         scale = person["scale"]
-        track = Track(
+        track = MethodTrack(
             frames=np.flatnonzero(exists),
             global_orient=person["smpl_orient_world"].floats(count, 3)[exists],
             body_pose=person["smpl_pose"].floats(count, 69)[exists],
@@ -104,11 +103,11 @@ def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> Meth
     return merge_people("own", people, {"shape": used})
 
 
-def _read_wham_track(person: Part, frames: NDArray[np.int64], suffix: str) -> Track:
+def _read_wham_track(person: Part, frames: NDArray[np.int64], suffix: str) -> MethodTrack:
     count = len(frames)
     pose = person[f"pose{suffix}"].floats(count, 72)
     place = person[f"trans{suffix}"].floats(count, 3)
-    return Track(frames, pose[:, :3], pose[:, 3:], place, person["betas"].floats(count, None))
+    return MethodTrack(frames, pose[:, :3], pose[:, 3:], place, person["betas"].floats(count, None))
 
 
 def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -149,11 +148,11 @@ def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
     return merge_people("own", people, {"shape": used})
 
 
-def _read_gvhmr_track(parameters: Part) -> Track:
+def _read_gvhmr_track(parameters: Part) -> MethodTrack:
     place = parameters["transl"].floats(None, 3)
     turns = parameters["global_orient"].floats(len(place), 3)
     angles = parameters["body_pose"].floats(len(place), 63)
-    return Track(np.arange(len(place)), turns, angles, place)
+    return MethodTrack(np.arange(len(place)), turns, angles, place)
 
 
 def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -196,7 +195,7 @@ def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
             raise format_error(file, expected, f"{frames[-1]}")
         count = len(frames)
         vectors = rotation_vectors(content["pred_rotmat"].floats(count, 24, 3, 3))
-        track = Track(
+        track = MethodTrack(
             frames=frames,
             global_orient=vectors[:, 0],
             body_pose=vectors[:, 1:].reshape(-1, 69),
@@ -234,7 +233,9 @@ def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRe
         count = len(frames)
         pose = person["smplx_world"]["pose"].floats(count, 165)
         place = person["smplx_world"]["trans"].floats(count, 3)
-        joints, used = pose_track(Track(frames, pose[:, :3], pose[:, 3:66], place), model, "other")
+        joints, used = pose_track(
+            MethodTrack(frames, pose[:, :3], pose[:, 3:66], place), model, "other"
+        )
         people.append(Person(number, frames, joints, person["bboxes"].floats(count, None)[:, :4]))
     width, height = (2.0 * content["camera"]["img_center"].floats(2)).tolist()
     return merge_people("shared", people, {"shape": used}, (width, height))
@@ -258,7 +259,7 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
         if not there.any():
             continue
         one = poses[person, there]
-        track = Track(
+        track = MethodTrack(
             np.flatnonzero(there), one.global_orient, one.body_pose, one.transl, one.betas
         )
         same = named in (None, model.name)
@@ -267,7 +268,6 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     return merge_people("shared", people, {"shape": used})
 
 
-_ARRAYS: Final = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
 _Piece = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -329,8 +329,9 @@ def _read_run(
     if not files:
         raise format_error(info.parent / phase, "<clip>_<iteration>_world_results.npz", "none")
     arrays = read_npz(files[-1], FILE_BYTES)
-    if not {*_ARRAYS} <= {*arrays}:
-        raise format_error(files[-1], f"the arrays {', '.join(_ARRAYS)}", ", ".join(arrays))
+    array_names = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
+    if not {*array_names} <= {*arrays}:
+        raise format_error(files[-1], f"the arrays {', '.join(array_names)}", ", ".join(arrays))
     where = str(files[-1])
     place = Part(f"{where}: trans", arrays["trans"]).floats(None, None, 3)
     count, length = place.shape[:2]
@@ -360,7 +361,7 @@ def _read_run(
         seen = np.flatnonzero(mask) - start
         rows = np.arange(seen[0], min(seen[-1] + 1, length))
         joints, used = pose_track(
-            Track(rows, turns[row, rows], pose[row, rows], place[row, rows]), model, "other"
+            MethodTrack(rows, turns[row, rows], pose[row, rows], place[row, rows]), model, "other"
         )
         relative = np.einsum("fab,fjb->fja", camera[row, rows], joints) + shift[row, rows, None]
         boxes = project_boxes(relative, focal[rows], center[rows])

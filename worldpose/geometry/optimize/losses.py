@@ -16,6 +16,9 @@ from worldpose.compiled import inline_kernel
 
 Number = TypeVar("Number", float, Floats)
 
+MEDIAN_SQUARED = 2.0 * np.log(2.0)
+"""Median squared length of a standard Gaussian in two dimensions [1]."""
+
 
 @inline_kernel
 def cauchy_loss(squared: Number, scale: float) -> Number:

@@ -13,9 +13,10 @@ from typing import Final, Literal
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
 from worldpose.body.occlusions import facing_axes
-from worldpose.simulation.foreign.rigs import View
+from worldpose.simulation.foreign.rigs import ForeignView
 from worldpose.simulation.reference import Report, list_detections
 
 
@@ -138,14 +139,10 @@ PROFILES: Final = {
 
 _PARENT: Final = (5, 0, 0, 1, 2, 6, 5, 5, 6, 7, 8, 12, 11, 11, 12, 13, 14)
 """Parent joint of the limb that leads to each joint."""
-_OTHER: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
-"""The same joint on the other side."""
 _EASE: Final = np.array(
     [0.5, 0.45, 0.45, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0, 1.25, 1.25, 1.3, 1.3, 1.05, 1.05, 1.15, 1.15]
 )
 """Error of each joint relative to the average one [1]."""
-_PARTS: Final = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
-"""Joints that are swapped left to right together."""
 
 _STICKMAN: Final = (
     np.array(
@@ -184,7 +181,7 @@ def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detecto
     """Return a detector of this profile; left and right are mirror images."""
     definition = profile.definition * rng.standard_normal((17, 3))
     height_bias = profile.height_bias * rng.standard_normal(17)
-    for joint, mirror in enumerate(_OTHER):
+    for joint, mirror in enumerate(COCO17_FLIP):
         if mirror < joint:
             definition[joint] = definition[mirror] * [1.0, -1.0, 1.0]
             height_bias[joint] = height_bias[mirror]
@@ -216,7 +213,7 @@ def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floa
 
 def detect_people(
     detector: Detector,
-    view: View,
+    view: ForeignView,
     defined: Floats,
     image_size: Integers,
     fps: float,
@@ -305,7 +302,7 @@ def _draw_errors(
     return np.asarray(own)
 
 
-def _bias(detector: Detector, view: View, size: Floats) -> Floats:
+def _bias(detector: Detector, view: ForeignView, size: Floats) -> Floats:
     """Return the bias (frames, persons, 17, 2) [px] by azimuth and elevation of the camera."""
     azimuth = view.azimuth
     waves = [np.cos(azimuth), np.sin(azimuth), np.cos(3.0 * azimuth), np.sin(3.0 * azimuth)]
@@ -315,7 +312,11 @@ def _bias(detector: Detector, view: View, size: Floats) -> Floats:
 
 
 def _misplace_joints(
-    profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
+    profile: DetectorProfile,
+    keypoints: Floats,
+    view: ForeignView,
+    fps: float,
+    rng: np.random.Generator,
 ) -> tuple[Floats, Flags]:
     """Return keypoints with gross errors in bursts, and their flags."""
     shape = keypoints.shape[:3]
@@ -326,7 +327,7 @@ def _misplace_joints(
     kind = rng.integers(3, size=len(frame))
     hider = view.hider[frame, person, joint]
     kind = np.where((hider >= 0) & (rng.random(len(frame)) < 0.7), 3, kind)
-    parents, others = np.array(_PARENT), np.array(_OTHER)
+    parents, others = np.array(_PARENT), np.array(COCO17_FLIP)
     share = rng.uniform(0.3, 0.9, len(frame))[:, None]
     here = keypoints[frame, person, joint]
     parent = keypoints[frame, person, parents[joint]]
@@ -344,17 +345,23 @@ def _misplace_joints(
 
 
 def _swap_sides(
-    profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
+    profile: DetectorProfile,
+    keypoints: Floats,
+    view: ForeignView,
+    fps: float,
+    rng: np.random.Generator,
 ) -> Floats:
     """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
     swapped = keypoints.copy()
-    for part in (*_PARTS, tuple(range(17))):
+    # Joints that are swapped left to right together.
+    parts = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
+    for part in (*parts, tuple(range(17))):
         on = _draw_bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
         more = _draw_bursts(profile.swapped, 0.2, view.size.shape, fps, rng)
         on |= more & (np.cos(view.azimuth) < 0.0)
         frame, person = np.nonzero(on)
         joints = np.array(part)
-        mirror = np.array(_OTHER)[joints]
+        mirror = np.array(COCO17_FLIP)[joints]
         swapped[frame[:, None], person[:, None], joints] = keypoints[
             frame[:, None], person[:, None], mirror
         ]
@@ -366,7 +373,7 @@ def _merge_people(
     keypoints: Floats,
     there: Flags,
     found: Flags,
-    view: View,
+    view: ForeignView,
     fps: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Flags, Flags]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -54,11 +54,6 @@ from worldpose.simulation.foreign.trajectories import (
 )
 from worldpose.simulation.recorded_files import follow_track
 from worldpose.simulation.reference import CLIP_ID, Report, write_reference
-
-REPLAYED: Final = 0.3
-"""Share of people who replay motion capture if there is any [1]."""
-_OFFSETS: Final = ((0, 1), (0, 1), (-40, 41), (0, 90000))
-"""Ranges of a camera's frame number at the match's first frame, one of which is drawn [frame]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +160,12 @@ def simulate_foreign_scene(
     clock_offsets, offsets, pillars = {}, {}, {}
     reports = dict[str, Report]()
     views = np.zeros(joints.shape[:3], np.int64)
+    # Ranges of a camera's frame number at the match's first frame, one of which is drawn [frame].
+    offset_ranges = ((0, 1), (0, 1), (-40, 41), (0, 90000))
     for (name, camera), own in zip(named.items(), streams[4].spawn(mounted), strict=True):
         rng = np.random.default_rng(own)
         clock_offsets[name] = float(rng.uniform(-0.5, 0.5)) if unsynchronised else 0.0
-        offsets[name] = int(rng.integers(*_OFFSETS[rng.integers(len(_OFFSETS))]))
+        offsets[name] = int(rng.integers(*offset_ranges[rng.integers(len(offset_ranges))]))
         pillars[name] = _draw_pillar(float(camera.camera.image_size[0]), rng)
         lost = float(rng.choice([0.0, 0.0, 0.0, 0.01, 0.03]))
         then = joints
@@ -265,8 +262,10 @@ def _draw_people(
     replayed = {}
     if pitch is not None and recordings is not None:
         known = _follow_tracking(recordings, count, times, pitch, rng)
+    # Share of people who replay motion capture if there is any [1].
+    replayed_share = 0.3
     if recordings is not None and recordings.motions:
-        for person in np.flatnonzero(rng.random(count) < REPLAYED).tolist():
+        for person in np.flatnonzero(rng.random(count) < replayed_share).tolist():
             one = recordings.motions[rng.integers(len(recordings.motions))]
             place = area[0] + area[1] * rng.uniform(-0.4, 0.4, 2)
             if person in known:

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
+from data_contracts.conventions import COCO17_TORSO
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
-from worldpose.body.occlusions import CAPSULES, TRUNK, facing_axes, find_hiders, is_covered
+from worldpose.body.occlusions import CAPSULES, facing_axes, find_hiders, is_covered
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import fold_radius
 from worldpose.geometry.rigid import Rigid
@@ -37,8 +38,6 @@ LENSES: Final = {
 }
 """Share of each kind [1]. `fisheye`: nearly equidistant; `beyond`: barrel distortion with a swirl
 that the five coefficients of the lens model cannot represent."""
-_BEYOND: Final = 0.9
-"""Maximum displacement by that swirl, at the corner of an image 1920 px wide [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +136,10 @@ def _draw_camera(
         image_size=np.array(size),
     )
     beyond = (0.0, 3, 0.0)
+    # Maximum displacement by that swirl, at the corner of an image 1920 px wide [px].
+    max_swirl_px = 0.9
     if lens == "beyond":
-        size_px = rng.uniform(0.3, 1.0) * _BEYOND * size[0] / 1920.0
+        size_px = rng.uniform(0.3, 1.0) * max_swirl_px * size[0] / 1920.0
         beyond = (float(size_px), int(rng.integers(2, 5)), float(rng.uniform(0.0, 2.0 * np.pi)))
     return RigCamera(camera, lens, mounting, beyond)
 
@@ -224,7 +225,7 @@ def _look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ForeignView:
     """People in one camera's image.
 
     Attributes:
@@ -251,7 +252,7 @@ class View:
 
 def view_people(
     camera: RigCamera, joints: Floats, statures: Floats, pillar: tuple[float, float] | None
-) -> View:
+) -> ForeignView:
     """Return positions of people in the image and their occlusions.
 
     `joints` (frames, persons, 17, 3) [m], world; `statures` (persons,) [m]; `pillar` is the left
@@ -262,13 +263,13 @@ def view_people(
     if pillar is not None:
         with np.errstate(invalid="ignore"):
             inside &= (pixels[..., 0] < pillar[0]) | (pixels[..., 0] > pillar[1])
-    trunk = joints[:, :, TRUNK].mean(axis=2)
+    trunk = joints[:, :, COCO17_TORSO].mean(axis=2)
     depth = camera.camera.cam_from_world.apply(trunk)[..., 2]
     size = float(camera.camera.focal.mean()) / np.where(depth > 0.1, depth, np.nan) * statures
     away = camera.camera.center - trunk
     forward, left = facing_axes(joints)
     level = np.linalg.norm(away[..., :2], axis=-1)
-    return View(
+    return ForeignView(
         inside=inside,
         hider=find_hiders(pixels, depth, size),
         behind_self=_is_behind_trunk(camera, joints, pixels, depth, size),
@@ -286,14 +287,6 @@ def _is_behind_trunk(
     flat = pixels.reshape(-1, 17, 2)
     covered = is_covered(flat, flat, size.ravel(), CAPSULES[:4]).reshape(own.shape)
     return np.asarray(covered & (own > depth[..., None] + 0.09))
-
-
-CLICK: Final = (0.3, 1.1)
-"""Spread of one person's clicks in an image of 1920 px, minimum and maximum [px]."""
-FEW: Final = 9
-"""If an image shows fewer points, lines and arcs are drawn, too [1]."""
-_CONFUSED: Final = (("left", "right"), ("near", "far"), ("front", "back"))
-_MARGIN: Final = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,16 +356,21 @@ def click_points(
     """Return a person's clicks, and by wrong name the name of the point under it."""
     misnamed = 0.04  # share of cameras with a click under a wrong name [1]
     click_tail = 4.0  # degrees of freedom of clicks (Student's t) [1]
-    spread = rng.uniform(CLICK[0], CLICK[1]) * np.sqrt(camera.camera.image_size[0] / 1920.0)
+    # Spread of one person's clicks in an image of 1920 px, minimum and maximum [px].
+    click_spread = (0.3, 1.1)
+    spread = rng.uniform(click_spread[0], click_spread[1]) * np.sqrt(
+        camera.camera.image_size[0] / 1920.0
+    )
     unit = np.sqrt(click_tail / (click_tail - 2.0))
     there = visible_points(camera, pitch)
     chosen = list(rng.permutation(there)[: int(rng.integers(8, 18))])
     pixels = camera.project(pitch.positions(chosen)).reshape(-1, 2)
     pixels = pixels + spread / unit * rng.standard_t(click_tail, pixels.shape)
     names = {name: name for name in chosen}
+    confused = (("left", "right"), ("near", "far"), ("front", "back"))
     if chosen and rng.random() < misnamed:
         victim = str(rng.choice(chosen))
-        pairs = [*_CONFUSED, *((two, one) for one, two in _CONFUSED)]
+        pairs = [*confused, *((two, one) for one, two in confused)]
         other = [victim.replace(one, two) for one, two in pairs if one in victim]
         other = [name for name in other if name in pitch.points and name not in names]
         if other:
@@ -382,7 +380,9 @@ def click_points(
         for name, xy in zip(chosen, pixels, strict=True)
     )
     drawn: list[DrawnMarking] = []
-    if len(there) < FEW:
+    # If an image shows fewer points, lines and arcs are drawn, too [1].
+    few_points = 9
+    if len(there) < few_points:
         for name in pitch.marking_names:
             course = camera.project(pitch.marking_points(name, 0.3))
             course = course[_is_inside(camera, course)]
@@ -398,8 +398,9 @@ def click_points(
 
 
 def _is_inside(camera: RigCamera, pixels: Floats) -> Flags:
+    margin_px = 6.0
     with np.errstate(invalid="ignore"):
-        inside = (pixels > _MARGIN) & (pixels < camera.camera.image_size - 1.0 - _MARGIN)
+        inside = (pixels > margin_px) & (pixels < camera.camera.image_size - 1.0 - margin_px)
     return np.asarray(inside.all(axis=-1))
 
 

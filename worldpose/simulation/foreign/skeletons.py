@@ -46,8 +46,6 @@ SHARES: Final[dict[Kind, dict[str, float]]] = {
 }
 """Bones as shares of stature [1]; `drop`, distance of the shoulders' centres below the neck along
 the trunk; `head`, the size of the face relative to a man's."""
-SPREAD: Final = 0.035
-"""Standard deviation of a person's share relative to the mean [1]."""
 FACE: Final = np.array(
     [
         [0.118, 0.086, 0.086, 0.0, 0.0],
@@ -128,8 +126,10 @@ def draw_skeleton(kind: Kind, rng: np.random.Generator) -> Skeleton:
     stature = float(mean + spread * np.clip(rng.standard_normal(), -2.2, 2.2))
     shares = SHARES[kind]
     deviation = np.clip(rng.standard_normal(len(shares)), -2.5, 2.5)
+    # Standard deviation of a person's share relative to the mean [1].
+    share_spread = 0.035
     own = {
-        name: share * (1.0 + SPREAD * deviation[i])
+        name: share * (1.0 + share_spread * deviation[i])
         for i, (name, share) in enumerate(shares.items())
     }
 

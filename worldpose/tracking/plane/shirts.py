@@ -16,9 +16,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from data_contracts.arrays import AnyFloats, Floats, Image
+from data_contracts.conventions import COCO17_TORSO
 
-TORSO: Final = (5, 6, 11, 12)
-"""Shoulders and hips in COCO-17."""
 LEAST_STD: Final = np.array([4.0, 2.0, 2.0])
 """Least standard deviation of one person's colour [1, CIELAB]: noise of a small image."""
 
@@ -62,9 +61,9 @@ def measure_shirts(
 
 def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floats:
     """Return places on a person's upper body (samples, 2) [px]."""
-    torso = np.asarray(keypoints[list(TORSO)], dtype=np.float64)
+    torso = np.asarray(keypoints[list(COCO17_TORSO)], dtype=np.float64)
     # Least confidence of each of them; with less the box tells where the upper body is [1].
-    known = np.asarray(confidence[list(TORSO)]) >= 0.3
+    known = np.asarray(confidence[list(COCO17_TORSO)]) >= 0.3
     # Shoulders, hips and width of the trunk in a box: from its top, relative to its height, and
     # relative to its width [1].
     box_torso = (0.18, 0.48, 0.35)

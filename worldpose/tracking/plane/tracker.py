@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import AnyFloats, Floats, Singles
+from data_contracts.conventions import COCO17_HIPS
 from worldpose.geometry.boxes import box_iou
 from worldpose.tracking.plane.feet import FrameBlocks, GroundPositions
 from worldpose.tracking.plane.kalman import Motion, PlaneTrack, compare
@@ -29,8 +30,6 @@ from worldpose.tracking.plane.paths import (
 )
 from worldpose.tracking.plane.shirts import ShirtMemory, ShirtModel
 
-HIPS: Final = [11, 12]
-"""The hips in COCO-17."""
 TRIANGULATED_NOISE: Final = np.diag([0.15**2, 0.15**2])
 """Covariance of the feet from the mid-hip of a triangulated person [m^2]."""
 
@@ -50,7 +49,7 @@ class TriangulatedPeople:
 
 def triangulated_places(joints: Singles) -> Floats:
     """Return the mid-hips on the ground (frames, persons, 2) [m] of joints (..., 17, 3)."""
-    return np.asarray(joints[:, :, HIPS, :2].mean(axis=2), dtype=np.float64)
+    return np.asarray(joints[:, :, COCO17_HIPS, :2].mean(axis=2), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -192,10 +192,3 @@ def test_what_is_hostile_or_damaged_is_refused_with_its_file_and_reason(tmp_path
         read_annotations(file)
     assert str(file) in str(refusal.value)
     assert len(str(refusal.value)) < 600  # no content of the file is poured out
-
-
-def test_a_file_that_is_not_there_or_is_none_of_text_is_refused(tmp_path):
-    (tmp_path / "a").write_bytes(bytes(range(256)))
-    for name in ("a", "none"):
-        with pytest.raises(InputError):
-            read_annotations(tmp_path / name)

@@ -2,13 +2,10 @@
 
 import csv
 import io
-import json
 
 import pytest
 from method_files import FIRST, STEP, WALK, WRITERS, scene, truth_of, wobbled
-from typer.testing import CliRunner
 
-from flows.cli.app import app
 from flows.results.baselines import score_methods, table_csv, table_latex, table_rows
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.baselines import METHODS
@@ -89,23 +86,6 @@ def test_table_has_the_papers_rows_and_says_where_a_figure_means_nothing(truth, 
         update={"evaluation": scores[2].evaluation.model_copy(update={"g_mpjpe_mm": 18888.9})}
     )
     assert "18\\,888.9" in table_latex([far])
-
-
-def test_the_command_prints_the_table_with_the_settings_that_gave_it(truth, tmp_path):
-    bodies, camera = scene()
-    path = WRITERS["glamr"](tmp_path, wobbled(bodies), camera)
-    asked = ("--method", f"glamr={path}", "--reference", str(truth), "--match-in", "clip")
-    table = CliRunner().invoke(app, ["evaluate", *asked, "--table", "csv"])
-    assert list(csv.reader(io.StringIO(table.stdout)))[1] == [
-        "GLAMR",
-        "10.0",
-        "0.0",
-        "0.1",
-        "100.0",
-    ]
-    told = json.loads(CliRunner().invoke(app, ["evaluate", *asked, "--json"]).stdout)
-    (score,) = told["methods"]
-    assert (score["match_in"], score["settings"]["min_overlap"]) == ("clip", 0.5)
 
 
 def test_method_without_a_common_world_needs_a_camera(truth, tmp_path):
