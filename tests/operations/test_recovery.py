@@ -19,14 +19,12 @@ from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
 from flows.service import recovery, run_queue, watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
-from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
 from flows.service.run_queue import beating, find_process
 from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import seal
 from worldpose.store.integrity import repair, verify
-from worldpose.store.paths import queue_path
 from worldpose.store.run_queue import MAX_KILLS, MAX_SERVICE_DEATHS, RunQueue, queue_of
 from worldpose.store.store import Store
 
@@ -97,19 +95,6 @@ def test_old_ends_are_forgotten_but_the_last_of_each_match(queue, tmp_path):
     assert len(queue.runs()) == 4
     queue.forget_ended(timedelta(0))
     assert [run.id for run in queue.runs()] == [old.id, "2"]
-
-
-def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
-    for number in range(3000):
-        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
-        file = tmp_path / queue_path(run)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(seal(run))
-    queue.runs()
-    lost = queue.change(queue.take(a_run("lost")), "begun")
-    began = time.process_time()
-    assert queue.open_runs() == [lost]
-    assert time.process_time() - began < 1.0
 
 
 def beats(queue, run, seconds):
@@ -268,18 +253,6 @@ def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
     del steps["looking at the inbox"]
     watching._watch_steps(plan, dispatcher)
     assert kept_alerts(plan.state_folder) == {}
-
-
-def test_what_stands_still_is_unhealthy(plan):
-    state = plan.state_folder
-    state.folder.mkdir()
-    kept = '{"told_by": [], "since": "2026-01-01", "match": "", "link": "http://h/status", '
-    entries = (
-        f'"{kind}": {kept}"alert": "{kind}", "text": "why"}}' for kind in ("quality", "run_late")
-    )
-    state.alerts.write_text(f"{{{', '.join(entries)}}}")
-    (finding,) = _check_progress(state)
-    assert (finding.is_well, finding.state) == (False, "why")
 
 
 def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp_path):
