@@ -177,3 +177,13 @@ def test_the_command_says_one_thing_and_writes_nothing(
     assert re.search(message, answer.err)
     assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
     assert {path.name for path in tmp_path.iterdir()} == {"empty.txt"}
+
+
+@pytest.mark.parametrize("left", ["triangulation", "broadcast_tracking"])
+def test_people_without_bodies_are_no_cameras_alone(match_folder, tmp_path, left):
+    kept = ("tracking__A_1", "broadcast_calibration__A_1")
+    results = {name: data for name, data in whole().items() if name in kept}
+    results[f"{left}__A_1"] = whole()["triangulation__A_1"]
+    with pytest.raises(InputError, match="results of body_fitting/A_1"):
+        export(origin(match_folder, **results), ["worldpose"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -165,3 +165,12 @@ def test_an_option_that_a_scenario_does_not_have_is_refused(tmp_path, scenario, 
     assert isinstance(done.exception, UsageError)
     assert done.exception.where == option
     assert not (tmp_path / "out").exists()
+
+
+def test_a_match_whose_folder_has_moved_says_how_it_goes_on_and_does(store, tmp_path):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    (tmp_path / "a").rename(tmp_path / "b")
+    with pytest.raises(InputError, match=r"worldpose ingest FOLDER"):
+        open_for_review(store, "a")
+    register(store, tmp_path / "b", unfinished=True)
+    assert open_for_review(store, "a").folder.folder == tmp_path / "b"

@@ -6,6 +6,7 @@ import http.client
 import importlib
 import os
 import sqlite3
+import ssl
 import subprocess
 import sys
 from contextlib import closing
@@ -17,12 +18,14 @@ import pytest
 from distributed import Client, Security
 
 from flows.orchestration import prefect_database
-from flows.orchestration.prefect_database import DATABASE
+from flows.orchestration.prefect_database import DATABASE, begin_database, keep_database
 from flows.orchestration.prefect_environment import (
+    AUTHORITIES,
     CLIENT_LOGIN,
     SERVER_LOGIN,
     authorization,
     local_cluster_options,
+    one_authority,
     prefect_server,
     require_login,
     without_secrets,
@@ -214,3 +217,36 @@ def test_workers_collect_no_garbage_until_they_have_imported_all():
     finally:
         gc.enable()
         gc.unfreeze()
+
+
+def test_one_authority_is_read_by_those_on_this_machine_who_talk_plainly(tmp_path, monkeypatch):
+    monkeypatch.delenv(AUTHORITIES, raising=False)
+    file = one_authority(tmp_path)[AUTHORITIES]
+    assert len(ssl.create_default_context(cafile=file).get_ca_certs()) == 1
+    own = {"prefect": "http://127.0.0.1:4200/api"}
+    plan = ServePlan(project=str(tmp_path), inbox=tmp_path, state=tmp_path, **own)
+    assert AUTHORITIES in environment_of(plan)
+    # Workers elsewhere do not see the file, and another's server may be one with TLS.
+    for other in ({"dask": "tcp://far:8786"}, {"owns_prefect": False}):
+        assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
+    monkeypatch.setenv(AUTHORITIES, "/of/somebody.pem")
+    assert one_authority(tmp_path)[AUTHORITIES] == "/of/somebody.pem"
+
+
+def test_a_database_is_copied_and_kept_only_where_there_is_none_and_a_place(tmp_path, kept):
+    keep_database(tmp_path)  # there is none: it is elsewhere
+    assert not kept.exists()
+    kept.parent.mkdir()
+    kept.write_bytes(b"empty")
+    (tmp_path / DATABASE).write_bytes(b"full")
+    assert not begin_database(tmp_path)
+    assert (tmp_path / DATABASE).read_bytes() == b"full"
+    assert not begin_database(tmp_path / "copied")
+    files = [at / DATABASE for at in (tmp_path, tmp_path / "copied")]
+    assert [file.stat().st_mode & 0o777 for file in files] == [0o600, 0o600]
+    kept.unlink()
+    kept.parent.rmdir()
+    kept.parent.touch()  # a file where the folder should be: every server makes its own
+    keep_database(tmp_path)
+    assert begin_database(tmp_path / "another")
+    assert (tmp_path / "another" / DATABASE).stat().st_mode & 0o777 == 0o600

@@ -389,3 +389,18 @@ def test_a_bad_file_of_users_is_refused_without_its_tokens(text, mode, problem, 
             "127.0.0.1", token=None, names=(), secure=False, users=users_file(tmp_path, text, mode)
         )
     assert "the token of" not in str(refusal.value) and "a secret" not in str(refusal.value)
+
+
+def test_tls_pages_tell_browsers_to_stay_with_tls_except_on_this_machine(tmp_path):
+    Store.create(str(tmp_path))
+    names = ("review.example.org",)
+    for secure, host, told in (
+        (True, "review.example.org:8571", True),
+        (True, "localhost:8571", False),
+        (False, "review.example.org", False),
+    ):
+        access = access_for("127.0.0.1", token=TOKEN, names=names, secure=secure)
+        browser = page_client.browser(create_app(str(tmp_path), access))
+        answer = browser.get("/login", headers={"host": host})
+        assert answer.status_code == 200
+        assert ("strict-transport-security" in answer.headers) == told

@@ -1,5 +1,8 @@
 """A proxy in front of the pages logs people in, and only the named one is believed."""
 
+import time
+
+import httpx
 import page_client
 import pytest
 from command_line import TINY
@@ -161,3 +164,17 @@ def test_a_bad_table_of_the_proxy_is_refused(old, new, problem, tmp_path):
     with pytest.raises(UsageError, match=problem) as refusal:
         access_for("127.0.0.1", token=None, names=(), secure=False, users=file)
     assert SECRET not in str(refusal.value)
+
+
+def test_another_address_named_by_a_client_does_not_allow_more_guesses(project_copy, tmp_path):
+    with page_client.serving(project_copy, tmp_path) as base:
+        wrong = {"who": "Eve", "token": TOKEN + "x"}
+        begun = time.monotonic()
+        codes = [
+            httpx.post(
+                f"{base}/api/login", json=wrong, headers={"X-Forwarded-For": f"10.0.0.{number}"}
+            ).status_code
+            for number in range(8)
+        ]
+        assert time.monotonic() - begun < 10.0, "too slow to tell"
+        assert codes == [401] * 5 + [429] * 3

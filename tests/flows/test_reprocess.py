@@ -1,5 +1,6 @@
 """Stale results of an edit, by match, found without a run."""
 
+import json
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -259,3 +260,12 @@ def test_reprocessing_computes_what_was_listed(server, store):
     assert store.run(TINY).parent == "0001"
     again = succeed("reprocess", "--project", store.url, "--json").json["matches"]
     assert [(each["state"], each["executed"]) for each in again] == [("untouched", [])]
+
+
+def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
+    gone = tmp_path / "gone.onnx"
+    write_layer(store, PROJECT, {"detection.pose": f"onnx:{gone}"})
+    status = json.loads(
+        CliRunner().invoke(app, ["status", "--project", store.url, "--json"]).stdout
+    )
+    assert str(gone) in json.dumps(status)

@@ -330,3 +330,10 @@ def test_true_is_no_number(text, found):
     with pytest.raises(UsageError, match="number") as refused:
         parse_overrides([text])
     assert refused.value.found == found
+
+
+def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
+    path = f"onnx-rtmdet:{tmp_path / 'net.onnx'}"
+    assert given["detection"] == {"detector": path, "pose": "embedded"}

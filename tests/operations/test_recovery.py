@@ -19,12 +19,14 @@ from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
 from flows.service import recovery, run_queue, watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
+from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
 from flows.service.run_queue import beating, find_process
 from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import seal
 from worldpose.store.integrity import repair, verify
+from worldpose.store.paths import queue_path
 from worldpose.store.run_queue import MAX_KILLS, MAX_SERVICE_DEATHS, RunQueue, queue_of
 from worldpose.store.store import Store
 
@@ -274,3 +276,28 @@ def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp
     assert next(states) == "SCHEDULED"
     monkeypatch.setattr(suspension.PrefectApi, "list_all", lambda *args, **more: [])
     assert suspension.resume_suspended(str(tmp_path), "m") == []
+
+
+def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
+    for number in range(3000):
+        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
+        file = tmp_path / queue_path(run)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(seal(run))
+    queue.runs()
+    lost = queue.change(queue.take(a_run("lost")), "begun")
+    began = time.process_time()
+    assert queue.open_runs() == [lost]
+    assert time.process_time() - began < 1.0
+
+
+def test_what_stands_still_is_unhealthy(plan):
+    state = plan.state_folder
+    state.folder.mkdir()
+    kept = '{"told_by": [], "since": "2026-01-01", "match": "", "link": "http://h/status", '
+    entries = (
+        f'"{kind}": {kept}"alert": "{kind}", "text": "why"}}' for kind in ("quality", "run_late")
+    )
+    state.alerts.write_text(f"{{{', '.join(entries)}}}")
+    (finding,) = _check_progress(state)
+    assert (finding.is_well, finding.state) == (False, "why")
