@@ -1,13 +1,14 @@
 """Fixtures that tests of the whole system share: one match, one project, one Prefect server."""
 
 import fcntl
-import functools
 import importlib
+import json
 import multiprocessing.util
 import os
 import shutil
 import threading
 import urllib.request
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import command_line
@@ -68,12 +69,6 @@ def make_once(tmp_path_factory, name, make):
             make(folder / name)
             (folder / "made").touch()
     return folder / name
-
-
-@pytest.fixture(scope="session")
-def shared_folder(tmp_path_factory):
-    """A function that makes a folder once for all processes of a test run."""
-    return functools.partial(make_once, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -143,3 +138,37 @@ def bucket():
         patch.setenv("AWS_REGION", "us-east-1")
         yield "s3://projects"
     server.stop()
+
+
+@pytest.fixture
+def webhook():
+    """A server that keeps posts and answers with the status codes in `codes`, then with 204.
+
+    `posted` has content types and bodies, those of JSON read; `asked` has paths and logins.
+    """
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_POST(self):
+            body, kind = (
+                self.rfile.read(int(self.headers["content-length"])),
+                self.headers["content-type"],
+            )
+            self.server.posted.append((kind, json.loads(body) if "json" in kind else body))
+            self.server.asked.append((self.path, self.headers["authorization"]))
+            self.send_response(self.server.codes.pop(0) if self.server.codes else 204)
+            self.send_header("content-length", "0")
+            self.end_headers()
+
+        def log_message(self, *arguments):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.posted, server.asked, server.codes = [], [], []
+    server.base = f"http://127.0.0.1:{server.server_port}"
+    server.address = f"{server.base}/hook?token=secret"
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()

@@ -4,13 +4,9 @@ import json
 import os
 import re
 import shutil
-import sqlite3
 import uuid
-from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-
-from long_journal import write_corrections
 
 from data_contracts.operations import QueuedRun
 from data_contracts.run import ResultManifest, RunRecord
@@ -83,15 +79,6 @@ def write(file, record):
     file.write_bytes(seal(record))
 
 
-def spread_corrections(project, count, each=10):
-    """Add corrections to every match in turn, `each` of them to one."""
-    store = Store.open(str(project))
-    names = store.matches()
-    step = max(1, len(names) * each // count)
-    for name in names[::step][: count // each]:
-        write_corrections(store, name, each)
-
-
 def queue_history(project, failed, days):
     """Add failed runs, spread over the matches, and the days' scans of the inbox to the queue."""
     store, now = Store.open(str(project)), datetime.now(UTC)
@@ -124,35 +111,3 @@ def queue_history(project, failed, days):
             write(Path(project) / queue_path(run), run.model_copy(update=change))
         found.append(run.model_copy(update=change))
     return found
-
-
-def prefect_history(database, runs):
-    """Write ended runs into Prefect's database as copies of one that it has of the same flow."""
-    with closing(sqlite3.connect(database, timeout=60)) as opened:
-        opened.row_factory = sqlite3.Row
-        for flow in {run.flow for run in runs}:
-            query = "select r.* from flow_run r join flow f on f.id = r.flow_id where f.name = ?"
-            sample = dict(opened.execute(f"{query} limit 1", (flow,)).fetchone())
-            rows, states = [], []
-            for run in (each for each in runs if each.flow == flow):
-                at, state = f"{run.asked_at:%Y-%m-%d %H:%M:%S.%f}", str(uuid.uuid4())
-                kind = "FAILED" if run.state == "failed" else "COMPLETED"
-                times = dict.fromkeys(
-                    ("created", "updated", "start_time", "end_time", "expected_start_time"), at
-                )
-                own = {"id": run.flow_run, "name": run.name, "idempotency_key": run.id}
-                own |= {"state_type": kind, "state_name": kind.title(), "state_id": state}
-                own |= {"state_timestamp": at, "next_scheduled_start_time": None, **times}
-                own |= {"parameters": json.dumps(run.parameters), "auto_scheduled": 0}
-                rows.append(tuple((sample | own).values()))
-                details = json.dumps({"flow_run_id": None})
-                about = (state, at, at, at, kind, kind.title(), run.message, details, "null")
-                states.append((*about, run.flow_run))
-            marks = ", ".join("?" * len(sample))
-            opened.executemany(f"insert into flow_run values ({marks})", rows)
-            opened.executemany(
-                "insert into flow_run_state (id, created, updated, timestamp, type, name, message,"
-                " state_details, data, flow_run_id) values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                states,
-            )
-        opened.commit()

@@ -13,21 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Floats
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
-from data_contracts.triangulation import CameraChange
 from flows.results import best_results
 from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
 from flows.results.run_cameras import (
     broadcast_views,
-    camera_in_frames,
     estimated_pitch,
     moving_cameras,
 )
-from flows.results.tool_exports import TOOL_EXPORTS
-from worldpose.body.keypoints import HALPE26, fold_keypoints
-from worldpose.body.occlusions import visible_joints
+from flows.results.tool_exports import TOOL_EXPORTS, export_alphapose, export_coco
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.formats import challenge
@@ -37,18 +33,15 @@ from worldpose.formats.baselines.result import (
     write_tracks,
 )
 from worldpose.formats.joints_file import write_joints, write_poses
-from worldpose.formats.motion_capture import alphapose_results, coco_dataset, write_json
 from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import LensModel
-from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run, read_pin
 from worldpose.store.store import Store
-from worldpose.triangulation.camera_changes import move_on
 from worldpose.video.files import write_video
 
 LENS_ERRORS = "lens_errors.json"
@@ -63,52 +56,6 @@ def export_joints(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         path = out / ("joints.npz" if len(origin.clips) == 1 else f"{clip}.joints.npz")
         write_joints(path, origin.tracks(clip))
         yield path
-
-
-def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `<camera or broadcast view>.json`, in `<clip>/` if there are several clips."""
-    for clip in origin.clips:
-        tracks = origin.tracks(clip)
-        frames = tracks.frames.astype(np.int64)
-        for name, camera, number, move in _views(origin, clip, frames):
-            if name in origin.static_cameras:
-                placed = best_results.placed_joints(origin.run, clip)
-                seen = placed["inliers"].sel(camera=name).values
-            else:
-                seen = visible_joints(tracks.joints, camera)[1]
-            path = (out if len(origin.clips) == 1 else out / clip) / f"{name}.json"
-            write_json(path, coco_dataset(name, camera, tracks, seen, number=number, move=move))
-            yield path
-
-
-def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `alphapose/<clip>/<camera or broadcast view>.json` of fitted bodies."""
-    for clip in origin.clips:
-        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
-        points = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
-        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
-        for name, camera, number, move in _views(origin, clip, frames.astype(np.int64)):
-            pixels, seen = visible_joints(points, camera)
-            size = camera.image_size.reshape(-1, 2)[0]
-            path = out / "alphapose" / clip / f"{name}.json"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, alphapose_results(move(pixels), seen, persons, size, number))
-            yield path
-
-
-def _views(
-    origin: best_results.Origin, clip: str, frames: Integers
-) -> Iterator[tuple[str, Camera, Integers, Callable[[Floats], Floats]]]:
-    """Yield name, camera, own frames, and where pixels move, of a clip's cameras and views."""
-    for name, camera in origin.static_cameras.items():
-        stated = best_results.placed_joints(origin.run, clip).attrs["changes"]
-        changes = [CameraChange.model_validate(each) for each in stated]
-        own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
-        move = partial(move_on, frame=frames, camera=camera, changes=own)
-        yield name, camera, unit_frames(origin.spec, name).numbers(frames), move
-    for view in broadcast_views(origin.run, clip):
-        number = unit_frames(origin.spec, view).numbers(frames)
-        yield view, camera_in_frames(origin.run, view, frames), number, lambda pixels: pixels
 
 
 def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:

@@ -1,4 +1,4 @@
-"""Export formats for biomechanics, animation and tables, with notes inside every file that can."""
+"""Export formats for labels, biomechanics, animation and tables, with notes where files can."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.run import BODY_STAGES, JOINT_STAGES
+from data_contracts.triangulation import CameraChange
 from flows.results import best_results
-from flows.results.run_cameras import estimated_pitch, moving_cameras
+from flows.results.run_cameras import (
+    broadcast_views,
+    camera_in_frames,
+    estimated_pitch,
+    moving_cameras,
+)
+from worldpose.body.keypoints import HALPE26, fold_keypoints
+from worldpose.body.occlusions import hidden_joints
 from worldpose.errors import UsageError
 from worldpose.formats import motion_capture
 from worldpose.formats.c3d_file import write_c3d
@@ -28,7 +36,10 @@ from worldpose.formats.tables import (
     write_parquet,
 )
 from worldpose.formats.usd_file import write_usd
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.footage import unit_frames
 from worldpose.store.store import Run
+from worldpose.triangulation.camera_changes import move_on
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -104,6 +115,58 @@ def _joint_definition(origin: best_results.Origin, clip: str, stage: str) -> str
     if stage == best_results.PLANE:
         return "none: people are placed on the pitch by their feet"
     return "COCO-17 keypoints of the detector, triangulated"
+
+
+def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
+    """Write `<camera or broadcast view>.json`, in `<clip>/` if there are several clips."""
+    for clip in origin.clips:
+        tracks = origin.tracks(clip)
+        frames = tracks.frames.astype(np.int64)
+        for name, camera, number, move in _views(origin, clip, frames):
+            if name in origin.static_cameras:
+                placed = best_results.placed_joints(origin.run, clip)
+                seen = placed["inliers"].sel(camera=name).values
+            else:
+                seen = ~hidden_joints(tracks.joints, camera)
+            path = (out if len(origin.clips) == 1 else out / clip) / f"{name}.json"
+            motion_capture.write_json(
+                path,
+                motion_capture.coco_dataset(name, camera, tracks, seen, number=number, move=move),
+            )
+            yield path
+
+
+def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
+    """Write `alphapose/<clip>/<camera or broadcast view>.json` of fitted bodies."""
+    for clip in origin.clips:
+        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        points = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
+        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
+        for name, camera, number, move in _views(origin, clip, frames.astype(np.int64)):
+            pixels = camera.project(points.reshape(len(points), -1, 3))
+            pixels = move(pixels.reshape(*points.shape[:3], 2))
+            hidden = hidden_joints(points, camera)
+            path = out / "alphapose" / clip / f"{name}.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            motion_capture.write_json(
+                path, motion_capture.alphapose_results(pixels, hidden, persons, camera, number)
+            )
+            yield path
+
+
+def _views(
+    origin: best_results.Origin, clip: str, frames: Integers
+) -> Iterator[tuple[str, Camera, Integers, Callable[[Floats], Floats]]]:
+    """Yield name, camera, own frames, and where pixels move, of a clip's cameras and views."""
+    for name, camera in origin.static_cameras.items():
+        stated = best_results.placed_joints(origin.run, clip).attrs["changes"]
+        changes = [CameraChange.model_validate(each) for each in stated]
+        own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
+        move = partial(move_on, frame=frames, camera=camera, changes=own)
+        yield name, camera, unit_frames(origin.spec, name).numbers(frames), move
+    for view in broadcast_views(origin.run, clip):
+        number = unit_frames(origin.spec, view).numbers(frames)
+        yield view, camera_in_frames(origin.run, view, frames), number, lambda pixels: pixels
 
 
 def export_markers(origin: best_results.Origin, out: Path) -> Iterator[Path]:

@@ -114,7 +114,6 @@ def _recover(
         is_elsewhere = not plan.owns_prefect and run.host != platform.node()
         if is_elsewhere or find_process(run.pid, run.flow_run) is not None:
             return False
-    there = _with_these_options(plan, runs, run, there)
     kind = None if there is None else there["state_type"]
     is_over = there is not None and kind not in ACTIVE
     killed: QueuedRun | None = run
@@ -140,43 +139,36 @@ def _recover(
         return False
     if killed.state == "waiting" and kind in ("SCHEDULED", "PENDING"):
         runs.queue.change(killed, "asked", "resumed")
-    has_run = killed.state != "killed" and there is not None and not is_over
+    # A scan has the options of the service as a parameter, and the worker takes its own alone.
+    own = plan.model_dump(mode="json")
+    is_former = there is not None and not is_over and there["parameters"].get("plan", own) != own
+    has_run = killed.state != "killed" and there is not None and not is_over and not is_former
     if has_run and not _is_stuck(killed, there, patience):
         return False
-    _start_again(runs, killed, there)
+    _start_again(runs, killed, there, is_former)
     return True
 
 
-def _with_these_options(
-    plan: ServePlan, runs: MatchRuns, run: QueuedRun, there: PrefectRun | None
-) -> PrefectRun | None:
-    """Return a run at Prefect; None if it has former options of the service, and is replaced.
-
-    A scan of the inbox has the options as a parameter, and the worker refuses others than its own.
-    """
-    own = plan.model_dump(mode="json")
-    if there is None or there["state_type"] not in ("SCHEDULED", "PENDING", "RUNNING"):
-        return there
-    if there["parameters"].get("plan", own) == own:
-        return there
-    why = "the options of the service have changed; a run with the new ones stands for it"
-    runs.set_state(run.flow_run, "CANCELLED", why)
-    return None
-
-
-def _start_again(runs: MatchRuns, run: QueuedRun, there: PrefectRun | None) -> None:
-    """Make a run due at Prefect; the queue says so first."""
-    why = run.message or "Prefect had lost it"
+def _start_again(
+    runs: MatchRuns, run: QueuedRun, there: PrefectRun | None, is_former: bool
+) -> None:
+    """Make a run due at Prefect; the queue says so first. One with former options is replaced."""
+    former = "the options of the service have changed"
+    why = run.message or (former if is_former else "Prefect had lost it")
     asked = runs.queue.change(run, "asked", why)
     if asked is None:
         return
     LOG.warning("%s: %s; it restarts", run.name, why)
-    if there is not None:
+    if there is not None and not is_former:
         runs.set_state(run.flow_run, "SCHEDULED", why, "AwaitingRetry")
         return
     key = f"queue-{run.id}.{asked.number}"
     created = runs.create_run(run.flow, run.name, run.parameters, run.priority, key)
     runs.queue.change(asked, "asked", why, flow_run=created["id"])
+    if is_former:
+        runs.set_state(
+            run.flow_run, "CANCELLED", f"{former}; a run with the new ones stands for it"
+        )
 
 
 def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> bool:

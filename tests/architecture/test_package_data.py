@@ -57,3 +57,13 @@ def test_the_table_has_each_equation_of_the_paper():
     page = next(page for page in PAGES if page.stem == "index").read_text(encoding="utf-8")
     equations = [line for line in page.partition("## The paper's")[2].splitlines() if "`" in line]
     assert len(equations) == 19
+
+
+def test_every_promise_of_the_threat_model_names_tests_that_there_are():
+    page = (Path(__file__).parents[2] / "docs/explanation/security.md").read_text(encoding="utf-8")
+    table = page.partition("## Who may do what")[2].partition("## Measures")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| ")][2:]
+    assert len(rows) >= 10 and all("`test_" in row for row in rows)
+    here = "\n".join(file.read_text() for file in Path(__file__).parents[1].rglob("test_*.py"))
+    for name in re.findall(r"`(test_\w+)`", page):
+        assert f"def {name}(" in here, name

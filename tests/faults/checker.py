@@ -49,16 +49,6 @@ def half_written(project):
     if not (project / "project.json").exists():
         return []
     store = Store.open(str(project))
-    runs = [(match, run) for match in store.matches() for run in store.runs(match)]
-    return [
-        *(f"{each.path}: {each.problem}" for each in verify(store)),
-        *(
-            f"{match}/{run}: not complete"
-            for match, run in runs
-            if not is_complete(store, match, run)
-        ),
-    ]
-
-
-def is_complete(store, match, run):
-    return store.run(match, run).state == "complete"
+    records = [store.run(match, run) for match in store.matches() for run in store.runs(match)]
+    unfinished = [f"{each.match_id}/{each.run_id}" for each in records if each.state != "complete"]
+    return [*(f"{each.path}: {each.problem}" for each in verify(store)), *unfinished]

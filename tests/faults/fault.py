@@ -1,34 +1,36 @@
-"""Kills the process at a named commit point, once.
+"""Kills or blocks a process where a test says so.
 
 A Dask worker loads this file as its preload; `python tests/faults/fault.py ARGS` runs the command
-line with it. WORLDPOSE_TEST_FAULT holds the plan as JSON: the point, how many of its visits in
-a process to skip, whether the whole process group dies, and a file that is made when the fault has
-struck, so that it strikes once over all processes.
+line with it. WORLDPOSE_TEST_FAULT holds the plan as JSON. With `point`, the process dies at this
+commit point, once over all processes: `skip` visits of each process before, with the whole process
+group if `whole_group`, and `struck` is a file that is made then. With `unit`, the process hangs or
+dies, as `how` says, whenever that unit is begun.
 """
 
 import json
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 from worldpose.store.blobs import install_fault_hook
+from worldpose.store.store import Store
 
 
 def install():
     plan = json.loads(os.environ["WORLDPOSE_TEST_FAULT"])
-    struck = Path(plan["struck"])
-    visits = 0
+    if "unit" in plan:
+        spoil_unit(plan)
+        return
+    visits = []
 
     def strike(point):
-        nonlocal visits
-        if point != plan["point"]:
-            return
-        visits += 1
-        if visits <= plan.get("skip", 0):
+        visits.append(point)
+        if point != plan["point"] or visits.count(point) <= plan.get("skip", 0):
             return
         try:
-            struck.touch(exist_ok=False)
+            Path(plan["struck"]).touch(exist_ok=False)
         except FileExistsError:
             return
         if plan.get("whole_group"):
@@ -36,6 +38,19 @@ def install():
         os.kill(os.getpid(), signal.SIGKILL)
 
     install_fault_hook(strike)
+
+
+def spoil_unit(plan):
+    publish = Store.publish
+
+    def spoiled(self, work):
+        if work.recipe.name == plan["unit"]:
+            if plan["how"] == "die":
+                os.kill(os.getpid(), signal.SIGKILL)
+            time.sleep(1e6)
+        return publish(self, work)
+
+    Store.publish = spoiled
 
 
 def dask_setup(worker):

@@ -14,6 +14,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import psutil
+from service import free_ports
 
 from flows.orchestration.prefect_environment import (
     CLIENT_LOGIN,
@@ -145,8 +146,8 @@ class Machines:
         self.link, self.small = Link(), Disk(folder / "disk", megabytes)
         self.disk = self.small.folder
         here = self.link.here
-        self.api = f"http://{here}:{_free_port()}/api"
-        self.dask = f"tcp://{here}:{_free_port()}"
+        self.api = f"http://{here}:{free_ports(1)[0]}/api"
+        self.dask = f"tcp://{here}:{free_ports(1)[0]}"
         own = {"PREFECT_API_URL": self.api, "PREFECT_HOME": str(folder / "prefect")}
         own[CLIENT_LOGIN] = new_login()
         self.environment = {**os.environ, **own, "NO_PROXY": "*", "no_proxy": "*"}
@@ -209,6 +210,12 @@ class Machines:
                 raise TimeoutError(f"a machine did not begin; see the logs in {self.folder}")
             time.sleep(0.2)
 
+    def mend(self):
+        """Lift every fault."""
+        self.small.free()
+        self.link.heal()
+        self.keep_up()
+
     def _end(self):
         for part in self.parts.values():
             part.kill()
@@ -216,12 +223,6 @@ class Machines:
 
 def _do(*command):
     subprocess.run(command, check=True, capture_output=True)
-
-
-def _free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def _listens(host, port):

@@ -22,16 +22,14 @@ from pathlib import Path
 
 from checker import problems_of
 from machines import Machines
-from recoveries import Fault, by_kind, reason_in, summary_of
 
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 
 WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2}
-LANES = 2
-MATCHES = 3
-"""Number per round."""
+LANES, MATCHES = 2, 3
+"""Matches at the same time, and per round."""
 STUCK_SECONDS = 420.0
 """A run without progress for this long hangs, whatever the fault was [s]."""
 MAX_STARTS = 60
@@ -55,21 +53,14 @@ FAULTS = {
 
 @dataclass
 class Stream:
-    """Matches that the machines process, and what went wrong.
-
-    Attributes:
-        machines: the machines that compute.
-        folders: match folders.
-        problems: descriptions of what went wrong.
-    """
+    """Matches that the machines process, and what went wrong."""
 
     machines: Machines
     folders: list
     problems: list = field(default_factory=list)
     endings: Counter = field(default_factory=Counter)
-    tracebacks: list = field(default_factory=list)
+    struck: Counter = field(default_factory=Counter)
     done: int = 0
-    begun: int = 0
     at_work: dict = field(default_factory=dict)
     is_over: threading.Event = field(default_factory=threading.Event)
 
@@ -91,25 +82,15 @@ class Stream:
             each.join()
         return seconds
 
-    def progress(self):
-        """How much is published and recorded."""
-        found = 0
-        for place, _, names in os.walk(self.project):
-            below = Path(place).relative_to(self.project).parts
-            if below[:1] in (("results",), ("runs",)):
-                found += sum(each == "manifest.json" or below[0] == "runs" for each in names)
-        return found
-
     def _until_done(self, folder):
         for _ in range(MAX_STARTS):
             code, said = self._run(folder)
-            self.begun += 1
+            if UNFORESEEN in said:
+                self.problems.append(said[said.index(UNFORESEEN) :][-3000:])
             if code == 0:
                 self.done += 1
                 return
-            self.endings["killed" if code == -signal.SIGKILL else reason_in(said)] += 1
-            if UNFORESEEN in said:
-                self.tracebacks.append(said[said.index(UNFORESEEN) :][-3000:])
+            self.endings[code] += 1
             time.sleep(1.0)
         self.problems.append(f"{folder.name} was begun {MAX_STARTS} times and is not done: {said}")
 
@@ -117,18 +98,14 @@ class Stream:
         command = ["run", str(folder), "--project", str(self.project), "--dask", self.machines.dask]
         log = self.machines.folder / f"run-{folder.name}.log"
         with log.open("wb") as said:
-            process = subprocess.Popen(
-                [*WORLDPOSE, *command],
-                stdout=said,
-                stderr=said,
-                env=self.machines.environment,
-                start_new_session=True,
-            )
+            given = {"stdout": said, "stderr": said, "env": self.machines.environment}
+            process = subprocess.Popen([*WORLDPOSE, *command], start_new_session=True, **given)
         self.at_work[folder.name] = process
         before, since = -1, time.monotonic()
         while process.poll() is None:
             time.sleep(0.25)
-            now = (self.progress(), log.stat().st_size)
+            made = [*self.project.rglob("manifest.json"), *self.project.glob("runs/*/*")]
+            now = (len(made), log.stat().st_size)
             if now != before:
                 before, since = now, time.monotonic()
             elif time.monotonic() - since > STUCK_SECONDS:
@@ -139,7 +116,7 @@ class Stream:
         return process.returncode, log.read_text(errors="replace")
 
 
-def disturb(stream, dice, pause, faults):
+def disturb(stream, dice, pause):
     """Faults until the stream is over."""
     machines = stream.machines
 
@@ -147,52 +124,41 @@ def disturb(stream, dice, pause, faults):
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and not stream.is_over.wait(min(left, 0.25)):
             machines.keep_up(held)
-            done = stream.progress()
-            for fault in faults:
-                if fault.recovered is None and fault.lifted is not None and done > fault.done:
-                    fault.recovered = time.monotonic() - fault.lifted
 
     while not stream.is_over.is_set():
         wait(dice.uniform(*pause))
         kind = dice.choice(list(FAULTS))
         seconds, target = dice.uniform(*FAULTS[kind]), dice.random()
-        held = None if stream.is_over.is_set() else _strike(stream, kind, target)
-        if held is None:
-            continue
-        fault = Fault(kind, seconds)
-        faults.append(fault)
-        wait(seconds, held)
-        machines.small.free()
-        machines.link.heal()
-        machines.keep_up()
-        fault.done, fault.lifted = stream.progress(), time.monotonic()
+        held = None if stream.is_over.is_set() else strike(stream, kind, target)
+        if held is not None:
+            stream.struck[kind] += 1
+            wait(seconds, held)
+            machines.mend()
 
 
-def _strike(stream, kind, target):
+def strike(stream, kind, target):
     """Cause the fault; return the parts that it keeps down, None if it found no target."""
     machines = stream.machines
+    worker = f"worker {int(target * machines.workers)}"
     if kind == "disk full":
         machines.small.fill()
-        return ()
-    if kind == "network cut":
+    elif kind == "network cut":
         machines.link.cut()
-        return ()
-    if kind == "run killed":
+    elif kind == "run killed":
         running = sorted(stream.at_work.items())
         if not running:
             return None
-        _, process = running[int(target * len(running))]
         try:
-            os.killpg(process.pid, signal.SIGKILL)
+            os.killpg(running[int(target * len(running))][1].pid, signal.SIGKILL)
         except ProcessLookupError:
             return None
-        return ()
-    worker = f"worker {int(target * machines.workers)}"
-    if kind == "worker's child killed":
+    elif kind == "worker's child killed":
         return () if machines.parts[worker].kill_child() else None
-    name = {"worker killed": worker, "scheduler killed": "scheduler"}.get(kind, "prefect")
-    machines.parts[name].kill()
-    return (name,)
+    else:
+        name = {"worker killed": worker, "scheduler killed": "scheduler"}.get(kind, "prefect")
+        machines.parts[name].kill()
+        return (name,)
+    return ()
 
 
 def soak(minutes, seed, folder):
@@ -203,57 +169,36 @@ def soak(minutes, seed, folder):
         seed: of the faults.
         folder: a new folder for matches and projects.
     """
-    folders = []
-    for number in range(MATCHES):
-        folders.append(folder / f"match-{number}")
-        options = {**SMALL, "calibrated": True, "stills": False, "video": False}
-        simulate_match(SCENARIOS["tiny"], number, folders[-1], MatchOptions(**options))
-    faults, rounds, problems = [], [], []
+    folders = [folder / f"match-{number}" for number in range(MATCHES)]
+    options = MatchOptions(**SMALL, calibrated=True, stills=False, video=False)
+    for number, each in enumerate(folders):
+        simulate_match(SCENARIOS["tiny"], number, each, options)
     with Machines(folder / "machines") as machines:
-        stream = Stream(machines, folders)
-        undisturbed = folder / "undisturbed"
+        stream, undisturbed = Stream(machines, folders), folder / "undisturbed"
         calm = stream.round(undisturbed)
-        problems += [f"undisturbed: {each}" for each in stream.problems]
-        stream.problems.clear()
-        began = time.monotonic()
-        dice = random.Random(seed)
-        while time.monotonic() - began < 60.0 * minutes and not problems:
-            project = machines.disk / f"round-{len(rounds)}"
+        pause = [share * min(calm.values()) for share in BETWEEN]  # others compiled kernels
+        began, dice, rounds = time.monotonic(), random.Random(seed), []
+        while time.monotonic() - began < 60.0 * minutes and not stream.problems:
+            stream.project = project = machines.disk / f"round-{len(rounds)}"
             project.mkdir()
-            stream.project = project
             stream.is_over.clear()
-            struck = []
-            pause = [share * min(calm.values()) for share in BETWEEN]  # others compiled kernels
-            trouble = threading.Thread(
-                target=disturb, args=(stream, dice, pause, struck), daemon=True
-            )
+            trouble = threading.Thread(target=disturb, args=(stream, dice, pause), daemon=True)
             trouble.start()
-            seconds = stream.round(project)
+            rounds.append(stream.round(project))
             stream.is_over.set()
             trouble.join()
-            machines.small.free()
-            machines.link.heal()
-            problems += stream.problems
-            stream.problems.clear()
-            problems += problems_of(project, undisturbed)
-            rounds.append(seconds)
-            faults += struck
+            machines.mend()
+            stream.problems += problems_of(project, undisturbed)
             shutil.rmtree(project)
-            told = f"endings {dict(stream.endings)}, problems {problems}"
-            print(f"round {len(rounds)}: {seconds}, {len(struck)} faults, {told}", flush=True)
-        took = time.monotonic() - began
+            print(f"{rounds[-1]} s, {stream.struck}, problems {stream.problems}", flush=True)
     return {
-        "seed": seed,
-        "minutes": round(took / 60.0, 1),
-        "rounds": len(rounds),
+        "minutes": round((time.monotonic() - began) / 60.0, 1),
         "matches_done": stream.done - MATCHES,
-        "runs_begun": stream.begun - MATCHES,
-        "seconds_a_match_undisturbed": calm,
-        "seconds_a_match": summary_of([each for round_ in rounds for each in round_.values()]),
-        "faults": by_kind(faults),
-        "endings": dict(stream.endings.most_common()),
-        "tracebacks": stream.tracebacks,
-        "problems": problems,
+        "seconds_undisturbed": calm,
+        "seconds": rounds,
+        "faults": dict(stream.struck),
+        "exit_codes": dict(stream.endings),
+        "problems": stream.problems,
     }
 
 
@@ -261,16 +206,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--report", type=Path, help="Also written to this file, as JSON.")
     parser.add_argument("--keep", type=Path, help="A new folder that is kept, with all logs.")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # and all machines with it
     folder = given.keep or Path(tempfile.mkdtemp(prefix="worldpose-soak-"))
     report = soak(given.minutes, given.seed, folder)
-    text = json.dumps(report, indent=2)
-    print(text)
-    if given.report:
-        given.report.write_text(text + "\n")
+    print(json.dumps(report, indent=2))
     if given.keep is None:
         shutil.rmtree(folder)
     sys.exit(1 if report["problems"] else 0)

@@ -1,16 +1,12 @@
 """Iterations, killed anywhere and resumed: the store equals that of undisturbed ones."""
 
-import json
 import multiprocessing
 import os
 import random
 import signal
-import subprocess
 from contextlib import contextmanager
 
 import pytest
-from checker import differences
-from command_line import WORLDPOSE, succeed
 from test_killed_runs import assert_nothing_half_written, assert_same_store
 
 from data_contracts.review import DeletedDetection
@@ -31,7 +27,6 @@ from worldpose.store.store import Store
 pytestmark = pytest.mark.faults
 
 PASSES = 2
-LOOPED = ["--iterations", str(PASSES), "--workers", "2"]
 
 
 def compute_here(stage, units, work):
@@ -117,21 +112,6 @@ def test_killed_at_a_random_commit_point_of_the_loop(seed, short, undisturbed, t
     assert_same_store(project, reference)
 
 
-@pytest.mark.slow
-def test_two_loops_over_one_match_at_once_end_with_one_result(server, short, tmp_path):
-    undisturbed, project = tmp_path / "undisturbed", tmp_path / "project"
-    succeed("run", short, "--project", undisturbed, *LOOPED)
-    both = [start(short, project) for _ in range(2)]
-    assert [process.wait() for process in both] == [0, 0]
-    store = Store.open(str(project))
-    records = [store.run(match, run) for match in store.matches() for run in store.runs(match)]
-    for number in (1, PASSES):
-        of_pass = [json.dumps(each.results) for each in records if each.iteration == number]
-        assert len(of_pass) >= 2
-        assert len(set(of_pass)) == 1
-    assert differences(project, undisturbed) == []
-
-
 def delete_a_box(project):
     """Edits of a person on another machine during the run."""
     store = Store.open(str(project))
@@ -193,13 +173,3 @@ def test_an_edit_at_a_random_moment_of_the_loop(seed, short, undisturbed, edited
     assert standing(project) in (standing(reference), standing(edited))
     loop(project, short, None)
     assert standing(project) == standing(edited)
-
-
-def start(folder, project):
-    """The command, leading a process group of its own."""
-    return subprocess.Popen(
-        [*WORLDPOSE, "run", str(folder), "--project", str(project), *LOOPED],
-        start_new_session=True,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )

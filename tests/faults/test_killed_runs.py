@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 from checker import half_written, problems_of
-from command_line import WORLDPOSE, succeed
+from command_line import TINY, WORLDPOSE, succeed, worldpose
 
 from worldpose.store.blobs import COMMIT_POINTS
+from worldpose.store.store import Store
 
 pytestmark = [pytest.mark.usefixtures("server"), pytest.mark.faults]
 
@@ -21,10 +22,15 @@ IN_WORKER = [point for point in COMMIT_POINTS if "run_record" not in point]
 IN_MAIN = [point for point in COMMIT_POINTS if "run_record" in point]
 
 
+def planned(**plan):
+    """The environment of a run whose processes load the fault."""
+    environment = {"DASK_DISTRIBUTED__WORKER__PRELOAD": str(FAULT)}
+    return environment | {"WORLDPOSE_TEST_FAULT": json.dumps(plan)}
+
+
 def fault_environment(tmp_path, point, **plan):
     struck = tmp_path / "struck"
-    plan = json.dumps({"point": point, "struck": str(struck), **plan})
-    return {"WORLDPOSE_TEST_FAULT": plan, "DASK_DISTRIBUTED__WORKER__PRELOAD": str(FAULT)}, struck
+    return planned(point=point, struck=str(struck), **plan), struck
 
 
 def assert_same_store(project, undisturbed):
@@ -46,6 +52,34 @@ def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tm
     succeed("run", tiny, "--project", project, "--workers", 2, environment=environment)
     assert struck.exists(), "the fault did not strike"
     assert_same_store(project, tiny_run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("how", "error", "said"),
+    [
+        # A worker's first unit took 5 s on two busy cores.
+        ("hang", "TaskTimeoutError", "stopped 2 times, each time after 0.5 minutes"),
+        ("die", "WorkerCrashError", "its process ended 3 times"),
+    ],
+)
+def test_a_deadly_unit_is_given_up_and_named_and_the_others_finish(
+    how, error, said, tiny, tmp_path
+):
+    project, unit = tmp_path / "worldpose-data", "ingest/cam01"
+    limited = ("--until", "ingest", "--time-limit", 0.5)
+    spoilt = planned(unit=unit, how=how)
+    answer = worldpose("run", tiny, "--project", project, *limited, environment=spoilt)
+    assert answer.code == 4, answer.err
+    record = Store.open(str(project)).run(TINY)
+    (failure,) = record.failed
+    assert (record.state, failure.unit, failure.error) == ("partial", unit, error)
+    assert said in failure.message
+    if how == "hang":
+        assert "fault.py" in failure.message, "it is not said where it hung"
+    assert len(record.executed) == len(record.results) == 6
+    again = worldpose("run", tiny, "--project", project, "--until", "ingest", "--json")
+    assert (again.code, again.json["executed"]) == (0, 1)
 
 
 @pytest.mark.slow
@@ -96,15 +130,7 @@ def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):
     marker = f"WORLDPOSE_TEST_MARK={tmp_path.name}"
     environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
     environment.pop("PREFECT_API_URL")  # so that it brings a server of its own
-    process = subprocess.Popen(
-        [*WORLDPOSE, "run", str(tiny), "--project", str(tmp_path / "worldpose-data")],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-    for line in process.stderr:
-        if b"tracking" in line:  # server and workers are up
-            break
+    process = run_until(b"tracking", tiny, tmp_path, environment)  # server and workers are up
     assert len(processes_with(marker)) > 2
     process.kill()
     process.wait()
@@ -112,6 +138,19 @@ def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):
     while processes_with(marker) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert processes_with(marker) == []
+
+
+def run_until(word, match, folder, environment):
+    """A run, leading a process group of its own, that has said so much."""
+    process = subprocess.Popen(
+        [*WORLDPOSE, "run", str(match), "--project", str(folder / "worldpose-data")],
+        start_new_session=True,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    assert any(word in line for line in process.stderr)
+    return process
 
 
 def processes_with(marker):
@@ -130,23 +169,14 @@ def processes_with(marker):
 @pytest.mark.slow
 def test_a_terminated_run_ends_at_once_and_goes_on_with_the_same_command(tiny, tmp_path):
     """Ctrl-C: tests/flows/test_progress.py."""
-    environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
+    environment = {**os.environ}
     environment.pop("PREFECT_API_URL")
-    process = subprocess.Popen(
-        [*WORLDPOSE, "run", str(tiny), "--project", str(tmp_path / "worldpose-data")],
-        start_new_session=True,
-        env=environment,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    for line in process.stderr:
-        if "ingest:" in line:
-            break
+    process = run_until(b"ingest:", tiny, tmp_path, environment)
     os.killpg(process.pid, signal.SIGTERM)
     started = time.monotonic()
     _, said = process.communicate(timeout=60)
     # It goes through Prefect, which took 3 s.
     assert time.monotonic() - started < 30
     assert process.returncode not in (0, None)
-    assert "Traceback" not in said, said
+    assert b"Traceback" not in said, said
     succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "tracking")

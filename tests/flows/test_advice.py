@@ -37,17 +37,9 @@ def test_the_one_camera_out_of_step_is_told_its_offset(cameras, late, told):
     assert f"set its offset_frames to {3 - round(late)} in match.yaml" in text
 
 
-def test_of_two_cameras_one_is_moved():
-    assert len(clock_advice(figures([0.0, 3.0]), match(2))) == 1
-
-
 @pytest.mark.parametrize(("late", "error"), [(0.4, 0.01), (3.0, 1.0)])
 def test_what_no_whole_frame_mends_or_nobody_knows_is_not_told(late, error):
     assert clock_advice(figures([late, 0.0, 0.0, 0.0], error), match(4)) == []
-
-
-def test_a_run_without_figures_of_clocks_tells_nothing():
-    assert clock_advice({"ingest/cam0": {"frames": 9.0}}, match(3)) == []
 
 
 def run(noise, cameras, freedom=8.0):

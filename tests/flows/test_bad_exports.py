@@ -5,7 +5,6 @@ import json
 import os
 import re
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,39 +30,27 @@ def whole():
     return results
 
 
-def few(people=slice(None), frames=slice(None)):
-    """Return the results of a run with a part of the people and frames."""
-    results = {}
-    for name, data in whole().items():
-        if "person" in data.sizes:
-            data = data.isel(person=people)
-        if "frame" in data.sizes and not name.startswith("broadcast"):
-            data = data.isel(frame=frames)
-        if name.startswith("tracking"):
-            kept = data["person"].values.tolist()
-            data.attrs["tracks"] = [t for t in data.attrs["tracks"] if t["person"] in kept]
-        results[name] = data
+def nobody():
+    results = {n: d.isel(person=[]) if "person" in d.sizes else d for n, d in whole().items()}
+    results["tracking__A_1"].attrs["tracks"] = []
     return results
+
+
+def one_frame():
+    every = whole().items()
+    return {n: d if n.startswith("broadcast") else d.isel(frame=[0]) for n, d in every}
 
 
 def without_joints():
     """Return results in which no joint of anybody is known."""
-    results = whole()
+    results = {name: data.copy(deep=True) for name, data in whole().items()}
     for name in ("triangulation__A_1", "body_fitting__A_1"):
-        data = results[name].copy(deep=True)
-        data["joints"][:] = np.nan
-        if "transl" in data:
-            data["transl"][:] = np.nan
-        results[name] = data
+        results[name]["joints"][:] = np.nan
+    results["body_fitting__A_1"]["transl"][:] = np.nan
     return results
 
 
-CASES = {
-    "nothing": dict,
-    "nobody": lambda: few(people=[]),
-    "one frame": lambda: few(frames=[0]),
-    "no joint": without_joints,
-}
+CASES = {"nothing": dict, "nobody": nobody, "one frame": one_frame, "no joint": without_joints}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -86,39 +73,20 @@ def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, ca
         assert there == {*written, out / OWNERS}, "no draft is left"
 
 
-def test_a_later_format_that_fails_leaves_the_earlier_ones_out(match_folder, tmp_path):
-    results = {name: data for name, data in tracked().items() if "broadcast" not in name}
-    run = origin(match_folder, **results)
-    with pytest.raises(WorldposeError, match="broadcast_calibration/A_1"):
-        export(run, ["joints", "csv", "challenge"], tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    export(run, ["csv"], tmp_path / "out")
-    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    with pytest.raises(WorldposeError, match="broadcast_calibration/A_1"):
-        export(run, ["joints", "csv", "challenge"], tmp_path / "out")
-    after = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    assert after == before
-
-
-@pytest.mark.parametrize("left", ["triangulation", "broadcast_tracking"])
-def test_people_without_bodies_are_no_cameras_alone(match_folder, tmp_path, left):
-    kept = ("tracking__A_1", "broadcast_calibration__A_1")
-    results = {name: data for name, data in whole().items() if name in kept}
-    results[f"{left}__A_1"] = whole()["triangulation__A_1"]
-    with pytest.raises(InputError, match="results of body_fitting/A_1"):
-        export(origin(match_folder, **results), ["worldpose"], tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_export_is_repeated_into_its_folder_and_joined_by_others(match_folder, tmp_path):
-    run = origin(match_folder, **tracked())
-    first = export(run, ["joints"], tmp_path / "out")
-    (tmp_path / "out" / "mine.txt").write_text("kept")
-    (tmp_path / "out" / "frame_rates.json").write_text('{"other": 25.0}')
-    assert export(run, ["joints", "csv"], tmp_path / "out")[:1] == first[:1]
-    assert (tmp_path / "out" / "mine.txt").read_text() == "kept"
-    rates = json.loads((tmp_path / "out" / "frame_rates.json").read_text())
-    assert rates == {"other": 25.0, "A_1": 50.0}
+    run, out = origin(match_folder, **tracked()), tmp_path / "out"
+    first = export(run, ["joints"], out)
+    (out / "mine.txt").write_text("kept")
+    (out / "frame_rates.json").write_text('{"other": 25.0}')
+    assert export(run, ["joints", "csv"], out)[:1] == first[:1]
+    assert (out / "mine.txt").read_text() == "kept"
+    assert json.loads((out / "frame_rates.json").read_text()) == {"other": 25.0, "A_1": 50.0}
+    # A later format that fails leaves the earlier ones as they are.
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    without = {name: data for name, data in tracked().items() if "broadcast" not in name}
+    with pytest.raises(WorldposeError, match="broadcast_calibration/A_1"):
+        export(origin(match_folder, **without), ["joints", "trc", "challenge"], out)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
 def test_an_export_replaces_no_file_of_another_match(match_folder, tmp_path):
@@ -132,19 +100,15 @@ def test_an_export_replaces_no_file_of_another_match(match_folder, tmp_path):
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=r"A_1\.csv.*a file of another.*--overwrite"):
         export(ours, ["csv", "positions"], out)
+    (tmp_path / "view.html").write_text("a page of unknown origin")
     with pytest.raises(InputError, match="Nothing was written"):
-        export(ours, ["viewer"], _foreign(tmp_path / "view.html"))
+        export(ours, ["viewer"], tmp_path / "view.html")
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     export(ours, ["csv"], out)  # files of other names are no obstacle
     export(ours, ["positions"], out, overwrite=True)
     export(ours, ["positions"], out)
     with pytest.raises(InputError, match=r"joints\.npz.*a file of another"):
         export(ours, ["joints"], out)
-
-
-def _foreign(path):
-    path.write_text("a page of unknown origin")
-    return path
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
@@ -171,10 +135,8 @@ def test_a_target_of_another_kind_is_refused(match_folder, tmp_path):
     (tmp_path / "out" / "joints.npz").mkdir(parents=True)
     for out, form, found in (
         (tmp_path / "file", "joints", "found a file"),
-        (tmp_path / "file" / "below", "joints", "found "),
         (tmp_path / "page.html", "viewer", "found a folder"),
         (tmp_path / "out", "joints", "joints.npz: .* found a folder"),
-        (Path("/proc/nothing/out"), "joints", "found "),
     ):
         with pytest.raises(InputError, match=found) as refused:
             export(run, [form], out)
@@ -199,11 +161,8 @@ def test_a_missing_package_is_named(match_folder, tmp_path, monkeypatch, form):
         (("MATCH", "--format", "excel"), 2, "--format excel: expected one of joints"),
         (("MATCH", "--format", "joints", "--stage", "sleep"), 2, "--stage sleep: expected a resu"),
         (("MATCH", "--format", "challenge", "--format", "worldpose"), 2, "different file names"),
-        (("MATCH", "--format", "joints", "--video"), 2, "expected --format viewer"),
-        (("MATCH", "--format", "gltf", "--licence", "absent.txt"), 1, "--licence absent.txt: exp"),
         (("MATCH", "--format", "gltf", "--licence", "EMPTY"), 1, "--licence .*found nothing"),
         (("MATCH", "--format", "joints", "--release", "one"), 2, "expected --licence FILE"),
-        (("MATCH", "--format", "joints", "--out", "EMPTY"), 1, "--out .*found a file"),
     ],
 )
 def test_the_command_says_one_thing_and_writes_nothing(
@@ -213,9 +172,18 @@ def test_the_command_says_one_thing_and_writes_nothing(
     (tmp_path / "empty.txt").write_bytes(b"")
     words = {"MATCH": TINY, "EMPTY": "empty.txt"}
     asked = [words.get(each, each) for each in arguments]
-    asked += [] if "--out" in asked else ["--out", "out"]
-    answer = worldpose("export", *asked, "--project", tiny_run)
+    answer = worldpose("export", *asked, "--out", "out", "--project", tiny_run)
     assert answer.code == code, answer.err
     assert re.search(message, answer.err)
     assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
     assert {path.name for path in tmp_path.iterdir()} == {"empty.txt"}
+
+
+@pytest.mark.parametrize("left", ["triangulation", "broadcast_tracking"])
+def test_people_without_bodies_are_no_cameras_alone(match_folder, tmp_path, left):
+    kept = ("tracking__A_1", "broadcast_calibration__A_1")
+    results = {name: data for name, data in whole().items() if name in kept}
+    results[f"{left}__A_1"] = whole()["triangulation__A_1"]
+    with pytest.raises(InputError, match="results of body_fitting/A_1"):
+        export(origin(match_folder, **results), ["worldpose"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()

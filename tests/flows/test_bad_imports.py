@@ -12,23 +12,16 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.video.files import write_video
 
-CALIBRATION = """
-[cam_0]
-name = "a"
+TABLE = """
+[cam_{0}]
+name = "{0}"
 size = [640, 480]
 matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
 distortions = [0.0, 0.0, 0.0, 0.0]
-rotation = [0.0, 0.0, 0.0]
-translation = [0.0, 0.0, 4.0]
-
-[cam_1]
-name = "b"
-size = [640, 480]
-matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
-distortions = [0.0, 0.0, 0.0, 0.0]
-rotation = [0.0, 1.0, 0.0]
+rotation = {1}
 translation = [0.0, 0.0, 4.0]
 """
+CALIBRATION = TABLE.format("a", [0.0, 0.0, 0.0]) + TABLE.format("b", [0.0, 1.0, 0.0])
 MATCH = """
 contract: 1
 match_id: lab
@@ -41,184 +34,144 @@ clips:
 NOISE = bytes(range(7, 255)) * 4
 
 
+def run(*arguments):
+    return CliRunner().invoke(app, ["import", *map(str, arguments)])
+
+
 def refuse(*arguments):
-    result = CliRunner().invoke(app, ["import", *map(str, arguments)])
+    result = run(*arguments)
     assert isinstance(result.exception, InputError), result.output
     return str(result.exception)
 
 
 @pytest.fixture
 def lab(tmp_path):
-    """A calibration of two cameras, 2D poses of none, and a match folder."""
+    """A calibration of two cameras, empty 2D poses, a trial of Pose2Sim, and a match folder."""
+    for folder in ("poses", "match/detections", "trial/calibration", "videos"):
+        (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "calibration.toml").write_text(CALIBRATION)
-    (tmp_path / "poses").mkdir()
-    (tmp_path / "match" / "detections").mkdir(parents=True)
-    (tmp_path / "match" / "match.yaml").write_text(MATCH)
+    (tmp_path / "match/match.yaml").write_text(MATCH)
+    np.savez(tmp_path / "match/detections/a.npz", a=1)
+    (tmp_path / "trial/Config.toml").write_text("[project]\nframe_rate = 60\n")
+    (tmp_path / "trial/calibration/Calib.toml").write_text(CALIBRATION)
+    for name in ("a", "b"):
+        (tmp_path / f"poses/{name}.json").write_text("[]")
+        (tmp_path / f"trial/pose/{name}_json").mkdir(parents=True)
+        file = tmp_path / f"trial/pose/{name}_json/{name}_000000.json"
+        file.write_text('{"version": 1.3, "people": []}')
     return tmp_path
 
 
-CALIBRATIONS = [
-    *("bad.toml", "bad.qca.txt", "bad.xml", "bad.json", "bad.yml", "bad.xcp", "bad.mcal"),
-    *("bad.calib", "bad.pickle", "intri.yml"),
-]
-
-
-@pytest.mark.parametrize("name", CALIBRATIONS)
-@pytest.mark.parametrize("content", [b"", NOISE], ids=["empty", "noise"])
-def test_calibrations(lab, name, content):
-    file = lab / name
-    file.write_bytes(content)
-    given = ("--detections", lab / "poses", "--fps", "25", "--out", lab / "out")
-    assert name in refuse("--calibration", file, *given)
-    assert not (lab / "out").exists()
-
-
-@pytest.mark.parametrize("name", ["a.json", "a.npz"])
-@pytest.mark.parametrize("content", [b"", NOISE, b"[1, 2]"], ids=["empty", "noise", "other"])
-def test_2d_poses(lab, name, content):
-    (lab / "poses" / name).write_bytes(content)
-    (lab / "poses" / "b.json").write_text("[]")
-    given = ("--calibration", lab / "calibration.toml", "--fps", "25", "--out", lab / "out")
-    assert name in refuse("--detections", lab / "poses", *given)
-    assert not (lab / "out").exists()
-
-
-@pytest.mark.parametrize("with_calibration", [True, False])
-def test_videos(lab, with_calibration):
-    (lab / "videos").mkdir()
+@pytest.fixture
+def filmed(lab):
+    """The same with two short videos."""
     for name in ("a.mp4", "b.mp4"):
-        (lab / "videos" / name).write_bytes(NOISE)
-    given = ("--calibration", lab / "calibration.toml") if with_calibration else ()
-    assert "a.mp4" in refuse("--videos", lab / "videos", *given, "--out", lab / "out")
-    (lab / "videos" / "b.mp4").unlink()
-    told = refuse("--videos", lab / "videos", "--out", lab / "out")
-    assert "expected a video for each of two cameras or more" in told
-    assert not (lab / "out").exists()
+        write_video(lab / "videos" / name, [np.zeros((48, 64, 3), np.uint8)] * 5, 25.0)
+    return lab
 
 
-@pytest.mark.parametrize(
-    "place", ["Config.toml", "calibration/Calib.toml", "pose/a_json/a_000000.json"]
-)
-@pytest.mark.parametrize("content", [NOISE, b"{"], ids=["noise", "cut"])
-def test_trials_of_pose2sim(lab, place, content):
-    trial = lab / "trial"
-    for folder in ("calibration", "pose/a_json", "pose/b_json"):
-        (trial / folder).mkdir(parents=True)
-    (trial / "Config.toml").write_text("[project]\nframe_rate = 60\n")
-    (trial / "calibration" / "Calib.toml").write_text(CALIBRATION)
-    for name in ("a", "b"):
-        file = trial / "pose" / f"{name}_json" / f"{name}_000000.json"
-        file.write_text('{"version": 1.3, "people": []}')
-    (trial / place).write_bytes(content)
-    assert place.rpartition("/")[2] in refuse("--pose2sim", trial, "--out", lab / "out")
-    assert not (lab / "out").exists()
+POSES = "--detections LAB/poses --fps 25 --out LAB/out"
+CALIBRATED = "--calibration LAB/calibration.toml --detections LAB/poses --fps 25 --out LAB/out"
+LENS = "--lens LAB/{} --camera a --out LAB/match"
+CLICKS = "--clicks LAB/{} --camera a --out LAB/match"
+FORMS = {
+    **dict.fromkeys(
+        [
+            "bad.toml",
+            "bad.qca.txt",
+            "bad.xml",
+            "bad.json",
+            "bad.yml",
+            "bad.xcp",
+            "bad.mcal",
+            "bad.calib",
+            "bad.pickle",
+            "intri.yml",
+        ],
+        f"--calibration LAB/{{}} {POSES}",
+    ),
+    **dict.fromkeys(("poses/a.json", "poses/a.npz"), CALIBRATED),
+    **dict.fromkeys(("videos/a.mp4", "videos/b.mp4"), "--videos LAB/videos --out LAB/out"),
+    **dict.fromkeys(
+        ["Config.toml", "calibration/Calib.toml", "pose/a_json/a_000000.json"],
+        "--pose2sim LAB/trial --out LAB/out",
+    ),
+    **dict.fromkeys(
+        ["lens.toml", "lens.xml", "lens.yml", "lens.json", "lens.npz", "lens.npy"], LENS
+    ),
+    **dict.fromkeys(("clicks.xml", "clicks.json"), CLICKS),
+    "bad.csv": "--pitch LAB/{} --out LAB/match",
+}
 
 
-@pytest.mark.parametrize("name", ["bad.toml", "bad.xml", "bad.yml", "bad.json", "bad.npz", "k.npy"])
-@pytest.mark.parametrize("content", [b"", NOISE], ids=["empty", "noise"])
-def test_lenses(lab, name, content):
-    np.savez(lab / "match" / "detections" / "a.npz", a=1)
-    (lab / name).write_bytes(content)
-    assert name in refuse("--lens", lab / name, "--camera", "a", "--out", lab / "match")
-    assert not (lab / "match" / "lenses.toml").exists()
-
-
-@pytest.mark.parametrize("name", ["bad.xml", "bad.json"])
-@pytest.mark.parametrize("content", [b"", NOISE, b"{}"], ids=["empty", "noise", "other"])
-def test_clicks(lab, name, content):
-    (lab / name).write_bytes(content)
-    assert name in refuse("--clicks", lab / name, "--camera", "a", "--out", lab / "match")
-
-
-@pytest.mark.parametrize("content", [b"", NOISE, b"a,b\n1,2\n"], ids=["empty", "noise", "other"])
-def test_surveys(lab, content):
-    (lab / "bad.csv").write_bytes(content)
-    assert "bad.csv" in refuse("--pitch", lab / "bad.csv", "--out", lab / "match")
-    assert not (lab / "match" / "pitch.json").exists()
+@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("content", [b"", NOISE, b"{"], ids=["empty", "noise", "cut"])
+def test_a_bad_file_is_named_and_nothing_is_written(filmed, name, content):
+    arguments = FORMS[name].format(name).replace("LAB", str(filmed)).split()
+    file = filmed / ("trial" if "--pose2sim" in arguments else "") / name
+    file.with_suffix(".json").unlink(missing_ok=True)
+    file.write_bytes(content)
+    if content or "--pose2sim" not in arguments:  # a trial may have empty files
+        assert name.rpartition("/")[2] in refuse(*arguments)
+    assert not (filmed / "out").exists()
+    assert {path.name for path in (filmed / "match").iterdir()} == {"detections", "match.yaml"}
 
 
 @pytest.mark.parametrize(
     ("content", "told"),
     [
         (b"", "found an empty file"),
-        (NOISE, "a.txt"),
         (b"0,1,5,5,5,5,1\n", "line 1: frame"),
         (b"1,1,900,5,5,5,1\n", "line 1: left, top"),
         (b"1,1,5,5,5,5,1\n1,1,9,5,5,5,1\n", "line 2: id"),
     ],
 )
-def test_boxes(lab, content, told):
-    (lab / "videos").mkdir()
-    for name in ("a.mp4", "b.mp4"):
-        frame = np.zeros((48, 64, 3), np.uint8)
-        write_video(lab / "videos" / name, [frame] * 5, 25.0)
-    (lab / "boxes").mkdir()
-    (lab / "boxes" / "a.txt").write_bytes(content)
-    given = ("--videos", lab / "videos", "--boxes", lab / "boxes", "--out", lab / "out")
+def test_boxes(filmed, content, told):
+    (filmed / "boxes").mkdir()
+    (filmed / "boxes/a.txt").write_bytes(content)
+    given = ("--videos", filmed / "videos", "--boxes", filmed / "boxes", "--out", filmed / "out")
     assert told in refuse(*given)
-    assert not (lab / "out").exists()
-    (lab / "boxes" / "a.txt").rename(lab / "boxes" / "c.txt")
+    assert not (filmed / "out").exists()
+    (filmed / "boxes/a.txt").rename(filmed / "boxes/c.txt")
     assert "found c.txt" in refuse(*given)
-    assert "--boxes with --videos" in refuse("--boxes", lab, "--fps", 25, "--out", lab / "match")
 
 
 def test_places_for_a_match(lab):
-    np.savez(lab / "poses" / "a.npz", a=1)
     cases = {
         lab / "match": "nothing, or an empty folder",
         lab / "calibration.toml": "nothing, or an empty folder",
         lab / "calibration.toml" / "below": "a place where a folder can be made",
-        "/proc/nothing/out": "a place where a folder can be made",
     }
-    (lab / "poses" / "a.npz").unlink()
     for name in ("a", "b"):
-        people = [
-            {"image_id": 0, "category_id": 1, "keypoints": [9.0, 9.0, 1.0] * 17, "score": 0.9}
-        ]
-        (lab / "poses" / f"{name}.json").write_text(json.dumps(people))
-    given = ("--calibration", lab / "calibration.toml", "--detections", lab / "poses")
+        person = {"image_id": 0, "category_id": 1, "score": 0.9}
+        person["keypoints"] = [9.0, 9.0, 1.0] * 17
+        (lab / f"poses/{name}.json").write_text(json.dumps([person]))
+    given = ("--calibration", lab / "calibration.toml", "--detections", lab / "poses", "--fps", 25)
     for out, told in cases.items():
-        assert told in refuse(*given, "--fps", "25", "--out", out)
-    assert (
-        CliRunner()
-        .invoke(app, ["import", *map(str, given), "--fps", "25", "--out", str(lab / "out")])
-        .exit_code
-        == 0
-    )
+        assert told in refuse(*given, "--out", out)
+    assert run(*given, "--out", lab / "out").exit_code == 0
 
 
-def test_a_full_disk_leaves_no_match(lab, monkeypatch):
-    (lab / "videos").mkdir()
-    for name in ("a.mp4", "b.mp4"):
-        write_video(lab / "videos" / name, [np.zeros((48, 64, 3), np.uint8)] * 5, 25.0)
-
+def test_a_full_disk_leaves_no_match(filmed, monkeypatch):
     def full(source, target):
         raise OSError(errno.ENOSPC, "No space left on device", str(target))
 
     monkeypatch.setattr("worldpose.ingest.camera_videos.shutil.copyfile", full)
-    given = ["import", "--videos", str(lab / "videos"), "--out", str(lab / "new" / "out")]
-    result = CliRunner().invoke(app, given)
-    assert isinstance(result.exception, InputError), result.exception
-    assert "No space left on device" in str(result.exception)
-    assert not (lab / "new").exists() or not list((lab / "new").iterdir())
+    told = refuse("--videos", filmed / "videos", "--out", filmed / "new" / "out")
+    assert "No space left on device" in told
+    assert not (filmed / "new").exists() or not list((filmed / "new").iterdir())
 
 
-def test_a_stated_unit_and_axis_hold_and_absurd_distances_are_refused(lab):
-    (lab / "videos").mkdir()
-    for name in ("a.mp4", "b.mp4"):
-        write_video(lab / "videos" / name, [np.zeros((48, 64, 3), np.uint8)] * 5, 25.0)
-    far = lab / "far.toml"
+def test_a_stated_unit_and_axis_hold_and_absurd_distances_are_refused(filmed):
+    far = filmed / "far.toml"
     far.write_text(CALIBRATION.replace("4.0]", "400.0]").replace("[0.0, 1.0, 0.0]", "[0, 3.1, 0]"))
-    videos, out = ("--videos", lab / "videos"), ("--out", lab / "out")
+    videos, out = ("--videos", filmed / "videos"), ("--out", filmed / "out")
     assert "--unit mm" in refuse("--calibration", far, *videos, *out)
-    given = ("import", "--calibration", far, *videos, *out, "--unit", "cm", "--up", "-y", "--json")
-    answer = CliRunner().invoke(app, list(map(str, given)))
-    assert (
-        "centimetres, as stated; up is -y, turned by 90.0" in json.loads(answer.output)["notes"][0]
-    )
-    found = read_calibration(lab / "out" / "calibration.toml")["a"]
+    answer = run("--calibration", far, *videos, *out, "--unit", "cm", "--up", "-y", "--json")
+    said = json.loads(answer.output)["notes"][0]
+    assert "centimetres, as stated; up is -y, turned by 90.0" in said
+    found = read_calibration(filmed / "out" / "calibration.toml")["a"]
     np.testing.assert_allclose(found.translation, [0.0, 0.0, 4.0], atol=1e-12)
     np.testing.assert_allclose(np.array(found.rotation)[:, 2], [0.0, -1.0, 0.0], atol=1e-12)
     for option, value in (("--unit", "cm"), ("--up", "y")):
-        result = CliRunner().invoke(app, list(map(str, ("import", *videos, *out, option, value))))
-        assert isinstance(result.exception, UsageError)
+        assert isinstance(run(*videos, *out, option, value).exception, UsageError)

@@ -51,23 +51,3 @@ def test_a_later_stage_goes_on_with_the_pass_that_the_latest_run_was_made_of(cli
     planned = plan.plan_stage(stages[0])
     assert {unit.key for unit in planned} <= set(latest.results.values())
     assert {unit.iteration for unit in planned} == {2}
-
-
-def test_a_new_setting_of_a_later_stage_finds_the_pass_before_as_it_was(clips):
-    store, match = clips
-    latest = iterate(store, match, {}, 2)
-    stages = selected_stages("body_fitting", None)
-    for tail in (3.0, 4.0):
-        asked = {"body_fitting": {"loss_scale": tail}}
-        log = RunLog.begin(store, match, stages, asked, iteration=1)
-        assert log.plan.iteration == 2
-        for stage in stages:
-            units = log.plan.plan_stage(stage)
-            assert not log.plan.blocked
-            for unit in units:
-                publish_stand_in(store, match, unit)
-            log.reuse(units)
-        record = log.close()
-        assert (record.state, record.iteration) == ("complete", 2)
-        kept = [name for name in latest.results if name.startswith("tracking/")]
-        assert {record.results[name] for name in kept} == {latest.results[name] for name in kept}

@@ -1,7 +1,6 @@
 """The command `calibrate` writes lenses that `import --lens` reads, or tells what is wrong."""
 
 import json
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +10,6 @@ from typer.testing import CliRunner
 from flows.cli.app import app
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.lens_files import read_lens_toml
-from worldpose.static_calibration.boards import calibrate_lens
 from worldpose.video.files import write_video
 
 SIZE = (640, 480)
@@ -96,29 +94,3 @@ def test_what_is_wrong_is_told(boards, tmp_path, place, options, kind, told):
     assert isinstance(result.exception, kind), result.exception
     assert told in str(result.exception)
     assert not (tmp_path / "lenses.toml").exists()
-
-
-def test_a_lens_that_folds_is_not_written(boards, tmp_path, monkeypatch):
-    def fold(name, views, size):
-        fit = calibrate_lens(name, views, size)
-        # r (1 - 2 r^2) grows up to r = 0.41; the image's corner is at 0.77.
-        return replace(fit, lens=fit.lens.model_copy(update={"distortion": (-2.0, *[0.0] * 4)}))
-
-    monkeypatch.setattr("worldpose.static_calibration.boards.calibrate_lens", fold)
-    result = calibrate(boards, *OPTIONS, "--out", tmp_path / "lenses.toml", "--camera", "a")
-    assert "int_a_img: distortion: expected a lens whose image radii" in str(result.exception)
-    assert not (tmp_path / "lenses.toml").exists()
-
-
-def test_images_that_cannot_be_read_or_differ_in_size_are_named(tmp_path):
-    folder = tmp_path / "cam"
-    folder.mkdir()
-    (folder / "1.png").write_bytes(b"no image")
-    found = calibrate(folder, *OPTIONS, "--out", tmp_path / "x.toml")
-    assert "1.png: expected an image, found none that OpenCV reads" in str(found.exception)
-    for name, size in (("1.png", (48, 64)), ("2.png", (64, 48))):
-        cv2.imwrite(str(folder / name), np.zeros(size, np.uint8))
-    found = calibrate(folder, *OPTIONS, "--out", tmp_path / "x.toml")
-    assert "cam: expected images of one size, found 64 x 48 in 1.png, 48 x 64 in 2.png" in str(
-        found.exception
-    )

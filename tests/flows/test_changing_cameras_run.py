@@ -7,11 +7,11 @@ import pytest
 import yaml
 from camera_builders import look_at_camera
 from command_line import succeed
+from imported_people import apart_from, circling, import_people, seen_by
 
 from flows.registering import open_match
 from flows.reports.cameras import health_picture
 from worldpose.camera_consistency.health import judge_health
-from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.joints_file import read_joints
 from worldpose.store.store import Store, open_run
 
@@ -19,46 +19,24 @@ FRAMES, FPS, BAD = 125, 25, "cam2"
 KNOCK = np.array([25.0, -12.0])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def joints(tiny):
-    """Two people (frames, 2, 17, 3) [m] who walk on circles."""
-    body = read_joints(tiny / "reference" / "joints.npz").joints[0, :2]
-    body = body - body.mean(axis=1, keepdims=True) * [1.0, 1.0, 0.0]
-    time = np.arange(FRAMES + 10)[:, None] / FPS + [0.0, 2.0]
-    way = 2.0 * np.stack([np.cos(time), np.sin(time), 0.0 * time], axis=-1)
-    return body + way[:, :, None]
+    return circling(tiny, np.arange(FRAMES + 10) / FPS)
 
 
 @pytest.fixture
 def imported(server, joints, tmp_path):
-    """Returns what imports a match; `spoil` changes pixels (frames, 2, 17, 2) of bad cameras."""
+    """Returns what imports a match; `spoil` changes the pixels of the bad camera."""
 
-    def build(spoil, bad=(BAD,)):
-        rng, records = np.random.default_rng(0), {}
-        (tmp_path / "poses").mkdir()
+    def build(spoil):
+        rng, cameras, pixels = np.random.default_rng(0), {}, {}
         for turn in range(4):
             name, angle = f"cam{turn}", 0.5 * np.pi * turn + 0.3
             place = [10.0 * np.cos(angle), 10.0 * np.sin(angle), 3.0]
-            camera = look_at_camera(place, [0.0, 0.0, 1.0], 1000.0)
-            records[name] = camera.to_calibration(name)
-            pixels = camera.project(joints.reshape(-1, 3)).reshape(*joints.shape[:3], 2)
-            pixels += rng.normal(0.0, 1.0, pixels.shape)
-            pixels = (spoil(pixels) if name in bad else pixels)[:FRAMES]
-            people = [
-                {
-                    "image_id": int(frame),
-                    "category_id": 1,
-                    "keypoints": np.insert(one, 2, 0.9, axis=-1).ravel().round(3).tolist(),
-                    "score": 0.9,
-                }
-                for frame in range(FRAMES)
-                for one in pixels[frame]
-            ]
-            (tmp_path / "poses" / f"{name}.json").write_text(json.dumps(people))
-        write_calibration_toml(tmp_path / "calibration.toml", records)
-        given = ("--calibration", tmp_path / "calibration.toml", "--detections", tmp_path / "poses")
-        succeed("import", *given, "--fps", FPS, "--out", tmp_path / "match")
-        return tmp_path / "match"
+            cameras[name] = look_at_camera(place, [0.0, 0.0, 1.0], 1000.0)
+            seen = seen_by(cameras[name], joints, rng)
+            pixels[name] = (spoil(seen) if name == BAD else seen)[:FRAMES]
+        return import_people(tmp_path, cameras, pixels, FPS)
 
     return build
 
@@ -70,16 +48,12 @@ def run(match, joints):
     out = match.parent / "out"
     forms = ("--format", "joints", "--format", "coco")
     succeed("export", "match", *forms, "--project", project, "--out", out)
-    found = read_joints(out / "joints.npz").joints
-    apart = np.linalg.norm(found[:, :, None] - joints[:FRAMES, None], axis=-1).mean(axis=-1)
-    return said.err + said.out, 1000.0 * np.nanmean(np.nanmin(apart, axis=2))
+    off = apart_from(read_joints(out / "joints.npz"), joints[:FRAMES])
+    return said.err + said.out, 1000.0 * np.nanmean(np.linalg.norm(off, axis=-1))
 
 
 def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(imported, joints):
-    def knock(pixels):
-        return np.concatenate([pixels[:60], pixels[60:] + KNOCK])
-
-    match = imported(knock)
+    match = imported(lambda pixels: np.concatenate([pixels[:60], pixels[60:] + KNOCK]))
     said, error = run(match, joints)
     assert "camera cam2 moves at frame 60, by 27 px" in said
     assert error < 11.5  # 10.5 mm; 10.3 without the knock
@@ -88,7 +62,6 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
     bad = {name: figures[f"unhealthy_share.cam{name}"] for name in range(4)}
     assert 0.4 < bad[2] == figures["unhealthy_share"] < 0.6
     assert max(bad[n] for n in (0, 1, 3)) < 0.05
-    assert 2.0 < figures["unhealthy_s.cam2"] < 2.8
     assert 55 <= figures["unhealthy_from_frame.cam2"] <= 65
     usability = opened.record.usability
     assert usability.verdict == "usable with reservations"
@@ -98,7 +71,6 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
     store = Store.open(match.parent / "project")
     (picture,) = health_picture(opened, open_match(store, "match"), "clip")
     assert "cam2 moves at frame 60, by 27 px" in picture.caption
-    assert picture.png.startswith(b"\x89PNG")
     given = json.loads((match.parent / "poses/cam2.json").read_text())
     written = json.loads((match.parent / "out/cam2.json").read_text())["annotations"]
     for frame in (30, 100):
@@ -119,21 +91,8 @@ def test_lost_frames_are_named_and_synchronized(imported, joints):
     assert list(applied) == [BAD]
     cameras = yaml.safe_load((match / "match.yaml").read_text())["cameras"]
     (before, first), (after, last) = cameras[2]["offset_frames"]
-    assert (first, last) == (0, -4)
-    assert after == before + 1
+    assert (first, last, after) == (0, -4, before + 1)
     assert abs(after - 60) <= 5
     said, corrected = run(match, joints)
     assert "camera cam2" not in said
     assert corrected < 11.5 < error  # 10.5 and 36.8 mm
-
-
-def test_poses_that_agree_nowhere_accuse_no_camera(imported, joints):
-    rng = np.random.default_rng(4)
-
-    def wrong(pixels):
-        wander = rng.normal(0.0, 12.0, (len(pixels), 2, 1, 2)).cumsum(axis=0)
-        return pixels + rng.uniform(-250.0, 250.0, (1, 2, 1, 2)) + wander
-
-    said, _ = run(imported(wrong, [f"cam{n}" for n in range(4)]), joints)
-    assert "moves at frame" not in said
-    assert "2D poses" in said

@@ -13,7 +13,7 @@ from distributed.comm.core import CommClosedError
 from flows.orchestration import local_cluster
 from flows.orchestration.cluster_errors import LostWorkersError, require_workers
 from flows.orchestration.prefect_environment import local_cluster_options
-from worldpose.errors import InputError, StoreError, WorldposeError
+from worldpose.errors import WorldposeError
 
 
 @pytest.mark.parametrize(
@@ -29,12 +29,6 @@ def test_what_is_lost_is_named_and_how_to_go_on(failure, lost):
     with pytest.raises(LostWorkersError, match=f"the {lost} was lost.*run again") as told:
         require_workers(failure)
     require_workers(told.value)  # told once
-
-
-def test_a_units_own_failure_is_its_own():
-    for failure in (StoreError("no space"), OSError(28, "no space"), ValueError("of a bug")):
-        require_workers(failure)
-    require_workers(InputError("a", expected="b", found="c", todo="d"))
 
 
 def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from importlib.metadata import version
 
 import pytest
 import typer
@@ -64,10 +63,6 @@ def test_a_shell_completes_the_names_of_commands():
         text=True,
     )
     assert sorted(answer.stdout.split()) == ["release", "report", "reprocess", "review"]
-
-
-def test_the_version_is_that_of_the_installed_package():
-    assert CliRunner().invoke(app, ["--version"]).output.strip() == version("worldpose")
 
 
 def test_a_misspelt_command_names_the_one_that_may_be_meant():

@@ -1,10 +1,8 @@
 """`worldpose evaluate` on files alone: what is scored, and what is said when nothing can be."""
 
-import shutil
-
 import numpy as np
 import pytest
-from command_line import succeed, worldpose
+from command_line import succeed
 
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import write_markers
@@ -60,28 +58,6 @@ def test_cameras_are_scored_against_those_of_the_reference(tiny, tmp_path):
     assert errors["ground_error_median_m"] == pytest.approx(0.3, abs=0.01)
     assert errors["rotation_error_deg"] == pytest.approx(0.0, abs=1e-9)
     assert errors["focal_error_percent"] == 0
-
-
-def test_tracks_can_be_matched_in_a_camera_of_the_reference(tiny):
-    reference = tiny / "reference"
-    name = sorted(file.stem for file in (reference / "cameras").iterdir())[0]
-    figures = evaluate(reference, reference, "--match-in", name)
-    assert figures["track_coverage"] == 1
-    assert figures["g_mpjpe_mm"] == pytest.approx(0.0, abs=1e-6)
-    answer = worldpose(
-        *("evaluate", "--prediction", reference, "--reference", reference, "--match-in", "nowhere")
-    )
-    assert answer.code == 2
-    assert f"expected a camera of the reference: {name}" in answer.err
-
-
-def test_nothing_in_common_is_refused(tiny, tmp_path):
-    shutil.copytree(tiny / "reference" / "cameras", tmp_path / "cameras")
-    answer = worldpose(
-        *("evaluate", "--prediction", tmp_path), *("--reference", tiny / "reference" / "joints.npz")
-    )
-    assert answer.code == 2
-    assert "expected joints on both sides, or cameras of the same names" in answer.err
 
 
 def test_markers_are_laid_over_and_scored(tiny, tmp_path):

@@ -1,9 +1,5 @@
 """People go out to annotators and come back as corrections that say where they come from."""
 
-import json
-import shutil
-
-import cv2
 import numpy as np
 import pytest
 from command_line import TINY
@@ -12,7 +8,7 @@ from flows.registering import open_match
 from flows.review.annotation_exchange import export_people, import_people
 from flows.review.detections import detections_now
 from flows.review.edit_conflicts import StaleEditError
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
 from worldpose.store.store import Store
 
@@ -70,39 +66,3 @@ def test_what_people_annotate_elsewhere_is_corrected_here_once(project_copy, tmp
     assert {*origins.values()} == {"automatic"}
     with pytest.raises(UsageError, match="absent or empty"):
         export_people(store, match, PLACES, out, form)
-
-
-def test_pictures_go_out_as_the_camera_took_them(project_copy, tiny, tmp_path):
-    """A folder of images, with one missing, is a video as any other."""
-    folder = shutil.copytree(tiny, tmp_path / "match")
-    frames = folder / "videos" / "cam00"
-    frames.mkdir(parents=True)
-    store = Store.open(str(project_copy))
-    match = open_match(store, TINY)
-    clip = match.folder.spec.clips[0]
-    size = match.folder.spec.camera("cam00")
-    for number in range(clip.first_frame, clip.first_frame + 5):
-        picture = np.full((size.height, size.width, 3), 40 * (number - clip.first_frame), np.uint8)
-        cv2.imwrite(str(frames / f"{number:06d}.png"), picture)
-    match.folder.videos["cam00"] = frames
-    export_people(store, match, [("cam00", clip.first_frame + 3)], tmp_path / "out", "coco")
-    name = f"cam00_{clip.first_frame + 3:06d}.png"
-    assert cv2.imread(str(tmp_path / "out" / "pictures" / name))[0, 0].tolist() == [120, 120, 120]
-
-
-def test_a_file_that_is_none_changes_nothing(project_copy, tmp_path):
-    store = Store.open(str(project_copy))
-    written = export_people(store, open_match(store, TINY), PLACES, tmp_path / "out", "coco")
-    dataset = json.loads(written.annotations.read_text())
-    dataset["annotations"][0]["keypoints"] = dataset["annotations"][0]["keypoints"][:-1]
-    written.annotations.write_text(json.dumps(dataset))
-    with pytest.raises(InputError, match=r"annotations\.0\.keypoints"):
-        import_people(
-            store,
-            lambda: open_match(store, TINY),
-            written.annotations,
-            tmp_path / "out" / "exported.json",
-            None,
-            who="Ada",
-        )
-    assert open_match(store, TINY).corrections == ()

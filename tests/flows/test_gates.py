@@ -17,7 +17,6 @@ from flows.review.verdicts import (
     correct,
     decide,
     origins_of,
-    resume,
     reviews_of,
     still_waiting,
     warnings_of,
@@ -30,17 +29,10 @@ from tasks.static_calibration import static_calibration
 from worldpose.errors import InputError
 from worldpose.review.journal import say
 from worldpose.store.integrity import verify
-from worldpose.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("strict_clicks")
 WRONG = "static_calibration/cam03"
 """The camera of `tiny` with a click that the others contradict."""
-
-
-@pytest.fixture
-def store(project_copy):
-    """A project whose every result is there: deciding and waiting needs no orchestrator."""
-    return Store.open(str(project_copy))
 
 
 def run(store, gates, **keywords):
@@ -68,13 +60,6 @@ def test_without_gates_nothing_waits_and_nothing_is_asked(store):
     record = run(store, "never")
     assert (record.run_id, record.gates, record.waiting) == ("0001", "never", ())
     assert store.blobs.entries("reviews") == []
-
-
-def test_a_setting_given_while_all_waits_is_that_of_the_run_after_the_review(store):
-    run(store, "always")
-    asked = RunRequest({"body_fitting": {"loss_scale": 3.0}}, gates="always")
-    assert run_match(store, open_match(store, TINY), asked).executed == ()
-    assert latest_run(store, TINY).overrides == {"body_fitting": {"loss_scale": 3.0}}
 
 
 def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_approved(store):
@@ -208,22 +193,6 @@ def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(s
     assert run(store, "auto").state == "complete"
 
 
-def test_a_correction_on_what_somebody_else_changed_is_refused(store):
-    run(store, "auto")
-    match = open_match(store, TINY)
-    correct(store, match, [wrong_click(match)], who="Ada", why="")
-    with pytest.raises(InputError, match="made since"):
-        correct(store, match, [wrong_click(match)], who="Bob", why="")
-    fresh = open_match(store, TINY)
-    gone = match.folder.clicked["cam03"].points[0].name
-    twice = MovedPoint(camera="cam03", marking=gone, was=(1.0, 1.0), xy=(2.0, 2.0))
-    with pytest.raises(InputError, match=r"in cam03: expected .*found not there"):
-        correct(store, fresh, [twice], who="Bob", why="")
-    with pytest.raises(InputError, match="changes nothing"):
-        correct(store, fresh, [wrong_click(match)], who="Bob", why="")  # it is gone already
-    assert len(open_match(store, TINY).corrections) == 1
-
-
 def test_a_correction_that_no_longer_applies_is_listed(store, tmp_path):
     folder = shutil.copytree(open_match(store, TINY).folder.folder, tmp_path / "match")
     record = store.registration(TINY).model_copy(update={"folder": str(folder)})
@@ -239,23 +208,6 @@ def test_a_correction_that_no_longer_applies_is_listed(store, tmp_path):
     assert warnings_of(match) == [f"correction {stale.id} no longer applies: {reason}"]
     assert (match.corrections, stale.who) == ((), "Ada")
     assert "when it was corrected" in reason
-
-
-def test_an_unknown_or_superseded_review_is_refused(store):
-    with pytest.raises(InputError, match="nothing that waits"):
-        approve(store)
-    request = run(store, "auto").waiting[0].request
-    with pytest.raises(InputError, match="no such question"):
-        approve(store, request, "static_calibration.cam00.000000000000")
-    assert not any(
-        isinstance(record, ReviewDecision) for record in open_match(store, TINY).journal.records
-    )
-
-
-def test_without_a_server_there_is_nothing_to_resume(store, monkeypatch):
-    monkeypatch.delenv("PREFECT_API_URL", raising=False)
-    with pytest.raises(InputError, match="worldpose run"):
-        resume(store, open_match(store, TINY))
 
 
 def test_a_corrected_result_is_computed_again_to_the_same_bytes(store):

@@ -15,12 +15,7 @@ from flows.run_record import latest_run
 from tasks.tracking import tracking
 from worldpose.review.identities import find_sighting
 from worldpose.store.paths import ResultId
-from worldpose.store.store import Run, Store
-
-
-@pytest.fixture
-def store(project_copy):
-    return Store.open(str(project_copy))
+from worldpose.store.store import Run
 
 
 def say(store, **edits):

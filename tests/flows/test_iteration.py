@@ -10,8 +10,7 @@ from test_refitting import halves
 
 from data_contracts.review import DeletedDetection
 from flows import iterate
-from flows.cli.run import parse_iterations
-from flows.iterate import held_out_error, iterate_match
+from flows.iterate import iterate_match
 from flows.method import METHOD
 from flows.registering import register
 from flows.review.verdicts import correct
@@ -169,24 +168,6 @@ def test_a_loop_whose_left_out_cameras_cannot_judge_keeps_the_first_and_says_so(
     found, runs = looped([None, None, None], most)
     assert (found.kept.number, runs) == (1, ran)
     assert found.ended == "held-out cameras cannot tell which iteration is better"
-
-
-def test_clips_count_by_their_keypoints():
-    both = {
-        "filtering/a": {"held_out_error": 0.02, "held_out_keypoints": 300.0},
-        "filtering/b": {"held_out_error": 0.06, "held_out_keypoints": 100.0},
-    }
-    assert held_out_error(record(1, None).model_copy(update={"figures": both})) == pytest.approx(
-        0.03
-    )
-
-
-def test_the_number_of_iterations_is_checked():
-    assert parse_iterations("3") == 3
-    assert parse_iterations("auto") == "auto"
-    for text in ("0", "-1", "x", "1.5"):
-        with pytest.raises(UsageError):
-            parse_iterations(text)
 
 
 def test_a_part_of_the_method_has_no_iterations():

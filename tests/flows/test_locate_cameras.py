@@ -99,10 +99,3 @@ def test_wrong_options_are_told_before_anything_is_computed(lab, tmp_path, optio
     result = CliRunner().invoke(app, command)
     assert isinstance(result.exception, UsageError)
     assert told in str(result.exception)
-
-
-def test_a_match_with_a_pitch_has_markings_for_this(tiny, tmp_path):
-    command = ["locate-cameras", str(tiny), "--stature", "1.8", "--project", str(tmp_path / "p")]
-    result = CliRunner().invoke(app, command)
-    assert isinstance(result.exception, InputError)
-    assert "expected a match without a pitch" in str(result.exception)

@@ -1,7 +1,6 @@
 """Commands that report on matches without running one."""
 
 import json
-import shutil
 
 import pytest
 import yaml
@@ -13,7 +12,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import app
-from flows.registering import find_registration, open_for_review, register
+from flows.registering import open_for_review, register
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.store.store import Store
@@ -80,19 +79,6 @@ def test_an_edit_of_match_yaml_that_the_files_do_not_bear_out_is_refused(store, 
     content["cameras"][1]["offset_frames"] = 2
     (folder / "match.yaml").write_text(yaml.safe_dump(content))
     assert open_for_review(store, "a").folder.spec.cameras[1].offset_frames == 2
-
-
-def test_a_match_that_cannot_be_read_hides_no_other_review(store, tmp_path):
-    for name in ("aa", "b"):
-        register(store, made(tmp_path / name, name), unfinished=True)
-    shutil.rmtree(tmp_path / "aa")
-    answer = said(store, "review", "list")
-    assert answer.exit_code == 0
-    assert answer.stderr.startswith(f"aa: match aa: expected its folder, registered as {tmp_path}")
-    assert "nothing waits" in answer.stdout  # though cam1 of b is not clicked yet
-    as_json = json.loads(said(store, "review", "list", "--json").stdout)
-    assert as_json["reviews"] == [] and list(as_json["problems"]) == ["aa"]
-    assert said(store, "review", "list", "aa").exit_code == 1
 
 
 @pytest.mark.parametrize(
@@ -179,16 +165,6 @@ def test_an_option_that_a_scenario_does_not_have_is_refused(tmp_path, scenario, 
     assert isinstance(done.exception, UsageError)
     assert done.exception.where == option
     assert not (tmp_path / "out").exists()
-
-
-def test_a_misspelt_match_or_scenario_is_guessed(store, tmp_path):
-    register(store, made(tmp_path / "cup_final", "cup_final"), unfinished=True)
-    with pytest.raises(InputError, match=r"Did you mean 'cup_final'\? If not, register the match"):
-        find_registration(store, "cup_fnal")
-    with pytest.raises(InputError, match=r"found 'derby'\. Register the match"):
-        find_registration(store, "derby")
-    words = ["simulate", "--scenario", "tinny", "--out", str(tmp_path / "out")]
-    assert "Did you mean 'tiny'?" in str(CliRunner().invoke(app, words).exception)
 
 
 def test_a_match_whose_folder_has_moved_says_how_it_goes_on_and_does(store, tmp_path):

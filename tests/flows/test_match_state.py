@@ -20,12 +20,6 @@ from flows.review.verdicts import decide, withdraw
 from flows.run_plan import plan_run
 from flows.run_record import describe_end
 from flows.running import RunRequest, run_match
-from worldpose.store.store import Store
-
-
-@pytest.fixture
-def store(project_copy):
-    return Store.open(str(project_copy))
 
 
 def say(store, **edits):

@@ -1,8 +1,6 @@
 """Lineage of a run as OpenLineage events, checked against the published schema."""
 
 import json
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
 
 import pytest
 from command_line import TINY
@@ -53,44 +51,21 @@ def test_every_result_leads_back_to_the_files_of_the_match(store, record):
     assert len({each["run"]["facets"]["parent"]["run"]["runId"] for each in events}) == 1
 
 
-@pytest.fixture
-def receiver():
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_POST(self):
-            body = self.rfile.read(int(self.headers["content-length"]))
-            self.server.got.append((self.path, self.headers["authorization"], json.loads(body)))
-            self.send_response(self.server.code)
-            self.send_header("content-length", "0")
-            self.end_headers()
-
-        def log_message(self, *arguments):
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.got, server.code = [], 201
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield server
-    server.shutdown()
-    server.server_close()
-
-
-def test_events_go_to_a_server_or_a_file(store, record, receiver, tmp_path, monkeypatch, caplog):
+def test_events_go_to_a_server_or_a_file(store, record, webhook, tmp_path, monkeypatch, caplog):
     tell_lineage(store, record)  # nothing is set, nothing is sent
     events = list(lineage_events(store, record))
-    monkeypatch.setenv("OPENLINEAGE_URL", f"http://127.0.0.1:{receiver.server_port}")
+    monkeypatch.setenv("OPENLINEAGE_URL", webhook.base)
     monkeypatch.setenv("OPENLINEAGE_API_KEY", "secret")
     tell_lineage(store, record)
-    assert [body for _, _, body in receiver.got] == events
-    assert {each[:2] for each in receiver.got} == {("/api/v1/lineage", "Bearer secret")}
+    assert [body for _, body in webhook.posted] == events
+    assert {*webhook.asked} == {("/api/v1/lineage", "Bearer secret")}
     monkeypatch.setenv("OPENLINEAGE_URL", f"file://{tmp_path}/lineage.ndjson")
     tell_lineage(store, record)
     lines = (tmp_path / "lineage.ndjson").read_text().splitlines()
     assert [json.loads(each) for each in lines] == events
     assert caplog.messages == []
-    receiver.code = 500
-    for address in (f"http://127.0.0.1:{receiver.server_port}", "http://127.0.0.1:9", "ftp://h"):
+    webhook.codes = [500] * 9
+    for address in (webhook.base, "http://127.0.0.1:9", "ftp://h"):
         monkeypatch.setenv("OPENLINEAGE_URL", address)
         tell_lineage(store, record)
     assert len(caplog.messages) == 3

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from camera_builders import look_at_camera
 from command_line import succeed
+from imported_people import import_people, seen_by
 
-from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.lens_models import LensModel
@@ -22,34 +22,12 @@ LENSES = {
 }
 
 
-def coco(camera, joints, rng):
-    """COCO results of two people (frames, 2, 17, 3) [m], with noise."""
-    frames, people = joints.shape[:2]
-    pixels = camera.project(joints.reshape(-1, 3)).reshape(*joints.shape[:3], 2)
-    pixels += rng.normal(0.0, NOISE_PX, pixels.shape)
-    size = camera.image_size
-    inside = ((pixels >= 0) & (pixels <= size - 1)).all(axis=-1)
-    points = np.where(inside[..., None], np.insert(pixels, 2, 0.9, axis=-1), 0.0)
-    return [
-        {
-            "image_id": frame,
-            "category_id": 1,
-            "keypoints": points[frame, person].ravel().round(3).tolist(),
-            "score": 0.9,
-        }
-        for frame in range(frames)
-        for person in range(people)
-        if inside[frame, person].sum() > 8
-    ]
-
-
 @pytest.fixture(scope="module")
 def exported(server, tiny, tmp_path_factory):
     """The true cameras and joints, and the folder of exports."""
     folder = tmp_path_factory.mktemp("lenses")
     joints = read_joints(tiny / "reference" / "joints.npz").joints[:, :2]
-    middle = joints.mean(axis=(0, 1, 2))
-    cameras = {}
+    middle, cameras = joints.mean(axis=(0, 1, 2)), {}
     for turn, (name, (model, lens)) in enumerate(LENSES.items()):
         away = np.array([np.cos(2.1 * turn), np.sin(2.1 * turn)])
         place = [*(middle[:2] + 14.0 * away), 5.0]
@@ -58,17 +36,8 @@ def exported(server, tiny, tmp_path_factory):
         camera = look_at_camera(place, aim, 800.0)
         cameras[name] = replace(camera, distortion=np.array(lens), lens_model=model)
     rng = np.random.default_rng(0)
-    (folder / "poses").mkdir()
-    for name, camera in cameras.items():
-        (folder / "poses" / f"{name}.json").write_text(json.dumps(coco(camera, joints, rng)))
-    records = {name: camera.to_calibration(name) for name, camera in cameras.items()}
-    write_calibration_toml(folder / "calibration.toml", records)
-    match, out = folder / "match", folder / "out"
-    succeed(
-        *("import", "--calibration", folder / "calibration.toml", "--detections"),
-        *(folder / "poses", "--fps", 50, "--out", match),
-    )
-    assert not (match / "reference").exists()
+    pixels = {name: seen_by(each, joints, rng, NOISE_PX) for name, each in cameras.items()}
+    match, out = import_people(folder, cameras, pixels, 50), folder / "out"
     succeed("run", match, "--project", folder / "project")
     formats = ("joints", "worldpose", "coco", "gltf", "viewer")
     asked = [word for form in formats for word in ("--format", form)]
@@ -92,21 +61,18 @@ def test_joints_of_fisheye_cameras_are_within_the_noise_of_the_truth(exported):
 def test_exports_say_the_lens_and_independent_readers_find_the_pixels(exported):
     cameras, _, out = exported
     errors = json.loads((out / "lens_errors.json").read_text())
-    assert {name: each["lens_model"] for name, each in errors.items()} == {
-        name: model.label for name, (model, _) in LENSES.items()
-    }
     (scene,) = (out / "scenes").glob("*.glb")
     blob = scene.read_bytes()
     document = json.loads(blob[20 : 20 + int.from_bytes(blob[12:16], "little")])
     extras = {each["name"]: each.get("extras", {}) for each in document["nodes"]}
     for name, camera in cameras.items():
+        model = LENSES[name][0].label
+        assert errors[name]["lens_model"] == extras[name]["lens_model"] == model
         points = camera.unproject(np.array([[500.0, 400.0], [1300.0, 800.0]]))
         world = points.origins + 15.0 * points.directions
         released = read_camera(out / "cameras" / f"{name}.npz")
         off = np.linalg.norm(released.project(world) - camera.project(world), axis=1).max()
         assert off < errors[name]["max_error_px"] + 1.5  # and the adjusted camera's own change
-        model = LENSES[name][0].label
-        assert extras[name]["lens_model"] == model
         lens = next(v for k, v in extras[name].items() if k.startswith("distortion"))
         function = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
         matrix = np.diag([*camera.focal, 1.0])

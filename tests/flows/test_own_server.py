@@ -93,25 +93,6 @@ def require_answers_for_its_run_alone():
     return login
 
 
-def test_a_database_is_copied_and_kept_only_where_there_is_none_and_a_place(tmp_path, kept):
-    keep_database(tmp_path)  # there is none: it is elsewhere
-    assert not kept.exists()
-    kept.parent.mkdir()
-    kept.write_bytes(b"empty")
-    (tmp_path / DATABASE).write_bytes(b"full")
-    assert not begin_database(tmp_path)
-    assert (tmp_path / DATABASE).read_bytes() == b"full"
-    assert not begin_database(tmp_path / "copied")
-    files = [at / DATABASE for at in (tmp_path, tmp_path / "copied")]
-    assert [file.stat().st_mode & 0o777 for file in files] == [0o600, 0o600]
-    kept.unlink()
-    kept.parent.rmdir()
-    kept.parent.touch()  # a file where the folder should be: every server makes its own
-    keep_database(tmp_path)
-    assert begin_database(tmp_path / "another")
-    assert (tmp_path / "another" / DATABASE).stat().st_mode & 0o777 == 0o600
-
-
 def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
     (tmp_path / "prefect").touch()  # a file where the folder should be
     with (
@@ -119,20 +100,6 @@ def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
         prefect_server(str(tmp_path), is_local=True),
     ):
         pass
-
-
-def test_one_authority_is_read_by_those_on_this_machine_who_talk_plainly(tmp_path, monkeypatch):
-    monkeypatch.delenv(AUTHORITIES, raising=False)
-    file = one_authority(tmp_path)[AUTHORITIES]
-    assert len(ssl.create_default_context(cafile=file).get_ca_certs()) == 1
-    own = {"prefect": "http://127.0.0.1:4200/api"}
-    plan = ServePlan(project=str(tmp_path), inbox=tmp_path, state=tmp_path, **own)
-    assert AUTHORITIES in environment_of(plan)
-    # Workers elsewhere do not see the file, and another's server may be one with TLS.
-    for other in ({"dask": "tcp://far:8786"}, {"owns_prefect": False}):
-        assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
-    monkeypatch.setenv(AUTHORITIES, "/of/somebody.pem")
-    assert one_authority(tmp_path)[AUTHORITIES] == "/of/somebody.pem"
 
 
 def test_a_prefect_server_without_a_login_does_not_start():
@@ -153,21 +120,11 @@ def test_a_server_that_asks_for_another_login_is_named(server, monkeypatch):
 
 
 def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
-    given = {
-        "WORLDPOSE_ALERT_URL": "https://hook",
-        "WORLDPOSE_ALERT_MAIL": "smtps://user:password@host",
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "PREFECT_API_DATABASE_CONNECTION_URL": "postgresql://user:password@host",
-        "GITHUB_TOKEN": "token",
-        "OPENAI_API_KEY": "key",
-        "PGPASSWORD": "password",
-        "WORLDPOSE_REVIEW_TOKEN": "of the terminal",
-    }
-    # Names that tell nothing of secrets.
-    given |= dict.fromkeys(
-        ("MYSQL_PWD", "GH_PAT", "SLACK_HOOK", "AZURE_STORAGE_KEY", "NPM_AUTH"), "x"
-    )
+    database = "PREFECT_API_DATABASE_CONNECTION_URL"
+    secret = "WORLDPOSE_ALERT_URL WORLDPOSE_ALERT_MAIL AWS_ACCESS_KEY_ID AWS_SECRET_ACCESS_KEY"
+    secret += f" GITHUB_TOKEN PGPASSWORD WORLDPOSE_REVIEW_TOKEN {database}"
+    secret += " MYSQL_PWD GH_PAT SLACK_HOOK"  # names that tell nothing of secrets
+    given = {name: f"of {name}" for name in secret.split()}
     harmless = {"AWS_REGION": "eu", "TOKENIZERS_PARALLELISM": "false", "LC_ALL": "C.UTF-8"}
     cloud = [name for name in os.environ if name.startswith("AWS_")]
     for name in (CLIENT_LOGIN, SERVER_LOGIN, METRICS_TOKEN, *cloud):
@@ -187,7 +144,6 @@ def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
     login, metrics = secrets.prefect, secrets.metrics
     cloud = {name: value for name, value in given.items() if name.startswith("AWS")}
     region = {"AWS_REGION": "eu"}
-    database = "PREFECT_API_DATABASE_CONNECTION_URL"
     alerts = {name: value for name, value in given.items() if "ALERT" in name}
     client = {CLIENT_LOGIN: login}
     expected = {
@@ -247,13 +203,6 @@ def test_own_workers_serve_their_run_alone():
                 connection.getresponse()
 
 
-def test_a_worker_that_somebody_starts_reports_its_use_to_nobody(monkeypatch):
-    monkeypatch.delenv("DO_NOT_TRACK", raising=False)
-    command = "import os, tasks.preload; print(os.environ['DO_NOT_TRACK'])"
-    said = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
-    assert said.stdout == "1\n"
-
-
 def test_workers_collect_no_garbage_until_they_have_imported_all():
     stopped = []
     try:
@@ -268,3 +217,36 @@ def test_workers_collect_no_garbage_until_they_have_imported_all():
     finally:
         gc.enable()
         gc.unfreeze()
+
+
+def test_one_authority_is_read_by_those_on_this_machine_who_talk_plainly(tmp_path, monkeypatch):
+    monkeypatch.delenv(AUTHORITIES, raising=False)
+    file = one_authority(tmp_path)[AUTHORITIES]
+    assert len(ssl.create_default_context(cafile=file).get_ca_certs()) == 1
+    own = {"prefect": "http://127.0.0.1:4200/api"}
+    plan = ServePlan(project=str(tmp_path), inbox=tmp_path, state=tmp_path, **own)
+    assert AUTHORITIES in environment_of(plan)
+    # Workers elsewhere do not see the file, and another's server may be one with TLS.
+    for other in ({"dask": "tcp://far:8786"}, {"owns_prefect": False}):
+        assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
+    monkeypatch.setenv(AUTHORITIES, "/of/somebody.pem")
+    assert one_authority(tmp_path)[AUTHORITIES] == "/of/somebody.pem"
+
+
+def test_a_database_is_copied_and_kept_only_where_there_is_none_and_a_place(tmp_path, kept):
+    keep_database(tmp_path)  # there is none: it is elsewhere
+    assert not kept.exists()
+    kept.parent.mkdir()
+    kept.write_bytes(b"empty")
+    (tmp_path / DATABASE).write_bytes(b"full")
+    assert not begin_database(tmp_path)
+    assert (tmp_path / DATABASE).read_bytes() == b"full"
+    assert not begin_database(tmp_path / "copied")
+    files = [at / DATABASE for at in (tmp_path, tmp_path / "copied")]
+    assert [file.stat().st_mode & 0o777 for file in files] == [0o600, 0o600]
+    kept.unlink()
+    kept.parent.rmdir()
+    kept.parent.touch()  # a file where the folder should be: every server makes its own
+    keep_database(tmp_path)
+    assert begin_database(tmp_path / "another")
+    assert (tmp_path / "another" / DATABASE).stat().st_mode & 0o777 == 0o600

@@ -1,7 +1,6 @@
 """Corrections of a match on its page: in groups, with first clicks apart, and undone together."""
 
 from datetime import timedelta
-from itertools import pairwise
 
 import page_client
 import pytest
@@ -9,10 +8,8 @@ from command_line import TINY
 from long_journal import SESSION, write_corrections
 from page_client import MATCH
 
-from data_contracts.review import MovedPoint, Withdrawal
+from data_contracts.review import Withdrawal
 from flows.registering import open_for_review, register
-from flows.review.corrections import keep_edits
-from flows.web.browser_words import in_browser
 from flows.web.corrections import SESSION_GAP
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
@@ -67,39 +64,6 @@ def test_a_group_is_undone_as_a_whole_and_only_as_it_was_seen(store, ada):
     assert {each.why for each in journal.entries[-1].records} == {"wrong camera"}
     assert ada.post(path, json={"count": last["count"]}).status_code == 409
     assert ada.post(f"{MATCH}/corrections/none/withdrawal", json={"count": 0}).status_code == 409
-
-
-def test_first_clicks_are_no_corrections(store, ada):
-    clicked = open_for_review(store, TINY).folder.clicked["cam01"].points[0]
-    places = [(clicked.xy[0] + n, clicked.xy[1]) for n in range(3)]
-    for number, (was, xy) in enumerate(pairwise(places)):
-        edit = MovedPoint(camera="cam01", marking=clicked.name, was=was, xy=xy)
-        keep_edits(
-            store, lambda: open_for_review(store, TINY), {f"m.{number}": edit}, who="Ada", note=""
-        )
-    (match,) = ada.get("/api/matches").json()["matches"]
-    assert (match["corrections"], match["first_clicks"]) == (0, 2)
-    (group,) = groups(ada)
-    assert (group["is_first"], group["count"], group["owner"]) == (True, 2, "cam01")
-
-
-@pytest.mark.parametrize(
-    ("said", "shown"),
-    [
-        ("It is dark.", "It is dark."),
-        ("Run it first: worldpose run final.", "Run the match on its page."),
-        ("Read with `worldpose review show`, continue.", "The page of the match shows what waits."),
-        ("Use --set a.click_noise_px=2.", "Ask the operator of this service."),
-        (
-            "It moved. Run worldpose run x --gates auto. It is late.",
-            "It moved. Run the match on its page. It is late.",
-        ),
-        ("The clocks differ (worldpose synchronize)", "The clocks differ"),
-        ("the worldpose-data folder", "the worldpose-data folder"),
-    ],
-)
-def test_a_page_names_no_command(said, shown):
-    assert in_browser(said) == shown
 
 
 def test_an_undo_that_is_repeated_is_done_and_goes_on_to_the_one_before(ada, store):

@@ -10,11 +10,10 @@ import cv2
 import numpy as np
 import page_client
 import pytest
-import yaml
 
 from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of
-from flows.web.access import Access, User, access_for
+from flows.web.access import access_for
 from flows.web.app import create_app
 from flows.web.drafts import SPARE_BYTES
 from flows.web.intake import CHUNK_BYTES, Intake
@@ -170,24 +169,6 @@ def test_an_upload_survives_a_reload_and_a_restart(place, footage):
     assert other != file
 
 
-def test_the_form_has_the_messages_of_match_yaml_at_its_fields(place, footage):
-    ada = open_pages(place)
-    _, view = upload(ada, footage)
-    name = view["files"][0]["name"]
-    wrong = a_match(name, camera={"id": "near left", "heigth": 64, "offset_frames": "3"}, fps=0)
-    said = {each["place"]: each["message"] for each in save(ada, view, wrong).json()["problems"]}
-    assert set(said) == {"fps", "cameras[0].id", "cameras[0].heigth", "cameras[0].offset_frames"}
-    assert "Did you mean 'height'?" in said["cameras[0].heigth"]
-    folder = place / "by hand"
-    folder.mkdir()
-    (folder / "match.yaml").write_text(yaml.safe_dump(wrong))
-    with pytest.raises(Exception, match="Did you mean 'height'") as error:
-        read_match(folder)
-    assert said["cameras[0].heigth"].removesuffix(".") in str(error.value)
-    # Another page had the form open before: it must not overwrite.
-    assert save(ada, view, a_match(name)).status_code == 409
-
-
 CONTRADICTIONS = [
     ({"camera": {"video": None}}, "file", "belongs to no camera"),
     ({"camera": {"width": 100}}, "cameras[0].video", "expected 100 x 64 px"),
@@ -319,23 +300,6 @@ def test_files_of_other_tools_become_calibration_clicks_and_poses(place, footage
     assert match.calibrations["near_left"].focal_px == (100.0, 100.0)
     assert match.clicked["near_left"].points[0].xy == (39.5, 29.5)  # the image begins at a corner
     assert not (place / "inbox" / "final" / "given").exists()
-
-
-def test_a_still_of_another_size_is_said_at_its_field(place, footage):
-    ada = open_pages(place)
-    draft, _ = upload(ada, footage)
-    view = add_still(ada, draft, (SIZE[0] + 2, SIZE[1]))
-    video, still = view["files"]
-    view = save(ada, view, a_match(video["name"], camera={"still": still["name"]})).json()
-    (problem,) = view["problems"]
-    assert problem["place"] == "cameras[0].still"
-    assert "expected 96 x 64 px" in problem["message"]
-    assert "found 98 x 64" in problem["message"]
-    # A file that is no image is none, whatever is chosen.
-    content = a_match(video["name"], camera={"still": video["name"]})
-    ada.post(f"{DRAFTS}/{draft}/files/{still['id']}/removal", json={})
-    (problem,) = save(ada, view, content).json()["problems"]
-    assert "expected an image of at most" in problem["message"]
 
 
 def test_frames_of_an_uploaded_video_are_shown(place, footage):
@@ -472,39 +436,3 @@ def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, 
     assert ada.get(DRAFTS).json() == {"drafts": []}
     assert not folder.exists()
     assert (place / "inbox" / "final" / "match.yaml").exists()
-
-
-def test_only_an_approver_creates_a_match(place):
-    roles = ("viewer", "annotator", "approver")
-    users = {role: User(role=role, token=f"the token of {role}") for role in roles}
-    access = Access(page_client.TOKEN, users=users)
-    app = create_app(str(place / "project"), access, Intake(place / "inbox"))
-    for role, status in (("viewer", 403), ("annotator", 403), ("approver", 200)):
-        browser = page_client.browser(app)
-        given = {"who": role, "token": f"the token of {role}"}
-        assert browser.post("/api/login", json=given).status_code == 200
-        secret = browser.get("/api/session").json()["form_secret"]
-        browser.headers["x-form-secret"] = secret
-        assert browser.post(DRAFTS, json={}).status_code == status
-        assert put(browser, "0" * 16, "a", 0, b"abc").status_code == (422 if status == 200 else 403)
-        # A group of corrections is withdrawn by those who correct: of a match that is not there.
-        path = "/api/matches/none/corrections/a/withdrawal"
-        expected = 403 if role == "viewer" else 404
-        assert browser.post(path, json={"count": 1}).status_code == expected
-
-
-def test_a_fault_of_the_server_is_shown_at_the_file_and_not_repeated(place, footage, monkeypatch):
-    asked = []
-
-    def fail(path):
-        asked.append(path)
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr("flows.web.drafts.index_frames", fail)
-    browser = open_pages(place)
-    draft, file_id, _ = begin(browser, footage)
-    assert put(browser, draft, file_id, 0, footage.read_bytes()).status_code == 200
-    (file,) = settle(browser, draft, "broken")["files"]
-    assert "RuntimeError" in file["problem"] and "log" in file["problem"]
-    settle(browser, draft, "broken")
-    assert len(asked) == 1

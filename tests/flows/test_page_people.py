@@ -95,20 +95,6 @@ def test_other_cameras_say_where_they_expect_a_keypoint(reader, tiny_run):
         assert (answer["here"]["error"][joint] > 5.0) == (least > 0)
 
 
-def test_of_a_person_whom_nobody_follows_the_other_cameras_show_only_the_ray(reader, tiny_run):
-    frame, _, seen = seen_by_two(tiny_run)
-    camera = next(iter(seen))
-    nobody = {"frame": frame, "detection": 999}
-    path = f"{MATCH}/detections/{camera}/views"
-    assert reader.get(path, params=nobody).json()["views"] == []
-    found = reader.get(path, params={**nobody, "joint": 0, "x": 960.0, "y": 600.0}).json()
-    assert found["person"] is None
-    assert found["views"]
-    assert all(each["curves"] and each["detection"] == -1 for each in found["views"])
-    assert reader.get(path, params={**nobody, "joint": 17}).json()["views"] == []
-    assert reader.get(f"{MATCH}/detections/nowhere/views", params=nobody).json()["views"] == []
-
-
 def test_an_added_person_is_in_all_that_follows(ada, bob, project_copy):
     store = Store.open(str(project_copy))
     frame = int(open_run(str(project_copy), TINY)["ingest/cam00"]["frame"].values[3])

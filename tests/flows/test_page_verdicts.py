@@ -88,33 +88,6 @@ def test_a_run_that_is_answered_while_it_ends_is_run_once_more(project_copy, tmp
     assert runs.state(TINY)["code"] == 0
 
 
-def test_a_run_at_work_says_how_far_it_is(project_copy, tmp_path, monkeypatch):
-    gate = tmp_path / "gate"
-    lines = (
-        "    1.0 s  tracking: 2 of 2 to compute: who is who",
-        "    9.0 s    tracking/clip               8.0 s        50 % 8 s      31 % 18 s",
-    )
-    script = (
-        "import pathlib, time\n"
-        f"print({chr(10).join(lines)!r}, flush=True)\n"
-        f"while not pathlib.Path({str(gate)!r}).exists(): time.sleep(0.01)\n"
-    )
-    monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", script])
-    monkeypatch.delenv("PREFECT_API_URL", raising=False)
-    runs = Continuing(Store.open(str(project_copy)))
-    runs.go_on(TINY)
-    end = time.monotonic() + 60.0
-    while (state := runs.state(TINY)).get("percent") != 31.0:
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    said = {"lines": ["tracking, 18 s left"], "percent": 31.0, "stage": "tracking"}
-    assert state == {"state": "running", **said}
-    gate.touch()
-    while runs.state(TINY)["state"] != "ended":
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def test_an_empty_verdict_approves_nothing(ada, project_copy, going_on):
     waiting(Store.open(str(project_copy)))
     name = ada.get(MATCH).json()["reviews"][0]["id"]

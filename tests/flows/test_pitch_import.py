@@ -1,15 +1,11 @@
 """`worldpose import` of a surveyed pitch and of clicks: match files, or a clear message."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from command_line import succeed, worldpose
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.pitch import PitchSpec
-from flows.stages import tracking
 from worldpose.pitch.template import PitchTemplate
 
 NAMES = (
@@ -57,31 +53,6 @@ def test_a_survey_in_feet_is_refused_and_nothing_is_written(survey, tmp_path):
     assert not (tmp_path / "match").exists()
 
 
-@pytest.mark.parametrize("named", ["none", "survey.json"])
-def test_a_survey_that_no_run_would_read_is_refused_and_nothing_is_written(survey, tmp_path, named):
-    match = tmp_path / "lab"
-    match.mkdir()
-    (match / "match.yaml").write_text(f"match_id: lab\npitch: {named}\n")
-    answer = worldpose("import", "--pitch", survey, "--out", match)
-    assert answer.code == 1
-    told = f"match.yaml: pitch: expected no `pitch: {named}` where pitch.json lies, found both"
-    assert told in answer.err
-    assert [path.name for path in match.iterdir()] == ["match.yaml"]
-
-
-@pytest.mark.parametrize("more", [["--fps", 25], ["--detections", "x"]])
-def test_a_pitch_is_imported_on_its_own(survey, tmp_path, more):
-    answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match", *more)
-    assert answer.code == 2
-    assert "--pitch with --out alone" in answer.err
-
-
-def test_a_match_needs_its_calibration_and_detections(tmp_path):
-    answer = worldpose("import", "--out", tmp_path / "match", "--fps", 25)
-    assert answer.code == 2
-    assert "--calibration with --detections and --fps or with --videos" in answer.err
-
-
 def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
     folder = tmp_path / "m"
     folder.mkdir()
@@ -101,14 +72,3 @@ def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
     assert "'halfway_far' is clicked at (10, 20) and at (30, 40). Which one is meant?" in done.err
     assert (folder / "annotations" / "static_calibration" / "east.json").is_file()
     assert worldpose(*command, "--fps", "25").code == 2
-
-
-def test_the_tracker_knows_the_areas_of_a_small_pitch():
-    camera, clip = CameraSpec(id="cam", width=1920, height=1080), ClipSpec(id="clip", frame_count=1)
-    spec = MatchSpec(match_id="m", fps=25, cameras=(camera,), clips=(clip,))
-    areas = {"penalty_area_depth": 10.0, "penalty_area_width": 24.0, "goal_area_depth": 0.0}
-    areas["penalty_mark_distance"] = 8.0
-    small = PitchSpec(length=60.0, width=40.0, any_size=True, dimensions=areas)
-    folder = SimpleNamespace(pitch=small, spec=spec, detections={}, videos={})
-    given = tracking.sources(SimpleNamespace(corrections=(), folder=folder), "clip")["pitch"]
-    assert PitchTemplate.from_spec(PitchSpec(any_size=True, **given)).length == 60.0

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from datetime import UTC, datetime
 
 import pytest
@@ -16,34 +15,13 @@ from rich.console import Console
 
 from flows import progress
 from flows.cli import console
-from flows.progress import MOST_TOLD, Reporter
+from flows.progress import Reporter
 from flows.registering import open_match
 from flows.run_plan import plan_run
 from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
 from flows.web.app_context import read_progress
 from worldpose.store.documents import seal
 from worldpose.store.store import Store
-
-
-class Heard(Reporter):
-    """Keeps the units that it would tell of."""
-
-    def __init__(self):
-        self.told = []
-
-    def tell_of(self, unit, seconds, figures):
-        self.told.append(unit)
-
-
-@pytest.mark.parametrize(("units", "told"), [(1, 1), (200, 200), (201, 101), (5000, 200)])
-def test_of_very_many_units_some_are_told_of_and_the_last_is(units, told):
-    heard = Heard()
-    heard.stage_started("ingest", "take in", units=units, missing=units)
-    for number in range(units):
-        heard.unit_done(f"ingest/c{number}", 0.1, {})
-    assert len(heard.told) == told <= MOST_TOLD
-    assert heard.told[-1] == f"ingest/c{units - 1}"
-    assert heard.left == 0
 
 
 @pytest.fixture
@@ -55,7 +33,7 @@ def clock(monkeypatch):
 
 
 def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
-    heard = Heard()
+    heard = Reporter()
     heard.run_planned({"ingest": 10.0, "tracking": 30.0})
     heard.stage_started("registration", "all there", units=2, missing=0)
     assert str(heard.run_progress) == "0 %"  # nothing was to be computed so far
@@ -79,24 +57,6 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     assert str(heard.run_progress) == "62 % 14 s"
     heard.unit_done("tracking/b", 5.0, {})
     assert str(heard.run_progress) == str(heard.stage_progress) == "100 %"
-
-
-@pytest.mark.parametrize("verbose", [False, True])
-def test_a_unit_is_one_line_of_80_columns_with_metrics_only_if_asked_for(verbose, monkeypatch):
-    terminal = Console(width=80, force_terminal=True, record=True, file=io.StringIO())
-    monkeypatch.setattr(console, "errors", terminal)
-    reporter = console.ConsoleReporter(verbose=verbose)
-    reporter.run_planned({"broadcast_calibration": 7200.0, "tracking": 9e5})
-    reporter.stage_started("broadcast_calibration", "a " * 60, units=300, missing=200)
-    name = "broadcast_calibration/a_clip_with_a_name_of_many_characters"
-    reporter._began = reporter._stage_began = time.monotonic() - 7000.0
-    reporter.unit_done(name, 5432.1, {"clicks_wrong": 1.0, "cam01.error_px": 2.0})
-    lines = terminal.export_text().splitlines()
-    assert len(lines) == 3 + verbose
-    assert all(len(each) <= 80 for each in lines), lines
-    row = r"broadcast_ca…y_characters 5432\.1 s +1 % 16 d +0 % 772 d$"
-    assert re.search(row, lines[2]), lines
-    assert ("clicks that contradict the others 1" in lines[-1]) == verbose
 
 
 def test_expected_work_comes_from_the_latest_run(project_copy):

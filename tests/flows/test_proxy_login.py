@@ -1,28 +1,15 @@
 """A proxy in front of the pages logs people in, and only the named one is believed."""
 
-import base64
-import http.client
-import http.server
-import json
-import os
-import shutil
-import subprocess
-import threading
 import time
-import urllib.error
-import urllib.request
-from contextlib import contextmanager
 
+import httpx
 import page_client
 import pytest
 from command_line import TINY
-from page_client import HERE, MATCH, TOKEN, a_click, free_port, moved
-from service import wait_until
-from starlette.datastructures import Headers
+from page_client import HERE, MATCH, TOKEN, a_click, moved
 
 from flows.web.access import access_for
 from flows.web.app import create_app
-from flows.web.proxy import Proxy
 from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
@@ -145,14 +132,6 @@ def test_who_is_not_the_named_proxy_names_nobody(pages):
             assert visitor.get("/api/session", headers=forged).status_code == 401
 
 
-def test_a_name_that_is_no_text_names_nobody():
-    proxy = Proxy(addresses=["10.1.2.3"], roles={"staff": "viewer"})
-    for name, who in (("Ömer".encode(), "Ömer"), (b"Dora\xff", None)):
-        raw = [(b"x-forwarded-user", name), (b"x-forwarded-groups", b"staff")]
-        found = proxy.visitor({"client": ("10.1.2.3", 1)}, Headers(raw=raw))
-        assert (None if found is None else found.who) == who
-
-
 def test_a_session_of_the_proxy_opens_nothing_past_it(pages):
     dora = client(pages)
     cookie = dora.get("/", headers=named("Dora")).headers["set-cookie"].partition(";")[0]
@@ -187,142 +166,14 @@ def test_a_bad_table_of_the_proxy_is_refused(old, new, problem, tmp_path):
     assert SECRET not in str(refusal.value)
 
 
-class LoggingIn(http.server.BaseHTTPRequestHandler):
-    """A proxy that asks for a name by HTTP Basic and passes it on with the person's groups."""
-
-    upstream = ("127.0.0.1", 0)
-
-    def do_GET(self):
-        given = self.headers.get("authorization", "").removeprefix("Basic ")
-        who = base64.b64decode(given).decode().partition(":")[0]
-        if who not in GROUPS:
-            self.send_error(401)
-            return
-        dropped = {"authorization", *map(str.lower, named("Dora"))}
-        kept = {k: v for k, v in self.headers.items() if k.lower() not in dropped}
-        body = self.rfile.read(int(self.headers.get("content-length", 0)))
-        connection = http.client.HTTPConnection(*self.upstream)
-        connection.request(self.command, self.path, body, {**kept, **named(who)})
-        answer = connection.getresponse()
-        content = answer.read()
-        self.send_response(answer.status)
-        for name, value in answer.getheaders():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(content)
-
-    def do_POST(self):
-        self.do_GET()
-
-    def log_message(self, *arguments):
-        pass
-
-
-@contextmanager
-def python_proxy(upstream, folder):
-    handler = type("Proxy", (LoggingIn,), {"upstream": ("127.0.0.1", upstream)})
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield server.server_port
-    server.shutdown()
-    server.server_close()
-
-
-@contextmanager
-def nginx(upstream, folder):
-    """nginx that passes the headers of docs/how-to/review.md, with names of a file for OpenID."""
-    if shutil.which("nginx") is None:
-        pytest.skip("nginx is not installed")
-    port = free_port()
-    folder.chmod(0o755)
-    people = folder / "people"
-    people.write_text("".join(f"{who}:{{PLAIN}}word\n" for who in GROUPS), encoding="utf-8")
-    groups = "\n".join(f'"{who}" "{listed}";' for who, listed in GROUPS.items())
-    config = folder / "nginx.conf"
-    config.write_text(
-        f"""
-daemon off; pid {folder}/nginx.pid; error_log {folder}/error.log; events {{}}
-http {{
-  access_log off; client_body_temp_path {folder}/body; proxy_temp_path {folder}/proxy;
-  fastcgi_temp_path {folder}/f; uwsgi_temp_path {folder}/u; scgi_temp_path {folder}/s;
-  map $remote_user $groups {{ {groups} }}
-  server {{
-    listen 127.0.0.1:{port};
-    location / {{
-      auth_basic "worldpose"; auth_basic_user_file {people};
-      proxy_pass http://127.0.0.1:{upstream};
-      proxy_set_header Host $http_host;
-      proxy_set_header Authorization "";
-      proxy_set_header X-Forwarded-User $remote_user;
-      proxy_set_header X-Forwarded-Groups $groups;
-      proxy_set_header X-Proxy-Secret "{SECRET}";
-    }}
-  }}
-}}
-""",
-        encoding="utf-8",
-    )
-    owner = ["-g", "user root;"] if os.geteuid() == 0 else []
-    server = subprocess.Popen(["nginx", "-c", config, *owner], stderr=subprocess.DEVNULL)
-    try:
-        yield port
-    finally:
-        server.terminate()
-        server.wait(30)
-
-
-def ask(port, path, who=None, body=None, **headers):
-    if who is not None:
-        headers["Authorization"] = "Basic " + base64.b64encode(f"{who}:word".encode()).decode()
-    data = None if body is None else json.dumps(body).encode()
-    headers["Content-Type"] = "application/json"
-    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", data, headers)
-    try:
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            content = answer.read()
-            return answer.status, content, answer.headers
-    except urllib.error.HTTPError as error:
-        return error.code, error.read(), error.headers
-
-
-@pytest.mark.parametrize("proxy", [python_proxy, nginx])
-def test_people_log_in_at_a_real_proxy(proxy, project_copy, tmp_path):
-    file = write_file(tmp_path)
-    with (
-        page_client.serving(project_copy, tmp_path, "--users", file) as base,
-        proxy(int(base.rpartition(":")[2]), tmp_path) as port,
-    ):
-        wait_until(lambda: ask(port, "/")[0] == 401)
-        assert ask(port, "/", "Eve")[0] == 401
-        for who, role in (("Dora", "approver"), ("Tom", "annotator"), ("Ömer", "viewer")):
-            code, _, headers = ask(port, "/", who)
-            assert code == 200, who
-            cookie = headers["set-cookie"].partition(";")[0]
-            # What a browser claims of itself does not reach the pages.
-            claimed = {"X-Forwarded-User": "Dora", "X-Forwarded-Groups": "directors"}
-            _, said, _ = ask(port, "/api/session", who, Cookie=cookie, **claimed)
-            session = json.loads(said)
-            assert (session["who"], session["role"]) == (who, role)
-            secret = {"Cookie": cookie, "X-Form-Secret": session["form_secret"]}
-            code, *_ = ask(port, f"{MATCH}/runs", who, {"no": 1}, **secret)
-            assert (code == 403) == (role != "approver"), who
-            code, *_ = ask(port, f"{MATCH}/corrections", who, {"no": 1}, **secret)
-            assert (code == 403) == (role == "viewer"), who
-            # Past the proxy the same headers and the cookie open nothing.
-            direct = int(base.rpartition(":")[2])
-            own = {"X-Forwarded-User": "Dora", "X-Forwarded-Groups": "directors", "Cookie": cookie}
-            assert ask(direct, "/api/session", **own)[0] == 401
-        code, said, _ = ask(port, "/", "Guest")
-        assert code == 403 and b"none of the groups of Guest" in said
-
-
 def test_another_address_named_by_a_client_does_not_allow_more_guesses(project_copy, tmp_path):
     with page_client.serving(project_copy, tmp_path) as base:
-        port = int(base.rpartition(":")[2])
         wrong = {"who": "Eve", "token": TOKEN + "x"}
         begun = time.monotonic()
         codes = [
-            ask(port, "/api/login", body=wrong, **{"X-Forwarded-For": f"10.0.0.{number}"})[0]
+            httpx.post(
+                f"{base}/api/login", json=wrong, headers={"X-Forwarded-For": f"10.0.0.{number}"}
+            ).status_code
             for number in range(8)
         ]
         assert time.monotonic() - begun < 10.0, "too slow to tell"

@@ -93,18 +93,3 @@ def test_shapes_of_a_named_person_are_pooled_over_clips(tiny, tmp_path):
     own, pooled = (np.trace(x["betas_covariance"].values[one]) for x in (before, again))
     # Another clip as long, with the detector's offsets in common.
     assert 0.3 * own < pooled < 0.95 * own
-
-
-def test_the_camera_at_its_clips_common_place_is_what_bodies_are_fitted_with(
-    tiny, tmp_path, monkeypatch
-):
-    match, _ = register(Store.create(tmp_path / "project"), tiny)
-    monkeypatch.setattr("flows.stages.broadcast_calibration.units", lambda match: ("clip",))
-    monkeypatch.setattr(
-        "flows.stages.detection.seen_in_broadcast", lambda match, unit: ("ingest/clip",)
-    )
-    assert "broadcast_calibration/clip" in REFITTING.inputs(match, "clip")
-    assert "broadcast_pooling/clip" not in REFITTING.inputs(match, "clip")
-    pooled = {"clip": ("clip", "other")}
-    monkeypatch.setattr("flows.stages.broadcast_calibration.pooled_clips", lambda match: pooled)
-    assert "broadcast_pooling/clip" in REFITTING.inputs(match, "clip")

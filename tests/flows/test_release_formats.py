@@ -197,28 +197,6 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
 
 
-def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_path):
-    results = {"body_fitting__A_1": bodies(), "broadcast_calibration__A_1": broadcast()}
-    with pytest.raises(InputError, match="none in 1 of 4, the first 3"):
-        write("slahmr-cameras", origin(match_folder, **results), tmp_path / "gap")
-    results["body_fitting__A_1"] = bodies().isel(frame=slice(0, 3))
-    path = write("slahmr-cameras", origin(match_folder, **results), tmp_path / "out")[1]
-    assert path.relative_to(tmp_path).as_posix() == "out/slahmr/cameras/A_1/shot-0/cameras.npz"
-    with np.load(path) as found:
-        w2c, (fx, fy, cx, cy) = found["w2c"][0], found["intrins"][0]
-        assert (int(found["width"]), int(found["height"]), float(found["focal"])) == (
-            1920,
-            1080,
-            4000.0,
-        )
-    # A head 1.8 m above a spot 3 m to the right and 5 m beyond the centre, y down there.
-    x, y, z, _ = w2c @ [3.0, -1.8, 5.0, 1.0]
-    # The camera stands at (0, -70, 2), looks along y.
-    assert (fx * x / z + cx, fy * y / z + cy) == pytest.approx(
-        (960 + 4000 * 3 / 75, 540 + 4000 * 0.2 / 75), abs=1e-9
-    )
-
-
 def tracked():
     """The data that tools' formats need: kinds of people, triangulated joints, fitted joints."""
     joints = np.random.default_rng(0).uniform(-20.0, 20.0, (4, 2, 17, 3))
@@ -317,3 +295,25 @@ def test_a_surface_with_terms_of_its_own_is_written_on_request_with_them(
     asked = replace(run, surface=True, licence="Terms of the model.")
     (path,) = write("gltf", asked, tmp_path / "asked")
     assert b'"skins"' in path.read_bytes() and b"Terms of the model." in path.read_bytes()
+
+
+def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_path):
+    results = {"body_fitting__A_1": bodies(), "broadcast_calibration__A_1": broadcast()}
+    with pytest.raises(InputError, match="none in 1 of 4, the first 3"):
+        write("slahmr-cameras", origin(match_folder, **results), tmp_path / "gap")
+    results["body_fitting__A_1"] = bodies().isel(frame=slice(0, 3))
+    path = write("slahmr-cameras", origin(match_folder, **results), tmp_path / "out")[1]
+    assert path.relative_to(tmp_path).as_posix() == "out/slahmr/cameras/A_1/shot-0/cameras.npz"
+    with np.load(path) as found:
+        w2c, (fx, fy, cx, cy) = found["w2c"][0], found["intrins"][0]
+        assert (int(found["width"]), int(found["height"]), float(found["focal"])) == (
+            1920,
+            1080,
+            4000.0,
+        )
+    # A head 1.8 m above a spot 3 m to the right and 5 m beyond the centre, y down there.
+    x, y, z, _ = w2c @ [3.0, -1.8, 5.0, 1.0]
+    # The camera stands at (0, -70, 2), looks along y.
+    assert (fx * x / z + cx, fy * y / z + cy) == pytest.approx(
+        (960 + 4000 * 3 / 75, 540 + 4000 * 0.2 / 75), abs=1e-9
+    )

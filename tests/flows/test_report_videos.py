@@ -1,8 +1,5 @@
 """Which camera's video lies beside the page, and what is loaded before a thread films it."""
 
-import json
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -10,35 +7,6 @@ import pytest
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.report import write_report
 from worldpose.errors import UsageError
-
-REPORT = """
-import json, sys, threading
-from flows.cli import main
-from flows.reports import report
-
-report._own_reference = lambda match: None  # scoring would import what the page needs
-imported = []
-
-def note_import(event, arguments):
-    if event == "import" and threading.current_thread() is not threading.main_thread():
-        imported.append(arguments[0].partition(".")[0])
-
-sys.addaudithook(note_import)
-try:
-    main()
-finally:
-    print(json.dumps(sorted(set(imported))))
-"""
-
-
-def test_threads_of_a_report_without_truth_import_no_library_whose_modules_form_a_circle(
-    tiny, tiny_run, tmp_path
-):
-    options = (str(tiny), "--project", str(tiny_run), "--out", str(tmp_path / "report.html"))
-    command = [sys.executable, "-c", REPORT, "report", *options]
-    told = subprocess.check_output(command, text=True).splitlines()[-1]
-    circular = {"dask", "xarray", "zarr", "pandas", "scipy", "numba", "matplotlib"}
-    assert circular.isdisjoint(json.loads(told))
 
 
 @pytest.mark.parametrize("asked", ["south", "main", "nobody"])

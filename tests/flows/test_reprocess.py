@@ -26,13 +26,6 @@ from flows.service import deployed
 from flows.stages.tracking import STAGE
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store.paths import ResultId
-from worldpose.store.store import Store
-
-
-@pytest.fixture
-def store(project_copy):
-    """A finished run, to be edited in the journal."""
-    return Store.open(project_copy)
 
 
 def made_from(store, *starts):
@@ -147,15 +140,6 @@ def test_a_later_iteration_is_stale_in_every_pass(store):
     found = run_status(store, TINY)
     assert {unit.iteration for unit in found.units} == {1, 2}
     assert len({unit.key for unit in found.to_compute}) == len(found.to_compute)
-
-
-def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
-    gone = tmp_path / "gone.onnx"
-    write_layer(store, PROJECT, {"detection.pose": f"onnx:{gone}"})
-    status = json.loads(
-        CliRunner().invoke(app, ["status", "--project", store.url, "--json"]).stdout
-    )
-    assert str(gone) in json.dumps(status)
 
 
 def test_a_result_that_holds_a_withdrawn_edit_is_not_taken_for_one_without_it():
@@ -276,3 +260,12 @@ def test_reprocessing_computes_what_was_listed(server, store):
     assert store.run(TINY).parent == "0001"
     again = succeed("reprocess", "--project", store.url, "--json").json["matches"]
     assert [(each["state"], each["executed"]) for each in again] == [("untouched", [])]
+
+
+def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
+    gone = tmp_path / "gone.onnx"
+    write_layer(store, PROJECT, {"detection.pose": f"onnx:{gone}"})
+    status = json.loads(
+        CliRunner().invoke(app, ["status", "--project", store.url, "--json"]).stdout
+    )
+    assert str(gone) in json.dumps(status)

@@ -9,19 +9,11 @@ from flows import iterate
 from flows.iterate import Iteration, iterate_match
 from flows.method import METHOD
 from flows.registering import open_match
-from flows.reprocess import reprocess_matches
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.review.verdicts import correct
 from flows.run_record import RunLog
 from flows.run_status import run_status
 from flows.running import RunRequest
-from flows.service import deployed
-from worldpose.store.store import Store
-
-
-@pytest.fixture
-def store(project_copy):
-    return Store.open(project_copy)
 
 
 def merge(store):
@@ -71,15 +63,6 @@ def test_a_run_during_an_edit_has_the_match_as_it_began_and_the_edit_is_seen_nex
     assert {unit.unit for unit in found.units if unit.own_reasons} == {"tracking/clip"}
 
 
-def test_an_iteration_is_refused_when_the_one_before_is_of_another_state_of_the_match(store):
-    match = open_match(store, TINY)
-    RunLog.begin(store, match, METHOD, {}, iteration=2)  # the first is there
-    merge(store)
-    RunLog.begin(store, match, METHOD, {}, iteration=2)  # and stays there for who began earlier
-    with pytest.raises(EditedMeanwhileError, match="filtering/clip"):
-        RunLog.begin(store, open_match(store, TINY), METHOD, {}, iteration=2)
-
-
 def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monkeypatch):
     begun = []
 
@@ -110,27 +93,6 @@ def test_a_run_is_judged_by_the_limits_of_its_match_and_anew_when_they_change(st
     assert (row["now"], row["usability"]) == ("usable with reservations", done.json["usability"])
     again = succeed("run", TINY, "--project", store.url, "--json").json
     assert again["run"] == done.json["run"]
-
-
-def served_run(store):
-    return deployed.match.fn(store.url, TINY, gates="never")
-
-
-def iterated_run(store):
-    return iterate_match(store, open_match(store, TINY), RunRequest({}), 1).record.run_id
-
-
-def reprocessed_run(store):
-    (found,) = reprocess_matches(store, [TINY], RunRequest({}))
-    return found.record.run_id
-
-
-@pytest.mark.parametrize("run", [served_run, iterated_run, reprocessed_run])
-def test_every_way_to_start_a_run_judges_a_match_by_changed_limits(store, run):
-    succeed("settings", TINY, "--set", "max_ray_distance_m=0.001", "--project", store.url)
-    assert run(store) == "0002"
-    assert store.run(TINY, "0002").usability.verdict == "usable with reservations"
-    assert run(store) == "0002"
 
 
 @pytest.mark.parametrize("failing", [None, "filtering"])

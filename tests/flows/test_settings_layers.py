@@ -11,7 +11,7 @@ import yaml
 from command_line import TINY
 from typer.testing import CliRunner
 
-from flows import layers, reprocess, settings
+from flows import layers, reprocess
 from flows.cli import run as run_command
 from flows.cli.app import app as worldpose
 from flows.layers import read_layer, write_layer
@@ -28,11 +28,6 @@ from worldpose.store.run_queue import queue_of
 from worldpose.store.store import Store
 
 BODY = "smpl-test"
-
-
-@pytest.fixture
-def store(project_copy):
-    return Store.open(project_copy)
 
 
 def command(*arguments, code=0):
@@ -188,13 +183,6 @@ def test_each_value_is_from_the_last_layer_that_states_it(store, tiny):
     assert shown(store, TINY)["tracking.gate_m"] == (0.45, "project")
 
 
-def test_a_question_about_settings_changes_nothing(store):
-    match = open_match(store, TINY)
-    found = resolve(match.layers, {"tracking": {"gate_m": 0.4}})
-    assert found.origins["tracking.gate_m"].origin == "command line"
-    assert store.blobs.entries("settings") == []
-
-
 @pytest.mark.parametrize(
     ("text", "key", "found"),
     [
@@ -221,20 +209,6 @@ def test_a_layer_that_is_wrong_is_refused_with_file_and_key(store, text, key, fo
         resolve(open_match(store, TINY).layers)
     assert refused.value.where.startswith(f"{store.url}/settings/project.yaml")
     assert key in refused.value.where
-
-
-def test_a_venue_without_a_file_is_refused_by_name_and_can_be_added(store):
-    write_layer(store, f"matches/{TINY}", {"venue": "hal"})
-    with pytest.raises(InputError, match=r"venue hal.*--venue hal --add"):
-        resolve(open_match(store, TINY).layers)
-    command("settings", "--venue", "hal", "--add", "--project", store.url)
-    assert resolve(open_match(store, TINY).layers).overrides == {}
-
-
-def test_a_refused_change_writes_nothing(store):
-    for text in ("detection.strid=2", "detection.stride=x", "iterations=0", "no"):
-        command("settings", "--set", text, "--project", store.url, code=1)
-    assert store.blobs.entries("settings") == []
 
 
 def test_match_yaml_names_its_venue_and_the_venue_gives_pitch_and_side(store, tiny, tmp_path):
@@ -305,14 +279,6 @@ def test_a_page_names_no_file_of_the_server_and_keeps_those_that_are_named(store
     assert save(**{"detection.detector": "model:rtdetr-v2-r18", "detection.stride": 3}) == 200
 
 
-def test_a_broken_layer_is_shown_on_the_page_that_corrects_it(store, ada):
-    write_layer(store, "project", {"detection.strid": 2})
-    found = ada.get("/api/settings").json()
-    assert "detection.strid" in found["problem"]
-    given = {"layer": "project", "values": {}, "revision": found["layers"][0]["revision"]}
-    assert ada.post("/api/settings", json=given).json()["problem"] == ""
-
-
 def test_layers_are_kept_in_object_storage_too(bucket):
     store = Store.create(f"{bucket}/layers")
     write_layer(store, "venues/hall", {"lenses": [], "tracking.gate_m": 0.6})
@@ -345,45 +311,11 @@ def test_a_venue_that_does_not_exist_is_refused_and_a_wrong_one_can_be_corrected
     assert shown(store, TINY)["tracking.gate_m"] == (0.6, "venue parken")
 
 
-def test_default_settings_forget_what_runs_stated_and_nothing_else(store):
-    stated = {"tracking.gate_m": 0.6, "iterations": 2, "gates": "always"}
-    write_layer(store, f"matches/{TINY}", stated)
-    settle(store, open_match(store, TINY), RunRequest({}, default_settings=True))
-    assert dict(read_layer(store, f"matches/{TINY}").values) == {"gates": "always"}
-
-
 def test_exports_have_the_pitch_of_the_layers(store):
     registration = open_match(store, TINY).registration
     folder = registration.model_copy(update={"folder": store.url})  # without pitch.json
     write_layer(store, "project", {"pitch": {"length": 101.0, "width": 66.0}})
     assert layers.pitch_of(store, folder).length == 101.0
-
-
-def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
-    path = f"onnx-rtmdet:{tmp_path / 'net.onnx'}"
-    assert given["detection"] == {"detector": path, "pose": "embedded"}
-
-
-def test_a_stated_value_that_replaces_one_of_the_match_is_reported(store, caplog):
-    write_layer(store, f"matches/{TINY}", {"detection.stride": 3})
-    caplog.set_level("INFO")
-    for stride in (3, 2):
-        caplog.clear()
-        settle(store, open_match(store, TINY), RunRequest({"detection": {"stride": stride}}))
-        said = f"{TINY}: detection.stride=2 replaces 3, which the settings of the match stated"
-        assert (said in caplog.messages) is (stride == 2)
-
-
-def test_a_venue_can_be_a_number(store, tmp_path):
-    at = ("--project", store.url)
-    command("settings", "--venue", "2024", "--add", *at)
-    command("settings", TINY, "--set", "venue=2024", *at)
-    assert read_layer(store, f"matches/{TINY}").values == {"venue": "2024"}
-    assert shown(store, TINY)["venue"] == ("2024", "match")
-    command("settings", TINY, "--set", "venue=null", *at)
-    assert read_layer(store, f"matches/{TINY}").values == {"venue": None}
 
 
 @pytest.mark.parametrize(
@@ -400,10 +332,8 @@ def test_true_is_no_number(text, found):
     assert refused.value.found == found
 
 
-def test_true_and_numbers_stay_what_they_are():
-    (name,) = [n for n, it in settings.known_settings().items() if it["default"] is True][:1]
-    stage, _, field = name.partition(".")
-    assert parse_overrides([f"{name}=false"]) == {stage: {field: False}}
-    assert parse_overrides(["detection.stride=2"]) == {"detection": {"stride": 2}}
-    for text in ("true", "yes", "0"):  # what pydantic reads as a boolean
-        assert parse_overrides([f"triangulation.learn_noise={text}"])
+def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
+    path = f"onnx-rtmdet:{tmp_path / 'net.onnx'}"
+    assert given["detection"] == {"detector": path, "pose": "embedded"}

@@ -1,9 +1,12 @@
-"""Time limits of units, parsed from the form in which people write them."""
+"""Time limits of units and schedules, parsed from the form in which people write them."""
+
+import re
 
 import pytest
 
 from flows.method import METHOD
 from flows.orchestration.time_limits import DEFAULT_MINUTES, parse_time_limits, seconds_of
+from flows.service.schedules import parse_schedules
 from worldpose.errors import UsageError
 
 
@@ -19,3 +22,19 @@ def test_a_number_is_for_every_stage_and_one_with_a_name_for_that():
 def test_what_is_no_limit_is_refused(text):
     with pytest.raises(UsageError, match="--time-limit"):
         parse_time_limits([text])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("reprocess=0 3 * *", "Invalid cron string"),
+        ("reprocess=0 3 * * * Mars/X", "Invalid timezone"),
+        ("match=0 3 * * *", "'match'"),
+        ("0 3 * * *", "'0 3"),
+    ],
+)
+def test_a_schedule_that_cannot_be_is_refused_before_anything_starts(text, said):
+    with pytest.raises(UsageError, match=re.escape(said)):
+        parse_schedules([text])
+    with pytest.raises(UsageError, match="twice"):
+        parse_schedules(["reprocess=0 3 * * * UTC", "reprocess=0 4 * * * UTC"])

@@ -49,16 +49,3 @@ def test_what_elapsed_counts_units_side_by_side_once():
     # 13 to 15 s, and 20 to 22 s.
     assert found.between == pytest.approx(4.0)
     assert found.seconds == found.start + found.between + ingest.elapsed + tracking.elapsed
-
-
-def test_core_hours_and_bytes_are_those_of_all_results():
-    class Reused(Told):
-        def run(self, match, run):
-            told = super().run(match, run)
-            told.executed = ("tracking/c2",)
-            return told
-
-    for store in (Told(), Reused()):
-        cost = timings.run_time(store, "m", "0001").cost
-        assert (cost.core_hours, cost.bytes) == (pytest.approx(13.0 / 3600.0), 4 * 750)
-    assert str(cost) == "0.00361 core hours, 3 kB"

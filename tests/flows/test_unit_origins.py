@@ -41,11 +41,6 @@ def test_a_correction_of_a_detection_marks_whatever_found_it():
     assert [unit for unit in found if origins[unit] == "corrected"] == ["detection/a.one"]
 
 
-def test_a_key_frame_s_correction_marks_the_clip_s_moving_camera():
-    origins = unit_origins({"broadcast_calibration/one": ()}, [moved("one", 3)], ())
-    assert origins == {"broadcast_calibration/one": "corrected"}
-
-
 def test_a_refusal_reaches_all_that_is_made_from_it():
     origins = unit_origins(MADE_FROM, [], ["tracking/one"])
     refused = {unit for unit, origin in origins.items() if origin == "rejected"}

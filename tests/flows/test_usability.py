@@ -15,6 +15,11 @@ HEALTHY = {
 }
 
 
+UNHEALTHY = {"unhealthy_s.cam2": 2.2, "unhealthy_s.cam3": 3.0}
+UNHEALTHY |= {"unhealthy_from_frame.cam3": 0, "unhealthy_to_frame.cam3": 74}
+ABSENT = {"absent_from_frame": 40, "absent_to_frame": 64, "absent_person": 7}
+
+
 def judge(unit="", limits=None, **outcome):
     """The verdict on a healthy run in which `unit` has other metrics."""
     figures = HEALTHY | {unit: HEALTHY.get(unit, {}) | outcome.pop("figures", {})}
@@ -37,17 +42,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ),
         (
             "tracking/clip",
-            {"absent_share": 0.2, "absent_from_frame": 40, "absent_to_frame": 64},
-            "people are missing in clip for 20 % (limit 5 %) of the time, longest in frames 40 to",
-        ),
-        (
-            "tracking/clip",
-            {
-                "absent_share": 0.2,
-                "absent_from_frame": 40,
-                "absent_to_frame": 64,
-                "absent_person": 7,
-            },
+            {"absent_share": 0.2, **ABSENT},
             "people are missing in clip for 20 % (limit 5 %) of the time, longest person 7 in ",
         ),
         ("tracking/clip", {"unmatched_share": 0.3}, "30 % (limit 15 %) of the detections in clip"),
@@ -55,14 +50,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
         (
             "retriangulation/clip",
-            {
-                "unhealthy_s.cam2": 2.2,
-                "unhealthy_from_frame.cam2": 50,
-                "unhealthy_to_frame.cam2": 104,
-                "unhealthy_s.cam3": 3.0,
-                "unhealthy_from_frame.cam3": 0,
-                "unhealthy_to_frame.cam3": 74,
-            },
+            UNHEALTHY,
             "the keypoints of cam3, cam2 depart from the people in clip, or its images are bad, "
             "for 3 s (limit 2 s) at a time, longest in frames 0 to 74.",
         ),
@@ -74,8 +62,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         (
             "bundle_adjustment/cameras",
             {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1},
-            "the people contradict the calibration of cam4: the adjustment moves it by 7.1 (limit "
-            "3) standard deviations.",
+            "the people contradict the calibration of cam4: the adjustment moves it by 7.1",
         ),
         ("body_fitting/clip", {"offset_rms_m": 0.05}, "bodies in clip lie 5 cm (limit 3 cm) off"),
         (
@@ -94,7 +81,6 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             "no camera sees 10 % (limit 5 %) of the joints in clip: motion alone places them.",
         ),
         ("tracking/clip", {"corrections_refused": 2.0}, "2 (limit 0) corrections of clip do not"),
-        ("broadcast_tracking/clip", {"unmatched_share": 0.9}, "90 % (limit 15 %) of the detect"),
         (
             "broadcast_tracking/clip",
             {"unmatched_share": 0.1, "plane_std_m": 9.0},
@@ -118,10 +104,6 @@ def test_a_metric_beyond_its_limit_is_a_reservation(unit, figures, said):
     assert found.verdict == "usable with reservations"
     (text,) = found.reservations
     assert text.startswith(said)
-
-
-def test_a_metric_that_reads_as_its_limit_is_within_it():
-    assert judge("tracking/clip", figures={"unmatched_share": 0.15000001}).verdict == "usable"
 
 
 def test_results_that_end_before_bodies_name_their_last_stage():

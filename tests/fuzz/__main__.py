@@ -29,45 +29,30 @@ def main():
     for folder in filter(None, (given.out, given.keep)):
         folder.mkdir(parents=True, exist_ok=True)
     wanted = [draw_case(given.seed, number) for number in range(given.cases)]
-    if given.case:
-        wanted = [parse_case(text) for text in given.case]
-    wanted = [
-        (names, seed)
-        for names, seed in wanted
-        if any(given.only in name or given.only == KINDS[name].group for name in names)
-    ]
-    answers = run_all(wanted, given)
-    print(summary(answers))
-    sys.exit(1 if any(answer["class"] in DEFECTS for answer in answers) else 0)
-
-
-def run_all(wanted, given):
-    """The outcome of every case."""
+    wanted = [parse_case(text) for text in given.case] if given.case else wanted
     answers = []
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     file = given.out / "cases.jsonl"
     with tempfile.TemporaryDirectory(prefix="worldpose-fuzz-") as place, file.open("w") as log:
-        prepare(Path(place))
+        template = prepare(Path(place))
         for names, seed in wanted:
-            name = case_name(names, seed)
-            answer = forked(run_case, names, seed, Path(place), given.keep)
-            answers.append({"case": name, "kinds": names, **answer})
+            if not any(given.only in f"{name} {KINDS[name].group}" for name in names):
+                continue
+            name, answer = (
+                case_name(names, seed),
+                forked(run_case, names, seed, template, given.keep),
+            )
+            answers.append({"case": name, **answer})
             print(json.dumps(answers[-1]), file=log, flush=True)
             if answer["class"] in DEFECTS or given.case:
                 message = answer.get("message", "")[:1500]
                 print(f"{answer['class']}: --case '{name}'\n  {message}", flush=True)
-    return answers
-
-
-def summary(answers):
-    """The classes counted, and the cases of harmless kinds alone that came out right."""
     counts = Counter(answer["class"] for answer in answers)
     harmless = [answer["class"] == RIGHT for answer in answers if answer.get("harmless")]
-    return (
-        f"{len(answers)} cases of {len(KINDS)} kinds: "
-        + ", ".join(f"{count} {name}" for name, count in counts.most_common())
-        + f"; harmless right: {sum(harmless)} of {len(harmless)}"
-    )
+    told = ", ".join(f"{count} {name}" for name, count in counts.most_common())
+    print(f"{len(answers)} cases of {len(KINDS)} kinds: {told}", end="; ")
+    print(f"harmless right: {sum(harmless)} of {len(harmless)}")
+    sys.exit(1 if any(answer["class"] in DEFECTS for answer in answers) else 0)
 
 
 if __name__ == "__main__":

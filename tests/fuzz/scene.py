@@ -13,9 +13,7 @@ import cv2
 import numpy as np
 import yaml
 
-FPS = 25.0
-FRAMES = 10
-COCO_JOINTS = 17
+FPS, FRAMES, COCO_JOINTS = 25.0, 10, 17
 
 
 @dataclass
@@ -42,14 +40,13 @@ class Camera:
     def pixels(self, points):
         """Pixels (..., 2) of world points (..., 3); NaN behind the camera and outside the image."""
         flat = np.reshape(np.asarray(points, dtype=float), (-1, 3))
-        depth = flat @ self.rotation[2] + self.translation[2]
-        rvec = cv2.Rodrigues(self.rotation)[0]
-        found, _ = cv2.projectPoints(
-            flat[:, None], rvec, self.translation, self.matrix, np.array(self.distortion)
-        )
+        seen_from_here = flat @ self.rotation.T + self.translation
+        pose = cv2.Rodrigues(self.rotation)[0], self.translation
+        found = cv2.projectPoints(flat[:, None], *pose, self.matrix, np.array(self.distortion))[0]
         found = found[:, 0]
         # Beyond the field of view a polynomial lens folds points back into the image.
-        plain = (flat @ self.rotation.T + self.translation)[:, :2] / depth[:, None]
+        depth = seen_from_here[:, 2]
+        plain = seen_from_here[:, :2] / depth[:, None]
         edge = np.array([self.width, self.height]) / (2.0 * np.array(self.focal))
         seen = (depth > 0.5) & (np.abs(plain) < 1.5 * edge + 0.2).all(axis=1)
         seen &= (found >= 0).all(axis=1) & (found < [self.width, self.height]).all(axis=1)
@@ -61,15 +58,8 @@ class Camera:
         forward = np.subtract(target, center) / np.linalg.norm(np.subtract(target, center))
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
-        down = np.cross(forward, right)
-        turn = np.array(
-            [
-                [math.cos(roll), math.sin(roll), 0.0],
-                [-math.sin(roll), math.cos(roll), 0.0],
-                [0.0, 0.0, 1.0],
-            ]
-        )
-        rotation = turn @ np.array([right, down, forward])
+        turn = cv2.Rodrigues(np.array([0.0, 0.0, -roll]))[0]
+        rotation = turn @ np.array([right, np.cross(forward, right), forward])
         return replace(self, rotation=rotation, translation=-rotation @ np.asarray(center, float))
 
 
@@ -99,43 +89,36 @@ LINES = {
     "goal_line_right": ("corner_right_near", "corner_right_far"),
     "halfway_line": ("halfway_near", "halfway_far"),
 }
+HEAD = [(0.11, 0.0, 1.60), (0.09, 0.03, 1.64), (0.09, -0.03, 1.64)]
+HEAD += [(0.0, 0.075, 1.62), (0.0, -0.075, 1.62)]
 
 
 def walking(start, heading, height, seconds, phase):
     """COCO-17 joints (frames, 17, 3) [m] of sticks that walk at 1.4 m/s, above z = 0."""
-    size = height / 1.75
     t = np.asarray(seconds, dtype=float)
-    ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
-    left = np.array([-math.sin(heading), math.cos(heading), 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    root = np.array([*start, 0.0]) + 1.4 * t[:, None] * ahead
+    axes = np.array([[math.cos(heading), math.sin(heading), 0.0], [0.0] * 3, [0.0, 0.0, 1.0]])
+    axes[1] = np.cross(axes[2], axes[0])
+    root = np.array([*start, 0.0]) + 1.4 * t[:, None] * axes[0]
 
-    def at(forward, sideways, above):
-        forward, sideways, above = np.broadcast_arrays(forward, sideways, above, t)[:3]
-        parts = zip((forward, sideways, above), (ahead, left, up), strict=True)
-        return root + size * sum(value[:, None] * axis for value, axis in parts)
+    def at(*place):  # forward, to the left, up
+        parts = np.stack(np.broadcast_arrays(*place, t)[:3], axis=-1)
+        return root + height / 1.75 * parts @ axes
 
     joints = np.zeros((len(t), COCO_JOINTS, 3))
-    places = [(0.11, 0.0, 1.60), (0.09, 0.03, 1.64), (0.09, -0.03, 1.64)]
-    places += [(0.0, 0.075, 1.62), (0.0, -0.075, 1.62)]
-    for joint, place in enumerate(places):
+    for joint, place in enumerate(HEAD):
         joints[:, joint] = at(*place)
     swing = 0.45 * np.sin(2 * math.pi * 0.95 * t + phase)
     for side, sign in ((0, 1.0), (1, -1.0)):
         arm, leg = -sign * swing, sign * swing
-        joints[:, 5 + side] = at(0.0, sign * 0.19, 1.43)
-        elbow = (0.29 * np.sin(arm), sign * 0.22, 1.43 - 0.29 * np.cos(arm))
-        joints[:, 7 + side] = at(*elbow)
-        joints[:, 9 + side] = at(
-            elbow[0] + 0.25 * np.sin(arm + 0.3), sign * 0.22, elbow[2] - 0.25 * np.cos(arm + 0.3)
-        )
-        joints[:, 11 + side] = at(0.0, sign * 0.12, 0.94)
-        knee = (0.43 * np.sin(leg), sign * 0.11, 0.94 - 0.43 * np.cos(leg))
-        joints[:, 13 + side] = at(*knee)
+        elbow = (0.29 * np.sin(arm), 1.43 - 0.29 * np.cos(arm))
+        wrist = (elbow[0] + 0.25 * np.sin(arm + 0.3), elbow[1] - 0.25 * np.cos(arm + 0.3))
+        knee = (0.43 * np.sin(leg), 0.94 - 0.43 * np.cos(leg))
         bend = leg - np.clip(0.5 - leg, 0.0, 0.6)
-        joints[:, 15 + side] = at(
-            knee[0] + 0.41 * np.sin(bend), sign * 0.11, knee[2] - 0.41 * np.cos(bend)
-        )
+        ankle = (knee[0] + 0.41 * np.sin(bend), knee[1] - 0.41 * np.cos(bend))
+        chain = [((0.0, 1.43), 0.19), (elbow, 0.22), (wrist, 0.22)]
+        chain += [((0.0, 0.94), 0.12), (knee, 0.11), (ankle, 0.11)]
+        for joint, ((ahead, up), out) in zip(range(5, 17, 2), chain, strict=True):
+            joints[:, joint + side] = at(ahead, sign * out, up)
     return joints
 
 
@@ -176,43 +159,28 @@ class Draft:
 def new_draft(rng, is_clicked):
     """A good match: four cameras around a penalty area or the centre, three people."""
     middle = np.array([rng.choice([-40.0, 0.0, 40.0]), rng.uniform(-6, 6), 0.9])
-    cameras = {}
-    turn = rng.uniform(0, 2 * math.pi)
+    cameras, turn = {}, rng.uniform(0, 2 * math.pi)
     for n in range(4):
         angle = turn + n * math.pi / 2 + rng.uniform(-0.3, 0.3)
-        distance = rng.uniform(24, 34)
-        above = rng.uniform(9, 15)
-        place = middle + [distance * math.cos(angle), distance * math.sin(angle), above]
-        focal = rng.uniform(900, 1200)
-        plain = Camera(
-            *(1920, 1080, (focal, focal), (959.5, 539.5), (-0.05, 0.01, 0.0, 0.0, 0.0)),
-            *(np.eye(3), np.zeros(3)),
-        )
-        cameras[f"cam{n}"] = plain.looking(place, middle + [*rng.uniform(-2, 2, 2), 0.0])
-    seconds = np.arange(FRAMES) / FPS
-    starts = [
-        middle[:2] + [3.0 * math.cos(a), 3.0 * math.sin(a)] for a in turn + np.arange(3) * 2.1
-    ]
-    people = [
-        walking(start, rng.uniform(0, 6.28), rng.uniform(1.65, 1.95), seconds, rng.uniform(0, 6.28))
-        for start in starts
-    ]
-    spec = {
-        "contract": 1,
-        "match_id": "fuzz",
-        "fps": FPS,
-        "cameras": [
-            {"id": name, "width": camera.width, "height": camera.height}
-            for name, camera in cameras.items()
-        ],
-        "clips": [{"id": "clip", "first_frame": 0, "frame_count": FRAMES}],
-    }
+        out = rng.uniform(24, 34)
+        place = middle + [out * math.cos(angle), out * math.sin(angle), rng.uniform(9, 15)]
+        focal, lens = rng.uniform(900, 1200), (-0.05, 0.01, 0.0, 0.0, 0.0)
+        plain = (1920, 1080, (focal, focal), (959.5, 539.5), lens, np.eye(3), np.zeros(3))
+        aim = middle + [*rng.uniform(-2, 2, 2), 0.0]
+        cameras[f"cam{n}"] = Camera(*plain).looking(place, aim)
+    people = []
+    for angle in turn + np.arange(3) * 2.1:
+        start = middle[:2] + [3.0 * math.cos(angle), 3.0 * math.sin(angle)]
+        own = rng.uniform([0.0, 1.65, 0.0], [6.28, 1.95, 6.28])
+        people.append(walking(start, own[0], own[1], np.arange(FRAMES) / FPS, own[2]))
     people = np.stack(people, axis=1)
     people[..., 2] -= 0.2 * (people[..., 1] / 34.0) ** 2  # they stand on the crown
+    sizes = [{"id": n, "width": c.width, "height": c.height} for n, c in cameras.items()]
+    spec = {"contract": 1, "match_id": "fuzz", "fps": FPS, "cameras": sizes}
+    spec["clips"] = [{"id": "clip", "first_frame": 0, "frame_count": FRAMES}]
     draft = Draft(cameras, people, spec, truth=people)
     if not is_clicked:
-        draft.spec["pitch"] = "none"
-        draft.given = {}
+        draft.spec["pitch"], draft.given = "none", {}
     return draft
 
 
@@ -231,29 +199,21 @@ def film(draft, rng):
                 "translation": camera.translation.tolist(),
             }
             continue
-        points = law_points()
-        pixels = camera.pixels(list(points.values()))
+        names, places = zip(*law_points().items(), strict=True)
+        pixels = camera.pixels(places)
         found = pixels + rng.normal(0, draft.click_noise, pixels.shape)
-        inside = (found > 2).all(axis=1) & (found < [camera.width - 2, camera.height - 2]).all(
-            axis=1
-        )
-        draft.clicks[name] = {
-            "points": [
-                {"name": point, "xy": [round(float(v), 2) for v in xy]}
-                for point, xy, kept in zip(points, found, inside, strict=True)
-                if kept
-            ],
-            "drawn": [],
-        }
+        inside = ((found > 2) & (found < [camera.width - 2, camera.height - 2])).all(axis=1)
+        kept = [(names[k], found[k].round(2).tolist()) for k in np.flatnonzero(inside)]
+        points = [{"name": point, "xy": xy} for point, xy in kept]
+        draft.clicks[name] = {"points": points, "drawn": []}
 
 
 def detections_of(draft, camera, rng):
     """Return detections of the people: pixels with noise, in arbitrary order."""
     frames, count = draft.people.shape[:2]
     order = np.array([rng.permutation(count) for _ in range(frames)])
-    pixels = camera.pixels(draft.people) + rng.normal(
-        0, draft.pixel_noise, (frames, count, COCO_JOINTS, 2)
-    )
+    pixels = camera.pixels(draft.people)
+    pixels = pixels + rng.normal(0, draft.pixel_noise, pixels.shape)
     pixels = np.take_along_axis(pixels, order[:, :, None, None], axis=1)
     confidence = rng.uniform(0.45, 0.95, pixels.shape[:-1])
     seen = np.isfinite(pixels).all(axis=-1)
@@ -264,19 +224,14 @@ def detections_of(draft, camera, rng):
         gone = np.where(few[..., None], np.nan, 0.0)
         low = np.where(np.isnan(pixels), np.inf, pixels).min(axis=2) - 8 + gone
         high = np.where(np.isnan(pixels), -np.inf, pixels).max(axis=2) + 8 + gone
-    return {
-        "frame": np.arange(frames),
-        "keypoints": pixels,
-        "confidence": confidence,
-        "boxes": np.concatenate([low, high], axis=-1),
-        "score": np.where(few, np.nan, rng.uniform(0.6, 0.99, (frames, count))),
-    }
+    score = np.where(few, np.nan, rng.uniform(0.6, 0.99, (frames, count)))
+    found = {"frame": np.arange(frames), "keypoints": pixels, "confidence": confidence}
+    return found | {"boxes": np.concatenate([low, high], axis=-1), "score": score}
 
 
 def drawn_line(draft, camera, name, count, rng, noise=0.6):
     """Pixels along a line of the pitch as a camera sees it; empty where it is out of view."""
-    points = law_points()
-    start, end = (np.array(points[each]) for each in LINES[name])
+    start, end = (np.array(law_points()[each]) for each in LINES[name])
     along = start + np.linspace(0, 1, 400)[:, None] * (end - start)
     along[:, 2] = -0.2 * (along[:, 1] / 34.0) ** 2
     pixels = camera.pixels(along)
@@ -290,70 +245,52 @@ def drawn_line(draft, camera, name, count, rng, noise=0.6):
 
 def write(draft, folder):
     """Write the match folder; nothing is checked."""
-    folder.mkdir(parents=True)
-    (folder / "match.yaml").write_text(
-        yaml.safe_dump(draft.spec, sort_keys=False, allow_unicode=True)
-    )
+    annotations = folder / "annotations" / "static_calibration"
+    annotations.mkdir(parents=True)
+    (folder / "detections").mkdir()
+    spec = yaml.safe_dump(draft.spec, sort_keys=False, allow_unicode=True)
+    (folder / "match.yaml").write_text(spec)
     if draft.given is not None:
         (folder / "calibration.toml").write_text(toml_text(draft.given))
     if draft.pitch is not None:
         (folder / "pitch.json").write_text(json.dumps(draft.pitch))
-    annotations = folder / "annotations" / "static_calibration"
     for name, content in draft.clicks.items():
-        annotations.mkdir(parents=True, exist_ok=True)
         (annotations / f"{name}.json").write_text(json.dumps(content))
-    (folder / "detections").mkdir()
     for name, arrays in draft.seen.items():
+        file = folder / "detections" / name
         if draft.coco:
-            content = json.dumps(coco_results(arrays))
-            (folder / "detections" / f"{name}.json").write_text(content)
+            file.with_name(f"{name}.json").write_text(json.dumps(coco_results(arrays)))
         else:
-            (folder / "detections" / f"{name}.npz").write_bytes(npz_bytes(arrays))
+            file.with_name(f"{name}.npz").write_bytes(npz_bytes(arrays))
     for spoil in draft.after:
         spoil(folder)
 
 
 def npz_bytes(arrays):
     """The arrays as an npz file, in the types that readers expect."""
-    packed = io.BytesIO()
-    types = {name: "<i8" if name == "frame" else "<f4" for name in arrays}
-    np.savez(packed, **{name: np.asarray(values, types[name]) for name, values in arrays.items()})
+    packed, types = io.BytesIO(), {"frame": "<i8"}
+    np.savez(packed, **{n: np.asarray(v, types.get(n, "<f4")) for n, v in arrays.items()})
     return packed.getvalue()
 
 
 def coco_results(arrays):
     """The same people as COCO keypoint results."""
     results = []
-    for row, frame in enumerate(arrays["frame"]):
-        for person in range(arrays["score"].shape[1]):
-            keypoints, confidence = (
-                arrays["keypoints"][row, person],
-                arrays["confidence"][row, person],
-            )
-            if not np.isfinite(confidence).any():
-                continue
-            triples = np.column_stack([keypoints, confidence])
-            x0, y0, x1, y1 = arrays["boxes"][row, person]
-            results.append(
-                {
-                    "image_id": int(frame),
-                    "category_id": 1,
-                    "keypoints": np.nan_to_num(triples).ravel().round(3).tolist(),
-                    "bbox": [round(float(v), 2) for v in (x0, y0, x1 - x0, y1 - y0)],
-                    "score": float(arrays["score"][row, person]),
-                }
-            )
+    for row, person in np.ndindex(arrays["score"].shape):
+        points, confidence = (arrays[name][row, person] for name in ("keypoints", "confidence"))
+        if np.isfinite(confidence).any():
+            x0, y0, x1, y1 = map(float, arrays["boxes"][row, person].round(2))
+            triples = np.nan_to_num(np.column_stack([points, confidence]))
+            about = {"image_id": int(arrays["frame"][row]), "category_id": 1}
+            about["keypoints"] = triples.ravel().round(3).tolist()
+            score = float(arrays["score"][row, person])
+            results.append({**about, "bbox": [x0, y0, x1 - x0, y1 - y0], "score": score})
     return results
 
 
 def toml_text(tables):
-    """Tables of plain values as TOML; a value that is a string starting with `raw:` stays as is."""
+    """Tables of plain values as TOML."""
     lines = []
     for key, table in tables.items():
-        lines.append(
-            f"[{key}]" if all(c.isalnum() or c in "_-" for c in key) else f"[{json.dumps(key)}]"
-        )
-        for name, value in table.items():
-            raw = isinstance(value, str) and value.startswith("raw:")
-            lines.append(f"{name} = {value[4:] if raw else json.dumps(value)}")
+        lines += [f"[{key}]", *(f"{name} = {json.dumps(value)}" for name, value in table.items())]
     return "\n".join(lines).replace("NaN", "nan").replace("Infinity", "inf") + "\n"

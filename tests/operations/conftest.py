@@ -1,6 +1,5 @@
 """A small match to put into inboxes, a served project, a Postgres server, a Dask cluster."""
 
-import json
 import os
 import shutil
 import signal
@@ -9,12 +8,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from threading import Thread
 
 import pytest
-from service import Served
+from service import Served, free_ports
 
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
@@ -48,8 +45,7 @@ def postgres():
     found = sorted(programs.glob("*/bin/postgres"))
     if not found:
         pytest.skip("no Postgres server is installed")
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    (port,) = free_ports(1)
     folder = Path(tempfile.mkdtemp(prefix="postgres-", dir="/tmp"))
     who = {"user": "postgres", "group": "postgres"} if os.geteuid() == 0 else {}
     if who:  # Postgres refuses to be run by root
@@ -85,8 +81,7 @@ def postgres():
 @pytest.fixture
 def dask():
     """The address of a Dask scheduler with two workers, each a process of its own; their ids."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    (port,) = free_ports(1)
     address = f"tcp://127.0.0.1:{port}"
     python = [sys.executable, "-m"]
     scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port)]
@@ -106,33 +101,6 @@ def dask():
         process.terminate()
     for process in processes:
         process.wait(60)
-
-
-@pytest.fixture
-def webhook():
-    """A server that records posts and answers with the status codes in `codes`, then with 204."""
-
-    class Server(HTTPServer):
-        posted: list = []
-        codes: list = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self):
-            body = self.rfile.read(int(self.headers["content-length"]))
-            self.server.posted.append((self.headers["content-type"], json.loads(body)))
-            self.send_response(self.server.codes.pop(0) if self.server.codes else 204)
-            self.end_headers()
-
-        def log_message(self, *arguments):
-            pass
-
-    server = Server(("127.0.0.1", 0), Handler)
-    server.posted, server.codes = [], []
-    server.address = f"http://127.0.0.1:{server.server_port}/hook?token=secret"
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield server
-    server.shutdown()
-    server.server_close()
 
 
 @pytest.fixture

@@ -225,15 +225,6 @@ def test_a_bad_file_is_refused_without_its_secrets(text, mode, problem, tmp_path
     assert "http://secret" not in str(refused.value)
 
 
-def test_a_login_of_the_file_may_have_any_characters(tmp_path):
-    login = "server = 'smtps://h:4650'\nuser = 'a@b'\npassword = 'p:/?#@ä'"
-    file = write_settings(tmp_path, f"[mail]\n{login}\nreceivers = ['c+d@e.org']")
-    (channel,) = channels_of({}, file)
-    mail = apprise.Apprise.instantiate(channel.address)
-    assert (mail.smtp_host, mail.port, mail.user, mail.password) == ("h", 4650, "a@b", "p:/?#@ä")
-    assert mail.targets == [(False, "c+d@e.org")]
-
-
 def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):
     trouble = Trouble("looking at the inbox")
     for _ in range(100):
@@ -312,13 +303,6 @@ def ended(match, state, message="", number=1, **more):
         changed_at=NOW,
         **more,
     )
-
-
-def test_an_alert_of_a_partial_run_says_so_and_why(plan):
-    text = "run 0003 of m: partial, 1 unit failed, 7 are blocked. tracking/clip: no light"
-    (alert,) = alerts_now(plan, [], [], [ended("m", "failed", text)])
-    assert alert.text == f"run m, 1 is partial: {text}"
-    assert alert.match_id == "m"
 
 
 def test_a_later_run_that_ended_well_ends_the_alert_and_old_failures_raise_none(plan):

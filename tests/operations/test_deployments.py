@@ -4,6 +4,7 @@ import importlib
 import os
 import platform
 import re
+import shutil
 from contextvars import copy_context
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,13 +13,16 @@ from uuid import uuid4
 
 import anyio
 import pytest
+from command_line import TINY
 from prefect import Flow
 from prefect.client.schemas.objects import FlowRun
+from prefect.flow_runs import resume_flow_run
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 from service import wait_until
 
-from flows.orchestration import prefect_api, suspension
-from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError, of_types
+from data_contracts.review import ReviewDecision
+from flows.orchestration.prefect_api import UnreachablePrefectError, of_types
+from flows.registering import register
 from flows.service import recovery
 from flows.service.alerts import alerts_now
 from flows.service.deployed import release_folder
@@ -33,6 +37,7 @@ from flows.service.worker import RefusedRunError, ServedWorker, require_installe
 from flows.web import app_context
 from flows.web.app_context import Continuing
 from worldpose.errors import InputError, UsageError
+from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
 
 
@@ -223,22 +228,6 @@ def test_a_week_of_missed_scans_is_one_scan_with_the_options_of_now(plan, prefec
     install(plan)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("reprocess=0 3 * *", "Invalid cron string"),
-        ("reprocess=0 3 * * * Mars/X", "Invalid timezone"),
-        ("match=0 3 * * *", "'match'"),
-        ("0 3 * * *", "'0 3"),
-    ],
-)
-def test_a_schedule_that_cannot_be_is_refused_before_anything_starts(text, said):
-    with pytest.raises(UsageError, match=re.escape(said)):
-        parse_schedules([text])
-    with pytest.raises(UsageError, match="twice"):
-        parse_schedules(["reprocess=0 3 * * * UTC", "reprocess=0 4 * * * UTC"])
-
-
 def planned_runs(prefect, deployment):
     wanted = {"deployment_id": {"any_": [deployment]}, "tags": {"all_": ["auto-scheduled"]}}
     return prefect.list_all("flow_runs", flow_runs=wanted)
@@ -246,15 +235,6 @@ def planned_runs(prefect, deployment):
 
 def open_of(prefect, match):
     return [run for run in prefect.queue.open_runs() if run.match_id == match]
-
-
-def test_runs_have_readable_names_of_their_own(plan, prefect):
-    run = prefect.start("lab", priority="urgent", key="twice", gates="never")
-    assert prefect.start("lab", key="twice") == run
-    assert open_of(prefect, "lab") == [run]
-    assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", run.name)
-    assert prefect.at_prefect([run])[run.flow_run]["name"] == run.name
-    prefect.cancel(run, "")
 
 
 def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
@@ -472,26 +452,43 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
     assert "absent" in ended["absent"].message
 
 
-def test_runs_are_found_on_all_pages(plan, prefect, monkeypatch):
-    monkeypatch.setattr(prefect_api, "PAGE", 5)
-    run = {
-        "state": {"type": "PAUSED"},
-        "parameters": {"project": plan.project, "match_id": "paused-match"},
-    }
-    place = f"/deployments/{deployments(prefect)['match']['id']}/create_flow_run"
-    for name in (f"paused-match, {number}" for number in range(11)):
-        prefect.ask(place, {**run, "name": name, "idempotency_key": name})
-    ask, resumed = PrefectApi.ask, set()
+@pytest.mark.slow  # a worker twice, and the processes of a run
+def test_a_run_that_waits_is_answered_in_prefects_own_form(plan, tiny, tmp_path, monkeypatch):
+    """One verdict on all that it asks about; the run's process has ended meanwhile."""
+    own = {"project": str(tmp_path / "p"), "state": tmp_path / "operations", "name": "asking"}
+    plan = plan.model_copy(update=own)
+    monkeypatch.setenv("WORLDPOSE_STATE", str(plan.state))
+    monkeypatch.setenv("WORLDPOSE_WORKERS", "1")
+    folder = shutil.copytree(tiny, tmp_path / "match")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    store = Store.create(plan.project)
+    register(store, folder)
+    prefect, installed = MatchRuns.of_plan(plan), install(plan)
+    asked = prefect.start(TINY, until_stage="static_calibration", gates="always")
 
-    def note_resumed(api, path, *body, **method):
-        if not path.endswith("/resume"):
-            return ask(api, path, *body, **method)
-        resumed.add(path)
-        return {"status": "ACCEPT"}
+    def work_until(name):
+        worker = ServedWorker("asking", installed)
+        at_work = Thread(
+            target=copy_context().run, args=(anyio.run, worker.start, True, False, str)
+        )
+        at_work.start()
+        state = f"/flow_runs/{asked.flow_run}"
+        wait_until(lambda: prefect.ask(state)["state_name"] in (name, "Failed", "Crashed"))
+        at_work.join(60)
+        assert prefect.ask(state)["state_name"] == name
 
-    monkeypatch.setattr(PrefectApi, "ask", note_resumed)
-    suspension.resume_suspended(plan.project, "paused-match")
-    assert len(resumed) == 11
+    work_until("Suspended")
+    first = store.run(TINY)
+    assert (first.state, first.gates, len(first.waiting)) == ("waiting", "always", 6)
+    with pytest.raises(RuntimeError, match="required property"):  # no verdict is none
+        resume_flow_run(asked.flow_run, run_input={"who": "Ada"})
+    resume_flow_run(asked.flow_run, run_input={"verdict": "approve", "who": "Bob", "why": "seen"})
+    work_until("Completed")
+    said = [each for each in read_journal(store, TINY).records if isinstance(each, ReviewDecision)]
+    assert [(each.verdict, each.who) for each in said] == [("approve", "Bob")] * 6
+    second = store.run(TINY)
+    assert (second.state, second.executed, second.results) == ("complete", (), first.results)
+    assert store.unfinished_runs(TINY) == ()
 
 
 def test_a_server_that_refuses_or_is_gone_is_named(plan):

@@ -19,8 +19,7 @@ from flows.service.inbox import (
     take_in,
     watch_once,
 )
-from flows.service.layout import StateFolder, state_folder
-from worldpose.errors import UsageError
+from flows.service.layout import StateFolder
 from worldpose.store.store import Store
 
 
@@ -236,35 +235,6 @@ def test_a_match_that_ends_the_process_stops_no_other_and_is_refused(desk, drop)
     assert [each.state for each in desk.take_in()] == ["taken"]
 
 
-def test_what_was_ended_on_purpose_or_by_an_error_is_no_death(desk, drop, monkeypatch):
-    drop("aaa")
-    desk.look()
-
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("flows.service.inbox.register", interrupt)
-        for _ in range(3):
-            with pytest.raises(KeyboardInterrupt):
-                desk.take_in()
-    assert desk.state.arrivals()["aaa"].deaths == 0
-    for _ in range(3):
-        assert die(desk) == 137
-        desk.state.end_orderly()  # as `worldpose serve` does on a signal to end
-    assert [each.state for each in desk.take_in()] == ["taken"]
-
-
-def test_a_damaged_note_of_an_arrival_is_made_again(desk, drop):
-    drop()
-    desk.look()
-    (file,) = (desk.state.folder / "arrivals").glob("*.json")
-    file.write_bytes(file.read_bytes()[:30])
-    assert desk.look() == 0
-    assert desk.look() == 1
-    assert [each.state for each in desk.take_in()] == ["taken"]
-
-
 def test_priorities_are_folders_unless_these_are_matches(desk, drop):
     drop("background")  # holds a match.yaml
     drop("urgent/b")
@@ -417,10 +387,3 @@ def test_more_files_than_any_match_has_are_refused(drop, monkeypatch):
     monkeypatch.setattr("flows.service.inbox.MOST_FILES", 3)
     with pytest.raises(RefusalError, match="more than 3 files"):
         fingerprint_of(folder)
-
-
-def test_a_project_on_object_storage_needs_a_folder_for_its_state(tmp_path):
-    assert state_folder(str(tmp_path), None).folder == tmp_path / "operations"
-    assert state_folder("s3://bucket/p", tmp_path).folder == tmp_path
-    with pytest.raises(UsageError, match="--state"):
-        state_folder("s3://bucket/p", None)

@@ -1,6 +1,5 @@
 """What infra/ sets up fits together: names, ports, options, secrets; tools check what they can."""
 
-import ast
 import re
 import shutil
 import ssl
@@ -134,18 +133,6 @@ def test_dask_takes_no_connection_without_its_certificate():
         for key in (key for key in environment if key.startswith(prefix)):
             place = key.removeprefix("DASK_").lower().replace("__", ".")
             assert dask.config.get(place.replace("_", "-"), "unknown") != "unknown", key
-
-
-def test_a_dask_scheduler_over_http_tells_health_and_figures_alone():
-    routes = "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES"
-    (scheduler,) = [each for each in manifests() if named(each) == ("Deployment", "dask-scheduler")]
-    (container,) = scheduler["spec"]["template"]["spec"]["containers"]
-    in_kubernetes = {each["name"]: each["value"] for each in container["env"]}[routes]
-    for value in (SERVICES["dask-scheduler"]["environment"][routes], in_kubernetes):
-        assert ast.literal_eval(value) == [
-            "distributed.http.scheduler.prometheus",
-            "distributed.http.health",
-        ]
 
 
 def test_pods_of_kubernetes_are_reached_by_those_alone_that_a_policy_names():
@@ -297,16 +284,3 @@ def test_the_batch_script_is_a_shell_script_that_asks_for_its_arguments():
     bare = subprocess.run(["bash", script], capture_output=True, text=True, env={"PATH": "/bin"})
     assert bare.returncode != 0
     assert "a match folder" in bare.stderr
-    directives = re.findall(r"^#SBATCH (--[\w-]+)", script.read_text(), re.MULTILINE)
-    assert {"--nodes", "--time", "--requeue"} <= set(directives)
-    text = script.read_text()
-    assert "prefect server start" not in text
-    assert text.index('mktemp -d "$project/operations') < text.index(
-        "flows.orchestration.private_cluster"
-    )
-    for started in (
-        "dask scheduler --protocol tls",
-        "flows.orchestration.prefect_server",
-        "--preload tasks",
-    ):
-        assert text.index("COMM__REQUIRE_ENCRYPTION=true") < text.index(started)

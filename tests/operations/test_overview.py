@@ -3,105 +3,23 @@
 import json
 import os
 import shutil
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from command_line import TINY
 from many_matches import copy_match
 from page_client import MATCH, log_in, served
-from run_records import run_record
 
-from data_contracts.review import NamedTrack, ReviewDecision, ReviewRequest
-from data_contracts.run import WaitingUnit
+from data_contracts.review import NamedTrack
 from flows import overview
-from flows.layers import layer_path, write_layer
+from flows.layers import write_layer
 from flows.overview import PAGE, Overview, make_summary, read_summary
 from flows.registering import open_match
 from flows.review.corrections import keep_edits
-from worldpose.body import body_file
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.registration import register_match
 from worldpose.store.paths import ResultId, summary_path
 from worldpose.store.store import Store
-
-UNIT = "static_calibration/cam03"
-REQUEST = "static_calibration.cam03.1f2e3d4c5b6a"
-CONTENT, OTHER = "c" * 64, "d" * 64
-ASKED = datetime(2026, 5, 1, 12, tzinfo=UTC)
-ENDED = ASKED + timedelta(minutes=5)
-WRONG = "clicks_wrong_share is 0.3333, at most 0.25 passes"
-IN_WORDS = "clicks that contradict the others: 33.3 %, limit 25 %"
-FIGURES = {
-    "expected_ground_error_median_m": 0.01,
-    "expected_ground_error_p95_m": 0.04,
-    "clicks_wrong": 1.0,
-    "clicks_used": 2.0,
-    "weak": 0.0,
-}
-
-
-def record():
-    """A run of one camera whose clicks need a review."""
-    return run_record(
-        run_id="0002",
-        state="waiting",
-        results={UNIT: "0" * 32},
-        waiting=(WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,)),),
-        started_at=ASKED,
-        finished_at=ENDED,
-    )
-
-
-def question(content=CONTENT):
-    return ReviewRequest(
-        id=REQUEST,
-        match_id="m",
-        run_id="0002",
-        gate="static_calibration",
-        keys={UNIT: "0" * 32},
-        contents={UNIT: content},
-        reasons=(WRONG,),
-        figures=FIGURES,
-        created_at=ASKED,
-    )
-
-
-def verdict(word):
-    return ReviewDecision(match_id="m", request=REQUEST, verdict=word, who="Ada", decided_at=ENDED)
-
-
-@pytest.fixture
-def glance(monkeypatch):
-    """A function that returns the stages of a run whose match has such a journal."""
-
-    def look(run, journal):
-        told = SimpleNamespace(last=0, questions=journal)
-        monkeypatch.setattr(overview, "read_journal", lambda store, match: told)
-        manifest = SimpleNamespace(content=CONTENT, seconds=2.0, figures=FIGURES, files=())
-        return overview.list_units(SimpleNamespace(manifest=lambda *place: manifest), run)
-
-    return look
-
-
-@pytest.mark.parametrize(
-    ("journal", "state", "objections", "since"),
-    [
-        ([question()], "waiting", (WRONG,), ASKED),
-        ([question(), verdict("reject")], "waiting", (WRONG,), ASKED),
-        ([question(), verdict("approve")], "done", (), None),
-        ([question(), verdict("approve"), verdict("reject")], "waiting", (WRONG,), ASKED),
-        # Somebody approved what was there before.
-        ([question(OTHER), verdict("approve")], "waiting", (WRONG,), ASKED),
-        ([], "waiting", (WRONG,), ENDED),
-    ],
-)
-def test_a_result_waits_until_it_is_approved_itself(glance, journal, state, objections, since):
-    ((stage, (unit,)),) = glance(record(), journal).items()
-    assert (stage, unit.unit, unit.state) == ("static_calibration", "cam03", state)
-    assert (unit.objections, unit.waiting_since) == (objections, since)
-    assert unit.why == (IN_WORDS if state == "waiting" else "")
 
 
 @pytest.fixture
@@ -190,23 +108,6 @@ def test_a_summary_is_used_until_something_changes_that_it_was_made_from(
     overview.code_digest.cache_clear()
 
 
-BROKEN = {
-    "project": b"detection.stride: [",
-    f"matches/{TINY}": b"- 1",
-    "venues/hall": b"pitch: 3",
-}
-
-
-@pytest.mark.parametrize("layer", BROKEN)
-def test_a_broken_layer_of_settings_can_be_corrected(store, layer):
-    if layer.startswith("venues"):
-        write_layer(store, f"matches/{TINY}", {"venue": "hall"})
-    store.blobs.put(layer_path(layer), BROKEN[layer])
-    assert layer in read_summary(store, TINY).problem
-    write_layer(store, layer, {})
-    assert read_summary(store, TINY).problem == ""
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -223,44 +124,6 @@ def test_files_that_settings_name_are_watched_even_if_they_are_absent(store, set
     assert read_summary(store, TINY) == first
     file.mkdir()
     assert read_summary(store, TINY).made_from != first.made_from
-
-
-def test_the_default_body_folder_is_watched(store, monkeypatch, tmp_path):
-    monkeypatch.delenv("WORLDPOSE_BODY_FOLDER", raising=False)
-    monkeypatch.setattr(body_file, "BODY_FOLDER", tmp_path / "bodies")
-    assert str(tmp_path / "bodies") in make_summary(store, TINY).watched
-
-
-def test_a_text_that_is_no_path_is_no_error():
-    assert list(overview._paths_in(["", "a\0b", 3, None, "~nobody-of-this-name/x"])) == [
-        str(Path("~nobody-of-this-name/x").absolute())
-    ]
-
-
-def test_a_match_is_read_again_after_a_look_that_failed(store, monkeypatch):
-    looked = Overview(store)
-    with monkeypatch.context() as patch:
-        patch.setattr(overview, "read_summary", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            looked.look()
-    (match,) = looked.look()
-    assert match.words == "ready"
-
-
-def test_pages_that_are_open_at_once_share_what_was_read(store, monkeypatch):
-    asked, reads = Overview(store), []
-    real = overview.read_summary
-    monkeypatch.setattr(overview, "read_summary", lambda *it: reads.append(it) or real(*it))
-    asked.look()
-    assert [asked.glance(TINY).words for _ in range(3)] == ["ready"] * 3
-    assert len(reads) == 2  # of the look, and of the first page
-    correct(store)
-    asked.look()
-    assert asked.glance(TINY).corrections == 1
-    monkeypatch.setattr(overview, "GLANCE_SECONDS", 0.0)
-    before = len(reads)
-    asked.glance(TINY)
-    assert len(reads) == before + 1
 
 
 def test_a_summary_that_is_damaged_or_of_another_match_is_made_again(store):

@@ -1,13 +1,12 @@
 """Prefect on Postgres, the store on S3, Dask as processes of their own: the bytes of any run."""
 
-import socket
 import subprocess
 import sys
-import time
 import uuid
 
 import pytest
 from command_line import TINY, succeed
+from service import free_ports, wait_until
 from store_comparison import compare_stores
 
 from flows.orchestration.prefect_environment import (
@@ -22,14 +21,12 @@ from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
 LOGIN = new_login()
-START_SECONDS = 300
-"""Maximum time for the start of a server on a busy machine."""
 
 
 @pytest.fixture
 def prefect_on_postgres(postgres, tmp_path):
     """The address of a Prefect server whose database is Postgres."""
-    api = f"http://127.0.0.1:{free_port()}/api"
+    api = f"http://127.0.0.1:{free_ports(1)[0]}/api"
     plan = ServePlan(project="none", inbox=tmp_path, state=tmp_path, prefect=api)
     environment = served_environment(api, tmp_path / "prefect")
     environment["PREFECT_API_DATABASE_CONNECTION_URL"] = postgres[0]
@@ -61,15 +58,3 @@ def test_real_components_give_the_bytes_of_an_embedded_run(
     # The server takes in the workers' events a moment later.
     ended = "select count(*) > 0 and bool_and(state_name = 'Completed') from task_run"
     wait_until(lambda: ask(ended) == "t")
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return probe.getsockname()[1]
-
-
-def wait_until(is_so):
-    deadline = time.monotonic() + START_SECONDS
-    while not is_so():
-        assert time.monotonic() < deadline
-        time.sleep(0.5)

@@ -99,19 +99,6 @@ def test_old_ends_are_forgotten_but_the_last_of_each_match(queue, tmp_path):
     assert [run.id for run in queue.runs()] == [old.id, "2"]
 
 
-def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
-    for number in range(3000):
-        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
-        file = tmp_path / queue_path(run)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(seal(run))
-    queue.runs()
-    lost = queue.change(queue.take(a_run("lost")), "begun")
-    began = time.process_time()
-    assert queue.open_runs() == [lost]
-    assert time.process_time() - began < 1.0
-
-
 def beats(queue, run, seconds):
     """How often a run showed progress in this time."""
     before = queue.beat(run)
@@ -270,18 +257,6 @@ def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
     assert kept_alerts(plan.state_folder) == {}
 
 
-def test_what_stands_still_is_unhealthy(plan):
-    state = plan.state_folder
-    state.folder.mkdir()
-    kept = '{"told_by": [], "since": "2026-01-01", "match": "", "link": "http://h/status", '
-    entries = (
-        f'"{kind}": {kept}"alert": "{kind}", "text": "why"}}' for kind in ("quality", "run_late")
-    )
-    state.alerts.write_text(f"{{{', '.join(entries)}}}")
-    (finding,) = _check_progress(state)
-    assert (finding.is_well, finding.state) == (False, "why")
-
-
 def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp_path):
     monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
     monkeypatch.setattr(suspension, "SUSPENDING", 5.0)
@@ -301,3 +276,28 @@ def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp
     assert next(states) == "SCHEDULED"
     monkeypatch.setattr(suspension.PrefectApi, "list_all", lambda *args, **more: [])
     assert suspension.resume_suspended(str(tmp_path), "m") == []
+
+
+def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
+    for number in range(3000):
+        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
+        file = tmp_path / queue_path(run)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(seal(run))
+    queue.runs()
+    lost = queue.change(queue.take(a_run("lost")), "begun")
+    began = time.process_time()
+    assert queue.open_runs() == [lost]
+    assert time.process_time() - began < 1.0
+
+
+def test_what_stands_still_is_unhealthy(plan):
+    state = plan.state_folder
+    state.folder.mkdir()
+    kept = '{"told_by": [], "since": "2026-01-01", "match": "", "link": "http://h/status", '
+    entries = (
+        f'"{kind}": {kept}"alert": "{kind}", "text": "why"}}' for kind in ("quality", "run_late")
+    )
+    state.alerts.write_text(f"{{{', '.join(entries)}}}")
+    (finding,) = _check_progress(state)
+    assert (finding.is_well, finding.state) == (False, "why")

@@ -104,12 +104,9 @@ def test_matches_started_on_pages_run_one_after_another(served, matches):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(
-    seed, served, matches, small_match
-):
+def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(served, matches, small_match):
     """Its runs began on pages and in the inbox; it is killed three times while they are at work."""
-    rng = random.Random(seed)
+    rng = random.Random(1)
     store, names = matches(2, first=100)
     served.options = {"--max-concurrent": 2, "--workers": 1, "--poll-interval": 5}
     served.begin()

@@ -10,8 +10,6 @@ from data_contracts.operations import Arrival, MatchSummary, UnitSummary
 from flows.overview import Overview
 from flows.service.layout import StateFolder
 from flows.service.status_page import (
-    MAX_DETAILS,
-    UNSEEN_SECONDS,
     StatusRow,
     status_html,
 )
@@ -98,26 +96,3 @@ def test_the_worst_state_of_a_stage_is_what_is_seen():
     assert '42 %</span> <progress max="100" value="42">' in text
     assert "results/report" not in text  # no run of it is complete
     assert "<script" not in text.replace(OWN, "")
-
-
-def test_an_empty_project_says_what_to_do():
-    text = status_html([], [], "", inbox="/data/in & out")
-    assert '<a href="/">Create one</a>' in text
-    assert "<code>/data/in &amp; out</code>" in text
-
-
-def test_cameras_of_many_matches_are_shown_for_one_of_them():
-    unit = {"ingest": (UnitSummary(unit="cam00", state="done", seconds=1.0),)}
-    names = [f"m{number}" for number in range(MAX_DETAILS + 1)]
-    many = [StatusRow(MatchSummary(match_id=name, stages=unit)) for name in names]
-    assert status_html(many[1:], [], "").count("<details>") == MAX_DETAILS
-    assert "<details>" not in status_html(many, [], "")
-    text = status_html(many, [], "", opened="m3")
-    assert text.count("<details>") == 1
-    assert "m3, camera by camera" in text
-
-
-def test_matches_that_were_not_read_yet_are_shown_by_name():
-    text = status_html([StatusRow(MatchSummary(match_id="m", is_unseen=True))], [], "")
-    assert "being read" in text
-    assert f'content="{UNSEEN_SECONDS}"' in text

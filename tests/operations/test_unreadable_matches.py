@@ -4,11 +4,10 @@ import errno
 import os
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
-from command_line import WORLDPOSE, worldpose
+from command_line import worldpose
 from page_client import log_in, served
 
 from flows.overview import Overview
@@ -42,36 +41,6 @@ def stale_mount(monkeypatch, two):
 
     monkeypatch.setattr(os, "stat", fail)
     return two
-
-
-def without_rights(*arguments):
-    """Run the command line as a user bound by file permissions, even if tests run as root."""
-    drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"]
-    command = [*(drop if os.geteuid() == 0 else ()), *WORLDPOSE, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=480)
-
-
-@pytest.fixture
-def locked(two):
-    """The first match's folder may not be read."""
-    if os.geteuid() == 0 and shutil.which("setpriv") is None:
-        pytest.skip("permissions do not hold for root, and setpriv is not installed")
-    (two / "first").chmod(0)
-    yield two
-    (two / "first").chmod(0o755)
-
-
-def test_status_names_a_folder_without_permission_and_shows_the_others(locked):
-    answer = without_rights("status", "--project", locked / "project")
-    assert answer.returncode == 0, answer.stderr
-    lines = answer.stdout.splitlines()
-    assert any(line.startswith("second ") for line in lines)
-    (problem,) = [line for line in lines if line.startswith("first: ")]
-    assert str(locked / "first") in problem
-    assert "Permission denied" in problem
-    assert "Traceback" not in answer.stderr
-    answer = without_rights("review", "list", "--project", locked / "project", "--json")
-    assert '"problems"' in answer.stdout
 
 
 def test_pages_show_the_others_beside_a_stale_mount(stale_mount):

@@ -210,7 +210,7 @@ class FoldedKeypoints:
 
 
 def fold_keypoints(model: BodyModel, points: tuple[str, ...]) -> FoldedKeypoints:
-    """Return named points of a model, for instance those of `skeletons.COCO17`.
+    """Return named points of a model, for instance `COCO17` or `HALPE26`.
 
     Raises:
         InputError: the name of a point is unknown, or the model has another number of vertices than
@@ -228,10 +228,10 @@ def fold_keypoints(model: BodyModel, points: tuple[str, ...]) -> FoldedKeypoints
         else:
             raise InputError(
                 f"keypoint {point!r}",
-                expected="a point of skeletons.JOINT_OF_POINT or VERTEX_OF_POINT, on a model of "
+                expected="head_top, or a point of JOINT_OF_POINT or VERTEX_OF_POINT, on a model of "
                 f"{SMPL_VERTICES} vertices",
                 found=f"no such point on {model.name} with {len(model.template)} vertices",
-                todo="Name another point or use fold_regressor with weights of your own.",
+                todo="Take a body of SMPL's vertices; fold_regressor takes any weights.",
             )
     return fold_regressor(model, joint_shares, vertex_shares)
 

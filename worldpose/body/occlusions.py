@@ -39,7 +39,7 @@ def find_hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16
     persons = depth.shape[1]
     hider = np.full(pixels.shape[:3], -1, np.int16)
     nearest = np.full(pixels.shape[:3], np.inf)
-    low, high = pixels.min(axis=2), pixels.max(axis=2)
+    low, high = np.fmin.reduce(pixels, axis=2), np.fmax.reduce(pixels, axis=2)
     room = 0.06 * size[..., None]
     for person in range(persons):
         with np.errstate(invalid="ignore"):
@@ -72,10 +72,8 @@ def is_covered(points: Floats, body: Floats, size: Floats, parts: Capsules = CAP
     return covered
 
 
-def visible_joints(joints: Floats, camera: Camera) -> tuple[Floats, Flags]:
-    """Return pixels, and which joints are in the image and hidden by no nearer person.
-
-    Shapes are (frames, persons, joints, 2) and (frames, persons, joints).
+def hidden_joints(joints: Floats, camera: Camera) -> Flags:
+    """Return which joints a nearer person hides (frames, persons, joints).
 
     Args:
         joints: (frames, persons, joints, 3) [m], world, COCO-17 first; NaN where missing.
@@ -84,11 +82,13 @@ def visible_joints(joints: Floats, camera: Camera) -> tuple[Floats, Flags]:
     stature = 1.8  # mean height of a person [m]
     frames, persons, count, _ = joints.shape
     pixels = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
-    trunk = joints[:, :, COCO17_TORSO].mean(axis=2)
-    depth = np.linalg.norm(trunk - camera.center[..., None, :], axis=-1)
-    size = stature * camera.focal.mean(axis=-1)[..., None] / depth
-    within = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)
-    return pixels, within.all(-1) & (find_hiders(pixels, depth, size) < 0)
+    trunk = joints[:, :, COCO17_TORSO]
+    known = np.isfinite(trunk).all(axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # who has no trunk neither hides nor is hidden
+        middle = np.where(known, trunk, 0.0).sum(axis=2) / known.sum(axis=2)
+        depth = np.linalg.norm(middle - camera.center[..., None, :], axis=-1)
+        size = stature * camera.focal.mean(axis=-1)[..., None] / depth
+        return find_hiders(pixels, depth, size) >= 0
 
 
 def visible_shares(joints: Floats, camera: Camera) -> Floats:
@@ -96,7 +96,10 @@ def visible_shares(joints: Floats, camera: Camera) -> Floats:
 
     Joints are (frames, persons, 17, 3) [m], world; NaN where a person, or the camera, is missing.
     """
-    seen = visible_joints(joints, camera)[1]
+    frames, persons, count, _ = joints.shape
+    pixels = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
+    within = (pixels >= -0.5) & (pixels <= camera.image_size[..., None, None, :] - 0.5)
+    seen = within.all(-1) & ~hidden_joints(joints, camera)
     placed = np.asarray(np.isfinite(camera.center).all(axis=-1))
     known = np.isfinite(joints).all((-1, -2)) & placed[..., None]
     return np.where(known, seen.mean(-1), np.nan)

@@ -118,7 +118,7 @@ class _File:
         """Append an array (rows, ...); return the index of its accessor.
 
         Args:
-            array: array of a type in `kinds`; 16-bit integers with a sign count as fractions.
+            array: (rows, ...) of int16 (fractions), uint8, uint16, uint32 or float32.
             target: use of the data, for vertices and indices.
             bounds: state the extreme values.
         """

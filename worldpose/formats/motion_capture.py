@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, find_runs
+from data_contracts.arrays import Flags, Floats, find_runs
 from data_contracts.conventions import COCO17, COCO17_BONES
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyModel, BodyParameters
@@ -37,12 +37,12 @@ def coco_dataset(
 ) -> dict[str, Any]:
     """Return the people of one camera as a COCO keypoints data set.
 
-    One image per frame: `id` is the camera's own frame number, `file_name` is <camera>/<frame with
-    six digits>. One annotation per person with at least one joint in the image: `keypoints` are the
-    reprojected 3D joints with v = 2 if this camera's own observation is an inlier of the joint, v =
-    1 if the joint comes from other cameras only, and 0, 0, 0 if there is no joint or it is outside
-    the image. `bbox` and `area` are those of the keypoints; `track_id` is the person, and
-    `identity_certainty` the probability of that, where it is known.
+    One image per frame with a camera: `id` is the camera's own frame number, `file_name` is
+    <camera>/<frame with six digits>. One annotation per person with at least one joint in the
+    image: `keypoints` are the reprojected 3D joints with v = 2 if they are `observed`, v = 1 if
+    not, and 0, 0, 0 if there is no joint or it is outside the image. `bbox` and `area` are those of
+    the keypoints; `track_id` is the person, and `identity_certainty` the probability of that, where
+    it is known.
 
     Args:
         camera_id: prefix of the image names.
@@ -60,13 +60,13 @@ def coco_dataset(
     pixels = camera.project(tracks.joints.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
     pixels = np.round(pixels if move is None else move(pixels), PIXEL_DECIMALS)
     within = (pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5)
-    own_frames = (tracks.frames if number is None else number).tolist()
-    is_first = np.diff(own_frames, prepend=-np.inf) > 0
-    visible = np.all(within, axis=-1) * np.where(observed, 2, 1) * is_first[:, None, None]
+    own_frames = tracks.frames if number is None else number
+    is_shown = _is_shown(own_frames, camera)
+    visible = np.all(within, axis=-1) * np.where(observed, 2, 1) * is_shown[:, None, None]
     annotations = [
         {
             "id": number,
-            "image_id": own_frames[frame],
+            "image_id": int(own_frames[frame]),
             "category_id": 1,
             "track_id": int(tracks.person_ids[person]),
             **_certainty(tracks, frame, person),
@@ -85,7 +85,7 @@ def coco_dataset(
         "licenses": [],
         "images": [
             {"id": frame, "file_name": f"{camera_id}/{frame:06d}", "width": width, "height": height}
-            for frame in dict.fromkeys(own_frames)
+            for frame in own_frames[is_shown].tolist()
         ],
         "annotations": annotations,
         "categories": [
@@ -100,6 +100,12 @@ def coco_dataset(
     }
 
 
+def _is_shown(number: NDArray[np.int64], camera: Camera) -> Flags:
+    """Return the frames (frames,) whose camera is known, and shows an image for the first time."""
+    first = (np.diff(number, prepend=-np.inf) > 0) & (number >= 0)
+    return np.asarray(first & np.isfinite(camera.center).all(axis=-1))
+
+
 def _certainty(tracks: JointTracks, frame: int, person: int) -> dict[str, float]:
     """Return the probability of a person's identity in a frame, where it is known."""
     stated = tracks.identity_certainty
@@ -110,9 +116,9 @@ def _certainty(tracks: JointTracks, frame: int, person: int) -> dict[str, float]
 
 def alphapose_results(
     pixels: Floats,
-    visible: NDArray[np.bool_],
+    hidden: Flags,
     person_ids: NDArray[np.integer],
-    size: NDArray[np.integer],
+    camera: Camera,
     number: NDArray[np.int64],
 ) -> list[dict[str, Any]]:
     """Return people in the images of a camera as results of AlphaPose in 26 points of Halpe.
@@ -123,14 +129,15 @@ def alphapose_results(
 
     Args:
         pixels: (frames, persons, 26, 2) [px]; NaN where missing.
-        visible: (frames, persons, 26), in the image and not hidden.
+        hidden: (frames, persons, 26), by a nearer person.
         person_ids: (persons,).
-        size: (2,) of the image [px].
+        camera: as in `coco_dataset`.
         number: (frames,) the camera's own frame, as in `coco_dataset`.
     """
+    size = camera.image_size.reshape(-1, 2)[0]
     within = np.all((pixels >= -0.5) & (pixels <= size - 0.5), axis=-1)
-    within &= (np.diff(number, prepend=-1) > 0)[:, None, None]
-    sure = np.where(within, np.where(visible, 1.0, 0.5), 0.0)
+    within &= _is_shown(number, camera)[:, None, None]
+    sure = np.where(within, np.where(hidden, 0.5, 1.0), 0.0)
     entries = []
     for frame, person in np.argwhere(within.any(-1)).tolist():
         here = within[frame, person]

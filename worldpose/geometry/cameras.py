@@ -387,8 +387,8 @@ class Camera:
     def describe_fold(self, where: str) -> str:
         """Return a warning of a single camera whose lens folds within the image, else nothing."""
         share = self.blind_share()
-        said = f"{where}: the lens folds within the image, {share:.1%} of which shows nothing"
-        return said if share > 0.0 else ""
+        said = f"{where}: the lens model folds within the image: {share:.0%} of it has no ray"
+        return said if share >= 0.01 else ""  # a corner or two hide nobody
 
     def require_rays(self, where: str) -> None:
         """Raise InputError if a single camera's lens folds in the middle of the image.

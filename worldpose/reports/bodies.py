@@ -119,17 +119,14 @@ def _light(
     surface: Singles, faces: NDArray[np.int32], corners: scipy.sparse.csr_array, eye: Singles
 ) -> Singles:
     """Return the light at each vertex (vertices,); 1 = unchanged colour."""
-    sunlit = 0.3
-    ambient = 0.45
+    ambient, sunlit, from_camera = 0.45, 0.3, 0.25  # together 1, where a face meets both
     a, b, c = (surface[faces[:, k]] for k in range(3))
     normals = _unit(corners @ np.cross(b - a, c - a))
     facing = np.einsum("vc,vc->v", normals, _unit(eye - surface))
     # Direction to the light, world: high, from the main camera's side.
     to_sun = np.array([0.35, -0.45, 0.82], dtype=np.float32)
     sun = normals @ _unit(to_sun)
-    # Shares of ambient light, sunlight and light from the camera.
-    shares = 0.25
-    light = ambient + sunlit * np.maximum(sun, 0.0) + shares * np.maximum(facing, 0.0)
+    light = ambient + sunlit * np.maximum(sun, 0.0) + from_camera * np.maximum(facing, 0.0)
     return np.asarray(light, dtype=np.float32)
 
 

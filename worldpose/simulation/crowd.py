@@ -126,9 +126,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
 
 def _rest_samples(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
     """Return the intervals of samples, first and behind the last, in which a person stands."""
-    standing_time = 0.3  # A person who is slower than `standing_speed` for this time stands [s]
-    # Slower people stand [m/s].
-    standing_speed = 0.25
+    standing_time, standing_speed = 0.3, 0.25  # [s], [m/s]: who is slower for so long stands
     slow = np.concatenate([[False], pace < standing_speed, [False]])
     begins, ends = np.flatnonzero(~slow[:-1] & slow[1:]), np.flatnonzero(slow[:-1] & ~slow[1:])
     long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= standing_time

@@ -106,7 +106,7 @@ def move_broadcast_camera(
     released clips: k1 0.1 to 1, k2 0.6 to 4.3.
 
     `times` (frames,) [s] are those of the camera's own images. `action` (samples, 2) [m], world, is
-    the place of the action at `action_times` (samples,) [s], from `warm_up` before the first frame
+    the place of the action at `action_times` (samples,) [s], from 1.5 s before the first frame
     to the last.
     """
     center = np.array(

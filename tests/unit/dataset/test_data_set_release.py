@@ -16,7 +16,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.results.best_results import Origin
 from flows.results.data_set_release import ASSETS, check_data_set, write_data_set
 from worldpose.body.keypoints import fold_keypoints
-from worldpose.body.occlusions import visible_shares
+from worldpose.body.occlusions import hidden_joints, visible_shares
 from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.manifest import read_data_set, released_files
 from worldpose.errors import InputError, UsageError
@@ -166,6 +166,8 @@ def test_people_behind_others_and_outside_the_image_are_less_visible(model, pose
     shares = visible_shares(people, camera)
     assert (shares[:, 0] == 1.0).all() and (shares[:, 2] == 0.0).all()
     assert (shares[:, 1] < 0.3).all() and np.isnan(shares[:, 3]).all()
+    people[:, 0, COCO17.index("left_wrist")] = np.nan  # the rest of the body hides all the same
+    assert (hidden_joints(people, camera)[:, 1].mean(axis=-1) > 0.6).all()
 
 
 def test_a_released_folder_is_scored(written):
