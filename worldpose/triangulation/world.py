@@ -379,8 +379,7 @@ def place_cameras(
         [Camera.from_calibration(each, f"{calibration}: {name}") for name, each in cameras.items()]
     )
     people = None
-    folds = (batch[n].describe_fold(name) for n, name in enumerate(cameras))
-    told = [f"warning: {each}" for each in folds if each]
+    told = [f"warning: {it}" for n, c in enumerate(cameras) if (it := batch[n].describe_fold(c))]
     if len(cameras) > 1 and detections.keys() >= cameras.keys():
         stacked = KeypointDetections.stack([detections[name] for name in cameras])
         find = partial(find_people, detections=stacked, fps=fps)
@@ -410,10 +409,8 @@ def place_cameras(
         return dict(cameras), [*([f"{calibration}: {unit}"] if unit else []), *notes]
     height = float(scale * people.ground @ up) if turned and people is not None else 0.0
     # The board of a calibration may lie on the ground, and tells it better than ankles.
-    if not abs(height) > 0.15:  # also NaN
-        height = 0.0
-    else:
-        turned += f"; people walk at {height:+.2f} m, which is z = 0 now"
+    height = height if abs(height) > 0.15 else 0.0  # also of NaN
+    turned += f"; people walk at {height:+.2f} m, which is z = 0 now" if height else ""
     done = "; ".join(each for each in (unit, turned) if each)
     motion = Similarity(np.array(scale), turn_to_z(up), np.array([0.0, 0.0, -height]))
     pose = move_cameras(motion, batch).cam_from_world

@@ -246,9 +246,9 @@ def test_a_lens_that_folds_in_the_middle_is_refused_and_at_the_corners_told(ring
         place_cameras(
             CALIBRATION, given(-((2.0 / (3.0 * 0.5 * corner)) ** 2) / 3.0), {}, FPS, NOTHING
         )
-    folds = given(-((2.0 / (3.0 * 0.98 * corner)) ** 2) / 3.0)
+    folds = given(-((2.0 / (3.0 * 0.9 * corner)) ** 2) / 3.0)
     _, (_, warning, *_) = place_cameras(CALIBRATION, folds, {}, FPS, NOTHING)
-    assert "c0: the lens folds within the image" in warning
+    assert "c0: the lens model folds within the image" in warning
 
 
 @pytest.mark.parametrize("also", [1.0 / 3.0, 0.5])
