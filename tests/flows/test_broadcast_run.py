@@ -94,8 +94,8 @@ def test_a_broadcast_camera_alone_gives_places_and_with_estimates_bodies(server,
         seen = points[:, 2] == 2
         if seen.any():
             offsets = keypoints[person["image_id"]][:, seen] - points[seen, :2]
-            distances = np.nanmean(np.linalg.norm(offsets, axis=-1), axis=-1)
-            away.append(np.nanmin(distances))
+            distances = np.ma.masked_invalid(np.linalg.norm(offsets, axis=-1)).mean(axis=-1)
+            away.append(float(distances.min()))
     assert len(away) > 100
     assert np.median(away) < 6.0  # px; of the wrong frame or camera: 15 and more
 
