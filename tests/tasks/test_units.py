@@ -77,7 +77,7 @@ def test_a_run_tells_of_a_given_lens_that_folds_at_the_corners(planned, tmp_path
     static_calibration.fn(unit.work(store.url, match, "0001"))
     written = store.manifest(match.match_id, "static_calibration", unit.recipe.unit, unit.key)
     (said,) = written.warnings
-    assert said.startswith(f"{unit.recipe.unit}: the lens folds within the image")
+    assert said.startswith(f"{unit.recipe.unit}: the lens model folds within the image")
 
 
 def test_an_imported_lens_is_the_prior_of_its_camera_and_of_no_other(clicked, tmp_path):
