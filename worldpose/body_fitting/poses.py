@@ -187,11 +187,22 @@ def pose_covariance(
     body = equations.points
     random = propagate(body.pose, factor(equations.blocks).inverse_blocks())
     alone = replace(objective, acceleration=np.inf, contacts=None)
-    blocks = alone.equations(pose, offsets, bordered=False).blocks
+    blocks = alone.equations(pose, offsets, bordered=False, points=body).blocks[:1]
     blocks *= objective.settings.repeated(objective.fps)
-    single = propagate(body.pose, factor(blocks).inverse_blocks())
+    lower = np.tril(_damp(blocks)[0])  # what factors read
+    whole = lower + np.tril(lower, -1).swapaxes(1, 2)
+    single = propagate(body.pose, np.linalg.inv(whole))
     smaller = np.einsum("tpii->tp", single) < np.einsum("tpii->tp", random)
     return body.keypoints, np.where(smaller[..., None, None], single, random)
+
+
+def _damp(blocks: Floats) -> Floats:
+    """Return blocks (bands, frames, n, n) with a little damping, which overwrites them."""
+    places = np.arange(blocks.shape[-1])
+    blocks[0][:, places, places] *= 1.0 + 1e-4
+    # Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad.
+    blocks[0][:, places, places] += 0.01
+    return blocks
 
 
 def factor(blocks: Floats) -> BandedFactor:
@@ -200,11 +211,7 @@ def factor(blocks: Floats) -> BandedFactor:
     Raises:
         DegenerateError: rounding leaves no positive definite system.
     """
-    places = np.arange(blocks.shape[-1])
-    blocks[0][:, places, places] *= 1.0 + 1e-4
-    # Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad.
-    blocks[0][:, places, places] += 0.01
-    solved = BandedFactor.of(blocks, overwrite=True)
+    solved = BandedFactor.of(_damp(blocks), overwrite=True)
     if not solved.determined:
         raise DegenerateError(
             "body fitting: the weights of the joints differ by more than double precision can "

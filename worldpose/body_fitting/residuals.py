@@ -137,23 +137,31 @@ class PersonObjective:
     starts: tuple[int, ...] = ()
     """First frames of the intervals after the first; motion ties no interval to another."""
 
-    def equations(self, pose: Pose, offsets: Floats, *, bordered: bool) -> NormalEquations:
+    def equations(
+        self,
+        pose: Pose,
+        offsets: Floats,
+        *,
+        bordered: bool,
+        points: KeypointJacobian | None = None,
+    ) -> NormalEquations:
         """Return the normal equations at a pose: of all terms but E_shape and E_offset.
 
         Args:
             pose: where to linearise.
             offsets: (17, 3) [m] forward, left, up, from a body's joints to the detector's.
             bordered: whether the equations have a border for betas and offsets.
+            points: those of the pose with their derivatives, if they are known.
         """
-        given, body = self.settings, self.differentiate(pose, by_betas=bordered)
-        frames, points = body.keypoints.shape[:2]
+        given, body = self.settings, points or self.differentiate(pose, by_betas=bordered)
+        frames, count = body.keypoints.shape[:2]
         # The points besides COCO-17 already lie where the detector has them.
-        offsets = np.concatenate([offsets, np.zeros((points - len(offsets), 3))])
+        offsets = np.concatenate([offsets, np.zeros((count - len(offsets), 3))])
         axes = body_axes(body.keypoints)
         perceived = body.keypoints + np.einsum("fab,jb->fja", axes, offsets)
 
-        sums = PointSums.empty(frames, points)
-        std = self.acceleration * acceleration_scale(points) / self.fps**2
+        sums = PointSums.empty(frames, count)
+        std = self.acceleration * acceleration_scale(count) / self.fps**2
         tail = 3.0 * given.acceleration_loss_scale**2
         add_smoothness(sums, body.keypoints, std, tail, self.starts)
         if self.contacts is not None:
