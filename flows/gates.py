@@ -103,10 +103,9 @@ class CameraLimits(Record):
     calibration page warns. People correct the cameras later (`bundle_adjustment`)."""
     expected_ground_error_p95_m: float = Field(default=_CALIBRATION.weak_p95_m, ge=0)
     """The same at its 95th percentile [m]: the far side, where a pixel is 5 to 20 cm."""
-    clicks_wrong_share: float = Field(default=0.25, ge=0)
-    """Share of clicks that are outliers to the others [1]. Calibration excludes them, and a few do
-    no harm where the expected error is small; from a quarter on, the others may be the wrong ones.
-    Below, they are a reservation of the results."""
+    clicks_wrong: float = Field(default=0, ge=0)
+    """Clicks that are outliers to the others [1]. A click at the wrong marking is one, and the
+    annotator sees at once which click is wrong."""
     weak: float = Field(default=0, ge=0)
     """1 if the clicks leave a direction of the camera undetermined [1]."""
 
@@ -197,18 +196,13 @@ class BroadcastLimits(Record):
 EXCESS: Final = "held_out_certain_excess_m"
 
 
-def _of_camera(figures: Figures) -> Figures:
-    wrong, used = figures.get("clicks_wrong", 0.0), figures.get("clicks_used", 0.0)
-    return {**figures, "clicks_wrong_share": wrong / max(1.0, wrong + used)}
-
-
 def _in_3d(figures: Figures) -> Figures:
-    """Metrics of people in 3D pass where nobody is in 3D: the run says so, and why."""
+    """Pass absent metrics of people in 3D if no person is in 3D: the run says so, and why."""
     flat = figures.get("plane_people", 0.0) >= figures.get("people", 1.0)
+    if not flat and figures.get("joints") != 0:
+        return figures
     names = ("mean_ray_distance_m", "standard_deviation_m", "filled_share")
-    return (
-        {**dict.fromkeys(names, 0.0), **figures} if flat or figures.get("joints") == 0 else figures
-    )
+    return {**dict.fromkeys(names, 0.0), **figures}
 
 
 def _of_people(figures: Figures) -> Figures:
@@ -244,7 +238,6 @@ GATES: Final[Mapping[str, Gate]] = {
             "Do the projected markings match those in the image, in all parts of it?",
             CameraLimits(),
             "the clicks of this camera",
-            _of_camera,
         ),
         Gate(
             "detection",

@@ -158,9 +158,10 @@ def _views(
     origin: best_results.Origin, clip: str, frames: Integers
 ) -> Iterator[tuple[str, Camera, Integers, Callable[[Floats], Floats]]]:
     """Yield name, camera, own frames, and where pixels move, of a clip's cameras and views."""
-    for name, camera in origin.static_cameras.items():
-        stated = best_results.placed_joints(origin.run, clip).attrs["changes"]
-        changes = [CameraChange.model_validate(each) for each in stated]
+    cameras = origin.static_cameras
+    stated = best_results.placed_joints(origin.run, clip).attrs["changes"] if cameras else ()
+    changes = [CameraChange.model_validate(each) for each in stated]
+    for name, camera in cameras.items():
         own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
         move = partial(move_on, frame=frames, camera=camera, changes=own)
         yield name, camera, unit_frames(origin.spec, name).numbers(frames), move

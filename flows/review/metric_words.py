@@ -21,7 +21,6 @@ _WORDS: Final[Mapping[str, str]] = {
     "expected_ground_error_median_m": "expected error on the pitch",
     "expected_ground_error_p95_m": "expected error on the worst part of the pitch",
     "clicks_wrong": "clicks that contradict the others",
-    "clicks_wrong_share": "clicks that contradict the others",
     "unreadable_share": "frames without a readable image",
     "empty_share": "images without people",
     "bridged_share": "boxes filled in between two frames",

@@ -107,7 +107,7 @@ def build(
     draft: Path,
     indexes: Mapping[str, Index | None],
 ) -> tuple[list[Problem], list[str]]:
-    """Make a match folder anew around its footage, with what all other files of a draft say.
+    """Make the match folder again around its footage, with what all other files of a draft say.
 
     Args:
         store: its matches are not to be made again.

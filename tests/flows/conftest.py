@@ -1,7 +1,5 @@
 """Fixtures that tests of the review pages share: the server and the browser."""
 
-from dataclasses import replace
-
 import pytest
 
 from worldpose.store.store import Store
@@ -47,13 +45,3 @@ def bob(app):
     import page_client
 
     return page_client.log_in(app, "Bob")
-
-
-@pytest.fixture
-def strict_clicks(monkeypatch):
-    """The gate of static cameras asks about one wrong click, as it does about a quarter of them."""
-    from flows import gates
-
-    limits = gates.CameraLimits(clicks_wrong_share=0.0)
-    gate = replace(gates.GATES["static_calibration"], limits=limits)
-    monkeypatch.setitem(gates.GATES, "static_calibration", gate)

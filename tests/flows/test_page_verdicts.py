@@ -20,8 +20,6 @@ from worldpose.review.journal import say
 from worldpose.store.store import Store, open_run
 from worldpose.video.files import VideoReader
 
-pytestmark = pytest.mark.usefixtures("strict_clicks")
-
 
 @pytest.fixture
 def going_on(monkeypatch):

@@ -3,7 +3,7 @@
 
 import { clicking, open, shoot, shootSizes, task, tell } from "../chromium.mjs";
 
-const seen = { errors: [], outside: [], states: [], asked: [] };
+const seen = { errors: [], outside: [], states: [] };
 const page = await open(seen, 900);
 page.on("dialog", (dialog) => dialog.accept());
 const match = encodeURIComponent(task.match);
@@ -17,7 +17,7 @@ const until = async (what, isSo) => {
   }
 };
 
-const STEPS = [create, calibrate, run, correct, mend, watch, download, schedule, leave];
+const STEPS = [create, calibrate, answer, correct, complete, mend, watch, download, schedule, leave];
 
 await page.goto(`${task.pages}/login#token=${task.token}`);
 await shootSizes(page, seen, "login");
@@ -74,19 +74,24 @@ async function calibrate() {
   await page.goto(matchPage);
 }
 
-// One wrong click is no question: the calibration excludes it, and the page names the camera.
-async function run() {
+// The run asks about the camera with the wrong click.
+async function answer() {
   await page.goto(matchPage);
   await page.click("[data-now=new] button");
   await page.waitForSelector("[data-now=running]");
   await shootSizes(page, seen, "running");
-  await complete();
+  await until("a question", async () => (await state()).waiting.length > 0 && (await state()).at_work?.state !== "running");
+  seen.asked = (await state()).waiting.map((each) => each.unit);
+  await page.waitForSelector(".evidence figure img", { timeout: 120000 });
+  await settled();
+  seen.blank = await page.evaluate(() => [...document.querySelectorAll(".evidence img")].filter((each) => !each.naturalWidth).length);
+  await shootSizes(page, seen, "question");
 }
 
-// The wrong click is taken out, which puts the results out of date.
+// The wrong click is taken out; the question needs no verdict, and the run continues.
 async function correct() {
   await page.goto(matchPage);
-  await page.click("tr:has-text('1 contradict') a");
+  await page.click("text=Correct its clicks");
   await page.waitForSelector("[data-figure]", { timeout: 60000 });
   await page.locator("body").press("n");
   await shoot(page, "worst");
@@ -94,17 +99,10 @@ async function correct() {
   await page.waitForSelector('[data-state="saved"]', { timeout: 60000 });
   await page.waitForTimeout(1500);
   await page.goto(matchPage);
-  await page.waitForSelector("text=1 correction");
+  await page.waitForSelector("text=Corrected, will be computed again");
   await shootSizes(page, seen, "corrected");
-  await again();
-}
-
-// Run again what is out of date.
-async function again() {
-  const last = (await state()).run.id;
-  await page.click("[data-now=outdated] button");
-  await until("the next run", async () => (await state()).run.id !== last || (await state()).at_work?.state === "running");
-  await complete();
+  await page.click("button >> text=Recompute");
+  await until("the run at work", async () => (await state()).at_work?.state === "running");
 }
 
 // Whatever else waits is approved, until the run is complete.
@@ -115,7 +113,6 @@ async function complete() {
     const at = now.at_work?.state === "running" ? "running" : now.run?.state;
     if (seen.states.at(-1) !== at) seen.states.push(at);
     if (at === "failed") throw new Error(`the run failed: ${JSON.stringify(now.failures)}`);
-    seen.asked.push(...now.waiting.map((each) => each.unit));
     if (at === "waiting" && now.waiting.some((each) => !each.rejected)) {
       await page.locator("button.first >> text=Approve").first().click();
       await page.waitForTimeout(1500);
@@ -152,7 +149,10 @@ async function mend() {
   await page.keyboard.press("Enter");
   await page.waitForSelector(".row >> text=Harry Kane");
   await page.goto(matchPage);
-  await again();
+  const last = (await state()).run.id;
+  await page.click("[data-now=outdated] button");
+  await until("the next run", async () => (await state()).run.id !== last || (await state()).at_work?.state === "running");
+  await complete();
 }
 
 // The result plays in 3D next to the video.

@@ -57,8 +57,9 @@ def test_a_match_of_videos_becomes_results_by_clicks_alone(served, recorded, tmp
     }
     seen = drive(SCRIPT, task, tmp_path, 3500)
     assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
-    # No gate asks about the one wrong click.
-    assert "static_calibration/cam03" not in seen["asked"]
+    # The gate asks about the camera with the wrong click, over images of its video.
+    assert seen["asked"] == ["static_calibration/cam03"]
+    assert seen["blank"] == 0
     assert seen["states"][-1] == "complete"
     assert seen["named"] == 1
     assert seen["left"] == 401
