@@ -69,7 +69,7 @@ def test_corrections_make_a_match_out_of_date_and_names_do_not(store):
 
 def test_questions_then_answers(store):
     run_match(store, open_match(store, TINY), RunRequest({}, gates="auto"))
-    assert state(store).words == "1 question"
+    assert state(store).words == "2 questions"
     decide(store, open_match(store, TINY), (), "approve", who="Ada", why="")
     assert state(store).words == "out of date because its questions are answered"
 
