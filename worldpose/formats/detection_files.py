@@ -45,7 +45,7 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
         InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
             unknown or a changing number of keypoints; the error names file and key.
     """
-    files = _frame_files(folder)
+    files = frame_files(folder)
     read = {frame: _read_frame(files[frame]) for frame in sorted(files)}
     sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
@@ -67,7 +67,8 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     return PeopleFile(people, kind, changed._replace(nobody=nobody, empty=empty))
 
 
-def _frame_files(folder: Path) -> dict[int, Path]:
+def frame_files(folder: Path) -> dict[int, Path]:
+    """Return the JSON file of each frame of a camera; errors as of `read_openpose_folder`."""
     there = {file.name: file for file in sorted(folder.glob("*.[jJ][sS][oO][nN]"))}
     numbers = frame_numbers(there)
     files: dict[int, Path] = {}

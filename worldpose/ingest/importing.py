@@ -189,17 +189,24 @@ def detections_by_camera(
     Raises:
         InputError: fewer than two cameras have a file.
     """
-    places = [each for each in sorted(folder.glob("[!.]*")) if each.is_dir()]
-    folders = {camera_of(each): each for each in places if camera_of(each) not in left_out}
-    if sorted(folders) == sorted(cameras):
-        return {name: folders[name] for name in cameras}
     suffixes = (".json", ".npz")
-    files: dict[str, Path] = {}
-    for file in sorted(folder.glob("[!.]*")):
-        name = camera_id(file.stem)
-        if file.suffix.lower() in suffixes:
-            files[file.name if name in files else name] = file  # a second one fits no camera
-    return pick_cameras(folder, files, cameras, calibration, suffixes, left_out)
+    there = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in suffixes]
+    found: dict[str, Path] = {}
+    for place in [*pose_folders(folder), *(each for each in there if each.is_file())]:
+        name = camera_of(place)
+        found[place.name if name in found else name] = place  # a second one fits no camera
+    endings = (*suffixes, "or a folder of .json")
+    return pick_cameras(folder, found, cameras, calibration, endings, left_out)
+
+
+def pose_folders(folder: Path) -> list[Path]:
+    """Return the folders in a folder that hold 2D poses: JSON, or names `<camera>_json`."""
+    return [
+        place
+        for place in sorted(folder.glob("[!.]*"))
+        if place.is_dir()
+        and (place.name.endswith("_json") or any(place.glob("*.[jJ][sS][oO][nN]")))
+    ]
 
 
 def import_lenses(
@@ -285,6 +292,7 @@ def build_spec(
     frames: tuple[int, int],
     *,
     videos: Mapping[str, Path] = MappingProxyType({}),
+    offsets: Mapping[str, int] = MappingProxyType({}),
     pitch: str | None = "none",
 ) -> MatchSpec:
     """Return match.yaml of a match with the one clip `clip`.
@@ -296,6 +304,7 @@ def build_spec(
         sizes: width and height of the cameras' images [px].
         frames: the clip's first frame, and the one after its last.
         videos: file in `videos/` of those cameras that have one.
+        offsets: `offset_frames` of those cameras whose clock is another.
         pitch: entry `pitch`.
 
     Raises:
@@ -307,6 +316,7 @@ def build_spec(
         "cameras": [
             {"id": name, "width": width, "height": height}
             | ({"video": f"videos/{videos[name].name}"} if name in videos else {})
+            | ({"offset_frames": offsets[name]} if offsets.get(name) else {})
             for name, (width, height) in sizes.items()
         ],
         "clips": [{"id": "clip", "first_frame": frames[0], "frame_count": frames[1] - frames[0]}],

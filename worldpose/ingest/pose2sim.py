@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,8 +20,8 @@ from worldpose.formats.calibration_forms import (
     find_calibration,
     read_calibration,
 )
-from worldpose.formats.detection_files import read_openpose_folder
-from worldpose.formats.files import read_toml
+from worldpose.formats.detection_files import frame_files, read_openpose_folder
+from worldpose.formats.files import by_last_number, read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.camera_videos import (
@@ -37,6 +40,7 @@ from worldpose.ingest.importing import (
     describe_outside,
     describe_people,
     find_people,
+    pose_folders,
 )
 from worldpose.ingest.writing import write_match
 from worldpose.video.folder import index_video
@@ -56,8 +60,9 @@ def import_pose2sim(
     Pose2Sim's batches, in any form that `read_calibration` reads; without it each video is a
     camera. 2D poses are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each
     camera; without them people are detected in the videos of `videos/`. Poses and videos belong to
-    the cameras of their names, or, as in Pose2Sim, in alphabetical order to the cameras in the
-    calibration's order. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
+    the cameras of their names, or, as in Pose2Sim, in the order of the last numbers in their names
+    to the cameras in the calibration's order. The shift of `pose-sync/` against `pose/` is the
+    clock of a camera's video. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
     smaller or larger than the calibrated images, with or without black bars, its camera is in the
     video's pixels, as the 2D poses are.
 
@@ -78,7 +83,7 @@ def import_pose2sim(
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
-    places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
+    places = pose_folders(folder)
     films = list(find_videos(project / "videos").values())
     if not places and not films:
         expected = f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4"
@@ -122,6 +127,7 @@ def import_pose2sim(
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
+    offsets = _find_shifts(project / "pose", poses, notes) if videos else {}
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     for name, files in poses.items():
@@ -131,11 +137,48 @@ def import_pose2sim(
     _require_video_sizes(folder, cameras, indices)
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     sizes = {name: sizes[name] for name in names}
-    spec = build_spec(out, match_id, rate, sizes, (first, stop), videos=videos)
+    spec = build_spec(out, match_id, rate, sizes, (first, stop), videos=videos, offsets=offsets)
+    for name, shift in offsets.items():
+        people[name] = replace(people[name], frame=people[name].frame + shift)
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
     return spec, notes + describe_outside(people, sizes) + _describe_poses(folder, read)
+
+
+def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict[str, int]:
+    """Return the frame of each camera's video that its frame 0 of synchronised poses shows.
+
+    Pose2Sim copies the files of `pose/` to `pose-sync/` under shifted numbers: files that are equal
+    tell the shift. Frames of one content, as those without people, tell none.
+    """
+
+    def once(folder: Path) -> dict[bytes, int]:
+        there = frame_files(folder).items() if folder.is_dir() else ()
+        told = {frame: hashlib.sha256(file.read_bytes()).digest() for frame, file in there}
+        count = Counter(told.values())
+        return {content: frame for frame, content in told.items() if count[content] == 1}
+
+    shifts: dict[str, int] = {}
+    unknown = []
+    for name, folder in poses.items():
+        if folder.parent == raw:
+            return {}
+        before, after = once(raw / folder.name), once(folder)
+        steps = {before[content] - after[content] for content in before.keys() & after.keys()}
+        if len(steps) == 1:
+            shifts[name] = steps.pop()
+        else:
+            unknown.append(name)
+    if listed := ", ".join(f"{name} {shift}" for name, shift in shifts.items() if shift):
+        notes.append(f"the videos follow pose-sync by offset_frames, from pose: {listed}")
+    if unknown:
+        notes.append(
+            f"warning: the shift of pose-sync against pose is not known of {', '.join(unknown)}: "
+            "if their poses were shifted, their videos do not show the same frames; set "
+            "offset_frames in match.yaml"
+        )
+    return shifts
 
 
 def _require_video_sizes(
@@ -252,7 +295,10 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
 def _assign(
     places: list[Path], cameras: list[str], calibration: Path, notes: list[str]
 ) -> dict[str, Path]:
-    """Return the folder or file of each camera: by name, or else by alphabetical order."""
+    """Return the folder or file of each camera: by name, or else by the last number in its name.
+
+    Names without a number are in alphabetical order.
+    """
     named = {camera_of(place): place for place in places}
     both = [camera for camera in cameras if camera in named]
     if len(both) > 1 or len(both) == len(cameras):
@@ -261,11 +307,11 @@ def _assign(
         if others := [place.name for name, place in named.items() if name not in both]:
             notes.append(f"{calibration.name} lacks {', '.join(others)}")
         return {camera: named[camera] for camera in both}
-    if len(places) != len(cameras):
+    if len(named) != len(cameras):
         expected = f"one for each camera in {calibration.name}: {', '.join(cameras)}"
         found = ", ".join(place.name for place in places)
         raise InputError(str(places[0].parent), expected, found, "Name them after the cameras.")
-    pairs = dict(zip(cameras, places, strict=True))
+    pairs = dict(zip(cameras, by_last_number(named).values(), strict=True))
     listed = ", ".join(f"{place.name} is {camera}" for camera, place in pairs.items())
-    notes.append(f"{places[0].parent.name}: in alphabetical order, {listed}")
+    notes.append(f"{places[0].parent.name}: in the order of the names, {listed}")
     return pairs

@@ -52,7 +52,7 @@ def index_frames(path: Path) -> FrameIndex:
     It decodes all frames of a file whose packets do not say when each frame is shown.
 
     Raises:
-        InputError: no video, or frames without time stamps.
+        InputError: no video, frames without time stamps, or stamps that start again.
     """
     try:
         with open_file(path) as container:
@@ -66,9 +66,14 @@ def index_frames(path: Path) -> FrameIndex:
                 raise _no_video(path, said)
             size: tuple[int, int] | None = None
             packets: list[tuple[int | None, bool]] = []
+            decoded, shown = [], []  # times of decoding, and those of showing key frames
             for packet in read_packets(container, stream):
                 size = _shown_size(path, packet) if size is None else size
                 if packet.size and not packet.is_discard:
+                    decoded += [] if packet.dts is None else [packet.dts]
+                    shown += [packet.pts] if packet.is_keyframe and packet.pts is not None else []
+                    if any(times[-1:] < times[-2:-1] for times in (decoded, shown)):
+                        raise _joined(path, len(packets))
                     packets.append((packet.pts, packet.is_keyframe))
             size = (stream.width, stream.height) if size is None else size
             _require_square(path, stream)
@@ -201,6 +206,16 @@ def _require_square(path: Path, stream: VideoStream) -> None:
         )
 
 
+def _joined(path: Path, number: int) -> InputError:
+    return InputError(
+        str(path),
+        expected="time stamps that rise",
+        found=f"they go back at frame {number}, as where two recordings are joined",
+        todo="Give one recording, or join them anew: ffmpeg -f concat -safe 0 -i LIST -c copy "
+        "OUT.mp4, with a line file 'NAME' for each in LIST.",
+    )
+
+
 def _no_video(path: Path, found: str) -> InputError:
     return InputError(
         str(path),
@@ -259,7 +274,7 @@ class VideoReader(Pictures):
             only: frames to yield; the others are decoded, but not converted. None = all.
 
         Raises:
-            InputError: there are no such frames.
+            InputError: there are no such frames, or one has another size than the first.
         """
         stop = len(self) if stop is None else stop
         if not 0 <= start <= stop <= len(self):
@@ -270,8 +285,23 @@ class VideoReader(Pictures):
                 todo="Ask for frames that the video has.",
             )
         for number, picture in self._sound_pictures(start, stop) if start < stop else ():
+            self._require_size(number, picture)
             if number >= start and (only is None or number in only):
                 yield number, None if picture is None else convert_pixels(picture, grey, width)
+
+    def _require_size(self, number: int, picture: av.VideoFrame | None) -> None:
+        """Raise InputError for a frame of another size than the first one."""
+        if picture is None:
+            return
+        shown = picture.width, picture.height
+        shown = shown[::-1] if picture.rotation % 180 else shown
+        if shown != self.index.size:
+            raise InputError(
+                f"{self.path}: frame {number}",
+                expected="images of {} x {} px, as the first one".format(*self.index.size),
+                found=f"{shown[0]} x {shown[1]}",
+                todo="Give a video of one camera in one mode.",
+            )
 
     def _sound_pictures(self, start: int, stop: int) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """Yield every frame from the last key frame up to `start` on; None if damaged."""

@@ -130,6 +130,35 @@ def test_a_file_that_was_cut_off_is_said(tmp_path, ending, words):
     assert words in note and "copied" in note
 
 
+def test_recordings_joined_byte_by_byte_are_refused(tmp_path):
+    one, two = (encode(tmp_path / f"{n}.ts", 20, {"g": "10"}) for n in range(2))
+    (tmp_path / "joined.ts").write_bytes(one.read_bytes() + two.read_bytes())
+    with pytest.raises(InputError, match="they go back at frame 20, as where two recordings"):
+        VideoReader(tmp_path / "joined.ts")
+
+
+def test_a_size_that_changes_within_a_video_is_refused(tmp_path):
+    with av.open(str(tmp_path / "a.ts"), "w") as container:
+        for size, first in ((SIZE, 0), ((96, 128), 10)):
+            picture = np.full((*size, 3), 90, np.uint8)
+            coder = av.CodecContext.create("libx264", "w")
+            coder.height, coder.width, coder.pix_fmt = *size, "yuv420p"
+            coder.time_base, coder.options = Fraction(1, 25), {"bf": "0"}
+            if not first:
+                stream = container.add_stream("libx264", 25)
+                stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
+            frames = [av.VideoFrame.from_ndarray(picture, format="rgb24") for _ in range(10)]
+            for number, frame in enumerate(frames):
+                frame.pts, frame.time_base = first + number, Fraction(1, 25)
+            for packet in [each for frame in [*frames, None] for each in coder.encode(frame)]:
+                packet.stream = stream
+                container.mux(packet)
+    with VideoReader(tmp_path / "a.ts") as video:
+        assert len([*video.frames(0, 5)]) == 5
+        with pytest.raises(InputError, match=r"frame 10: expected images of 64 x 48.*128 x 96"):
+            list(video.frames())
+
+
 def test_two_videos_of_one_camera_are_refused(tmp_path):
     film(tmp_path / "videos", ("a", "b"))
     (tmp_path / "videos" / "a.mov").write_bytes(b"")
