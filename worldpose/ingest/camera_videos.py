@@ -17,7 +17,7 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import camera_id
 from worldpose.formats.calibration_unit import scaled
 from worldpose.ingest.footage import stretches
-from worldpose.video.folder import SUFFIXES, open_video
+from worldpose.video.folder import SUFFIXES, numbered_images, open_video
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 from worldpose.video.recordings import describe_video, join_videos
@@ -32,7 +32,7 @@ def find_videos(
     """Return the video of each camera in a folder: a file, or a folder of numbered images.
 
     A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
-    folder of the camera.
+    folder of the camera, as may be its only video.
 
     Args:
         folder: holds them.
@@ -49,25 +49,53 @@ def find_videos(
     groups += [[file] for file in videos] if named else _recordings(videos)
     for place in there:
         if place.is_dir() and not _has_images(place):
-            groups += _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
+            groups += [group for group in _recordings_in(place) if not _is_unnamed(place, group)]
     found: dict[str, Path] = {}
     for group in groups:
-        inside = group[0].parent != folder
-        if inside and len(group) == 1:
-            continue  # an only video in a folder is not named after a camera
-        place = group[0].parent if inside else group[0]
+        place = group[0].parent if group[0].parent != folder else group[0]
         name = camera_id(place.stem if place.is_file() else place.name)
         if name in found:
             expected = "one video of each camera"
             todo = "Name each video after its camera."
-            raise InputError(str(folder), expected, f"{found[name].name} and {place.name}", todo)
-        found[name] = place
+            both = f"{found[name].relative_to(folder)} and {group[0].relative_to(folder)}"
+            raise InputError(str(folder), expected, both, todo)
+        found[name] = group[0]
         if len(group) > 1:
             if workshop is None or not _is_whole(group):
                 raise _chapters_error(folder, group)
             found[name] = workshop / f"{name}{group[0].suffix.lower()}"
             join_videos(group, found[name])
     return found
+
+
+def _recordings_in(place: Path) -> list[list[Path]]:
+    return _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
+
+
+def _is_unnamed(place: Path, group: Sequence[Path]) -> bool:
+    """Return whether a video is one of several of a folder, none of which is called as a camera."""
+    return len(group) == 1 and len(_recordings_in(place)) > 1
+
+
+def describe_unused(folder: Path) -> list[str]:
+    """Return sentences about files and videos in a folder that are of no camera."""
+    there = sorted(folder.glob("[!.]*"))
+    others = [file.name for file in there if file.is_file() and not is_video(file)]
+    inner: list[Path] = []
+    for place in (each for each in there if each.is_dir()):
+        if _has_images(place):
+            every = sorted(place.glob("[!.]*"))
+            inner += [each for each in every if each.suffix.lower() not in SUFFIXES]
+        else:
+            groups = _recordings_in(place)
+            inner += [group[0] for group in groups if _is_unnamed(place, group)]
+    reasons = {
+        "as they have no ending of a video": others,
+        "as a camera's folder has one video, or images": [
+            each.relative_to(folder).as_posix() for each in inner
+        ],
+    }
+    return [f"left out, {why}: {', '.join(them):.200}" for why, them in reasons.items() if them]
 
 
 def _has_images(folder: Path) -> bool:
@@ -184,15 +212,21 @@ def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
     return "; ".join(said)
 
 
+def video_name(camera: str, file: Path) -> str:
+    """Return the name of a camera's video in a match folder: its own, if that is the camera's."""
+    own = camera_id(file.name if file.is_dir() else file.stem)
+    return file.name if own == camera else f"{camera}{file.suffix.lower()}"
+
+
 def copy_videos(files: Mapping[str, Path], folder: Path) -> None:
     """Copy the videos of cameras into a match folder."""
     if files:
         (folder / "videos").mkdir()
-    for file in files.values():
-        target = folder / "videos" / file.name
+    for name, file in files.items():
+        target = folder / "videos" / video_name(name, file)
         if file.is_dir():
             target.mkdir()
-            for image in sorted(file.glob("[!.]*")):
+            for _, image in numbered_images(file):
                 shutil.copyfile(image, target / image.name)
         else:
             shutil.copyfile(file, target)

@@ -96,7 +96,8 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or
             has another size; or clicks exist already.
     """
-    images = read_marked_images(file)
+    every = read_marked_images(file)
+    images = [image for image in every if image.points or image.lines]
     spec = read_spec(folder)
     pitch = read_pitch(folder, spec)
     if pitch is None:
@@ -105,6 +106,9 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         raise InputError(f"{folder / 'match.yaml'}: pitch", expected, "pitch: none", todo)
     by_owner = _assign_images(file, images, spec, owner)
     report = ImportedClicks()
+    unread = Counter(shape for image in every for shape in image.left_out)
+    if listed := ", ".join(f"{count} {shape}" for shape, count in sorted(unread.items())):
+        report.notes.append(f"shapes are left out that are no labelled points or lines: {listed}")
     labels = _Labels(file, images, pitch, report)
     records: dict[str, Record] = {}
     for name, (camera, given) in by_owner.items():

@@ -23,18 +23,20 @@ from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 from worldpose.ingest.camera_videos import (
     copy_videos,
+    describe_unused,
     describe_videos,
     find_videos,
     fit_to_video,
     require_cameras,
     shared_length,
+    video_name,
 )
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.registration import file_state, require_settled
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
 from worldpose.video.folder import index_video
-from worldpose.video.names import VIDEO_SUFFIXES, is_video
+from worldpose.video.names import VIDEO_SUFFIXES
 from worldpose.video.pictures import FrameIndex
 
 Placing: TypeAlias = Callable[
@@ -117,6 +119,7 @@ _CHANGES: Final = {
     "clamped": "confidences above 1, which count as 1",
     "nobody": "entries without a known joint, which count as no person",
     "pointless": "annotations without keypoints, such as of the ball, which count as no person",
+    "foreign": "annotations of another category, which count as no person",
     "empty": "empty files, which count as frames without people",
 }
 
@@ -315,7 +318,7 @@ def build_spec(
         "fps": fps,
         "cameras": [
             {"id": name, "width": width, "height": height}
-            | ({"video": f"videos/{videos[name].name}"} if name in videos else {})
+            | ({"video": f"videos/{video_name(name, videos[name])}"} if name in videos else {})
             | ({"offset_frames": offsets[name]} if offsets.get(name) else {})
             for name, (width, height) in sizes.items()
         ],
@@ -418,9 +421,7 @@ def _import_found(
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)
-    there = (file for file in sorted(folder.glob("[!.]*")) if file.is_file())
-    if others := [file.name for file in there if not is_video(file)]:
-        notes.append(f"left out, as they have no ending of a video: {', '.join(others):.200}")
+    notes += describe_unused(folder)
     sizes = {name: index.size for name, index in indices.items()}
     count = shared_length(map(len, clocks.values()))
     spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)

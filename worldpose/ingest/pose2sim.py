@@ -26,6 +26,7 @@ from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.camera_videos import (
     copy_videos,
+    describe_unused,
     describe_videos,
     find_videos,
     fit_to_video,
@@ -83,13 +84,13 @@ def import_pose2sim(
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
-    places = pose_folders(folder)
-    films = list(find_videos(project / "videos").values())
+    places = {camera_of(each): each for each in pose_folders(folder)}
+    films = find_videos(project / "videos")
     if not places and not films:
         expected = f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4"
         todo = "Run Pose2Sim.poseEstimation() first, or add the videos."
         raise InputError(str(project), expected, "neither", todo)
-    known = {file: index_video(file) for file in films}
+    known = {file: index_video(file) for file in films.values()}
     left_out = LeftOut()
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
@@ -97,16 +98,16 @@ def import_pose2sim(
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        require_cameras(project / "videos", {camera_of(file): file for file in films})
-        names = [camera_of(file) for file in films]
+        require_cameras(project / "videos", films)
+        names = list(films)
         source = project / "videos"
     else:
-        shown = {camera_of(file): index.size for file, index in known.items()}
+        shown = {name: known[file].size for name, file in films.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
-        places = [each for each in places if camera_of(each) not in left_out]
-        films = [each for each in films if camera_of(each) not in left_out]
+        places = {name: each for name, each in places.items() if name not in left_out}
+        films = {name: each for name, each in films.items() if name not in left_out}
     is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
     poses = _assign(places, names, source, notes) if places else {}
     videos = _assign(films, names, source, notes) if films else {}
@@ -122,7 +123,8 @@ def import_pose2sim(
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
-    notes += describe_videos(videos, indices, clocks) if clocks else []
+    if clocks:
+        notes += describe_videos(videos, indices, clocks) + describe_unused(project / "videos")
     length = shared_length(map(len, clocks.values()))
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
@@ -293,13 +295,13 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
 
 
 def _assign(
-    places: list[Path], cameras: list[str], calibration: Path, notes: list[str]
+    named: dict[str, Path], cameras: list[str], calibration: Path, notes: list[str]
 ) -> dict[str, Path]:
     """Return the folder or file of each camera: by name, or else by the last number in its name.
 
     Names without a number are in alphabetical order.
     """
-    named = {camera_of(place): place for place in places}
+    places = list(named.values())
     both = [camera for camera in cameras if camera in named]
     if len(both) > 1 or len(both) == len(cameras):
         if lacking := [camera for camera in cameras if camera not in named]:

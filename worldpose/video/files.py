@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
-from itertools import dropwhile, islice, pairwise
+from itertools import chain, dropwhile, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -65,21 +65,17 @@ def index_frames(path: Path) -> FrameIndex:
                 said = f"frames without a size, or of more than {MAX_FRAME_PIXELS:,} pixels"
                 raise _no_video(path, said)
             size: tuple[int, int] | None = None
-            packets: list[tuple[int | None, bool]] = []
-            decoded, shown = [], []  # times of decoding, and those of showing key frames
+            packets: list[tuple[int | None, bool, int | None]] = []
             for packet in read_packets(container, stream):
                 size = _shown_size(path, packet) if size is None else size
                 if packet.size and not packet.is_discard:
-                    decoded += [] if packet.dts is None else [packet.dts]
-                    shown += [packet.pts] if packet.is_keyframe and packet.pts is not None else []
-                    if any(times[-1:] < times[-2:-1] for times in (decoded, shown)):
-                        raise _joined(path, len(packets))
-                    packets.append((packet.pts, packet.is_keyframe))
+                    packets.append((packet.pts, packet.is_keyframe, packet.dts))
+            _require_one(path, packets)
             size = (stream.width, stream.height) if size is None else size
             _require_square(path, stream)
             base = stream.time_base
             reorders = stream.codec_context.has_b_frames
-        given = [stamp for stamp, _ in packets if stamp is not None]
+        given = [stamp for stamp, _, _ in packets if stamp is not None]
         if not given or base is None:
             raise _no_video(path, f"{len(packets)} pictures without time stamps")
         is_told = len(set(given)) == len(packets)
@@ -95,7 +91,7 @@ def index_frames(path: Path) -> FrameIndex:
         raise _no_video(path, found) from error
     stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
-    key = np.array([key for _, key in packets], dtype=np.bool_)[order]
+    key = np.array([key for _, key, _ in packets], dtype=np.bool_)[order]
     return FrameIndex(stamps[order], key, base, size)
 
 
@@ -206,14 +202,17 @@ def _require_square(path: Path, stream: VideoStream) -> None:
         )
 
 
-def _joined(path: Path, number: int) -> InputError:
-    return InputError(
-        str(path),
-        expected="time stamps that rise",
-        found=f"they go back at frame {number}, as where two recordings are joined",
-        todo="Give one recording, or join them anew: ffmpeg -f concat -safe 0 -i LIST -c copy "
-        "OUT.mp4, with a line file 'NAME' for each in LIST.",
-    )
+def _require_one(path: Path, packets: Sequence[tuple[int | None, bool, int | None]]) -> None:
+    """Raise InputError where the times of decoding, or of key frames, go back."""
+    dts = [(number, time) for number, (_, _, time) in enumerate(packets) if time is not None]
+    keys = [
+        (number, pts) for number, (pts, key, _) in enumerate(packets) if key and pts is not None
+    ]
+    for (_, before), (number, time) in chain(pairwise(dts), pairwise(keys)):
+        if time < before:
+            found = f"they go back at frame {number}, as where two recordings are joined"
+            todo = "Give each recording as a file of its own, or join them by ffmpeg -f concat."
+            raise InputError(str(path), "time stamps that rise", found, todo)
 
 
 def _no_video(path: Path, found: str) -> InputError:
@@ -291,10 +290,8 @@ class VideoReader(Pictures):
 
     def _require_size(self, number: int, picture: av.VideoFrame | None) -> None:
         """Raise InputError for a frame of another size than the first one."""
-        if picture is None:
-            return
-        shown = picture.width, picture.height
-        shown = shown[::-1] if picture.rotation % 180 else shown
+        shown = self.index.size if picture is None else (picture.width, picture.height)
+        shown = shown[::-1] if picture is not None and picture.rotation % 180 else shown
         if shown != self.index.size:
             raise InputError(
                 f"{self.path}: frame {number}",

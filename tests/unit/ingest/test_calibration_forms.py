@@ -95,7 +95,7 @@ def test_a_camchain_counts_by_the_numbers_of_its_cameras(tmp_path):
     found = {name: one.center[0] for name, one in read_cameras(path).items()}
     assert found == {f"cam{n}": n * (n + 1) / 2 for n in range(12)}
     path.write_text("\n".join(lines[5:]) + "\n")
-    with pytest.raises(InputError, match="cam1.T_cn_cnm1: expected none in the first camera"):
+    with pytest.raises(InputError, match=r"cam1\.T_cn_cnm1: expected none in the first camera"):
         read_cameras(path)
 
 
