@@ -37,7 +37,8 @@ from worldpose.formats.tables import (
 )
 from worldpose.formats.usd_file import write_usd
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.footage import unit_frames
+from worldpose.ingest.clock import remaining_offset
+from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.store.store import Run
 from worldpose.triangulation.camera_changes import move_on
 
@@ -163,11 +164,36 @@ def _views(
     changes = [CameraChange.model_validate(each) for each in stated]
     for name, camera in cameras.items():
         own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
-        move = partial(move_on, frame=frames, camera=camera, changes=own)
-        yield name, camera, unit_frames(origin.spec, name).numbers(frames), move
+        unit = unit_frames(origin.spec, name)
+        late = remaining_offset(frames, unit.offset, unit.rate)
+        move = partial(_move, late=late, frame=frames, camera=camera, changes=own)
+        yield name, camera, unit.numbers(frames), move
     for view in broadcast_views(origin.run, clip):
-        number = unit_frames(origin.spec, view).numbers(frames)
-        yield view, camera_in_frames(origin.run, view, frames), number, lambda pixels: pixels
+        clock = image_clock(origin.spec, view)
+        row = frames - unit_frames(origin.spec, view).first
+        move = partial(_at_images, late=clock.late[row])
+        yield view, camera_in_frames(origin.run, view, frames), clock.number[row], move
+
+
+def _move(
+    pixels: Floats, late: Floats, frame: Integers, camera: Camera, changes: list[CameraChange]
+) -> Floats:
+    return move_on(_at_images(pixels, late), frame=frame, camera=camera, changes=changes)
+
+
+def _at_images(pixels: Floats, late: Floats) -> Floats:
+    """Return pixels (frames, ...) of consecutive frames `late` (frames,) [frame] after them.
+
+    x(t) = x(f) + (t - f) v, with the step v [px/frame] to the next frame if t > f, else from the
+    one before; the other one, or none, where that is not known.
+    """
+    step = np.diff(pixels, axis=0)
+    gap = np.full((1, *pixels.shape[1:]), np.nan)
+    ahead, back = np.concatenate([step, gap]), np.concatenate([gap, step])
+    share = late.reshape(-1, *(1,) * (pixels.ndim - 1))
+    speed, other = np.where(share > 0, ahead, back), np.where(share > 0, back, ahead)
+    speed = np.where(np.isfinite(speed), speed, other)
+    return np.asarray(pixels + share * np.where(np.isfinite(speed), speed, 0.0))
 
 
 def export_markers(origin: best_results.Origin, out: Path) -> Iterator[Path]:

@@ -165,6 +165,13 @@ def describe_videos(
         notes += describe_video(files[name], indices[name])
         if gaps := describe_gaps(clock):
             notes.append(f"{name}: {gaps}")
+    starts = {n: int(index.stamps[0]) for n, index in indices.items() if index.time_base is None}
+    if len(set(starts.values())) > 1:
+        notes.append(
+            f"images begin at {', '.join(f'{start} of {name}' for name, start in starts.items())}; "
+            "these count as one moment: if the numbers are of one clock, set offset_frames to "
+            + ", ".join(f"{min(starts.values()) - start} of {n}" for n, start in starts.items())
+        )
     counts = {name: len(clock) for name, clock in clocks.items()}
     length = shared_length(counts.values())
     if early := [f"{name} after {count}" for name, count in counts.items() if count < length]:

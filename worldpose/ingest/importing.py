@@ -175,7 +175,17 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
+    spans = {name: seen_frames(found.people) or (0, -1) for name, found in read.items()}
+    shared = [n for n, a in spans.items() for m, b in spans.items() if m != n and _meet(a, b)]
+    if len(spans) > 1 and spans.keys() - set(shared):
+        listed = ", ".join(f"{first} to {last} of {name}" for name, (first, last) in spans.items())
+        notes.append(f"warning: a camera has people in frames of no other camera: {listed}")
     return notes
+
+
+def _meet(one: tuple[int, int], two: tuple[int, int]) -> bool:
+    """Return whether two ranges of frames, first and last, share one; (0, -1) shares with all."""
+    return max(one[0], two[0]) <= min(one[1], two[1]) or -1 in (one[1], two[1])
 
 
 def detections_by_camera(

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -213,12 +214,13 @@ def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:
 
 
 def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
-    """Return the frame rate of the first video [1/s]; raise InputError without videos."""
-    if not indices:
+    """Return the frame rate of the first video [1/s]; raise InputError if none tells it."""
+    rates = [index.fps for index in indices if isfinite(index.fps)]
+    if not rates:
         expected = "frames per second, as there are no videos to take them from"
         todo = "Write for example frame_rate = 60, or give --fps."
         raise InputError(f"{config}: project.frame_rate", expected, "'auto'", todo)
-    return round(indices[0].fps, 3)
+    return round(rates[0], 3)
 
 
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:

@@ -34,8 +34,9 @@ def test_our_own_tracks_are_read_back(tmp_path):
     corner = rng.uniform(0, 300, (5, 3, 2))
     boxes = np.concatenate([corner, corner + rng.uniform(5, 100, (5, 3, 2))], axis=-1)
     boxes[2, 1] = np.nan
-    write_tracks(tmp_path / "t.txt", boxes, np.array([0, 4, 9]))
-    found = read_boxes(tmp_path / "t.txt", SIZE, 5)
+    write_tracks(tmp_path / "t.txt", boxes, np.array([0, 4, 9]), np.arange(12, 17))
+    found = read_boxes(tmp_path / "t.txt", SIZE, 17)
+    assert set(found.frame) == set(range(12, 17))
     np.testing.assert_allclose(found.box, boxes[np.isfinite(boxes).all(-1)], atol=0.0101)
     assert found.person.tolist() == [1, 5, 10] * 2 + [1, 10] + [1, 5, 10] * 2
 
