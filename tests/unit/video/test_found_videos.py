@@ -101,6 +101,34 @@ def test_folders_of_images_are_videos_of_cameras(tmp_path):
         list(video.frames())
 
 
+def test_the_only_video_of_a_folder_is_its_camera_and_the_rest_is_named(tmp_path):
+    videos = tmp_path / "videos"
+    film(videos, ("cam01",), (0,))
+    film(videos / "cam02", ("video",), (0,))
+    film(videos / "cam03", ("video",), (0,))
+    film(videos / "cam04", ("a", "b"))
+    spec, notes = import_videos(None, videos, tmp_path / "m")
+    assert [each.id for each in spec.cameras] == ["cam01", "cam02", "cam03"]
+    assert len(set(read_match(tmp_path / "m").videos.values())) == 3
+    assert "has one video, or images: cam04/a.MP4, cam04/b.MP4" in str(notes)
+    film(tmp_path / "more", ("cam02",), (0,))
+    (tmp_path / "more" / "cam02.MP4").rename(videos / "cam02.mp4")
+    with pytest.raises(InputError, match=r"cam02\.mp4 and cam02/video\.MP4"):
+        find_videos(videos)
+
+
+def test_images_that_begin_at_other_numbers_and_what_is_beside_them_are_said(tmp_path):
+    for camera, first in (("a", 0), ("b", 5)):
+        folder = tmp_path / "videos" / camera
+        (folder / "thumbs").mkdir(parents=True)
+        for n in range(first, 9):
+            cv2.imwrite(str(folder / f"{n:06d}.png"), numbered(n, 1)[0])
+    _, notes = import_videos(None, tmp_path / "videos", tmp_path / "m", fps=25.0)
+    assert "images begin at 0 of a, 5 of b; " in str(notes)
+    assert "set offset_frames to 0 of a, -5 of b" in str(notes)
+    assert "has one video, or images: a/thumbs, b/thumbs" in str(notes)
+
+
 def encode(path, count=30, options=None, name="libx264"):
     with av.open(str(path), "w") as container:
         stream = container.add_stream(name, 25, options=options or {})
