@@ -356,20 +356,18 @@ def is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
     # Parts of names of lens models, which names of devices do not have.
     lens_part = r"fish|omni|equi|kannala|ucm|fov|spher|mei|division|poly|radial|^ds$|^eq$"
     said = {}
-    for key in given:
-        if plain_key(key) in MODEL_NAMES:
-            word = "".join(map(str, np.ravel(given[key])[:1])).lower()
-            word = re.sub(r"[ -]+", "_", word)
-            is_device = plain_key(key) in MODEL_NAMES[-4:] and not re.search(lens_part, word)
-            if word not in FISHEYE_WORDS + OTHER_WORDS and not is_device:
-                words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
-                raise calibration_error(f"{where}: {key}", f"one of {words}", repr(word))
-            said[key] = word
-    yes = [key for key, word in said.items() if word in FISHEYE_WORDS]
-    no = [key for key, word in said.items() if word in OTHER_WORDS and word != "pinhole"]
+    for key in [key for key in given if plain_key(key) in MODEL_NAMES]:
+        word = re.sub(r"[ -]+", "_", "".join(map(str, np.ravel(given[key])[:1])).lower())
+        is_device = plain_key(key) in MODEL_NAMES[-4:] and not re.search(lens_part, word)
+        if word not in FISHEYE_WORDS + OTHER_WORDS and not is_device:
+            words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
+            raise calibration_error(f"{where}: {key}", f"one of {words}", repr(word))
+        said[word] = key
+    yes = said.keys() & set(FISHEYE_WORDS)
+    no = said.keys() & set(OTHER_WORDS) - {"pinhole"}
     if yes and no:
-        found = f"{said[no[0]]}, and {yes[0]} {said[yes[0]]}"
-        raise calibration_error(f"{where}: {no[0]}", "one lens model", found)
+        found = ", ".join(f"{key} {word}" for word, key in said.items())
+        raise calibration_error(where, "one lens model", found)
     return bool(yes)
 
 

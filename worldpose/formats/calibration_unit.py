@@ -16,16 +16,6 @@ from worldpose.formats.files import read_toml
 MILLIMETRE: Final = 1e-3
 """[m]"""
 
-FREEMOCAP: Final = (
-    "charuco_square_size",
-    "charuco_board_object",
-    "groundplane_calibration",
-    "groundplane_applied",
-    "recording_info",
-    "path_to_recorded_videos",
-)
-"""Keys of `metadata` that FreeMoCap alone writes."""
-
 
 def require_metres(
     path: Path, cameras: Mapping[str, CameraCalibration], unit_m: float = 1.0
@@ -84,16 +74,18 @@ def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
         InputError: FreeMoCap's file has no ground plane.
     """
     content = read_toml(path) if content is None else content
+    # Keys of `metadata` that FreeMoCap alone writes.
+    own = {"charuco_square_size", "charuco_board_object", "groundplane_calibration"}
+    own |= {"groundplane_applied", "recording_info", "path_to_recorded_videos"}
     metadata = content.get("metadata")
-    if not isinstance(metadata, dict) or not any(key in metadata for key in FREEMOCAP):
+    if not isinstance(metadata, dict) or not own & metadata.keys():
         return 1.0
     if not (metadata.get("groundplane_calibration") or metadata.get("groundplane_applied")):
-        raise InputError(
-            f"{path}: metadata.groundplane_calibration",
-            expected="true: the world's z axis points up from the ground",
-            found="no ground plane: the world is that of the first camera",
-            todo="Process the calibration again in FreeMoCap with the board on the ground ('Use "
-            "Charuco as groundplane'), or import the lenses (worldpose import --lens) and locate "
-            "the cameras from people (worldpose locate-cameras).",
-        )
+        where = f"{path}: metadata.groundplane_calibration"
+        expected = "true: the world's z axis points up from the ground"
+        todo = "Process the calibration again in FreeMoCap with the board on the ground ('Use "
+        todo += "Charuco as groundplane'), or import the lenses (worldpose import --lens) and "
+        todo += "locate the cameras from people (worldpose locate-cameras)."
+        found = "no ground plane: the world is that of the first camera"
+        raise InputError(where, expected, found, todo)
     return MILLIMETRE

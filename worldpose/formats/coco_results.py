@@ -65,32 +65,27 @@ def read_coco_results(path: Path) -> PeopleFile:
     keep = ("images", "meta_info")
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
     names, others = _categories(path, json_bytes)
-    foreign: list[int] = []
-    entries = _of_people(plain_entries(str(path), items), others, foreign)
-    batches, pointless = [], 0
+    entries = plain_entries(str(path), items)
+    batches, pointless, foreign = [], 0, 0
     for first, given in _batches(path, entries):
         results = given
         if items.is_mapping:
+            for each in given:
+                if each.get("keypoints") and each.get("category_id") in others:
+                    each["keypoints"], foreign = None, foreign + 1
             results, without = _with_points(given)
             pointless += without
         batches.append(_read_batch(path, results, first))
     if not items.has_list:
-        expected = (
-            "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
-            "results of MMPose or Ultralytics"
-        )
-        todo = "Export the poses as COCO keypoint results."
-        raise InputError(
-            str(path), expected, describe_value(items.other or ", ".join(items.seen)), todo
-        )
+        expected = "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
+        expected += "results of MMPose or Ultralytics"
+        given = describe_value(items.other or ", ".join(items.seen))
+        raise InputError(str(path), expected, given, "Export the poses as COCO keypoint results.")
     found = _join(path, batches)
     points = found.points
     if pointless and pointless == len(points):
-        expected = "keypoints of people"
-        todo = "Export the poses, not the boxes alone."
-        raise InputError(
-            f"{path}: annotations", expected, f"{pointless} annotations without keypoints", todo
-        )
+        there, todo = f"{pointless} annotations without keypoints", "Export poses, not boxes alone."
+        raise InputError(f"{path}: annotations", "keypoints of people", there, todo)
     if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
@@ -105,9 +100,8 @@ def read_coco_results(path: Path) -> PeopleFile:
     points, changed = clean_points(order.select(points))
     frames = _frames(path, found.images, items.kept.get("images"))
     people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, _limit(path))
-    changed = changed._replace(
-        nobody=nobody - pointless, pointless=pointless - len(foreign), foreign=len(foreign)
-    )
+    nobody, pointless = nobody - pointless, pointless - foreign
+    changed = changed._replace(nobody=nobody, pointless=pointless, foreign=foreign)
     return PeopleFile(people, order.name, changed)
 
 
@@ -271,17 +265,6 @@ def _categories(path: Path, limit: int) -> tuple[list[str], list[Any]]:
         chosen = set(people)
     others = [each.get("id", ()) for n, each in enumerate(given) if names.get(n) not in chosen]
     return [name for each in chosen for name in each], others if chosen else []
-
-
-def _of_people(entries: Iterable[Any], others: list[Any], foreign: list[int]) -> Iterator[Any]:
-    """Yield entries, those of other categories without points; add their places to `foreign`."""
-    for index, each in enumerate(entries):
-        is_other = type(each) is dict and bool(each.get("keypoints"))
-        if is_other and "category_id" in each and each["category_id"] in others:
-            foreign.append(index)
-            yield {**each, "keypoints": None}
-        else:
-            yield each
 
 
 def _model_names(about: object) -> list[str]:

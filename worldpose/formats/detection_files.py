@@ -50,11 +50,9 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
         (one, file), (two, other) = list(sizes.items())[:2]
-        expected = "the same keypoints in all frames"
+        said = f"{one} in {file.name}, {two} in {other.name}"
         todo = "Use the files of one estimator, and remove older ones."
-        raise InputError(
-            str(folder), expected, f"{one} in {file.name}, {two} in {other.name}", todo
-        )
+        raise InputError(str(folder), "the same keypoints in all frames", said, todo)
     empty = sum(people is None for people in read.values())
     found = [one for people in read.values() for one in people or ()]
     frames = np.repeat(list(read), [len(people or ()) for people in read.values()])
@@ -99,12 +97,10 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
     if content == []:
         return None
     if not isinstance(people, list) or len(people) > PEOPLE_LIMIT:
-        raise InputError(
-            f"{file}: people",
-            expected=f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it",
-            found=f"{len(people)} people" if isinstance(people, list) else type(people).__name__,
-            todo="Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose').",
-        )
+        expected = f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it"
+        found = f"{len(people)} people" if isinstance(people, list) else type(people).__name__
+        todo = "Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose')."
+        raise InputError(f"{file}: people", expected, found, todo)
     return [_read_person(f"{file}: people[{n}]", person) for n, person in enumerate(people)]
 
 
@@ -213,7 +209,8 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     if not kept.any():
         expected = "a box of a person (class 1 or -1) with a confidence above 0"
         found = f"{len(rows)} boxes, {int((~is_person).sum())} of them of another class"
-        raise InputError(str(file), expected, found, "Write the class of people as 1, or as -1.")
+        todo = "Write the class of people as 1 or -1, and confidences above 0."
+        raise InputError(str(file), expected, found, todo)
     changes = {
         "of another class than 1, a person, which are left out": int((~is_person).sum()),
         "of confidence 0, which are left out": int((is_person & (score == 0.0)).sum()),

@@ -17,7 +17,7 @@ import tomllib
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Final, TypeVar
+from typing import IO, Any, Final
 from xml.etree import ElementTree
 
 import yaml
@@ -34,18 +34,11 @@ EVENTS = 100_000
 """Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
 
 
-Value = TypeVar("Value")
-
-
-def by_last_number(named: Mapping[str, Value]) -> dict[str, Value]:
-    """Return entries in the order of the last numbers in their names: cam2 before cam10.
-
-    Names stay in their order if one has no number.
-    """
+def by_last_number(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return entries by the last numbers in their names; in their order if a name has none."""
     numbers = {name: re.findall(r"\d+", name) for name in named}
-    if not all(numbers.values()):
-        return dict(named)
-    return {name: named[name] for name in sorted(named, key=lambda name: int(numbers[name][-1]))}
+    key = (lambda name: int(numbers[name][-1])) if all(numbers.values()) else lambda _: 0
+    return {name: named[name] for name in sorted(named, key=key)}
 
 
 @contextmanager

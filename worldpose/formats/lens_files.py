@@ -279,12 +279,9 @@ def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, 
         given = given if isinstance(given, dict) else {}
         model, lens = given.get("camera_model"), given.get("distortion_model", "none")
         if model != "pinhole" or lens not in ("radtan", "equidistant", "none"):
-            raise InputError(
-                where,
-                expected="camera_model pinhole with distortion_model radtan, equidistant or none",
-                found=f"{model} with {lens}",
-                todo="Calibrate again with --models pinhole-radtan or pinhole-equi.",
-            )
+            expected = "camera_model pinhole with distortion_model radtan, equidistant or none"
+            todo = "Calibrate again with --models pinhole-radtan or pinhole-equi."
+            raise InputError(where, expected, f"{model} with {lens}", todo)
         numbers = given.get("intrinsics")
         if not isinstance(numbers, list) or len(numbers) != 4:
             raise calibration_error(f"{where}.intrinsics", "fx, fy, cx, cy", f"{numbers!r:.60}")

@@ -175,17 +175,13 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
-    spans = {name: seen_frames(found.people) or (0, -1) for name, found in read.items()}
-    shared = [n for n, a in spans.items() for m, b in spans.items() if m != n and _meet(a, b)]
-    if len(spans) > 1 and spans.keys() - set(shared):
-        listed = ", ".join(f"{first} to {last} of {name}" for name, (first, last) in spans.items())
-        notes.append(f"warning: a camera has people in frames of no other camera: {listed}")
+    spans = {name: seen for name, one in read.items() if (seen := seen_frames(one.people))}
+    for name, (first, last) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(start <= last and first <= stop for start, stop in others):
+            said = f"{name} has people in frames {first} to {last}, where no other camera has any"
+            notes.append(f"warning: {said}")
     return notes
-
-
-def _meet(one: tuple[int, int], two: tuple[int, int]) -> bool:
-    """Return whether two ranges of frames, first and last, share one; (0, -1) shares with all."""
-    return max(one[0], two[0]) <= min(one[1], two[1]) or -1 in (one[1], two[1])
 
 
 def detections_by_camera(
@@ -214,12 +210,9 @@ def detections_by_camera(
 
 def pose_folders(folder: Path) -> list[Path]:
     """Return the folders in a folder that hold 2D poses: JSON, or names `<camera>_json`."""
-    return [
-        place
-        for place in sorted(folder.glob("[!.]*"))
-        if place.is_dir()
-        and (place.name.endswith("_json") or any(place.glob("*.[jJ][sS][oO][nN]")))
-    ]
+    there = [place for place in sorted(folder.glob("[!.]*")) if place.is_dir()]
+    json = "*.[jJ][sS][oO][nN]"
+    return [each for each in there if each.name.endswith("_json") or any(each.glob(json))]
 
 
 def import_lenses(
@@ -282,13 +275,10 @@ def pick_cameras(
     both = [name for name in cameras if name in files]
     if len(both) < max(1, min(2, len(cameras))):
         there = files.values() or sorted(folder.glob("[!.]*"))
-        raise InputError(
-            str(folder),
-            expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
-            + ", ".join(cameras),
-            found=", ".join(file.name for file in there) or "no such file",
-            todo="Rename the files as the cameras.",
-        )
+        expected = f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
+        found_names = ", ".join(file.name for file in there) or "no such file"
+        todo = "Rename the files as the cameras."
+        raise InputError(str(folder), expected + ", ".join(cameras), found_names, todo)
     left_out.update({name: f"{folder} has no file of it" for name in cameras if name not in files})
     if others := [file.name for name, file in files.items() if name not in both]:
         left_out.notes.append(

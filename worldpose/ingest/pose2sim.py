@@ -100,8 +100,7 @@ def import_pose2sim(
             "poses from people who walk"
         ]
         require_cameras(project / "videos", films)
-        names = list(films)
-        source = project / "videos"
+        names, source = list(films), project / "videos"
     else:
         shown = {name: known[file].size for name, file in films.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
@@ -119,8 +118,6 @@ def import_pose2sim(
     for name, file in videos.items():
         if name in cameras:
             cameras[name] = fit_to_video(file, cameras[name], indices[name], notes, is_part=is_part)
-    sizes = {name: index.size for name, index in indices.items()}
-    sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
@@ -138,8 +135,10 @@ def import_pose2sim(
     if place is not None:
         cameras, notes[:0] = place(calibration or project, cameras, people, rate)
     _require_video_sizes(folder, cameras, indices)
-    sizes |= {name: camera.image_size for name, camera in cameras.items()}
-    sizes = {name: sizes[name] for name in names}
+    sizes = {
+        name: (cameras[name].image_size if name in cameras else indices[name].size)
+        for name in names
+    }
     spec = build_spec(out, match_id, rate, sizes, (first, stop), videos=videos, offsets=offsets)
     for name, shift in offsets.items():
         people[name] = replace(people[name], frame=people[name].frame + shift)
@@ -157,29 +156,24 @@ def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict
     """
 
     def once(folder: Path) -> dict[bytes, int]:
-        there = frame_files(folder).items() if folder.is_dir() else ()
-        told = {frame: hashlib.sha256(file.read_bytes()).digest() for frame, file in there}
+        there = frame_files(folder) if any(folder.glob("*.[jJ][sS][oO][nN]")) else {}
+        told = {frame: hashlib.sha256(file.read_bytes()).digest() for frame, file in there.items()}
         count = Counter(told.values())
         return {content: frame for frame, content in told.items() if count[content] == 1}
 
-    shifts: dict[str, int] = {}
-    unknown = []
+    steps: dict[str, set[int]] = {}
     for name, folder in poses.items():
         if folder.parent == raw:
             return {}
         before, after = once(raw / folder.name), once(folder)
-        steps = {before[content] - after[content] for content in before.keys() & after.keys()}
-        if len(steps) == 1:
-            shifts[name] = steps.pop()
-        else:
-            unknown.append(name)
+        steps[name] = {before[same] - after[same] for same in before.keys() & after.keys()}
+    shifts = {name: min(found) for name, found in steps.items() if len(found) == 1}
     if listed := ", ".join(f"{name} {shift}" for name, shift in shifts.items() if shift):
         notes.append(f"the videos follow pose-sync by offset_frames, from pose: {listed}")
-    if unknown:
+    if unknown := ", ".join(name for name in steps if name not in shifts):
         notes.append(
-            f"warning: the shift of pose-sync against pose is not known of {', '.join(unknown)}: "
-            "if their poses were shifted, their videos do not show the same frames; set "
-            "offset_frames in match.yaml"
+            f"warning: how pose-sync was shifted against pose is not known of {unknown}: set "
+            "offset_frames in match.yaml where a video shows other frames"
         )
     return shifts
 
@@ -190,16 +184,11 @@ def _require_video_sizes(
     """Raise InputError if the 2D poses in a folder make a camera another size than its video's."""
     for name, camera in cameras.items():
         if name in indices and camera.image_size != indices[name].size:
-            raise InputError(
-                str(folder),
-                expected="2D poses in the pixels of the videos, {} x {} in {}".format(
-                    *indices[name].size, name
-                ),
-                found="people on whom the cameras agree in images of {} x {} px alone".format(
-                    *camera.image_size
-                ),
-                todo="Give the videos in which the poses were estimated, or estimate them again.",
-            )
+            (width, height), (own_width, own_height) = indices[name].size, camera.image_size
+            expected = f"2D poses in the pixels of the videos, {width} x {height} in {name}"
+            agreed = f"people on whom the cameras agree in images of {own_width} x {own_height} px"
+            todo = "Give the videos in which the poses were estimated, or estimate them again."
+            raise InputError(str(folder), expected, f"{agreed} alone", todo)
 
 
 def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:

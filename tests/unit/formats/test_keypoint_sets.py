@@ -334,5 +334,5 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     same = [{"image_id": 1, **{"keypoints": one["pose_keypoints_2d"]}} for one in (sure, nobody)]
     (tmp_path / "a.json").write_text(json.dumps(same))
     listed = read_coco_results(tmp_path / "a.json")
-    assert listed.changes == (17, 1, 0, 0)
+    assert listed.changes == (17, 1, 0, 0, 0)
     np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])

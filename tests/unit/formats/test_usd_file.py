@@ -86,9 +86,8 @@ def test_cameras_of_one_plain_name_are_apart_and_keep_their_own(model, tmp_path)
     given = dict.fromkeys(names, camera)
     path = tmp_path / "a.usdc"
     write_usd(path, model, people(), FPS, cameras=given, markings=[LINE], notes=NOTES)
-    prims = [
-        prim for prim in Usd.Stage.Open(str(path)).Traverse() if prim.GetTypeName() == "Camera"
-    ]
+    stage = Usd.Stage.Open(str(path))
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
     assert [prim.GetCustomDataByKey("camera") for prim in prims] == list(names)
 
 

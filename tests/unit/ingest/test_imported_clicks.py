@@ -302,7 +302,8 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
 
 LEFT_OUT = {
     "cvat.xml": """<annotations><image name="east.png" width="1920" height="1080">
-<points label="center_spot" points="100.5,200.5"/><box label="b"/><ellipse label="center_circle"/>
+<points label="corner_left_near" points="100.5,200.5"/><box label="b"/>
+<ellipse label="center_circle"/>
 <polygon label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
     "studio.json": json.dumps(
         [
@@ -318,7 +319,7 @@ LEFT_OUT = {
                                 "value": {"x": 50, "y": 50, kind: [label]},
                             }
                             for kind, label in (
-                                ("keypointlabels", "center_spot"),
+                                ("keypointlabels", "corner_left_near"),
                                 ("brushlabels", "halfway_line"),
                             )
                         ]
@@ -336,7 +337,7 @@ LEFT_OUT = {
                 {"image_id": 1, "category_id": 2, "segmentation": [[1, 2, 3, 4, 5, 6]]},
             ],
             "categories": [
-                {"id": 1, "name": "spot", "keypoints": ["center_spot"]},
+                {"id": 1, "name": "spot", "keypoints": ["corner_left_near"]},
                 {"id": 2, "name": "halfway_line"},
             ],
         }

@@ -192,7 +192,7 @@ def test_a_camera_without_a_common_frame_is_said(tmp_path, source):
     (source / "detections" / "left.json").write_text(json.dumps(results(5300, 5302)))
     folder = source / "detections"
     _, notes = import_match(source / "calibration.toml", folder, 25.0, tmp_path / "m")
-    assert "frames of no other camera: 300 to 302 of right, 5300 to 5302 of left" in str(notes)
+    assert "left has people in frames 5300 to 5302, where no other camera has any" in str(notes)
 
 
 def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):

@@ -124,8 +124,7 @@ def test_images_that_begin_at_other_numbers_and_what_is_beside_them_are_said(tmp
         for n in range(first, 9):
             cv2.imwrite(str(folder / f"{n:06d}.png"), numbered(n, 1)[0])
     _, notes = import_videos(None, tmp_path / "videos", tmp_path / "m", fps=25.0)
-    assert "images begin at 0 of a, 5 of b; " in str(notes)
-    assert "set offset_frames to 0 of a, -5 of b" in str(notes)
+    assert "set offset_frames as bracketed: a at 0 (0), b at 5 (-5)" in str(notes)
     assert "has one video, or images: a/thumbs, b/thumbs" in str(notes)
 
 

@@ -33,7 +33,8 @@ IMAGE_NAME: Final = re.compile(
     r"([^/\\?&=]+)\.(?:png|jpe?g|tiff?|bmp|webp)(?=$|[?&#])", re.IGNORECASE
 )
 """The name of an image file at the end of a path, or in an address with a query."""
-_PAIRS: Final = re.compile(r"-?[0-9.]+(?:[eE][+-]?\d+)?,-?[0-9.]+(?:[eE][+-]?\d+)?")
+_NUMBER: Final = r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
+_PAIRS: Final = re.compile(f"{_NUMBER},{_NUMBER}", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +119,7 @@ def _marked(
         given = text.split(";")
         if not all(_PAIRS.fullmatch(pair.strip()) for pair in given):
             raise ContentError(f"{name}: {label}: points are {text[:60]!r}")
-        try:
-            pixels = np.array([pair.split(",") for pair in given], dtype=np.float64) - CORNER
-        except ValueError:
-            raise ContentError(f"{name}: {label}: points are {text[:60]!r}") from None
+        pixels = np.array([pair.split(",") for pair in given], dtype=np.float64) - CORNER
         if shape.tag == "points":
             points += [(label, pixel) for pixel in pixels]
         else:
@@ -290,21 +288,19 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
             return
     dataset = _Dataset.model_validate(given)
     names = {category.id: category.keypoints for category in dataset.categories}
-    called = {category.id: category.name for category in dataset.categories}
+    called = {category.id: category.name or str(category.id) for category in dataset.categories}
     listed = {image.id for image in dataset.images}
-    if lost := sum(each.image_id not in listed for each in dataset.annotations):
-        yield MarkedImage("", None, (), (), left_out=("annotation of an image not listed",) * lost)
+    lost = sum(each.image_id not in listed for each in dataset.annotations)
+    yield MarkedImage("", None, (), (), left_out=("annotation of an image not listed",) * lost)
     for image in dataset.images:
         points = []
-        left_out = tuple(
-            f"annotation without keypoints of {called.get(each.category_id, each.category_id)}"
-            for each in dataset.annotations
-            if each.image_id == image.id and not each.keypoints
-        )
+        left_out = []
         for each in dataset.annotations:
             if each.image_id != image.id:
                 continue
             labels = names.get(each.category_id, ())
+            if not each.keypoints:
+                left_out.append(f"annotation without keypoints of {called.get(each.category_id)}")
             if len(each.keypoints) != 3 * len(labels):
                 what = f"{len(labels)} keypoints of category {each.category_id}"
                 raise ContentError(f"{image.file_name}: {len(each.keypoints)} numbers for {what}")
@@ -314,7 +310,7 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
                 if visible > 0:
                     points.append((label, np.array([x, y])))
         size = image.width, image.height
-        yield MarkedImage(image.file_name, size, tuple(points), (), left_out=left_out)
+        yield MarkedImage(image.file_name, size, tuple(points), (), left_out=tuple(left_out))
 
 
 class _Share(Given):
@@ -342,17 +338,15 @@ def _read_game_state(given: dict[str, Any]) -> Iterator[MarkedImage]:
 
 def _read_soccernet(image: str, given: dict[str, Any]) -> MarkedImage:
     """Return the image of SoccerNet's lines: shares of width and height by names of markings."""
-    lines, left_out = [], []
+    lines = []
     for name, places in TypeAdapter(dict[str, tuple[_Share, ...]]).validate_python(given).items():
         # Annotators drag ends past the border, where nothing is visible.
         inside = [(at.x, at.y) for at in places if 0.0 <= at.x <= 1.0 and 0.0 <= at.y <= 1.0]
         if inside and "unknown" not in name.lower():  # SoccerNet's word for lines of no name
             lines.append((name, np.array(inside)))
-        elif inside:
-            left_out.append(f"line of {name}")
         elif not inside and any(max(at.x, at.y) > 2.0 for at in places):
             raise ContentError(f"{name}: places in pixels; SoccerNet's are shares, from 0 to 1")
-    return MarkedImage(image, None, (), tuple(lines), left_out=tuple(left_out))
+    return MarkedImage(image, None, (), tuple(lines))
 
 
 def _soccernet_markings() -> dict[str, str]:
