@@ -79,8 +79,8 @@ def read_coco_results(path: Path) -> PeopleFile:
     if not items.has_list:
         expected = "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
         expected += "results of MMPose or Ultralytics"
-        given = describe_value(items.other or ", ".join(items.seen))
-        raise InputError(str(path), expected, given, "Export the poses as COCO keypoint results.")
+        there = describe_value(items.other or ", ".join(items.seen))
+        raise InputError(str(path), expected, there, "Export the poses as COCO keypoint results.")
     found = _join(path, batches)
     points = found.points
     if pointless and pointless == len(points):

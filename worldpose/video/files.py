@@ -293,12 +293,9 @@ class VideoReader(Pictures):
         shown = self.index.size if picture is None else (picture.width, picture.height)
         shown = shown[::-1] if picture is not None and picture.rotation % 180 else shown
         if shown != self.index.size:
-            raise InputError(
-                f"{self.path}: frame {number}",
-                expected="images of {} x {} px, as the first one".format(*self.index.size),
-                found=f"{shown[0]} x {shown[1]}",
-                todo="Give a video of one camera in one mode.",
-            )
+            expected = "images of {} x {} px, as the first one".format(*self.index.size)
+            found, todo = "{} x {}".format(*shown), "Give a video of one camera in one mode."
+            raise InputError(f"{self.path}: frame {number}", expected, found, todo)
 
     def _sound_pictures(self, start: int, stop: int) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """Yield every frame from the last key frame up to `start` on; None if damaged."""
