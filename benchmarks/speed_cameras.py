@@ -68,15 +68,15 @@ def compare_projection(options: Namespace) -> Tables:
     # OpenCV 4 has the form with a stopping rule under its own name.
     iterate: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
     rule = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-    projecting = {"projectPoints": partial(cv2.projectPoints, points, *pose_of(pose), *lens)}
+    project = partial(cv2.projectPoints, points, pose.rotvec, pose.translation, *lens)
     undistorting: dict[str, Any] = {
         "undistortPoints, 5 iterations": partial(cv2.undistortPoints, pixels, *lens),
         "undistortPoints to 1e-12": partial(iterate, pixels, *lens, None, None, None, rule),
     }
     tables = {}
     for name, given, peers in (
-        ("project", points, projecting),
-        ("project_with_jacobians", points, projecting),
+        ("project", points, {"projectPoints": project}),
+        ("project_with_jacobians", points, {"projectPoints": project}),
         ("normalize", pixels, undistorting),
         ("unproject", pixels, undistorting),
     ):
@@ -90,11 +90,6 @@ def compare_projection(options: Namespace) -> Tables:
         errors.append([name, float(np.linalg.norm(back - pixels, axis=1).max())])
     tables["error"] = Table("largest round trip error", ["undistortion", "error"], errors, "px")
     return tables
-
-
-def pose_of(pose: Rigid) -> tuple[Floats, Floats]:
-    """Return a pose in OpenCV's form."""
-    return pose.rotvec, pose.translation
 
 
 @benchmark(
@@ -314,4 +309,8 @@ def adjust_by_colmap(problem: AdjustmentProblem) -> Callable[[], float]:
         if np.isinf(problem.point_information[p]):
             config.add_constant_point(number)
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, scene)
-    return lambda: 2.0 * float(adjuster.solve().ceres_summary.final_cost)
+
+    def run(scene: object = scene) -> float:  # which the adjuster refers to
+        return 2.0 * float(adjuster.solve().ceres_summary.final_cost)
+
+    return run

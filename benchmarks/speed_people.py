@@ -21,7 +21,7 @@ from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.body_file import load_open_body
 from worldpose.body.differentiable import DifferentiableBody
-from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.keypoints import FoldedKeypoints, fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior, start_poses
@@ -98,52 +98,16 @@ def compare_triangulations(options: Namespace) -> Tables:
     points, views = work.joints.reshape(-1, 3), len(work.cameras.focal)
     flat = np.ascontiguousarray(pixels.swapaxes(0, 1).reshape(views, -1, 2))
     weight = sure.swapaxes(0, 1).reshape(views, -1)
-    pose = work.cameras.cam_from_world
-    poses = np.concatenate([pose.rotation, pose.translation[..., None]], axis=-1)
 
     def ours(settings: TriangulationSettings) -> Floats:
         return triangulate_joints(work.cameras, seen, settings).joints.reshape(-1, 3)
-
-    def equations(count: int) -> Floats:
-        """Return the rows (points, 2 views, 4) of the direct linear transformation."""
-        lenses = [
-            (lens_matrix(each), np.array(each.distortion))
-            for each in map(work.cameras.__getitem__, range(views))
-        ]
-        plane = np.stack(
-            [
-                cv2.undistortPoints(own[:count], *lens)[:, 0]
-                for own, lens in zip(flat, lenses, strict=True)
-            ]
-        )
-        x, y = np.moveaxis(plane, -1, 0)[..., None]
-        rows = [
-            x * poses[:, None, 2] - poses[:, None, 0],
-            y * poses[:, None, 2] - poses[:, None, 1],
-        ]
-        return np.concatenate(rows).swapaxes(0, 1)
-
-    def normal_equations() -> Floats:
-        rows = equations(len(points)) * np.tile(weight, (2, 1)).T[..., None]
-        matrix = rows.swapaxes(1, 2) @ rows
-        found = np.linalg.solve(matrix[:, :3, :3] + 1e-12 * np.eye(3), matrix[:, :3, 3:])
-        return np.asarray(-found[..., 0])
-
-    def aniposelib_style() -> Floats:
-        out = np.full((17 * 60, 3), np.nan)
-        for n, rows in enumerate(equations(len(out))):
-            good = np.tile(weight[:, n] > 0.3, 2)
-            if good.sum() >= 4:
-                vector = np.linalg.svd(rows[good], full_matrices=True)[2][-1]
-                out[n] = vector[:3] / vector[3]
-        return out
 
     kernel = TriangulationSettings(learn_noise=False, offsets="none", undo_swaps=False)
     sides: dict[str, Callable[[], Floats]] = {
         "ours, default settings": partial(ours, TriangulationSettings()),
         "ours, robust kernel alone": partial(ours, kernel),
-        "numpy normal equations": normal_equations,
-        "aniposelib-style loop": aniposelib_style,
+        "numpy normal equations": partial(by_normal_equations, work.cameras, flat, weight),
+        "aniposelib-style loop": partial(by_single_points, work.cameras, flat, weight),
     }
     found, enough = {name: side() for name, side in sides.items()}, (weight > 0).sum(axis=0) >= 3
 
@@ -152,13 +116,42 @@ def compare_triangulations(options: Namespace) -> Tables:
         off = np.linalg.norm(found[name] - points[:count], axis=-1)[enough[:count]]
         return float(1e3 * np.nanmean(off)), 1e3 * quantile(off)
 
-    title, columns = (
-        f"{len(points)} joints, {views} cameras, one thread",
-        ("mean [mm]", "median [mm]"),
-    )
+    title = f"{len(points)} joints, {views} cameras, one thread"
+    columns = ("mean [mm]", "median [mm]")
     scale = {name: len(points) / len(joints) for name, joints in found.items()}
     table = compare_times(title, sides, options.rounds, *columns, more=errors, scale=scale)
     return {"times": table}
+
+
+def linear_equations(cameras: Camera, pixels: Floats) -> Floats:
+    """Return the rows (points, 2 cameras, 4) of the direct linear transformation."""
+    rows: tuple[list[Floats], list[Floats]] = ([], [])
+    for c, own in enumerate(pixels):
+        lens = lens_matrix(cameras[c]), np.array(cameras[c].coefficients)
+        plane, pose = cv2.undistortPoints(own, *lens)[:, 0], cameras[c].cam_from_world
+        matrix = np.column_stack([pose.rotation, pose.translation])
+        for axis in (0, 1):
+            rows[axis].append(plane[:, axis, None] * matrix[2] - matrix[axis])
+    return np.stack(rows[0] + rows[1], axis=1)
+
+
+def by_normal_equations(cameras: Camera, pixels: Floats, weight: Floats) -> Floats:
+    """Return all points from weighted equations, of pixels (cameras, points, 2)."""
+    rows = linear_equations(cameras, pixels) * np.tile(weight, (2, 1)).T[..., None]
+    matrix = rows.swapaxes(1, 2) @ rows
+    found = np.linalg.solve(matrix[:, :3, :3] + 1e-12 * np.eye(3), matrix[:, :3, 3:])
+    return np.asarray(-found[..., 0])
+
+
+def by_single_points(cameras: Camera, pixels: Floats, weight: Floats) -> Floats:
+    """Return some of the points, one decomposition each, of pixels (cameras, points, 2)."""
+    out = np.full((17 * 60, 3), np.nan)
+    for n, rows in enumerate(linear_equations(cameras, pixels[:, : len(out)])):
+        good = np.tile(weight[:, n] > 0.3, 2)
+        if good.sum() >= 4:
+            vector = np.linalg.svd(rows[good], full_matrices=True)[2][-1]
+            out[n] = vector[:3] / vector[3]
+    return out
 
 
 @benchmark(
@@ -244,7 +237,7 @@ def compare_fits(options: Namespace) -> Tables:
     exact, noise = keypoints(truth), 0.02
     joints = exact + noise * np.random.default_rng(4).standard_normal(exact.shape)
     covariance = np.broadcast_to(noise**2 * np.eye(3), (*joints.shape, 3))
-    shape, true, wanted = truth.flat().betas, exact.reshape(-1, 17, 3), joints.reshape(-1, 17, 3)
+    true, wanted = exact.reshape(-1, 17, 3), joints.reshape(-1, 17, 3)
     rows: list[list[Any]] = []
 
     def clock(label: str, work: Callable[[], Floats]) -> None:
@@ -261,37 +254,41 @@ def compare_fits(options: Namespace) -> Tables:
         return fit_bodies(model, evidence, settings).joints.reshape(-1, 17, 3)
 
     def search(count: int, iterations: int) -> Floats:
-        at = np.zeros((count, 75))
-        for person in np.unique(shape[:count], axis=0):
-            own = (shape[:count] == person).all(-1)
-            place, orient, angles = start_poses(
-                model, person, wanted[:count][own], load_pose_prior()
-            )
-            at[own] = np.concatenate([place, orient, angles @ SPREAD.T], axis=-1)
-        start = torch.tensor(at).float().requires_grad_()
-        goal, betas = (torch.tensor(each[:count]).float() for each in (wanted, shape))
-        least = float(((true - wanted)[:count] ** 2).sum())
-        least += 1e-4 * float((truth.flat().body_pose[:count] ** 2).sum())
-        solver = torch.optim.LBFGS([start], max_iter=iterations, line_search_fn="strong_wolfe")
-        found = goal
+        return by_lbfgs(keypoints, truth.flat()[:count], wanted[:count], iterations)
 
-        def loss() -> torch.Tensor:
-            nonlocal found
-            solver.zero_grad()
-            found = body(betas, start[:, 3:6], start[:, 6:], start[:, :3])
-            value = ((found - goal) ** 2).sum() + 1e-4 * (start[:, 6:] ** 2).sum()
-            if value <= least:
-                raise StopIteration
-            value.backward()
-            return value
-
-        with suppress(StopIteration):
-            solver.step(loss)
-        return found.detach().numpy()
-
-    body = DifferentiableBody(keypoints, torch.float32).keypoints
-    fit((slice(8), slice(1))), search(2, 2)  # not timed: what compiles and loads
+    fit((slice(8), slice(1)))  # not timed: what compiles and loads
+    search(2, 2)
     clock("fit_bodies", fit)
     clock("LBFGS", partial(search, min(options.compare, len(true)), 300))
     columns = ["side", "time [s]", "CPU [s]", "times ours", "error [mm]"]
     return {"times": Table(f"{len(true)} poses", columns, rows)}
+
+
+def by_lbfgs(
+    keypoints: FoldedKeypoints, truth: BodyParameters, wanted: Floats, iterations: int
+) -> Floats:
+    """Return the keypoints (poses, 17, 3) of LBFGS, which ends at the cost of the true bodies."""
+    at, model = np.zeros((len(wanted), 75)), keypoints.model
+    for person in np.unique(truth.betas, axis=0):
+        own = (truth.betas == person).all(-1)
+        place, orient, angles = start_poses(model, person, wanted[own], load_pose_prior())
+        at[own] = np.concatenate([place, orient, angles @ SPREAD.T], axis=-1)
+    start = torch.tensor(at).float().requires_grad_()
+    goal, betas = torch.tensor(wanted).float(), torch.tensor(truth.betas).float()
+    least = ((keypoints(truth) - wanted) ** 2).sum() + 1e-4 * (truth.body_pose**2).sum()
+    solver = torch.optim.LBFGS([start], max_iter=iterations, line_search_fn="strong_wolfe")
+    body, found = DifferentiableBody(keypoints, torch.float32).keypoints, goal
+
+    def loss() -> torch.Tensor:
+        nonlocal found
+        solver.zero_grad()
+        found = body(betas, start[:, 3:6], start[:, 6:], start[:, :3])
+        value = ((found - goal) ** 2).sum() + 1e-4 * (start[:, 6:] ** 2).sum()
+        if value <= least:
+            raise StopIteration
+        value.backward()
+        return value
+
+    with suppress(StopIteration):
+        solver.step(loss)
+    return found.detach().numpy()
