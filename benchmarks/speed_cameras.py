@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 from common import best_seconds, compare_times, quantile, tell
+from numpy.typing import NDArray
 from registry import Table, Tables, benchmark, integer, option
 from scipy.optimize import least_squares
 from speed_people import draw_match, lens_matrix
@@ -123,9 +124,7 @@ def compare_calibrations(options: Namespace) -> Tables:
         )
         away = distance_map(picture, start, line_points(start, 6000))
         sides: dict[str, Callable[[], object]] = {
-            "ours, from the picture": lambda prior=prior, picture=picture: (
-                refine_on_lines(prior, PITCH, picture, survey_error=0.0).estimate.camera
-            ),
+            "ours, from the picture": partial(refine_on_picture, prior, picture),
             "SciPy's least squares, from the map": partial(refine_on_map, away, start, spread),
             "making the map": partial(distance_map, picture, start, line_points(start, 6000)),
         }
@@ -158,7 +157,12 @@ def line_error(camera: Camera, true: Camera) -> float:
     return float(np.sqrt((off**2).sum(axis=-1).mean()))
 
 
-def refine_on_map(away: Image, start: Camera, spread: Floats) -> Camera:
+def refine_on_picture(prior: CameraOnPitch, picture: Image) -> Camera:
+    """Return our refinement on the markings."""
+    return refine_on_lines(prior, PITCH, picture, survey_error=0.0).estimate.camera
+
+
+def refine_on_map(away: NDArray[np.float32], start: Camera, spread: Floats) -> Camera:
     """Return the camera with the least robust distances to edges, at points of the markings."""
     away = np.minimum(away, np.float32(30.0))
     slopes = [cv2.Sobel(away / 8.0, cv2.CV_32F, *way, ksize=3) for way in ((1, 0), (0, 1))]
