@@ -45,14 +45,8 @@ RESULT_PAGES = {
         "People, joints and bodies",
         "tracking triangulation body_fitting challenge second_world",
     ),
-    "moving_cameras": (
-        "Moving cameras",
-        "broadcast_accuracy broadcast_line_sets broadcast_clip broadcast_cuts",
-    ),
-    "whole_runs": (
-        "Time and memory",
-        "run_memory data_set_size",
-    ),
+    "moving_cameras": ("Moving cameras", "broadcast_accuracy broadcast_clip broadcast_cuts"),
+    "whole_runs": ("Time and memory", "run_memory data_set_size"),
 }
 """Title of each page of results, and the benchmarks whose tables it has."""
 
