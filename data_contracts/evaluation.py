@@ -9,9 +9,9 @@ from pydantic import Field, JsonValue
 from data_contracts.records import Amount, Count, Frame, Record, Share
 
 
-def _figure(title: str, description: str, **limits: float) -> Any:  # noqa: ANN401
+def _figure(title: str, description: str, **limits: Any) -> Any:  # noqa: ANN401
     """Return a metric that may be absent: its title in reports, and what it says, with its unit."""
-    return Field(default=None, title=title, description=description, **limits)  # type: ignore[arg-type]
+    return Field(default=None, title=title, description=description, **limits)
 
 
 class CameraErrors(Record):

@@ -24,7 +24,7 @@ Index: TypeAlias = (
 """Index types of numpy; an index addresses the batch dimensions only."""
 
 
-def unit(vectors: Floats) -> Floats:
+def unit(vectors: NDArray[Any]) -> NDArray[Any]:
     """Return vectors (..., n) of length 1 in the same direction."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, 1e-9))
