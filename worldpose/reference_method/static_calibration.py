@@ -109,9 +109,7 @@ def look_up(away: Tensor, pixels: Tensor) -> Tensor:
     return away[row, column] + (slope * (pixels - pixels.detach())).sum(-1)
 
 
-def refine_on_distance_map(
-    start: Camera, away: NDArray[np.float32], points: Floats, iterations: int = 300
-) -> Camera:
+def refine_on_distance_map(start: Camera, away: NDArray[np.float32], points: Floats) -> Camera:
     """Return Lambda* = arg min over Lambda of the sum over X' of D[Pi(X'; Lambda)] (Stage 3).
 
     The paper names no solver: Adam takes steps of at most 1e-4 in each parameter, a fifth of a
@@ -121,7 +119,6 @@ def refine_on_distance_map(
         start: of stage 2.
         away: (height, width) D [px].
         points: (n, 3) X' [m], world, sampled from the markings; those that the start images count.
-        iterations: number of steps.
     """
     pixels = start.project(points)
     kept = ((pixels >= 0.0) & (pixels <= start.image_size - 1.0)).all(axis=-1)
@@ -134,7 +131,7 @@ def refine_on_distance_map(
     free = torch.zeros_like(values)
     free[:, list(K1_K2)] = 1.0
     best, least = cameras.values, torch.inf
-    for _ in range(iterations):
+    for _ in range(300):
         solver.zero_grad()
         cost = look_up(table, cameras.with_values(values).project(places)).sum()
         if float(cost.detach()) < least:
