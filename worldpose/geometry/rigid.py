@@ -278,6 +278,14 @@ class Similarity:
         return moved
 
 
+def shortest_rotation(start: Floats, end: Floats) -> Floats:
+    """Return the smallest rotations (..., 3, 3) of unit vectors (..., 3) to others."""
+    axis = np.cross(start, end)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (start * end).sum(axis=-1, keepdims=True))
+    return Rigid.from_rotvec(axis / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation
+
+
 def align(
     source: ArrayLike, target: ArrayLike, *, with_scale: bool, weights: ArrayLike = 1.0
 ) -> Similarity:
