@@ -111,11 +111,12 @@ class CameraLimits(Record):
 
 
 class PeopleLimits(Record):
-    """Metric limits of the people found in a camera's clip (D6)."""
+    """Metric limits of the people found in a camera's clip (D6).
 
-    unreadable_share: float = Field(default=0.02, ge=0)
-    """Share of frames with a missing or damaged image [1]: half a second per minute is a
-    recorder glitch; more needs a check of the video."""
+    Frames without an image are no question: nobody can correct them on a page. The verdict on the
+    results names them.
+    """
+
     empty_share: float = Field(default=0.5, ge=0)
     """Share of images without detections [1]. A camera can look away from play at times; one
     without people for half a clip is turned, dark or outside the detector's training data."""
@@ -140,8 +141,10 @@ class IdentityLimits(Record):
     undecided: float = Field(default=0, ge=0)
     """Joins of two tracks with ambiguous evidence [1]: a person decides these at once, and a
     wrong guess corrupts all that follows."""
-    unmatched_share: float = Field(default=_USABLE.max_unmatched_share, ge=0)
-    """Share of detections without a track [1]."""
+    unmatched_share: float = Field(default=0.5, ge=0)
+    """Share of detections without a track [1]. People beside the pitch are a quarter of them at a
+    small ground, which nobody can correct: the verdict names them. At half, a clock or a camera is
+    wrong, or the net finds people where none are."""
     mean_ray_distance_m: float = Field(default=_USABLE.max_ray_distance_m, ge=0)
     """Distance between the rays of matched detections [m]."""
     corrections_refused: float = Field(default=0, ge=0)
@@ -256,7 +259,7 @@ GATES: Final[Mapping[str, Gate]] = {
             "tracking",
             "Is every person one track over the whole clip?",
             IdentityLimits(),
-            "the tracks: split, join",
+            "the tracks: split, join; or clicks and clocks of cameras that disagree",
             _in_3d,
         ),
         Gate(

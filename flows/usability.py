@@ -59,6 +59,12 @@ class _Rule:
 
 _RULES: Final = (
     _Rule(
+        "static_calibration",
+        "clicks_wrong",
+        "",
+        "{value} clicks of {unit} contradict the others and are not used. Correct or remove them.",
+    ),
+    _Rule(
         "detection",
         "unreadable_share",
         "max_unreadable_share",
@@ -255,7 +261,8 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
     if beyond:
         yield rule.says.format(
             unit=place,
-            value=f"{quantity(rule.metric, own[beyond[0]])} (limit {quantity(rule.metric, limit)})",
+            value=quantity(rule.metric, own[beyond[0]])
+            + (f" (limit {quantity(rule.metric, limit)})" if rule.limit else ""),
             part=", ".join(beyond),
             when=_when(rule.metric.rpartition("_")[0], beyond[0], figures),
         )

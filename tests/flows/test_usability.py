@@ -80,7 +80,12 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             {"filled_share": 0.1},
             "no camera sees 10 % (limit 5 %) of the joints in clip: motion alone places them.",
         ),
-        ("tracking/clip", {"corrections_refused": 2.0}, "2 (limit 0) corrections of clip do not"),
+        ("tracking/clip", {"corrections_refused": 2.0}, "2 corrections of clip do not"),
+        (
+            "static_calibration/cam1",
+            {"clicks_wrong": 5.0},
+            "5 clicks of cam1 contradict",
+        ),
         (
             "broadcast_tracking/clip",
             {"unmatched_share": 0.1, "plane_std_m": 9.0},

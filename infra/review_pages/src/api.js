@@ -18,8 +18,14 @@ export async function openSession() {
 export const get = (path) => ask("GET", path);
 export const post = (path, body) => ask("POST", path, body);
 
+// What a browser says of a server that does not answer differs, and is not plain.
+const reach = (path, what) =>
+  fetch(path, what).catch(() => {
+    throw new Error((what?.method ?? "GET") === "GET" ? "The server does not answer; trying again." : "The server does not answer. Try again when it does.");
+  });
+
 async function ask(method, path, body) {
-  const answer = await fetch(path, {
+  const answer = await reach(path, {
     method,
     headers:
       method === "GET"
@@ -37,7 +43,7 @@ async function ask(method, path, body) {
 }
 
 export async function getBytes(path) {
-  const answer = await fetch(path);
+  const answer = await reach(path);
   if (answer.status === 401) location.assign("/login");
   if (!answer.ok) throw new Refusal(answer.status, await answer.json().catch(() => ({})));
   return answer.arrayBuffer();

@@ -1,6 +1,9 @@
 // How numbers and moments are written.
 
-export const spoken = (name) => name.replaceAll("_", " ");
+// A point that only its place names, `at_52.50_19.16`, is (52.5, 19.2) m.
+export const spoken = (name) =>
+  name.replace(/^at_(-?[\d.]+)_(-?\d+\.\d+)/, (_, ...place) => `(${place.slice(0, 2).map((text) => Number(Number(text).toFixed(1))).join(", ")}) m`)
+    .replace(/\.again\w*$/, ", once more").replaceAll("_", " ");
 
 export function shown(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
