@@ -64,6 +64,9 @@ export function result(unit) {
   return `${RESULTS[stage] ?? spoken(stage)} ${name.replace(".", ", ")}`;
 }
 
+// A message that names results as the journal does, `tracking/clip`.
+export const plain = (text) => text.replace(/\b([a-z_]+)\/[\w.-]*\w/g, (unit, stage) => (stage in RESULTS ? result(unit) : unit));
+
 export function bytes(count) {
   if (count < 1e6) return `${Math.ceil(count / 1e3)} kB`;
   return count < 1e9 ? `${(count / 1e6).toFixed(0)} MB` : `${(count / 1e9).toFixed(1)} GB`;
