@@ -23,6 +23,7 @@ Figures = Mapping[str, float]
 
 DOUBTING: Final = (
     "static_calibration",
+    "detection",
     "camera_consistency",
     "tracking",
     "triangulation",
@@ -222,6 +223,7 @@ def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
             for name, warnings in outcome.warnings.items()
             if name.partition("/")[0] in DOUBTING
             for text in warnings
+            if not text.endswith("the camera does not film this clip.")
         ),
     ]
     verdict = "not usable" if against else "usable with reservations" if said else "usable"

@@ -173,3 +173,12 @@ def test_people_who_are_not_in_3d_are_places_that_can_be_used():
     assert found.verdict == "usable with reservations"
     assert found.reservations[0].startswith("no person is in 3D: people have places on the pitch")
     assert "could not be computed" not in str(found.reservations)  # there are no joints to judge
+
+
+def test_people_whom_the_nets_do_not_know_are_a_reservation_and_a_clip_not_filmed_is_none():
+    warnings = {
+        "detection/cam1.clip": ["cam1.clip: people are 833 px tall in the images."],
+        "detection/cam2.clip": ["cam2.clip: the camera does not film this clip."],
+    }
+    found = judge_run(RunOutcome(warnings=warnings), UsableLimits())
+    assert found.reservations == ("cam1.clip: people are 833 px tall in the images.",)
