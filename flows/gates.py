@@ -141,7 +141,7 @@ class IdentityLimits(Record):
     undecided: float = Field(default=0, ge=0)
     """Joins of two tracks with ambiguous evidence [1]: a person decides these at once, and a
     wrong guess corrupts all that follows."""
-    unmatched_share: float = Field(default=0.5, ge=0)
+    unmatched_share: float = Field(default=_USABLE.max_unusable_share, ge=0)
     """Share of detections without a track [1]. People beside the pitch are a quarter of them at a
     small ground, which nobody can correct: the verdict names them. At half, a clock or a camera is
     wrong, or the net finds people where none are."""

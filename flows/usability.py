@@ -310,3 +310,8 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
         if stage == "tracking" and own.get("absent_share", 0.0) > most:
             share = f"{quantity('absent_share', most)} of the time"
             yield f"people are missing in {unit} for more than {share}. Check the videos."
+        if stage == "tracking" and own.get("unmatched_share", 0.0) > most:
+            yield (
+                f"more than {quantity('unmatched_share', most)} of the detections in {unit} belong "
+                "to no track. A camera's pose or clock is wrong, or the nets do not fit the images."
+            )

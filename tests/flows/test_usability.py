@@ -182,3 +182,9 @@ def test_people_whom_the_nets_do_not_know_are_a_reservation_and_a_clip_not_filme
     }
     found = judge_run(RunOutcome(warnings=warnings), UsableLimits())
     assert found.reservations == ("cam1.clip: people are 833 px tall in the images.",)
+
+
+def test_results_are_not_usable_where_most_detections_belong_to_nobody():
+    found = judge("tracking/clip", figures={"unmatched_share": 0.63})
+    assert found.verdict == "not usable"
+    assert found.reservations[0].startswith("more than 50 % of the detections in clip belong to no")
