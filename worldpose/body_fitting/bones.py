@@ -107,7 +107,10 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
 def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     """Return the most probable betas for bones, with exact lengths of the blended bones (S1).
 
-    The prior of betas is normal with variance 1; without bones they are 0 with covariance 1.
+        beta* = arg min sum_b (l_b - |T_b + D_b beta|)^2 / s_b^2 + |beta|^2
+
+    The paper has an absolute value for the square, lengths linear in beta, and no prior. Without
+    bones, betas are 0 with covariance 1. `shapes.solve_shapes` starts here.
     """
     ends = np.array([[JOINT_OF_POINT[COCO17[k]] for k in bone] for bone in COCO17_RIGID_BONES])
     template = model.joint_template[ends[:, 1]] - model.joint_template[ends[:, 0]]

@@ -243,7 +243,7 @@ class PointSums:
 def add_data(
     sums: PointSums, perceived: Floats, evidence: PersonEvidence, loss_scale: float
 ) -> Floats:
-    """Add E_data; return its derivative (frames, points, 3) by the points.
+    """Add E_data = sum_tj rho(r_tj^T W_tj r_tj; c), r = P + A o - X; return its derivative by P.
 
     Args:
         sums: changed.
@@ -275,7 +275,7 @@ def acceleration_scale(points: int) -> Floats:
 def add_smoothness(
     sums: PointSums, keypoints: Floats, std: Floats, tail: float, starts: Sequence[int]
 ) -> None:
-    """Add E_smooth.
+    """Add E_smooth = sum_tj rho(|P_t+2,j - 2 P_t+1,j + P_tj|^2 / s_j^2; c).
 
     Args:
         sums: changed.
@@ -356,7 +356,7 @@ def limit_term(angles: Floats, std: float) -> PriorTerm:
 
 
 def shape_term(betas: Floats, mean: Floats, precision: Floats) -> PriorTerm:
-    """Return E_shape of betas (shapes,) about a mean."""
+    """Return E_shape = 1/2 (beta - beta_0)^T B (beta - beta_0) of betas (shapes,)."""
     away = betas - mean
     slope = precision @ away
     return PriorTerm(0.5 * float(away @ slope), slope, precision)

@@ -134,8 +134,10 @@ def boxes_of(keypoints: Floats) -> Floats:
 def similarity(projected: Floats, detected: Floats) -> Floats:
     """Return the similarity of projected and detected people (persons, detections) [-1..1] (M4).
 
-    Intersection over union of the boxes about all keypoints (n, 17, 2) [px], times the mean cosine
-    between corresponding bones, over the bones that both have. 0 with too few common joints.
+        sim(p_i, p_j) = IoU(box of p_i, box of p_j) (1 / K) sum_k cos(p_i,k, p_j,k)
+
+    Boxes enclose all keypoints (n, 17, 2) [px]; the sum is over the K of the 16 `BONES` that both
+    have. Fewer than six common joints, half a body, give 0.
     """
     overlap = box_iou(boxes_of(projected), boxes_of(detected))
     with np.errstate(invalid="ignore", divide="ignore"):

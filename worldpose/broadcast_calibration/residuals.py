@@ -92,7 +92,7 @@ def field_residuals(
     weight: float,
     system: ArrowSystem,
 ) -> float:
-    """Add weight * E_field of clicks and painted lines to a system, and return it."""
+    """Add weight * E_field, 1/2 sum_i rho(|W_i (Pi(X_i + d_i) - x_i)|^2), and return it."""
     return _add_points(
         camera.rows, bounds(points.frame, len(camera)), points, paint_offsets, weight, system
     )
@@ -101,7 +101,7 @@ def field_residuals(
 def player_residuals(
     camera: MovingCamera, points: PointArrays, weight: float, system: ArrowSystem
 ) -> float:
-    """Add weight * E_player of matched keypoints to a system, and return it."""
+    """Add weight * E_player, 1/2 sum_ij I_ij rho(|Pi(P_i) - p_j|^2 / s_j^2), and return it."""
     exact = np.zeros((0, 3))
     return _add_points(
         camera.rows, bounds(points.frame, len(camera)), points, exact, weight, system
@@ -111,7 +111,7 @@ def player_residuals(
 def flow_residuals(
     camera: MovingCamera, flow: FlowEvidence, loss: float, weight: float, system: ArrowSystem
 ) -> float:
-    """Add weight * E_flow of followed points to a system, and return it."""
+    """Add weight * E_flow, 1/2 sum_k rho(|Pi(Pi^-1(y_k)) - y'_k|^2 / s_k^2), and return it."""
     if not len(flow) or weight == 0.0:
         return 0.0
     edges = bounds(flow.frame, len(camera))
@@ -119,8 +119,9 @@ def flow_residuals(
 
 
 def smoothness_residuals(camera: MovingCamera, spread: Floats, system: ArrowSystem) -> float:
-    """Add E_smooth of squared second differences to a system, and return it.
+    """Add E_smooth = 1/2 sum_t |(l_t-1 - 2 l_t + l_t+1) / s|^2 to a system, and return it.
 
+    l_t is the rotation and the log focal length of frame t.
     The derivatives assume a small rotation between neighbouring frames: a fast pan has a hundredth
     of a radian per frame. The spread (4,) of a second difference is infinite where free.
     """
@@ -154,7 +155,7 @@ def second_differences(camera: MovingCamera) -> Floats:
 def lens_residuals(
     camera: MovingCamera, prior: Prior, walk: Floats | None, system: ArrowSystem
 ) -> float:
-    """Add E_lens of changes of the lens to a system, and return it.
+    """Add E_lens = 1/2 sum_t |(k_t+1 / s_t+1 - k_t / s_t) / w_t|^2 to a system, and return it.
 
     The distortion in deviations of its prior, which grow with the zoom, changes from a frame to the
     next with the standard deviation `walk` (frames - 1,); None = free.

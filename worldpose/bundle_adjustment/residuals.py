@@ -240,7 +240,7 @@ def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> Floats:
 
 
 def player_residuals(cameras: Camera, points: Floats, observed: Observations) -> Floats:
-    """Return projected minus observed pixels (n, 2) of keypoints at points (points, 3) [m]."""
+    """Return Pi(X_j; L_c) - x_jc [px] (n, 2) of keypoints at points X (points, 3) [m]."""
     off = np.empty_like(observed.image)
     for c in range(len(cameras.focal)):
         rows = observed.camera_of == c

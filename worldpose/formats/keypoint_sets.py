@@ -244,7 +244,10 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
             todo = "Estimate poses with a model of COCO, or write COCO's joints."
             raise InputError(where, "the 17 joints in COCO's order", found, todo)
     misfit = misfits[orders.index(chosen)]
-    is_doubtful = chosen.name == "MPI-15" or (named is None and (stated or "").strip() != "")
+    # Landmarks of a face, such as 300-W's, are 68 points too.
+    is_doubtful = chosen.name in ("MPI-15", "HALPE-68") or (
+        named is None and (stated or "").strip() != ""
+    )
     if (len(points) and is_doubtful and not misfit <= plausible) or (
         len(points) >= fewest and misfit > wrong
     ):

@@ -248,7 +248,9 @@ def project_with_jacobians(
 
 @compile_kernel
 def normalize(cameras: Floats, image: Floats, plane: Floats, status: Image) -> None:
-    """Write undistorted coordinates on the plane z = 1; NaN where there are none.
+    """Write points (x, y) on the plane z = 1 whose images are given; NaN where there are none.
+
+    The first half of Pi^-1: distort(x, y) = ((u - cx) / fx, (v - cy) / fy).
 
     Args:
         cameras: (batch, WIDTH).
@@ -272,6 +274,8 @@ def normalize(cameras: Floats, image: Floats, plane: Floats, status: Image) -> N
 @compile_kernel
 def point_rays(cameras: Floats, plane: Floats, directions: Floats) -> None:
     """Write unit directions in the world frame through points on the plane z = 1.
+
+    The second half of Pi^-1, after `normalize`: d = R^T (x, y, 1) / |(x, y, 1)|.
 
     Args:
         cameras: (batch, WIDTH).

@@ -32,7 +32,7 @@ def plane_from_image(
     scale: float,
     middle: Floats,
 ) -> Floats | None:
-    """Return the (3, 3) homography from pixels to the plane [m] by the DLT, or None.
+    """Return the (3, 3) homography H from pixels x to the plane [m], x' = H x, by the DLT, or None.
 
     A point gives two equations; a pixel drawn anywhere on a straight line gives one, which is
     linear as well in this direction: line . (H pixel) = 0. None if they do not determine one
@@ -77,6 +77,8 @@ def camera_from_homography(
     focal_range: tuple[float, float],
 ) -> Camera | None:
     """Return the camera of a homography (3, 3) from the plane z = 0, or None (C2).
+
+    Decomposes H ~ K [r1 r2 t], the inverse of the paper's H, with r1, r2 the columns of R.
 
     Pixels are square and the principal point is the image center: a plane gives two equations for
     the internal parameters, here both for the focal length. Where they contradict each other or are

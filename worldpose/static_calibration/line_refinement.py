@@ -108,6 +108,12 @@ def refine_on_lines(
 ) -> LineRefinement:
     """Return the most probable camera and surface from the painted lines and a Gaussian prior.
 
+        L* = arg min sum_s rho(o_s(L) / s_s) + d^T C^-1 d
+
+    In place of the paper's distance D[Pi(X'; L)] to extracted lines, o_s [px] is the offset of a
+    sample of paint from the projected line, found by `LineSearch`, rho the Geman-McClure loss, and
+    d the step from the prior.
+
     The start's covariance gives samples and search widths: the search begins with samples of small
     projected uncertainty, which reduce the uncertainty of the others.
 

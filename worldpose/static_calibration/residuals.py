@@ -123,7 +123,7 @@ def _add(by: Floats, residual: float, weight: float, system: Floats, gradient: F
 def click_residuals(
     c: Floats, world: Floats, pixels: Floats, residual: Floats, jacobian: Floats
 ) -> None:
-    """Write pixel residuals (n, 2) of points and their derivatives (n, 2, 12) by a step [px].
+    """Write residuals Pi(X'_i) - x_i (n, 2) and their derivatives (n, 2, 12) by a step [px].
 
     Beyond the radius where the lens folds, the magnification at that radius applies, so that image
     radii keep growing. If points folded back into the image, a strong distortion would fit a point

@@ -24,6 +24,8 @@ def ray_affinity(
 ) -> Floats:
     """Return minus the mean distance of each person's joints to each detection's rays.
 
+        A(P, p) = -(1 / J) sum_j dist(P_j, ray of p_j)   over the J joints known on both sides
+
     Args:
         joints: (persons, joints, 3) [m], world; NaN where unknown.
         centers: (cameras, 3) [m], world, origins of the rays.
@@ -37,8 +39,7 @@ def ray_affinity(
         beyond the gate.
 
     Note:
-        T1: the plain mean over the joints known on both sides. Computation of a pair stops as soon
-        as the joints so far put its mean beyond the gate, whatever the distance of the others.
+        T1. Computation of a pair stops as soon as its joints so far put the mean beyond the gate.
     """
     cameras, detections, joint_count, _ = directions.shape
     persons = joints.shape[0]

@@ -174,9 +174,10 @@ def estimate_midhip_shift(
 ) -> Floats:
     """Return the mid-hip residual of each person in each image, with zero as third component.
 
-    With the shift subtracted, reprojection residuals are those of the paper's second stage,
-    relative to the mid-hip. The shift is 0 in an image without both hips, and for a person without
-    a mid-hip.
+        X* = arg min sum_c |(Pi(X) - Pi(X_mid)) - (x - x_mid)|^2
+
+    With the shift x_mid - Pi(X_mid) subtracted from x, `residuals.add_data` minimizes this. It is 0
+    in an image without both hips, and for a person without a mid-hip.
 
     Returns:
         (frames, cameras, persons, 3) [px].

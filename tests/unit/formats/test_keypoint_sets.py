@@ -207,6 +207,19 @@ def test_many_people_of_no_known_order_are_refused(tmp_path):
         read_openpose_folder(frames(tmp_path / "a", shuffled, 24))
 
 
+def test_landmarks_of_two_faces_are_no_bodies(tmp_path):
+    jaw = np.linspace(np.pi, 0, 17)
+    around = np.linspace(0, 2 * np.pi, 51)
+    face = np.r_[
+        np.c_[70 * np.cos(jaw), 90 * np.sin(jaw)], np.c_[30 * np.cos(around), 30 * np.sin(around)]
+    ]
+    row = np.c_[face + 300, np.full(68, 0.9)].ravel().tolist()
+    file = tmp_path / "faces.json"
+    file.write_text(json.dumps([{"image_id": n, "keypoints": row} for n in (0, 1)]))
+    with pytest.raises(InputError, match="limbs of usual lengths in the order of HALPE-68"):
+        read_coco_results(file)
+
+
 @pytest.mark.parametrize(
     ("names", "wanted"),
     [
