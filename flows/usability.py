@@ -63,7 +63,7 @@ _RULES: Final = (
         "static_calibration",
         "clicks_wrong",
         "",
-        "{value} clicks of {unit} contradict the others and are not used. Correct or remove them.",
+        "clicks of {unit} contradict the others and are not used: {value}. Correct or remove them.",
     ),
     _Rule(
         "detection",

@@ -84,7 +84,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         (
             "static_calibration/cam1",
             {"clicks_wrong": 5.0},
-            "5 clicks of cam1 contradict",
+            "clicks of cam1 contradict the others and are not used: 5.",
         ),
         (
             "broadcast_tracking/clip",
