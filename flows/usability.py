@@ -303,7 +303,10 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
     if outcome.lacks_people:
         yield "no person is placed. Check videos, 2D poses and calibration in the report."
     if outcome.waiting:
-        yield f"results that wait for review: {outcome.waiting}. Decide them, and run again."
+        yield (
+            f"results that wait for review: {outcome.waiting}. Decide or correct them, "
+            "and run again."
+        )
     most = limits.max_unusable_share
     for name, own in outcome.figures.items():
         stage, _, unit = name.partition("/")

@@ -18,7 +18,8 @@ from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.residuals import Pose
 from worldpose.body_fitting.shapes import Shapes
 from worldpose.errors import InputError
-from worldpose.triangulation.results import ExtraJoints
+from worldpose.ingest.clock import row_rate
+from worldpose.triangulation.results import ExtraJoints, Triangulation
 
 
 class EvidenceSource(Protocol):
@@ -58,7 +59,7 @@ class ClipEvidence:
         extra: points besides COCO-17 of the same frames and persons; None = none.
 
     Raises:
-        InputError: the shapes do not match.
+        InputError: the shapes do not match, or `fps` is not positive.
     """
 
     joints: Floats
@@ -79,6 +80,20 @@ class ClipEvidence:
                 found=f"{shape} and {self.covariance.shape}",
                 todo="Give triangulated joints with their covariance.",
             )
+        row_rate("body fitting", self.fps)
+
+    @staticmethod
+    def of(placed: Triangulation, fps: float, rays: RayConstraints) -> ClipEvidence:
+        """Return the evidence of triangulated joints and points, and of lines of sight."""
+        return ClipEvidence(
+            placed.joints,
+            placed.covariance,
+            fps,
+            placed.common_bias,
+            [rays],
+            shared_covariance=placed.shared_covariance,
+            extra=placed.extra,
+        )
 
     @property
     def size(self) -> tuple[int, int]:

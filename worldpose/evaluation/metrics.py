@@ -23,6 +23,7 @@ from worldpose.evaluation.matching import (
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
+from worldpose.ingest.clock import row_rate
 
 LIMBS: Final = {
     "left upper arm": ((5,), (7,)),
@@ -286,9 +287,12 @@ def evaluate_joints(
             do not project there; None = around the joints.
 
     Raises:
-        InputError: camera and reference have different numbers of frames.
+        InputError: camera and reference have different numbers of frames, or `fps` is not
+            positive.
     """
     settings = settings or EvaluationSettings()
+    if fps is not None:
+        row_rate("evaluate_joints", fps)
     people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate_m)

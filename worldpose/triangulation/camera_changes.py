@@ -454,8 +454,8 @@ def describe_change(change: CameraChange) -> str:
     if change.kind == "clock":
         rate = late / max(1.0, change.frame_count - 1.0)
         return (
-            f"camera {camera}: its offset changes by {-late:+.1f} frames within the clip: its "
-            f"clock runs {abs(rate):.2%} {'fast' if rate > 0.0 else 'slow'}. {todo}"
+            f"camera {camera}: its offset changes by {-late:+.1f} frames within the clip: it "
+            f"takes {abs(rate):.3%} {'fewer' if rate > 0.0 else 'more'} images. {todo}"
         )
     parts = [f"{math.hypot(*change.shift_px):.0f} px"]
     if abs(change.zoom) > 0.003:
