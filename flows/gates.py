@@ -149,8 +149,7 @@ GATES: Final[Mapping[str, Gate]] = {
             "detection",
             "Are exactly the people on the pitch detected?",
             {
-                # Half a second per minute is a recorder glitch; more needs a check of the video.
-                "unreadable_share": 0.02,
+                # Frames without an image are no question: no page corrects them, the verdict names them.
                 # A camera without people for half a clip is turned, dark or outside of training.
                 "empty_share": 0.5,
                 # Boxes interpolated between two processed frames: the detector misses too many.
@@ -176,12 +175,14 @@ GATES: Final[Mapping[str, Gate]] = {
             {
                 # Ambiguous joins: a wrong guess corrupts all that follows.
                 "undecided": 0.0,
-                "unmatched_share": _USABLE.max_unmatched_share,
+                # People beside the pitch are a quarter of the detections at a small ground: the
+                # verdict names them. At half, a clock or a camera is wrong, or the net is.
+                "unmatched_share": _USABLE.max_unusable_share,
                 "mean_ray_distance_m": _USABLE.max_ray_distance_m,
                 # Identity corrections that do not fit these tracks, which lack them.
                 "corrections_refused": 0.0,
             },
-            "the tracks: split, join",
+            "the tracks: split, join; or clicks and clocks of cameras that disagree",
             _in_3d,
         ),
         Gate(
