@@ -149,7 +149,7 @@ GATES: Final[Mapping[str, Gate]] = {
             "detection",
             "Are exactly the people on the pitch detected?",
             {
-                # Frames without an image are no question: no page corrects them, the verdict names them.
+                # Frames without an image are no question, but a reservation: no page adds them.
                 # A camera without people for half a clip is turned, dark or outside of training.
                 "empty_share": 0.5,
                 # Boxes interpolated between two processed frames: the detector misses too many.
