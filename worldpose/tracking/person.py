@@ -223,7 +223,8 @@ def measure_doubt(
     wander = settings.velocity_change_std_m_s * np.sqrt(unseen**3 / 3.0)
     # The velocity estimate needs a few frames; before, a person may be running.
     known = [1.0 - math.exp(-each.fixed / (fps * settings.velocity_time_s)) for each in people]
-    return np.hypot(wander, (1.0 - np.array(known)) * settings.rms_speed_m_s * unseen)
+    away = (1.0 - np.array(known)) * settings.rms_speed_m_s * unseen
+    return np.asarray(np.hypot(wander, away))
 
 
 @compile_kernel

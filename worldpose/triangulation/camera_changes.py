@@ -403,6 +403,11 @@ def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:
     return same and near and other.is_explained
 
 
+def is_by_chance(change: CameraChange) -> bool:
+    """Return whether a change is more than a knock: people who agree nowhere seem to show it."""
+    return abs(change.zoom) > 0.1 or abs(change.roll_rad) > np.radians(10.0)
+
+
 def join_changes(first: CameraChange, then: CameraChange) -> CameraChange:
     """Return a change of a view with the little that was found after its correction."""
     x, y, zoom, roll = (_view_amount(first) + _view_amount(then)).tolist()
