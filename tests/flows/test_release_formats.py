@@ -29,6 +29,8 @@ from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.formats.challenge import read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
 from worldpose.formats.release_cameras import read_camera
+from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.geometry.rigid import Rigid
 
 FRAMES = np.arange(100, 104)
 
@@ -134,6 +136,34 @@ def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, 
         places[late] = np.array([each["keypoints"][::3] for each in entries])
     # 0.4 of a step of 0.1 m, at 4000 px and 70 m.
     np.testing.assert_allclose(places[0.4] - places[0.0], 0.4 * 0.1 * 4000 / 70, rtol=0.02)
+
+
+def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
+    moving = bodies()
+    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+    pose = Rigid(
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.r_[0.0, 2.0, 70.0]
+    )
+    camera = Camera([4000.0, 4000.0], [959.5, 539.5], np.zeros(8), pose, [1920, 1080])
+    arrays = camera_arrays(Camera.stack([camera])).items()
+    cameras = {
+        name: ((f"{name}_0", *(f"{name}_{n + 1}" for n in range(each.ndim - 1))), each)
+        for name, each in arrays
+    }
+    static = xr.Dataset(cameras, coords={"camera": ["north"]})
+    placed = tracked()["triangulation__A_1"].assign_attrs(changes=[])
+    results = {"body_fitting__A_1": moving, "triangulation__A_1": placed}
+    run = origin(match_folder, **results, bundle_adjustment__cameras=static)
+    places = {}
+    for offset in (0.0, [[0, 0.25]]):
+        north = run.spec.cameras[0].model_copy(update={"offset_frames": offset})
+        spec = run.spec.model_copy(update={"cameras": (north, *run.spec.cameras[1:])})
+        shifted = replace(run, registration=SimpleNamespace(spec=spec))
+        (results,) = write("alphapose", shifted, tmp_path / str(bool(offset)))
+        entries = json.loads(results.read_text())
+        places[bool(offset)] = np.array([each["keypoints"][::3] for each in entries])
+    # Image 100 is a quarter of a frame before match frame 100: 0.025 m, at 4000 px and 70 m.
+    np.testing.assert_allclose(places[True] - places[False], -0.025 * 4000 / 70, rtol=0.02)
 
 
 def test_alphapose_results_are_the_projected_bodies(match_folder, tmp_path):
