@@ -7,6 +7,7 @@ In the TOML form each table has `size`, `matrix` and `distortions` as in calibra
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -280,8 +281,9 @@ def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, 
         expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
         raise calibration_error(str(path), expected, f"{content!r:.60}")
     pose: NDArray[np.float64] | None = np.eye(4)
-    # Kalibr sorts its cameras by the alphabet: cam0, cam1, cam10, cam2.
-    tables = by_last_number({str(name): given for name, given in content.items()})
+    tables = {str(name): given for name, given in content.items()}
+    if all(re.fullmatch(r"cam\d+", name) for name in tables):
+        tables = by_last_number(tables)  # Kalibr writes cam0, cam1, cam10, cam2
     for index, (name, given) in enumerate(tables.items()):
         where = f"{path}: {name}"
         given = given if isinstance(given, dict) else {}
