@@ -178,7 +178,7 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     lenses: dict[str, list[Path]] = {}
     notes: list[str] = []
     for file in sorted({*given.iterdir()} - posed):
-        named = [each for each in owners if file.stem.lower().startswith(each.lower())]
+        named = [each for each in owners if _begins_with(file.stem.lower(), each.lower())]
         owner = max(named, key=len, default=None)
         kind = _kind_of(file)
         if kind == "calibration":
@@ -198,6 +198,13 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
         elif kind == "lens":
             lenses.setdefault(owner, []).append(file)
         else:
+            if owner in people:
+                raise InputError(
+                    str(file),
+                    expected=f"one file with 2D poses of {owner}",
+                    found="a second one",
+                    todo="Remove one of the two, or rename it after its own camera.",
+                )
             read = read_people(file)
             people[owner] = read.people
             (folder / "detections").mkdir(exist_ok=True)
@@ -210,6 +217,11 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
         where = posed.pop() if len(posed) == 1 else given
         notes += _take_calibration(where, folder, indexes, people)
     return notes
+
+
+def _begins_with(name: str, owner: str) -> bool:
+    """Return whether a file's name is that of a camera, or continues it with another word."""
+    return name.startswith(owner) and not name[len(owner) : len(owner) + 1].isalnum()
 
 
 def _kind_of(file: Path) -> str:
@@ -255,7 +267,15 @@ def _take_calibration(
     placed, changes = place_as_stated(None, None)(
         source, {name: cameras[name] for name in known}, people, spec.fps
     )
-    write_calibration_toml(folder / "calibration.toml", placed)
+    own = folder / "calibration.toml"
+    if own.exists():
+        raise InputError(
+            str(source),
+            expected="one calibration",
+            found=f"this one besides {own.name}",
+            todo="Remove one of the two.",
+        )
+    write_calibration_toml(own, placed)
     return notes + changes
 
 

@@ -45,7 +45,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
-        opened = context.match(match_id)
+        opened = context.stored_match(match_id)
         latest = latest_run(context.store, match_id)
         folder = opened.folder
         return {
@@ -53,7 +53,7 @@ def routes(context: PageContext) -> APIRouter:
             "reviews": [
                 describe_review(each) for each in reviews_of(context.store, opened, latest)
             ],
-            "groups": describe_groups(opened),
+            "groups": describe_groups(context.store, opened),
             "cameras": [
                 {
                     "id": camera.id,

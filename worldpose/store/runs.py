@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+from pathlib import Path
 
 from data_contracts.pin import Pin
 from data_contracts.run import Reservation
@@ -134,6 +135,19 @@ def run_files(blobs: Blobs, match_id: str) -> tuple[set[str], set[str], set[str]
             kind = damaged if is_damaged else reserved if is_reservation else finished
             kind.add(run_id)
     return finished, reserved, damaged
+
+
+def identify_process(pid: int) -> str:
+    """Return the machine's boot and a process's start since then; empty where neither is told.
+
+    Unlike the time of its start, they do not change with the clock.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        told = Path(f"/proc/{pid}/stat").read_text(errors="replace")
+    except OSError:
+        return ""
+    return f"{boot} {told.rpartition(')')[2].split()[19]}"  # the name before it can have anything
 
 
 def run_order(run_id: str) -> tuple[int, str]:

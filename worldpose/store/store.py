@@ -40,7 +40,14 @@ from worldpose.store.paths import (
     reservation_path,
 )
 from worldpose.store.recipes import STORE_FORMAT, recipe_key
-from worldpose.store.runs import LATEST, read_document, read_pin, run_files, run_order
+from worldpose.store.runs import (
+    LATEST,
+    identify_process,
+    read_document,
+    read_pin,
+    run_files,
+    run_order,
+)
 from worldpose.store.writer import ResultWriter
 
 if TYPE_CHECKING:
@@ -254,6 +261,7 @@ class Store:
                 started_at=datetime.now(UTC),
                 host=platform.node(),
                 pid=os.getpid(),
+                process=identify_process(os.getpid()),
             )
             if not self.blobs.put_new(path, seal(reservation)):
                 continue
