@@ -21,6 +21,7 @@ from flows.stage import Match, Stage
 from flows.usability import usable_limits
 from worldpose.errors import StoreError, UsageError
 from worldpose.sources import code_version
+from worldpose.store.paths import ResultId
 from worldpose.store.recipes import libraries, recipe_key
 from worldpose.store.store import Store
 
@@ -309,7 +310,9 @@ def lost_inputs(
     return [
         name
         for name in sorted(used & before.keys())
-        if not store.has(match.match_id, *name.split("/", 1), before[name])
+        if not store.blobs.exists(
+            ResultId.from_name(match.match_id, name, before[name]).manifest_path
+        )
     ]
 
 

@@ -21,8 +21,9 @@ from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.dataset import check, count
 from flows.results.export import keep_run
-from worldpose.body.body_file import BodyModel, find_body
+from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyModel
 from worldpose.body.occlusions import visible_shares
 from worldpose.dataset import manifest as manifests
 from worldpose.dataset.contents import camera_files
@@ -171,7 +172,7 @@ def _write_clip(
             images[label] = unit_frames(spec, view).number(spec.clips_of(view)[0].first_frame)
     found = best_results.tracked_people(origin.run, clip)[1]
     named = {person: track.name or f"{clip}/{person}" for person, track in found.items()}
-    return contracts.ReleasedSequence(
+    released = contracts.ReleasedSequence(
         split=split,
         match_id=spec.match_id,
         run_id=origin.run.record.run_id,
@@ -186,6 +187,7 @@ def _write_clip(
         footage=videos,
         first_images=images,
     )
+    return released, model
 
 
 def _write_footage(origin: Origin, view: str, out: Path, form: FootageForm) -> StoredFile:

@@ -10,7 +10,8 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.release import CheckReport, DataSetStatistics, Finding
-from worldpose.body.body_file import OPEN_BODY, BodyModel, find_body
+from worldpose.body.body_file import OPEN_BODY, find_body
+from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import camera_files, list_clips, read_clip
 from worldpose.dataset.manifest import (

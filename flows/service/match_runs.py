@@ -23,7 +23,7 @@ from data_contracts.operations import Priority, QueuedRun
 from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
 from flows.run_record import runs_at_work
-from flows.service.layout import served_state
+from flows.service.layout import is_alive, served_state
 from flows.service.plan import TITLES, ServePlan, deployment_name
 from flows.service.run_queue import queued_run
 from worldpose.store.run_queue import RunQueue, queue_of
@@ -149,7 +149,9 @@ def match_runs_of(url: str) -> MatchRuns | None:
     serving = state.read_serving()
     if serving is None or "serve" not in serving.services:
         return None
-    with state.only_one("serve", wait=False) as is_free:  # a process that serves holds it
+    if not is_alive(serving.services["serve"].pid):
+        return None
+    with state.only_one("serve", wait=False) as is_free:  # else another process has its number
         if is_free:
             return None
     pages = serving.services.get("pages")

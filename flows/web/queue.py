@@ -182,7 +182,7 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
     latest = latest_run(context.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")
     pick_next = []
-    if key is not None:
+    if key is not None and context.store.has(match.match_id, "broadcast_calibration", clip, key):
         result = context.store.open_result(match.match_id, "broadcast_calibration", clip, key)
         pick_next = [int(frame) for frame in result.attrs["pick_next"]]
     folder = match.folder
