@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from data_contracts.release import EXPORT_FORMATS
 from data_contracts.review import SplitTrack
 from data_contracts.run import UnitFailure, WaitingUnit
-from flows import registering
 from flows.cli.app import app
 from flows.registering import open_match
 from flows.reports.cameras import camera_table
@@ -165,8 +164,9 @@ def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
         assert "found results of ingest" in answer.json()["error"]
 
 
-def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tmp_path, monkeypatch):
-    monkeypatch.setattr(registering, "_is_there", lambda folder: False)
+def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tmp_path):
+    away = {"folder": str(tmp_path / "away")}
+    store.register(store.registration(TINY).model_copy(update=away))
     page = ada.get(MATCH)
     assert page.status_code == 200
     assert "registered as" in page.json()["problem"]

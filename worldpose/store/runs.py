@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+from datetime import UTC, datetime
 from pathlib import Path
 
 from data_contracts.pin import Pin
@@ -135,6 +136,18 @@ def run_files(blobs: Blobs, match_id: str) -> tuple[set[str], set[str], set[str]
             kind = damaged if is_damaged else reserved if is_reservation else finished
             kind.add(run_id)
     return finished, reserved, damaged
+
+
+def begin_run(match_id: str, run_id: str) -> Reservation:
+    """Return the reservation of a run that this process begins now."""
+    return Reservation(
+        run_id=run_id,
+        match_id=match_id,
+        started_at=datetime.now(UTC),
+        host=platform.node(),
+        pid=os.getpid(),
+        process=identify_process(os.getpid()),
+    )
 
 
 def identify_process(pid: int) -> str:

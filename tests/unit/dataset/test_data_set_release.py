@@ -122,10 +122,11 @@ def test_a_release_has_the_bodies_of_the_folder_of_its_run(model, origins, tmp_p
     save_body(tmp_path / "smpl-test.npz", replace(model, name="smpl-test"))
     store, [(origin, split), *_] = origins
     about = {**vars(origin.run.record), "body_folder": str(tmp_path)}
+    del about["results"]
     parts = {name: part.copy() for name, part in origin.run.results.items()}
     for name in ("body_fitting/A", "body_fitting/B"):
         parts[name].attrs["body_model"] = "smpl-test"
-    run = StubRun(parts, store, **{**about, "results": parts})
+    run = StubRun(parts, store, **about)
     written = write_data_set(
         store, [(replace(origin, run=run), split)], tmp_path / "set", "own", LICENCES
     )
