@@ -76,7 +76,8 @@ def open_for_review(store: Store, match_id: str) -> Match:
 def open_stored(store: Store, name: str) -> Match:
     """Open a registered match, given by folder or id, to show its results.
 
-    If its folder is away or invalid, the match is as the project knows it: without any file.
+    If its folder is away or invalid, the match is as the project knows it: without images and
+    clicks.
 
     Raises:
         InputError: there is no such match.
@@ -87,7 +88,9 @@ def open_stored(store: Store, name: str) -> Match:
         return open_for_review(store, match_id)
     except (InputError, OSError):
         spec, pitch = registration.spec, _pitch_of_run(store, match_id)
-        folder = MatchFolder(Path(registration.folder), spec, {}, {}, pitch, {}, {}, {}, {})
+        paths = [Path(registration.folder, file.path) for file in registration.files]
+        given = {path.stem: path for path in paths if path.parent.name == "detections"}
+        folder = MatchFolder(Path(registration.folder), spec, {}, given, pitch, {}, {}, {}, {})
         journal, layers = read_journal(store, match_id), read_layers(store, spec)
         return Match(folder, registration, journal, layers=layers)
 
