@@ -1,8 +1,7 @@
-"""Accuracy and coverage of cameras in simulation: static, adjusted and moving."""
+"""Accuracy and coverage of cameras in simulation: static and moving."""
 
 from __future__ import annotations
 
-import time
 from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from common import places_of_feet, quantile, simulate, tell
-from registry import Table, Tables, benchmark, duration, integer, option, seeds
+from registry import Table, Tables, benchmark, integer, option
 from scipy.stats import chi2
 
 from data_contracts.arrays import Flags, Floats, Image
@@ -19,8 +18,6 @@ from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCame
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.bundle_adjustment.clip import Clicks, Clip
-from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.errors import InputError
 from worldpose.evaluation.cameras import surface_points
 from worldpose.formats.joints_file import read_joints
@@ -31,28 +28,17 @@ from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.simulation.scene import Scene
-from worldpose.simulation.settings import Scenario
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
-    project_with_jacobian,
     step_between,
 )
-from worldpose.static_calibration.report import StaticCalibration, calibration_arrays
-from worldpose.static_calibration.venue import join_cameras
-from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.estimate import triangulate_joints
-from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.video.files import VideoReader
 
 SHARES = (0.5, 0.8, 0.95, 0.99)
 
 GROUND = ("number", "median [cm]", "95 % [cm]", *(f"in {100 * s:g} % regions [%]" for s in SHARES))
 
-MOMENTS = 6
-"""Number of frames of a clip whose players count."""
 
 LASTING, ANEW = 0.01, 0.02
 
@@ -166,107 +152,6 @@ def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:
                 weak=found[0].report.weak,
                 refined=found[1].report.stage == "lines",
             )
-
-
-@benchmark(
-    "adjustment_accuracy",
-    "static cameras alone, on one pitch, and adjusted together: ground error, coverage",
-    option("--scenario", default="match"),
-    seeds(601, 602),
-    duration(4.0),
-)
-def score_adjustment(options: Namespace) -> Tables:
-    """Cameras from clicks and one image each, then on the pitch that all show, then adjusted.
-
-    People are tracked and triangulated with the second ones, as the stages do it. Regions: share
-    of players' places in a camera's image whose image error is within the camera's covariance.
-    """
-    kinds = ("alone", "on one pitch", "adjusted")
-    found: dict[str, list[tuple[Floats, Floats]]] = {kind: [] for kind in kinds}
-    changed = []
-    for seed in options.seeds:
-        scenario, scene = simulate(options.scenario, seed, options.duration)
-        painted = PitchTemplate.from_spec(scenario.pitch)
-        known = calibrate_static(scene, scenario, seed)
-        clip = as_clip(scene, scenario.fps, known)
-        begin = time.process_time()
-        adjusted = adjust_cameras(clip)
-        spent = time.process_time() - begin
-        moments = np.linspace(0, len(clip.detections.frame) - 1, MOMENTS).astype(int)
-        places = places_of_feet(scene.truth.joints[moments], painted)
-        true = Camera.stack([scene.cameras[name] for name in known])
-        own = Camera.stack([each.estimate.camera for each in known.values()])
-        spread = np.stack([each.estimate.covariance for each in known.values()])
-        cameras = ((own, spread), (clip.cameras, clip.covariance))
-        last = (adjusted.cameras, adjusted.covariance)
-        for kind, (camera, covariance) in zip(kinds, (*cameras, last), strict=True):
-            found[kind].append(errors(camera, covariance, true, places, painted))
-        changed.append([seed, int(adjusted.accepted.sum()), len(known), spent])
-    rows = []
-    for kind, parts in found.items():
-        ground, squared = (np.concatenate(part) for part in zip(*parts, strict=True))
-        held = [100.0 * float(np.mean(squared < chi2.ppf(share, 2))) for share in SHARES]
-        row = [kind, len(parts), 100.0 * quantile(ground), 100.0 * quantile(ground, 0.95)]
-        rows.append([*row, *held])
-    title = f"{options.scenario}, seeds {options.seeds}, {options.duration:g} s"
-    columns = ["seed", "changed cameras", "of", "time [s]"]
-    return {
-        "ground": Table(title, ["cameras", *GROUND], rows),
-        "changed": Table("adjustment", columns, changed),
-    }
-
-
-def calibrate_static(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticCalibration]:
-    """Return every static camera from clicks and the lines of one image."""
-    surveyed = PitchTemplate.from_spec(scene.surveyed)
-    painted = PitchTemplate.from_spec(scenario.pitch)
-    found = {}
-    for name, camera in scene.cameras.items():
-        still = render_pitch(camera, painted, scene.poses[:, 0], seed)
-        size = (int(camera.image_size[0]), int(camera.image_size[1]))
-        found[name] = calibrate_camera(surveyed, scene.clicks[name].markings, size, picture=still)
-    return found
-
-
-def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Clip:
-    """Return the clip in bundle adjustment's format."""
-    seen, settings = scene.static_views(list(known)), TriangulationSettings()
-    venue = join_cameras([calibration_arrays(each) for each in known.values()])
-    cameras, covariance = venue.cameras, venue.covariance
-    index = track_people(cameras, seen.detections, fps, TrackingSettings()).detection_index
-    detections = seen.detections.assign_people(index)
-    placed = triangulate_joints(cameras, detections, settings, covariance)
-    surveyed = PitchTemplate.from_spec(scene.surveyed)
-    if venue.surface is not None:
-        surveyed = surveyed.with_surface(venue.surface.shape)
-    return Clip(
-        cameras=cameras,
-        covariance=covariance,
-        clicks=tuple(Clicks.of(each, surveyed) for each in known.values()),
-        fps=fps,
-        detections=detections,
-        joints=placed.joints,
-        views=placed.views.astype(np.int64),
-        triangulation=settings,
-        pitch=surveyed,
-        on_lines=np.array([each.report.stage == "lines" for each in known.values()]),
-    )
-
-
-def errors(
-    cameras: Camera, covariance: Floats, true: Camera, places: Floats, pitch: PitchTemplate
-) -> tuple[Floats, Floats]:
-    """Return errors on the ground [m], and squared ones in the image over their covariance."""
-    ground, squared = [], []
-    for c in range(len(covariance)):
-        pixels = true[c].project(places)
-        inside = ((pixels > 0.0) & (pixels < true[c].image_size - 1.0)).all(axis=-1)
-        found, slope = project_with_jacobian(cameras[c], places[inside])
-        spread = np.einsum("nij,jk,nlk->nil", slope, covariance[c], slope)
-        off = found - pixels[inside]
-        squared.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off))
-        ground.append(ground_errors(cameras[c], true[c], places, pitch))
-    return np.concatenate(ground), np.concatenate(squared)
 
 
 @benchmark(

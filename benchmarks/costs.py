@@ -7,12 +7,10 @@ import resource
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from argparse import Namespace
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
 from itertools import chain, starmap
@@ -30,9 +28,7 @@ from data_contracts.arrays import Image
 from flows.results.dataset import check, count
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.body.model import BodyParameters
-from worldpose.detection import bundled_detector, bundled_pose, pipeline, sampling, suppression
-from worldpose.detection.box_tracking import BoxCleaner
-from worldpose.detection.enlargement import Part, SeesParts, expect_parts
+from worldpose.detection.enlargement import SeesParts, expect_parts
 from worldpose.detection.models import (
     BUNDLED_WEIGHTS,
     load_bundled_detector,
@@ -118,7 +114,7 @@ def measure_detection(options: Namespace) -> Tables:
             f"{title}{before / whole:.2f}", ["work", "ms/image", "images/s", "people/s"], rows
         ),
         "match": Table("a match", names, match),
-        "between": time_parts(pictures, Place(camera, pitch), options.rounds),
+        "between": time_between(pictures, Place(camera, pitch), options.rounds),
     }
 
 
@@ -137,74 +133,27 @@ class Recorded:
         return self._outputs[self.call - 1]
 
 
-class Stopwatch:
-    """Processor time of named functions, without that of others inside."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = dict.fromkeys(PARTS, 0.0)
-        self._inside = [0.0]
-
-    def wrap(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function with its time added to that of a part."""
-
-        def timed(*given: Any, **named: Any) -> Any:
-            begun = time.thread_time()
-            self._inside.append(0.0)
-            try:
-                return function(*given, **named)
-            finally:
-                whole = time.thread_time() - begun
-                self.seconds[part] += whole - self._inside.pop()
-                self._inside[-1] += whole
-
-        return timed
-
-
-PARTS: dict[str, list[tuple[Any, str]]] = {
-    "parts of frames, resized": [(sampling, "resize")],
-    "frames and parts as planes": [(bundled_detector, "pad")],
-    "boxes from maps": [(bundled_detector, "decode_boxes")],
-    "suppression": [(suppression, "nms_indices"), (pipeline, "suppress_poses")],
-    "groups of people": [(bundled_detector, "find_groups"), (Part, "merge")],
-    "crops": [(bundled_pose, "sample_crops")],
-    "joints from maps": [(bundled_pose, "decode_candidates")],
-    "joints shared out": [(bundled_pose, "assign_joints")],
-    "tracks of boxes": [(BoxCleaner, "_add_detections"), (BoxCleaner, "_release_frame")],
-    "pitch": [(pipeline, "on_pitch")],
-}
-"""The functions of each part of the work between the nets, by owner and name."""
-
-
-def time_parts(pictures: list[Image], place: Place, rounds: int) -> Table:
+def time_between(pictures: list[Image], place: Place, rounds: int) -> Table:
     """Return the time of the work between the nets, and the memory before and after many rounds."""
-    settings, watch = DetectionSettings(), Stopwatch()
+    settings = DetectionSettings()
     nets: list[Any] = [*load_detectors(settings), load_pose(settings)]
     finder = PeopleFinder(nets[:-1], nets[-1], settings)
-    sessions = [(each._net._net, Recorded(each._net._net._session)) for each in nets]
     whole, memory, process = 0.0, list[float](), psutil.Process()
     with ExitStack() as patches:
-        for net, recorded in sessions:
-            patches.enter_context(patch.object(net, "_session", recorded))
-        for name, functions in PARTS.items():
-            for owner, function in functions:
-                timed = watch.wrap(name, getattr(owner, function))
-                patches.enter_context(patch.object(owner, function, timed))
+        recorded = [Recorded(each._net._net._session) for each in nets]
+        for each, session in zip(nets, recorded, strict=True):
+            patches.enter_context(patch.object(each._net._net, "_session", session))
         for number in range(rounds + 2):
-            for _, recorded in sessions:
-                recorded.call = 0
-            if number == 2:  # recorded and warm
-                whole, watch.seconds = 0.0, dict.fromkeys(PARTS, 0.0)
+            for session in recorded:
+                session.call = 0
             memory.append(process.memory_info().rss / 2**20)
             seconds, _ = time_work(lambda: list(finder.find(enumerate(pictures), place)))
-            whole += seconds
+            whole += seconds if number > 1 else 0.0  # recorded and warm
     images = rounds * len(pictures)
-    rows = [[name, 1e3 * each / images] for name, each in watch.seconds.items()]
-    rest = whole - sum(watch.seconds.values())
-    rows += [["the rest", 1e3 * rest / images], ["together", 1e3 * whole / images]]
     title = (
         f"between the nets; {memory[2]:.0f} MB before {images} images, {memory[-1]:.0f} MB after"
     )
-    return Table(title, ["part", "ms/image"], rows)
+    return Table(title, ["part", "ms/image"], [["together", 1e3 * whole / images]])
 
 
 def render_crowd(people: int, frames: int) -> tuple[float, list[Image], Camera, PitchTemplate]:
@@ -284,9 +233,8 @@ def measure_runs(options: Namespace) -> Tables:
         share = (options.to - runs[0][0]) / (runs[-1][0] - runs[0][0])
     rows = []
     for stage in runs[-1][1]:
-        costs = [run.get(stage, Cost(0.0, 0, 0)) for _, run in runs]
-        peaks = [cost.total if stage == "all" else cost.largest for cost in costs]
-        cells = [(cost.seconds, peak / 1e6) for cost, peak in zip(costs, peaks, strict=True)]
+        costs = [run.get(stage, (0.0, 0, 0)) for _, run in runs]
+        cells = [(cost[0], cost[2 if stage == "all" else 1] / 1e6) for cost in costs]
         if share:
             ends = zip(cells[0], cells[-1], strict=True)
             cells.append(tuple(a + share * (b - a) for a, b in ends))  # type: ignore[arg-type]
@@ -294,42 +242,9 @@ def measure_runs(options: Namespace) -> Tables:
     return {"stages": Table("whole runs", ["stage", *columns], rows)}
 
 
-@dataclass
-class Memory:
-    """Resident memory over time: moment [s since the epoch], largest process and sum [byte]."""
-
-    samples: list[tuple[float, int, int]] = field(default_factory=list)
-
-    def follow(self, root: int, ended: threading.Event) -> None:
-        """Sample a process and those that descend from it until `ended`."""
-        while not ended.wait(INTERVAL_S):
-            with suppress(psutil.Error):  # a process ended meanwhile
-                family = [psutil.Process(root), *psutil.Process(root).children(recursive=True)]
-                sizes = [each.memory_info().rss for each in family]
-                self.samples.append((time.time(), max(sizes), sum(sizes)))
-
-    def peak(self, begin: float, end: float) -> tuple[int, int]:
-        """Return the largest process and the largest sum between two moments."""
-        inside = [each for each in self.samples if begin <= each[0] <= end + INTERVAL_S]
-        return (
-            max((largest for _, largest, _ in inside), default=0),
-            max((total for _, _, total in inside), default=0),
-        )
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Cost of a stage or of the whole run.
-
-    Attributes:
-        seconds: from the start of its first unit to the end of its last [s].
-        largest: peak of the largest process [byte].
-        total: peak of all processes together [byte].
-    """
-
-    seconds: float
-    largest: int
-    total: int
+Cost = tuple[float, int, int]
+"""Time from the start of the first to the end of the last unit [s], peak of the largest process and
+of all together [byte]."""
 
 
 def stage_spans(project: Path, folder: Path) -> dict[str, tuple[float, float]]:
@@ -350,24 +265,24 @@ def stage_spans(project: Path, folder: Path) -> dict[str, tuple[float, float]]:
 def measure_run(folder: Path, project: Path) -> dict[str, Cost]:
     """Run a match in a new project and return the cost of its stages and of `all`."""
     command = [str(WORLDPOSE), "run", str(folder), "--project", str(project)]
-    begin = time.time()
+    begin, samples = time.time(), list[tuple[float, int, int]]()
     with (project.parent / f"{project.name}.log").open("w") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-        memory, ended = Memory(), threading.Event()
-        watcher = threading.Thread(target=memory.follow, args=(process.pid, ended))
-        watcher.start()
-        code = process.wait()
-        ended.set()
-        watcher.join()
-    whole = time.time() - begin
-    if code != 0:
-        raise SystemExit(f"{' '.join(command)} ended with {code}: see {log.name}")
-    spans = stage_spans(project, folder)
-    costs = {
-        stage: Cost(last - first, *memory.peak(first, last))
-        for stage, (first, last) in sorted(spans.items(), key=lambda item: item[1])
-    }
-    return {**costs, "all": Cost(whole, *memory.peak(begin, begin + whole))}
+        process = psutil.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        while process.poll() is None:
+            with suppress(psutil.Error):  # a process ended meanwhile
+                family = [process, *process.children(recursive=True)]
+                sizes = [each.memory_info().rss for each in family]
+                samples.append((time.time(), max(sizes), sum(sizes)))
+            time.sleep(INTERVAL_S)
+    if process.returncode != 0:
+        raise SystemExit(f"{' '.join(command)} ended with {process.returncode}: see {log.name}")
+    spans = sorted(stage_spans(project, folder).items(), key=lambda item: item[1])
+    costs = {}
+    for stage, (first, last) in [*spans, ("all", (begin, time.time()))]:
+        inside = [each[1:] for each in samples if first <= each[0] <= last + INTERVAL_S]
+        largest, total = np.max([(0, 0), *inside], axis=0).tolist()
+        costs[stage] = (last - first, largest, total)
+    return costs
 
 
 STEPS = ("write", "check", "count")

@@ -130,26 +130,6 @@ def score_line_sets(options: Namespace) -> Tables:
     return {"jaccard": Table("JaC", columns, rows, "%"), "overlap": parts}
 
 
-@benchmark(
-    "broadcast_line_sets", "moving cameras from single key frames: lines of real main cameras", DATA
-)
-def score_key_frames(options: Namespace) -> Tables:
-    """DATA holds `wc14`, as for pitch_lines. There are no images.
-
-    Every line set is the only key frame of its clip, whose camera depends on the drawn lines alone.
-    """
-    lines, scorer = key_frame_lines(options.data), load_scorer(options.data)
-    found = cameras_of_key_frames(lines)
-    hits = [jaccards(scorer, lines[name], each, SIZE) for name, each in found.items()]
-    centers = np.array([each.center for each in found.values()])
-    away, height = np.hypot(centers[:, 0], centers[:, 1]), centers[:, 2]
-    ends = [away.min(), away.max(), height.min(), height.max()]
-    row = [len(found), len(lines), *ends, *(100.0 * np.mean(hits, axis=0))]
-    columns = ["cameras", "of", "nearest [m]", "farthest [m]", "lowest [m]", "highest [m]"]
-    columns += [f"JaC@{pixels} [%]" for pixels in PIXELS]
-    return {"cameras": Table("cameras of single key frames", columns, [row])}
-
-
 def key_frame_lines(folder: Path) -> dict[str, Lines]:
     """Return 30 line sets, of the half that settings were not tuned on."""
     return dict(list(load_lines(folder, "wc14", 1, 1).items())[:30])

@@ -33,7 +33,7 @@ from worldpose.errors import WorldposeError
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "results" / "data"
 MODULES = (
-    *("speed_projection", "speed_cameras", "speed_people", "costs", "second_world"),
+    *("speed_cameras", "speed_people", "costs", "second_world"),
     *("camera_accuracy", "camera_faults", "bodies"),
     *("real", "shelf", "mvor", "line_sets", "real_cameras", "stills", "pose2sim_demo"),
     "result_digests",

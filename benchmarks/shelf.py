@@ -39,9 +39,6 @@ SCORED: tuple[tuple[str, str | None, JointDefinition], ...] = (
 )
 """Letter, stage and definition of joints; no stage = what an export has by default."""
 
-POINTS, MILLIMETERS = 0.3, 1.0
-"""Loss through a stage that counts as worse."""
-
 AWAY_M = 0.2
 """Mean distance from which a person is another one [m]."""
 
@@ -135,8 +132,7 @@ def score_subsets(options: Namespace) -> Tables:
     Scored are joints of `triangulation` (T) and `retriangulation` (R), bodies in the definition of
     the body model (B) and of the detector (D), and what an export has by default (E): PCP3D at
     alpha 0.5 and mean error. `away` is the longest time for which an actor has nobody within
-    0.2 m. The further tables have the means and the worst over the subsets, and count the cases in
-    which a stage is worse than its input by more than 0.3 points or 1 mm.
+    0.2 m. The further table has the means and the worst over the subsets.
     """
     data = options.data / "shelf_dev"
     scorer, truth = load_module(data / "pcp.py"), np.load(data / "gt.npz")
@@ -191,28 +187,19 @@ def format_rows(rows: list[list[Any]], label: str) -> str:
 
 
 def tabulate(rows: list[list[Any]]) -> Tables:
-    """Return all cases, their means and worst by number of cameras, and stages that lose."""
+    """Return all cases, and their means and worst by number of cameras."""
     scored = [row for row in rows if len(row) == 8 and row[4] is not None]
-    summary, worse = list[list[Any]](), dict[str, list[bool]]()
+    summary = list[list[Any]]()
     for key in dict.fromkeys((row[2], row[1], row[3]) for row in scored):
         own = np.array([row[4:] for row in scored if (row[2], row[1], row[3]) == key])
         least, most = own.min(axis=0), own.max(axis=0)
         mean = np.nanmean(own, axis=0)
         summary.append([*key, mean[0], least[0], mean[1], most[1], int(own[:, 2].sum()), most[3]])
-    marks = {(row[0], row[1], row[3]): row[4:6] for row in scored}
-    for (label, part, name), (pcp, error) in marks.items():
-        before = {"R": "T", "B": "R", "E": "B"}.get(name[0])
-        if before is not None and (label, part, before + name[1:]) in marks:
-            given = marks[label, part, before + name[1:]]
-            lost, risen = given[0] - pcp, error - given[1] if name[0] != "B" else 0.0
-            worse.setdefault(f"{before} to {name}", []).append(lost > POINTS or risen > MILLIMETERS)
-    counts = [[name, sum(cases), len(cases)] for name, cases in worse.items()]
     values = ["PCP3D [%]", "error [mm]", "switches", "away [s]"]
     means = ["PCP3D [%]", "least", "error [mm]", "most", "switches", "away [s]"]
     return {
         "cases": Table("cases", ["case", "frames", "cameras", "joints", *values], rows),
         "means": Table("means and worst", ["cameras", "frames", "joints", *means], summary),
-        "worse": Table("worse than the input", ["step", "cases", "of"], counts),
     }
 
 

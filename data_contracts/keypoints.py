@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import TypeVar
 
 from data_contracts.arrays import (
@@ -31,6 +31,12 @@ def _no_frames() -> Integers:
 
 def _no_people() -> NDArray[np.integer]:
     return np.empty((0, 0, 0), dtype=np.int16)
+
+
+def _as_floats(values: ArrayLike) -> AnyFloats:
+    """Return an array of float32, or of float64 if the values are of neither."""
+    array = np.asarray(values)
+    return array.astype(np.float32 if array.dtype.type is np.float32 else np.float64, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +76,13 @@ class KeypointDetections(Generic[Array]):
 
     @staticmethod
     def from_keypoints(
-        keypoints: AnyFloats,
-        confidence: AnyFloats,
+        keypoints: ArrayLike,
+        confidence: ArrayLike,
         detection_index: NDArray[np.integer] | None = None,
-        frame: Integers | None = None,
+        frame: ArrayLike | None = None,
     ) -> KeypointDetections:
         """Return detections without boxes and scores, which are NaN and read-only."""
+        keypoints, confidence = _as_floats(keypoints), _as_floats(confidence)
         shape = confidence.shape[:-1]
         nan = np.array(np.nan, dtype=confidence.dtype)
         return KeypointDetections(
@@ -83,7 +90,7 @@ class KeypointDetections(Generic[Array]):
             confidence,
             np.broadcast_to(nan, (*shape, 4)),
             np.broadcast_to(nan, shape),
-            _no_frames() if frame is None else frame,
+            _no_frames() if frame is None else np.asarray(frame, dtype=np.int64),
             _no_people() if detection_index is None else detection_index,
         )
 

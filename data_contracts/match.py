@@ -86,7 +86,7 @@ class CameraSpec(Record):
     """[1/s]; absent = the match's."""
     offset_frames: ClockOffset = 0.0
     """This camera's own frame number at match frame 0: camera frame = match frame + offset. Pairs
-    [match frame, offset] describe a clock that runs fast, or frames that a recorder lost."""
+    [match frame, offset] describe a clock that drifts, or frames that a recorder lost."""
     video: str | None = None
     """Video file or folder of images, relative to the match folder."""
     still: str | None = None

@@ -103,6 +103,10 @@ class DescribedFields(GenerateJsonSchema):
             made["properties"][name].setdefault("description", text)
         return made
 
+    def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ANN401
+        """Return False: a title made of a field's name says nothing more."""
+        return False
+
 
 def documents() -> dict[str, Any]:
     """Every generated document by file name: schemas, array layouts, conventions."""

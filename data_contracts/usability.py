@@ -56,8 +56,8 @@ class UsableLimits(Record):
     root of the trace, median over people and frames [m]: twice that of a good camera in simulation,
     0.47 m."""
     max_unusable_share: Share = 0.5
-    """Share of the time without people beyond which results are not usable [1]: most of the clip
-    has none."""
+    """Share of the time without people, or of detections without a track, beyond which results are
+    not usable [1]: most of the clip has none."""
 
 
 class Usability(Record):

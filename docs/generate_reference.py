@@ -39,21 +39,14 @@ RESULT_PAGES = {
     "static_cameras": (
         "Static cameras",
         "static_calibration static_accuracy camera_projection camera_faults synchronization "
-        "proposals pitch_lines still_cameras bundle_adjustment adjustment_accuracy",
+        "proposals pitch_lines still_cameras bundle_adjustment",
     ),
     "people": (
         "People, joints and bodies",
-        "tracking triangulation body_fitting body_accuracy challenge second_world",
+        "tracking triangulation body_fitting challenge second_world",
     ),
-    "moving_cameras": (
-        "Moving cameras",
-        "broadcast_calibration broadcast_accuracy broadcast_line_sets broadcast_clip "
-        "broadcast_cuts",
-    ),
-    "whole_runs": (
-        "Time and memory",
-        "run_memory data_set_size",
-    ),
+    "moving_cameras": ("Moving cameras", "broadcast_accuracy broadcast_clip broadcast_cuts"),
+    "whole_runs": ("Time and memory", "run_memory data_set_size"),
 }
 """Title of each page of results, and the benchmarks whose tables it has."""
 

@@ -11,9 +11,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from pydantic import Field
-
-from data_contracts.records import Record
 from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
 from data_contracts.usability import UsableLimits
@@ -33,14 +30,14 @@ class Gate:
     Attributes:
         stage: the stage that the gate follows, also the gate's name.
         question: the decision for the reviewer.
-        limits: record of the largest metrics that `auto` lets pass.
+        limits: the largest metrics that `auto` lets pass.
         judged: maps a result's metrics to those that are compared with the limits.
         to_correct: what a person corrects after a rejection.
     """
 
     stage: str
     question: str
-    limits: Record
+    limits: Mapping[str, float]
     to_correct: str
     judged: Callable[[Figures], Figures] = lambda figures: figures
 
@@ -54,7 +51,7 @@ class Gate:
             return ()
         judged = self.judged(figures)
         lines = []
-        for name, limit in self.limits:
+        for name, limit in self.limits.items():
             if name not in judged:
                 lines.append(f"{name} could not be computed")
             elif exceeds(judged[name], limit):
@@ -69,7 +66,7 @@ class Gate:
         judged = self.judged(figures)
         beyond = [
             judged[name] / limit - 1.0 if limit else judged[name]
-            for name, limit in self.limits
+            for name, limit in self.limits.items()
             if name in judged
         ]
         return max([0.0, *beyond])
@@ -93,106 +90,6 @@ def _beyond(name: str, judged: Figures, limit: float) -> str:
 
 _CALIBRATION: Final = StaticCalibrationSettings()
 _USABLE: Final = UsableLimits()
-
-
-class CameraLimits(Record):
-    """Metric limits of a calibrated static camera."""
-
-    expected_ground_error_median_m: float = Field(default=_CALIBRATION.weak_median_m, ge=0)
-    """Expected error on the pitch, median over the visible pitch [m]: the limit of which the
-    calibration page warns. People correct the cameras later (`bundle_adjustment`)."""
-    expected_ground_error_p95_m: float = Field(default=_CALIBRATION.weak_p95_m, ge=0)
-    """The same at its 95th percentile [m]: the far side, where a pixel is 5 to 20 cm."""
-    clicks_wrong: float = Field(default=0, ge=0)
-    """Clicks that are outliers to the others [1]. A click at the wrong marking is one, and the
-    annotator sees at once which click is wrong."""
-    weak: float = Field(default=0, ge=0)
-    """1 if the clicks leave a direction of the camera undetermined [1]."""
-
-
-class PeopleLimits(Record):
-    """Metric limits of the people found in a camera's clip (D6)."""
-
-    unreadable_share: float = Field(default=0.02, ge=0)
-    """Share of frames with a missing or damaged image [1]: half a second per minute is a
-    recorder glitch; more needs a check of the video."""
-    empty_share: float = Field(default=0.5, ge=0)
-    """Share of images without detections [1]. A camera can look away from play at times; one
-    without people for half a clip is turned, dark or outside the detector's training data."""
-    bridged_share: float = Field(default=0.25, ge=0)
-    """Share of boxes interpolated between two processed frames [1]; at a quarter, the detector
-    misses too many."""
-    flicker_share: float = Field(default=0.10, ge=0)
-    """Boxes of discarded short tracks per kept box [1]: false positives on turf, boards and
-    crowd."""
-
-
-class ConsistencyLimits(Record):
-    """Limits of the cross-checks between static cameras; a left-out camera always needs review."""
-
-    contradictions: float = Field(default=0, ge=0)
-    """Cameras that contradict another with no evidence which is wrong [1]."""
-
-
-class IdentityLimits(Record):
-    """Metric limits of a clip's tracks."""
-
-    undecided: float = Field(default=0, ge=0)
-    """Joins of two tracks with ambiguous evidence [1]: a person decides these at once, and a
-    wrong guess corrupts all that follows."""
-    unmatched_share: float = Field(default=_USABLE.max_unmatched_share, ge=0)
-    """Share of detections without a track [1]."""
-    mean_ray_distance_m: float = Field(default=_USABLE.max_ray_distance_m, ge=0)
-    """Distance between the rays of matched detections [m]."""
-    corrections_refused: float = Field(default=0, ge=0)
-    """Identity corrections that do not fit these tracks [1]; the tracks lack these corrections."""
-
-
-class JointLimits(Record):
-    """Metric limits of a clip's triangulated joints."""
-
-    standard_deviation_m: float = Field(default=_USABLE.max_standard_deviation_m, ge=0)
-    """Root of the trace of a joint's covariance, median over joints [m]."""
-    filled_share: float = Field(default=_USABLE.max_filled_share, ge=0)
-    """Share of joints filled by the motion model alone [1]."""
-    unhealthy_share: float = Field(default=0.05, ge=0)
-    """Share of the clip in which a camera's keypoints depart from people, its images are missing,
-    dark, bright or blurred; of the worst camera [1]."""
-
-
-class AdjustmentLimits(Record):
-    """Metric limits of adjusted cameras.
-
-    The number of changes that held-out validation refused has no limit: accurate cameras need none.
-    """
-
-    held_out_error_after_px: float = Field(default=5.0, ge=0)
-    """Median reprojection error of held-out people in the adjusted cameras [px]; 1.5 to 2.4 on
-    simulated matches."""
-    held_out_growth: float = Field(default=1.0, ge=0)
-    """The same relative to before the adjustment [1]: above 1 the adjustment did harm."""
-
-
-class ClipLimits(Record):
-    """Metric limits of the bodies of a clip before release."""
-
-    offset_rms_m: float = Field(default=_USABLE.max_body_offset_m, ge=0)
-    """Offset of the detector's joints from the body's joints, along an axis [m]."""
-    filled_share: float = Field(default=0.05, ge=0)
-    """Share of bodies in frames without any joint of the person [1]."""
-    held_out_certain_excess_m: float = Field(default=_USABLE.max_body_excess_m, ge=0)
-    """Error of fitted joints beyond that of triangulated joints, of the worst joint group [m]."""
-
-
-class BroadcastLimits(Record):
-    """Metric limits of a clip's calibrated broadcast camera."""
-
-    expected_error_median_px: float = Field(default=_USABLE.max_broadcast_error_px, ge=0)
-    """Expected error of the pitch in the image, median over frames [px]."""
-    weak: float = Field(default=0, ge=0)
-    """1 if the clip's report asks for a check [1]."""
-
-
 EXCESS: Final = "held_out_certain_excess_m"
 
 
@@ -236,54 +133,103 @@ GATES: Final[Mapping[str, Gate]] = {
         Gate(
             "static_calibration",
             "Do the projected markings match those in the image, in all parts of it?",
-            CameraLimits(),
+            {
+                # Median over the visible pitch: the limit of which the calibration page warns.
+                "expected_ground_error_median_m": _CALIBRATION.weak_median_m,
+                # The far side, where a pixel is 5 to 20 cm.
+                "expected_ground_error_p95_m": _CALIBRATION.weak_p95_m,
+                # The annotator sees at once which click is wrong.
+                "clicks_wrong": 0.0,
+                # 1 if the clicks leave a direction of the camera undetermined.
+                "weak": 0.0,
+            },
             "the clicks of this camera",
         ),
         Gate(
             "detection",
             "Are exactly the people on the pitch detected?",
-            PeopleLimits(),
+            {
+                # Frames without an image are no question, but a reservation: no page adds them.
+                # A camera without people for half a clip is turned, dark or outside of training.
+                "empty_share": 0.5,
+                # Boxes interpolated between two processed frames: the detector misses too many.
+                "bridged_share": 0.25,
+                # Boxes of discarded short tracks per kept box: turf, boards and crowd.
+                "flicker_share": 0.10,
+            },
             "the people in this video, or the video itself",
             _of_people,
         ),
         Gate(
             "camera_consistency",
             "Are these cameras wrong, for this reason? If you approve, the run leaves them out.",
-            ConsistencyLimits(),
+            {
+                # Cameras that contradict another with no evidence which is wrong.
+                "contradictions": 0.0
+            },
             "the clicks or the clock of the cameras that are named",
         ),
         Gate(
             "tracking",
             "Is every person one track over the whole clip?",
-            IdentityLimits(),
-            "the tracks: split, join",
+            {
+                # Ambiguous joins: a wrong guess corrupts all that follows.
+                "undecided": 0.0,
+                # People beside the pitch are a quarter of the detections at a small ground: the
+                # verdict names them. At half, a clock or a camera is wrong, or the net is.
+                "unmatched_share": _USABLE.max_unusable_share,
+                "mean_ray_distance_m": _USABLE.max_ray_distance_m,
+                # Identity corrections that do not fit these tracks, which lack them.
+                "corrections_refused": 0.0,
+            },
+            "the tracks: split, join; or clicks and clocks of cameras that disagree",
             _in_3d,
         ),
         Gate(
             "triangulation",
             "Are the joints where the images show them, and are the cameras healthy?",
-            JointLimits(),
+            {
+                "standard_deviation_m": _USABLE.max_standard_deviation_m,
+                "filled_share": _USABLE.max_filled_share,
+                # Share of the clip in which the worst camera departs from people or shows little.
+                "unhealthy_share": 0.05,
+            },
             "the keypoints in the images, or the cameras",
             _in_3d,
         ),
         Gate(
             "bundle_adjustment",
             "Did the adjustment improve the cameras, and are its outliers correct?",
-            AdjustmentLimits(),
+            {
+                # Of held-out people in the adjusted cameras; 1.5 to 2.4 on simulated matches.
+                "held_out_error_after_px": 5.0,
+                # Relative to before the adjustment: above 1 it did harm.
+                "held_out_growth": 1.0,
+            },
             "the outliers that are listed",
             _of_adjustment,
         ),
         Gate(
             "body_fitting",
             "Is the clip good enough to be released?",
-            ClipLimits(),
+            {
+                "offset_rms_m": _USABLE.max_body_offset_m,
+                # Share of bodies in frames without any joint of the person.
+                "filled_share": 0.05,
+                # Of the worst joint group.
+                EXCESS: _USABLE.max_body_excess_m,
+            },
             "the tracks and the keypoints that are off",
             _of_bodies,
         ),
         Gate(
             "broadcast_calibration",
             "Does the drawn pitch match the pitch in the image in every frame?",
-            BroadcastLimits(),
+            {
+                "expected_error_median_px": _USABLE.max_broadcast_error_px,
+                # 1 if the clip's report asks for a check.
+                "weak": 0.0,
+            },
             "the key frames of this camera",
         ),
     )
@@ -381,7 +327,7 @@ class Gatekeeper:
             and metric in before
             and metric in now
             and not exceeds(now[metric], before[metric])
-            for metric, limit in gate.limits
+            for metric, limit in gate.limits.items()
             if any(reason.startswith(f"{metric} ") for reason in reasons)
         )
 

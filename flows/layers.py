@@ -57,11 +57,6 @@ class Layer:
     revision: str = ""
 
     @property
-    def is_stored(self) -> bool:
-        """Whether it is a layer of the store."""
-        return self.name == PROJECT or "/" in self.name
-
-    @property
     def origin(self) -> str:
         """The layer in words, as users know it."""
         kind, _, name = self.name.partition("/")

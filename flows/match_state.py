@@ -233,7 +233,8 @@ def _describe_part(record: RunRecord) -> tuple[str, str, str]:
         names = ", ".join(step_words(each) for each in record.failed[:3])
         return f"partial: {names} is missing", why, todo
     missing = "people in 3D" if not record.blocked else "the later steps"
-    why = " ".join(record.warnings)
+    causes = [each for each in record.warnings if each.startswith("tracking/")]
+    why = " ".join(causes or record.warnings)
     return f"partial: {missing} are missing", why, "Download what is there, or correct the cause."
 
 

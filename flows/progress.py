@@ -19,6 +19,8 @@ logger = logging.getLogger("worldpose.run")
 EXPECTATION_SECONDS: Final = 60.0
 """Measured computation time that counts as much as the expected one for the time left [s]: a first
 unit that takes a hundred times its expected time says little about other stages."""
+MOST_UNFINISHED: Final = 0.8
+"""Share of a unit's expected time that counts as done before the unit is."""
 MOST_TOLD: Final = 200
 """Units of a stage that are reported one by one; of more, only every n-th."""
 
@@ -73,6 +75,8 @@ class Reporter:
     _missing: int = 0
     _began: float | None = None
     _stage_began: float = 0.0
+    _moved: float = 0.0
+    """Time at which the stage began or a unit of it ended [s]."""
 
     def run_planned(self, work: Mapping[str, float]) -> None:
         """Begin to measure a run.
@@ -101,7 +105,11 @@ class Reporter:
         if self._began is None:  # all stages so far had their results
             return Progress(0.0, None)
         done = sum(self._work.get(stage, 0.0) for stage in self._reached[:-1])
-        done += self._work.get(self._reached[-1], 0.0) * self.stage_progress.share
+        own = self._work.get(self._reached[-1], 0.0)
+        done += own * self.stage_progress.share
+        if self.left > 0:  # a unit may take minutes: it is on its way until it is nearly due
+            due = own / self._missing
+            done += min(time.monotonic() - self._moved, MOST_UNFINISHED * due)
         share = min(done / total, 1.0)
         if not done:
             return Progress(share, None)
@@ -121,6 +129,7 @@ class Reporter:
         """Report that a stage starts, with the numbers of its units and of those to compute."""
         self.left, self.every = missing, max(1, math.ceil(missing / MOST_TOLD))
         self._missing, self._stage_began = missing, time.monotonic()
+        self._moved = self._stage_began
         self._reached = (*self._reached, stage)
         if missing and self._began is None:
             self._began = self._stage_began
@@ -128,7 +137,7 @@ class Reporter:
 
     def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
         """Report that a unit has been computed and published."""
-        self.left -= 1
+        self.left, self._moved = self.left - 1, time.monotonic()
         if self.left % self.every == 0:
             self.tell_of(unit, seconds, figures)
 
@@ -142,7 +151,7 @@ class Reporter:
 
     def unit_failed(self, unit: str, message: str) -> None:
         """Report that a unit has no result."""
-        self.left -= 1
+        self.left, self._moved = self.left - 1, time.monotonic()
         logger.error("%s: failed: %s", unit, message)
 
     def report_interruption(self) -> None:

@@ -305,6 +305,7 @@ class RunLog:
             failed=self.failed,
             lacks_results=state == "failed",
             lacks_people=self.plan.lacks_cameras or self._lacks_people(),
+            lacks_joints=self._lacks(triangulation.STAGE, "joints"),
             waiting=len(self.plan.waiting),
         )
         record = RunRecord(
@@ -374,24 +375,22 @@ class RunLog:
         return settings, overrides
 
     def _lacks_people(self) -> bool:
-        """Return whether a stage of this run found no person, or no joint, in any clip."""
-        wanted = (
-            (tracking.STAGE, "people"),
-            (triangulation.STAGE, "joints"),
-            (broadcast_calibration.TRACKING, "people"),
-        )
-        for stage, figure in wanted:
-            clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]
-            found = [self.figures.get(clip, {}).get(figure) for clip in clips]
-            if stage in self.plan.stages and found and all(count == 0 for count in found):
-                return True
-        return False
+        """Return whether a stage of this run found no person in any clip."""
+        stages = tracking.STAGE, broadcast_calibration.TRACKING
+        return any(self._lacks(stage, "people") for stage in stages)
+
+    def _lacks(self, stage: Stage, figure: str) -> bool:
+        """Return whether a stage of this run found none of what a metric counts, in any clip."""
+        clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]
+        found = [self.figures.get(clip, {}).get(figure) for clip in clips]
+        return stage in self.plan.stages and bool(found) and all(count == 0 for count in found)
 
     def _state(self) -> RunState:
         if not self.failed:
             if self.plan.waiting:
                 return "waiting"
-            return "partial" if self.plan.lacks_cameras or self._lacks_people() else "complete"
+            lacks = self.plan.lacks_cameras or self._lacks_people()
+            return "partial" if lacks or self._lacks(triangulation.STAGE, "joints") else "complete"
         asked = [stage.name for stage in self.plan.stages if stage.units(self.match)]
         through = [stage.name for stage in METHOD[: METHOD.index(body_fitting.STAGE) + 1]]
         last = next((name for name in reversed(asked) if name in through), asked[-1])

@@ -125,7 +125,7 @@ class Stage:
     Attributes:
         name: the one name of this stage, and of its task.
         about: text of progress lines.
-        settings: the record of its settings.
+        settings: the record of its settings; by default it has none.
         units: names of the pieces that are computed, retried and stored separately.
         inputs: returns the `stage/unit` names of a unit's input results.
         sources: returns all data of the match folder that a unit's result depends on.
@@ -143,10 +143,10 @@ class Stage:
 
     name: str
     about: str
-    settings: type[Record]
     units: Callable[[Match], tuple[str, ...]]
-    inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
+    inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
+    settings: type[Record] = Record
     previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
     late_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
     first_pass: Literal[1, 2] = 1

@@ -23,6 +23,7 @@ Figures = Mapping[str, float]
 
 DOUBTING: Final = (
     "static_calibration",
+    "detection",
     "camera_consistency",
     "tracking",
     "triangulation",
@@ -59,11 +60,17 @@ class _Rule:
 
 _RULES: Final = (
     _Rule(
+        "static_calibration",
+        "clicks_wrong",
+        "",
+        "clicks of {unit} contradict the others and are not used: {value}. Correct or remove them.",
+    ),
+    _Rule(
         "detection",
         "unreadable_share",
         "max_unreadable_share",
         "the video of {unit} has no image, or none that can be decoded, for {value} of the frames"
-        "{when}. Check the video, and convert it with any video tool.",
+        "{when}. Check the video and its offset, or convert it with any video tool.",
     ),
     _Rule(
         "tracking",
@@ -182,6 +189,7 @@ class RunOutcome:
         failed: units without a result.
         lacks_results: whether no unit of the last requested stage has a result.
         lacks_people: whether no person was found, or too few cameras are left to place any.
+        lacks_joints: whether no person has a joint in 3D.
         waiting: number of results that need review before others are computed.
     """
 
@@ -191,6 +199,7 @@ class RunOutcome:
     failed: Sequence[UnitFailure] = ()
     lacks_results: bool = False
     lacks_people: bool = False
+    lacks_joints: bool = False
     waiting: int = 0
 
 
@@ -207,13 +216,14 @@ def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
         *against,
         *(f"{each.unit} failed: {' '.join(each.message.split())}" for each in outcome.failed),
         *outcome.left_out,
-        *(() if against else _describe_early_end(outcome.figures)),
+        *(() if against else _describe_lack(outcome)),
         *exceeded_limits(outcome.figures, limits),
         *(
             text
             for name, warnings in outcome.warnings.items()
             if name.partition("/")[0] in DOUBTING
             for text in warnings
+            if not text.endswith("the camera does not film this clip.")
         ),
     ]
     verdict = "not usable" if against else "usable with reservations" if said else "usable"
@@ -244,7 +254,7 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
         if name.partition(".")[0] == rule.metric
     }
     unknown = [part for part, value in own.items() if not isfinite(value)]
-    if unknown or (rule.is_required and figures and not own):
+    if unknown or (rule.is_required and figures and not own and figures.get("joints") != 0):
         parts = f" ({', '.join(unknown)})" if any(unknown) else ""
         yield (
             f"{metric_words(rule.metric)[0]} could not be computed in {place}{parts}. Look at it "
@@ -255,7 +265,8 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
     if beyond:
         yield rule.says.format(
             unit=place,
-            value=f"{quantity(rule.metric, own[beyond[0]])} (limit {quantity(rule.metric, limit)})",
+            value=quantity(rule.metric, own[beyond[0]])
+            + (f" (limit {quantity(rule.metric, limit)})" if rule.limit else ""),
             part=", ".join(beyond),
             when=_when(rule.metric.rpartition("_")[0], beyond[0], figures),
         )
@@ -273,9 +284,11 @@ def _when(subject: str, part: str, figures: Figures) -> str:
     return f", longest {whose}in {frames}"
 
 
-def _describe_early_end(figures: Mapping[str, Figures]) -> Iterator[str]:
-    """Yield that the results, in the order of the method, end before people have places."""
-    stages = [name.partition("/")[0] for name in figures]
+def _describe_lack(outcome: RunOutcome) -> Iterator[str]:
+    """Yield that the results, in the order of the method, end before people have bodies."""
+    if outcome.lacks_joints:
+        yield "no person is in 3D: people have places on the pitch, without joints and bodies."
+    stages = [name.partition("/")[0] for name in outcome.figures]
     if stages and not {*BODY_STAGES, "broadcast_tracking"} & {*stages}:
         yield (
             f"no person has a body: the results end with {stages[-1]}. Run the match without "
@@ -290,10 +303,18 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
     if outcome.lacks_people:
         yield "no person is placed. Check videos, 2D poses and calibration in the report."
     if outcome.waiting:
-        yield f"results that wait for review: {outcome.waiting}. Decide them, and run again."
+        yield (
+            f"results that wait for review: {outcome.waiting}. Decide or correct them, "
+            "and run again."
+        )
     most = limits.max_unusable_share
     for name, own in outcome.figures.items():
         stage, _, unit = name.partition("/")
         if stage == "tracking" and own.get("absent_share", 0.0) > most:
             share = f"{quantity('absent_share', most)} of the time"
             yield f"people are missing in {unit} for more than {share}. Check the videos."
+        if stage == "tracking" and own.get("unmatched_share", 0.0) > most:
+            yield (
+                f"more than {quantity('unmatched_share', most)} of the detections in {unit} belong "
+                "to no track. A camera's pose or clock is wrong, or the nets do not fit the images."
+            )

@@ -15,10 +15,9 @@ from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import (
-    ChunkedRows,
     ClipInputs,
+    PagedArray,
     open_tracked_clip,
-    read_rows,
     triangulation_settings,
 )
 from tasks.triangulation import camera_errors
@@ -87,7 +86,7 @@ class ClipPeople:
         self.common_bias: Floats = placed["common_bias"].values
         self.views = views
         self._placed = placed
-        self._exchanged = ChunkedRows(placed["exchanged"])
+        self._exchanged = PagedArray.of(placed["exchanged"])
         self._last: tuple[slice, ClipEvidence] | None = None
         self._whole: tuple[slice, ClipEvidence] | None = None
 
@@ -114,51 +113,45 @@ class ClipPeople:
     def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
         """Return the detections in some frames, as triangulated: left-right swaps are undone."""
         rows = np.arange(self.size[0])[frames]
-        if isinstance(frames, slice):
-            exchanged = self._exchanged[slice(int(rows[0]), int(rows[-1]) + 1)]
-        else:
-            exchanged = read_rows(self._placed["exchanged"], rows)
-        return undo_swaps(self.clip.detections[rows], exchanged)
+        return undo_swaps(self.clip.detections[rows], self._exchanged[rows])
 
     def read_joints(self, frames: slice) -> ClipEvidence:
         """Return the triangulated joints and points of some frames."""
-        if self._last is None or not _holds(self._last[0], frames):
-            self._last = self._whole = None  # else both windows would be in memory
-            placed = self._placed.isel(frame=frames)
-            self._last = (
-                frames,
-                ClipEvidence(
-                    placed["joints"].values,
-                    placed["covariance"].values,
-                    self.fps,
-                    common_bias=self.common_bias,
-                    shared_covariance=placed["shared_covariance"].values,
-                    extra=extra_joints(placed),
-                ),
-            )
-        return _part(self._last, frames)
+        if (held := _part(self._last, frames)) is not None:
+            return held
+        self._last = self._whole = None  # else both windows would be in memory
+        placed = self._placed.isel(frame=frames)
+        evidence = ClipEvidence(
+            placed["joints"].values,
+            placed["covariance"].values,
+            self.fps,
+            common_bias=self.common_bias,
+            shared_covariance=placed["shared_covariance"].values,
+            extra=extra_joints(placed),
+        )
+        self._last = frames, evidence
+        return evidence
 
     def read(self, frames: slice) -> ClipEvidence:
         """Return all evidence in some frames."""
-        if self._whole is None or not _holds(self._whole[0], frames):
+        if (held := _part(self._whole, frames)) is None:
             placed = self.read_joints(frames)
             alone = find_ray_constraints(self.clip.cameras, _Frames(self, frames), placed.joints)
             moving = [view(frames) for view in self.views]
             rays = [alone, *(seen for seen, _ in moving)]
             monocular = join_poses([poses for _, poses in moving if poses is not None])
-            self._whole = (frames, replace(placed, ray_constraints=rays, monocular_poses=monocular))
-        return _part(self._whole, frames)
+            held = replace(placed, ray_constraints=rays, monocular_poses=monocular)
+            self._whole = frames, held
+        return held
 
 
-def _holds(held: slice, frames: slice) -> bool:
-    return bool(held.start <= frames.start and frames.stop <= held.stop)
-
-
-def _part(read: tuple[slice, ClipEvidence], frames: slice) -> ClipEvidence:
-    held, evidence = read
-    if held == frames:
-        return evidence
-    return evidence.read(slice(frames.start - held.start, frames.stop - held.start))
+def _part(read: tuple[slice, ClipEvidence] | None, frames: slice) -> ClipEvidence | None:
+    """Return some frames of what was read; None unless all of them were."""
+    if read is None or frames.start < read[0].start or frames.stop > read[0].stop:
+        return None
+    first = read[0].start
+    part = slice(frames.start - first, frames.stop - first)
+    return read[1] if read[0] == frames else read[1].read(part)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from data_contracts.arrays import ClipArray, Flags, Integers, Singles
 from data_contracts.detection import redetection_name
@@ -40,47 +40,6 @@ SMALL_BYTES = 2**28 + 2**27
 a third of it. Stages read a clip up to six times."""
 
 
-class ChunkedRows:
-    """Rows of a stored array, read by whole chunks; the last one read stays in memory.
-
-    A page seldom ends where a chunk does: by pages, each chunk would be decoded two or three times.
-    """
-
-    def __init__(self, array: xr.DataArray) -> None:
-        chunks = array.encoding.get("chunks")
-        length = chunks[0] if chunks else PAGE
-        self._array = array
-        self._length = length * math.ceil(PAGE / length)
-        self._last: tuple[int, NDArray[Any]] = (-1, np.empty(0))
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Return the rows from a start to a stop."""
-        length = self._length
-        parts = []
-        for number in range(rows.start // length, (rows.stop - 1) // length + 1):
-            held, values = self._last  # read at once: threads may replace it
-            first = number * length
-            if held != number:
-                values = self._array[first : first + length].values
-                self._last = (number, values)
-            parts.append(values[max(rows.start - first, 0) : rows.stop - first])
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def read_rows(array: xr.DataArray, rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Return some rising rows of a stored array, one read for each run of consecutive ones.
-
-    Zarr finds numbers at a list of indices one by one, which takes a microsecond and a hundred
-    bytes for each.
-    """
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1) if len(rows) else [rows]
-    parts = [
-        array[int(run[0]) : int(run[-1]) + 1].values if len(run) else array[:0].values
-        for run in runs
-    ]
-    return np.concatenate(parts)
-
-
 class PagedArray:
     """An array that is read in pages, the last of which stay in memory.
 
@@ -88,24 +47,52 @@ class PagedArray:
         shape: (frames, ...).
     """
 
-    def __init__(self, shape: tuple[int, ...], read: Callable[[slice], NDArray[Any]]) -> None:
-        """Open an array of a shape, whose rows `read` returns."""
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        read: Callable[[slice], NDArray[Any]],
+        dtype: DTypeLike = np.float64,
+        page: int = PAGE,
+        pages: int | None = None,
+    ) -> None:
+        """Open an array of a shape, whose rows `read` returns.
+
+        Args:
+            shape: (frames, ...).
+            read: returns the rows from a start to a stop.
+            dtype: type of the numbers that it gives.
+            page: rows per read.
+            pages: pages in memory; None = all of a small array, else `PAGES`.
+        """
         self.shape = shape
+        self._dtype, self._rows = np.dtype(dtype), page
         is_small = math.prod(shape) * np.dtype(np.float32).itemsize <= SMALL_BYTES
-        self._page = lru_cache(None if is_small else PAGES)(
-            lambda number: read(slice(number * PAGE, min((number + 1) * PAGE, shape[0])))
+        self._page = lru_cache(pages or (None if is_small else PAGES))(
+            lambda number: read(slice(number * page, min((number + 1) * page, shape[0])))
         )
         self._reading = Lock()
 
-    def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
-        """Return some frames as float64."""
+    @classmethod
+    def of(cls, array: xr.DataArray) -> PagedArray:
+        """Open a stored array, read by whole chunks; the last one read stays in memory.
+
+        A page seldom ends where a chunk does: by pages, each chunk would be decoded two or three
+        times. Zarr finds numbers at a list of indices one by one, at a microsecond for each.
+        """
+        chunks = array.encoding.get("chunks")
+        length = chunks[0] if chunks else PAGE
+        page = length * math.ceil(PAGE / length)
+        return cls(array.shape, lambda rows: array[rows].values, array.dtype, page, 1)
+
+    def __getitem__(self, frames: slice | Integers) -> NDArray[Any]:
+        """Return some frames."""
         row = np.arange(self.shape[0])[frames]
-        out = np.empty((len(row), *self.shape[1:]))
-        for number in np.unique(row // PAGE).tolist():
-            here = row // PAGE == number
+        out = np.empty((len(row), *self.shape[1:]), self._dtype)
+        for number in np.unique(row // self._rows).tolist():
+            here = row // self._rows == number
             with self._reading:  # else two threads that need one page would both read it
                 page = self._page(number)
-            out[here] = page[row[here] - number * PAGE]
+            out[here] = page[row[here] - number * self._rows]
         return out
 
 
@@ -132,7 +119,7 @@ class StoredFeedback:
         used = {"rejected": filtered, "shift": shifted}
         self._cameras, self._hide = cameras, not redetected
         self._results = {
-            name: ChunkedRows(filtering[name])
+            name: PagedArray.of(filtering[name])
             for name, wanted in used.items()
             if wanted and filtering is not None
         }
@@ -182,7 +169,7 @@ def open_detections(
     most = max(1, *(camera.sizes["detection"] for camera in cameras))
 
     def open_array(name: str) -> PagedArray:
-        stored = [ChunkedRows(camera[name]) for camera in aligned]
+        stored = [PagedArray.of(camera[name]) for camera in aligned]
         frames, _, *rest = aligned[0][name].shape
         shape = (frames, len(stored), most, *rest)
 
@@ -344,7 +331,7 @@ def triangulation_settings(inputs: UnitInputs, clip: str) -> TriangulationSettin
 def select_frames(stored: xr.Dataset, frame: NDArray[np.int64]) -> xr.Dataset:
     """Return some rising match frames of a result, read on access.
 
-    Evenly spaced frames are a slice, which is read faster than a list (`read_rows`).
+    Evenly spaced frames are a slice, which is read faster than a list.
     """
     places = stored.get_index("frame").get_indexer(frame)
     steps = np.unique(np.diff(places))

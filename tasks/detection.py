@@ -101,8 +101,8 @@ def _warn_of_size(found: _Found, settings: DetectionSettings) -> list[str]:
         return []
     return [
         f"people are {usual:.0f} px tall in the images, and the bundled detector knows people of "
-        "28 to 160 px: it misses people and finds wrong ones. Give 2D poses, or other nets by "
-        "detection.detector and detection.pose"
+        "28 to 160 px: it misses people and finds wrong ones, and bodies are wrong. Give 2D poses "
+        "of another tool, or other nets (settings detection.detector and detection.pose)"
     ]
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -20,12 +20,11 @@ from data_contracts.filtering import FILTERING
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import (
     ADJUSTED,
-    ChunkedRows,
     ClipInputs,
+    PagedArray,
     load_dropped_boxes,
     open_clip,
     open_tracked_clip,
-    read_rows,
     triangulation_settings,
 )
 from tasks.detection import footage_index, require_weights
@@ -139,7 +138,9 @@ class _Bodies:
 
     def __init__(self, fitted: xr.Dataset, common_bias: Floats) -> None:
         self.person: NDArray[np.integer] = fitted["person"].values
-        self._fitted = fitted
+        self._joints, self._covariance = (
+            PagedArray.of(fitted[name]) for name in ("joints", "covariance")
+        )
         self._offsets: Floats = fitted["joint_offsets"].values
         self._common_bias = common_bias
 
@@ -151,14 +152,14 @@ class _Bodies:
             motion per frame (frames, persons, 17, 3) [m], NaN if unknown; the covariance of the
             joints (frames, persons, 17, 3, 3) [m^2].
         """
-        last = self._fitted.sizes["frame"] - 1
+        last = self._joints.shape[0] - 1
         rows = np.arange(last + 1)[frames]
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, last)
         read = np.unique(np.concatenate([before, rows, after]))
-        joints = perceived_joints(read_rows(self._fitted["joints"], read), self._offsets)
+        joints = perceived_joints(self._joints[read], self._offsets)
         step = joints[np.searchsorted(read, after)] - joints[np.searchsorted(read, before)]
         step /= np.maximum(after - before, 1)[:, None, None, None]
-        covariance = read_rows(self._fitted["covariance"], rows)
+        covariance = self._covariance[rows]
         return (
             joints[np.searchsorted(read, rows)],
             step,
@@ -173,7 +174,7 @@ class _Case:
     Attributes:
         clip: all detections, without earlier rejections, of tracked people.
         bodies: the bodies.
-        placed: result of `retriangulation`.
+        placed: arrays `PLACED` of `retriangulation`.
         dropped: (frames, cameras, detections), boxes that the previous iteration dropped; None in
             the first.
         triangulation: settings of the triangulation.
@@ -181,7 +182,7 @@ class _Case:
 
     clip: ClipInputs
     bodies: _Bodies
-    placed: xr.Dataset
+    placed: Mapping[str, PagedArray]
     dropped: NDArray[np.bool_] | None
     triangulation: TriangulationSettings
 
@@ -192,17 +193,14 @@ class _Case:
 
     def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, TriangulatedDetections]:
         """Project the bodies into all images; return views, motion, and the detections to test."""
-        offsets, exchanged = (read_rows(self.placed[name], frames) for name in PLACED)
-        views, motion = self.project(frames)
-        return views, motion, self.read(frames, offsets, exchanged)
+        return *self.project(frames), self.read(frames)
 
     def parts(self) -> Iterator[_Part]:
         """Yield all frames, `PART` at a time, with their detections."""
         count = len(self.clip.detections.frame)
-        placed = [ChunkedRows(self.placed[name]) for name in PLACED]
         for first in range(0, count, PART):
             frames = slice(first, min(first + PART, count))
-            yield frames, self.read(frames, *(array[frames] for array in placed))
+            yield frames, self.read(frames)
 
     def project(self, frames: _Frames) -> tuple[BodyViews, BodyMotion]:
         """Return the bodies, and their motion, in all images."""
@@ -210,10 +208,9 @@ class _Case:
         motion = watch_motion(self.clip.cameras, joints, step)
         return view_bodies(self.clip.cameras, joints, covariance), motion
 
-    def read(
-        self, frames: _Frames, offsets: NDArray[Any], exchanged: NDArray[Any]
-    ) -> TriangulatedDetections:
-        """Return the detections to test, with these results of their triangulation."""
+    def read(self, frames: _Frames) -> TriangulatedDetections:
+        """Return the detections to test, with results of their triangulation."""
+        offsets, exchanged = (self.placed[name][frames] for name in PLACED)
         detections = self.clip.detections[frames]
         boxes = detections.confidence.shape[:3]
         before = np.zeros(boxes, dtype=np.bool_) if self.dropped is None else self.dropped[frames]
@@ -233,7 +230,7 @@ def _open_case(inputs: UnitInputs) -> _Case:
     return _Case(
         clip=open_tracked_clip(inputs, filtered=False, shifted=False),
         bodies=_Bodies(bodies, placed["common_bias"].values),
-        placed=placed,
+        placed={name: PagedArray.of(placed[name]) for name in PLACED},
         dropped=load_dropped_boxes(inputs),
         triangulation=triangulation_settings(inputs, unit),
     )

@@ -47,6 +47,7 @@ from worldpose.tracking.tracker import Tracking, track_people
 from worldpose.triangulation.camera_changes import (
     change_record,
     describe_change,
+    is_by_chance,
     is_same_change,
     refine_change,
 )
@@ -227,8 +228,7 @@ def _follow_changes(
             camera = clip.camera_ids.index(changes[-1].camera)
             given = clip.cameras, people, clip.fps, TriangulationSettings()
             changes[-1] = refine_change(*given, camera, changes[-1])
-            if abs(changes[-1].zoom) > 0.1 or abs(changes[-1].roll_rad) > np.radians(10.0):
-                # No knock does that: people who agree nowhere seem to agree by chance.
+            if is_by_chance(changes[-1]):
                 clip = open_clip(inputs, further=changes[:-1])
                 return clip, track(clip), tuple(changes[:-1])
             clip = open_clip(inputs, further=changes)

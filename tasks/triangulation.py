@@ -35,6 +35,7 @@ from worldpose.triangulation.camera_changes import (
     change_record,
     describe_change,
     explain_changes,
+    is_by_chance,
     is_same_change,
     join_changes,
     measure_departures,
@@ -220,7 +221,11 @@ def _find_changes(
         camera = names[measured.found.camera]
         change = change_record(measured, camera, clip.detections.frame)
         same = [n for n, other in enumerate(new) if is_same_change(other, change, clip.fps)]
-        if camera in spoilt or any(is_same_change(one, change, clip.fps) for one in known):
+        if (
+            is_by_chance(change)
+            or camera in spoilt
+            or any(is_same_change(one, change, clip.fps) for one in known)
+        ):
             break
         if same:  # what other changes had hidden of it
             frame = new[same[0]].frame

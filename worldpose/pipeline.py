@@ -7,7 +7,7 @@ checks of cameras against each other, review gates, iterations, chunks, stored r
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.report import BundleAdjustment
 from worldpose.detection.pipeline import detect_people
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import image_clock, read_still, read_unit, unit_frames
 from worldpose.ingest.match_folder import MatchFolder
@@ -88,11 +89,7 @@ def reconstruct(match: MatchFolder, clip_id: str | None = None) -> Reconstructio
     joints = reconstruct_joints(cameras, people, fps, camera_covariance=errors).triangulation
 
     rays = find_ray_constraints(cameras, undo_swaps(people, joints.exchanged), joints.joints)
-    shared = joints.shared_covariance
-    evidence = ClipEvidence(
-        joints.joints, joints.covariance, fps, joints.common_bias, [rays], shared_covariance=shared
-    )
-    bodies = fit_bodies(find_body(), evidence, ground=pitch.height)
+    bodies = fit_bodies(find_body(), ClipEvidence.of(joints, fps, rays), ground=pitch.height)
     views = (name for name in match.spec.views_of(clip_id) if name in match.key_frames)
     broadcast = {name: calibrate_moving_camera(match, name, pitch, bodies) for name in views}
     return Reconstruction(seen.frame, tracks, adjusted, joints, bodies, broadcast)
@@ -102,6 +99,9 @@ def calibrate_static_cameras(match: MatchFolder, pitch: PitchTemplate) -> list[S
     """Return each static camera from clicks on markings, and from painted lines in its still."""
     calibrations = []
     for spec in match.spec.static_cameras:
+        if spec.id not in match.clicked:
+            expected, todo = f"clicks of static camera {spec.id!r}", "Add them, or use a run."
+            raise InputError(str(match.folder / "annotations"), expected, "none", todo)
         size, still = (spec.width, spec.height), match.stills.get(spec.id)
         picture = None if still is None else read_still(still, size)
         calibrations.append(calibrate_camera(pitch, match.clicked[spec.id], size, picture=picture))
@@ -112,16 +112,17 @@ def find_people(match: MatchFolder, clip_id: str) -> KeypointDetections:
     """Return the 2D poses (frames, cameras, detections, 17): given ones, or those of our nets."""
     clip, cameras = match.spec.clip(clip_id), []
     for camera in match.spec.static_cameras:
-        if camera.id in match.detections:
-            given = read_unit(match, camera.id)[0]
-            after = given.frame - clip.first_frame
-            cameras.append(given[np.flatnonzero((after >= 0) & (after < clip.frame_count))])
+        if camera.id in match.detections or camera.id not in match.videos:
+            seen = read_unit(match, camera.id)[0]
         else:
-            frame = np.arange(clip.first_frame, clip.first_frame + clip.frame_count)
-            number = unit_frames(match.spec, camera.id).numbers(frame)
-            with open_video(match.videos[camera.id]) as video:
-                pictures = (each for _, each in video.frames(number[0], number[-1] + 1))
-                cameras.append(detect_people(pictures)[number - number[0]])
+            clock, file = unit_frames(match.spec, camera.id), match.videos[camera.id]
+            start, last = clock.numbers(clip.first_frame + np.array([0, clip.frame_count - 1]))
+            first = max(0, int(start))
+            with open_video(file) as video:
+                shown = detect_people(each for _, each in video.frames(first, int(last) + 1))
+            seen = clock.place(file, replace(shown, frame=shown.frame + first))
+        after = seen.frame - clip.first_frame
+        cameras.append(seen[np.flatnonzero((after >= 0) & (after < clip.frame_count))])
     return KeypointDetections.stack(cameras)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -187,6 +188,12 @@ def paint_pictures(
     ]
 
 
+def _spoken(point: str) -> str:
+    """Return a point's name as pages write it; `at_52.50_19.16` is (52.5, 19.2) m."""
+    place = re.match(r"at_(-?[\d.]+)_(-?\d+\.\d+)", point)
+    return f"({float(place[1]):.1f}, {float(place[2]):.1f}) m" if place else point.replace("_", " ")
+
+
 def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
     """Return a PNG of one calibrated camera: clicks on its still, and the expected ground error."""
     pitch = shown_pitch(run, match)
@@ -199,7 +206,7 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
         f"camera {name}",
         pitch,
         clicks=[
-            Click(point, place, inlier[point])
+            Click(_spoken(point), place, inlier[point])
             for point, place in _clicked_places(run, name).items()
         ],
         still=background_image(store, match, name),

@@ -78,6 +78,8 @@ class Review:
         uses = "uses it as it is"
         if self.request.gate == "camera_consistency":
             uses = "leaves these cameras out"
+        elif self.request.figures.get("clicks_wrong"):
+            uses = "uses the camera without the clicks that contradict the others"
         return {
             "approve": f"Approve: the run goes on and {uses}.",
             "reject": f"Reject: nothing later uses it. Correct {fix}; then it is computed again.",

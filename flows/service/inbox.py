@@ -11,6 +11,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -175,6 +176,16 @@ Begin = Callable[[Match, Arrival], str]
 """Starts a match's run, only once however often it is called; returns the run's Prefect id."""
 
 
+def note_whole(state: StateFolder, path: Path, name: str, priority: Priority) -> None:
+    """Note an arrival that came in one step: no scan has to see that nothing of it changes."""
+    with suppress(RefusalError, WorldposeError, OSError):  # then scans wait as for any other
+        arrival = Arrival(
+            name=name, state="arriving", priority=priority, changed_at=datetime.now(UTC)
+        )
+        seen = {"fingerprint": fingerprint_of(path)}
+        state.write_arrival(arrival.model_copy(update=seen))
+
+
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
     """Scan the inbox, save its state, and return the names of complete arrivals.
 
@@ -216,10 +227,8 @@ def _take(
             f"the process that took it in died {arrival.deaths} times, killed or by a crash: the "
             "system's log says which (out of memory?). It is tried again when a file of it changes",
         )
-    number = arrival.deaths + 1
-    state.write_arrival(
-        change_state(arrival, "arriving", f"being taken in, try {number}", is_begun=True)
-    )
+    again = f", try {arrival.deaths + 1}" if arrival.deaths else ""
+    state.write_arrival(change_state(arrival, "arriving", f"being taken in{again}", is_begun=True))
     try:
         return _decide(store, entry, arrival, begin)
     except BaseException:
@@ -271,12 +280,15 @@ def _look_at(entry: Entry, before: Arrival | None, quiet: float) -> tuple[Arriva
     # We hold the lock, so a process that began an intake is dead.
     deaths = arrival.deaths + arrival.is_begun if is_same else 0
     reason = f"taken in when nothing of it has changed for {quiet:g} s"
+    is_ready = is_same and now - since >= quiet
+    if is_ready:
+        reason = "being taken in"
     if deaths:
         times = f"{deaths} time{'s' if deaths > 1 else ''}"
         reason += f"; the process that took it in died {times}"
     update = {"unchanged_since": since, "deaths": deaths, "is_begun": False}
     arrival = change_state(arrival, "arriving", reason, fingerprint=fingerprint, **update)
-    return arrival, is_same and now - since >= quiet
+    return arrival, is_ready
 
 
 def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arrival:

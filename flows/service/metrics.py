@@ -169,7 +169,7 @@ def _quality(matches: list[MatchSummary]) -> Iterator[Metric]:
     """Yield the metrics that gates judge: the worst of a match's units, and the limit."""
     worst, limits = {}, {}
     for gate in GATES.values():
-        for name, limit in gate.limits:
+        for name, limit in gate.limits.items():
             limits[gate.stage, name] = limit
             for match in matches:
                 units = match.stages.get(gate.stage, ())

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
@@ -95,10 +94,6 @@ STAGE = Stage(
 )
 
 
-class BroadcastPoolingSettings(Record):
-    """No settings: the covariances of the clips decide whether their positions agree."""
-
-
 @once_a_match
 def pooled_clips(match: Match) -> dict[str, tuple[str, ...]]:
     """Return the views whose camera is also calibrated in others, each with all of these views."""
@@ -114,17 +109,12 @@ POOLING = Stage(
     name="broadcast_pooling",
     task_file="broadcast_calibration",
     about="give the broadcast camera one place in all its clips",
-    settings=BroadcastPoolingSettings,
     units=lambda match: tuple(pooled_clips(match)),
     inputs=lambda match, unit: tuple(
         f"broadcast_calibration/{clip}" for clip in pooled_clips(match)[unit]
     ),
     sources=lambda match, unit: {"clips": list(pooled_clips(match)[unit])},
 )
-
-
-class BroadcastTrackingSettings(Record):
-    """No settings: covariances of feet and camera, and shirts, decide who is one person."""
 
 
 @once_a_match
@@ -158,7 +148,6 @@ TRACKING = Stage(
     name="broadcast_tracking",
     task_file="broadcast_calibration",
     about="place the broadcast camera's people on the pitch",
-    settings=BroadcastTrackingSettings,
     units=clips_without_static_cameras,
     inputs=camera_inputs,
     sources=tracking_sources,

@@ -7,16 +7,11 @@ from __future__ import annotations
 
 from pydantic import JsonValue, TypeAdapter
 
-from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
 from worldpose.ingest.footage import footage_clips, footage_size, unit_frames
 from worldpose.review.detections import DETECTION_EDITS, DetectionEdit
 
 _EDITS = TypeAdapter(list[DetectionEdit])
-
-
-class IngestSettings(Record):
-    """No settings: `ingest` reads its inputs as given."""
 
 
 @once_a_match
@@ -82,9 +77,7 @@ def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
 STAGE = Stage(
     name="ingest",
     about="take in 2D poses and videos",
-    settings=IngestSettings,
     units=units,
-    inputs=lambda match, unit: (),
     sources=sources,
     leaves_out=True,
 )

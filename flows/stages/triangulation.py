@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from data_contracts.records import Record
 from flows.stage import Match, Stage
 from flows.stages import detection, tracking
 from worldpose.triangulation.settings import TriangulationSettings
@@ -34,10 +33,6 @@ STAGE = Stage(
 )
 
 
-class RetriangulationSettings(Record):
-    """No settings of its own: joints are triangulated with the settings of `triangulation`."""
-
-
 def adjusted_inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the adjusted cameras, their detections, and the tracks of a clip."""
     seen = detection.seen_by_cameras(match, unit)
@@ -53,7 +48,6 @@ RETRIANGULATION = Stage(
     name="retriangulation",
     task_file="triangulation",
     about="place every joint again with the adjusted cameras",
-    settings=RetriangulationSettings,
     units=tracking.units,
     inputs=retriangulation_inputs,
     sources=tracking.clip_sources,

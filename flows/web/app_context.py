@@ -197,11 +197,12 @@ class Continuing:
                 first = seen.open.index(run)
                 ahead = [it for it in others if it.state == "begun" or seen.open.index(it) < first]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
-                lines = ["The run starts in a moment."]
+                lines = ["It starts in a moment."]
                 if ahead:
-                    lines = [f"The run waits for its turn: {runs} before it."]
+                    lines = [f"{runs} before it."]
             return {
                 "state": "running",
+                "waits": run.state != "begun",
                 "lines": lines,
                 "percent": 0.0 if beat is None else 100.0 * beat.share,
                 "prefect": seen.served.link(run),
@@ -324,7 +325,8 @@ class LocalRuns:
                 printed = "" if output is None else output.read_text(errors="replace")
                 return {"state": "running", **read_progress(printed)}
             if match_id in dict(self._waiting):
-                return {"state": "running", "lines": [f"waits for the run of {self._at_work}"]}
+                lines = [f"The run of {self._at_work} is before it."]
+                return {"state": "running", "waits": True, "lines": lines}
             ended = self._ended.get(match_id)
         if ended is None:
             return None

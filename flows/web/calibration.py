@@ -60,7 +60,7 @@ class Clicked(Record):
         )
 
 
-GROUND_LIMIT_M: Final = dict(GATES["static_calibration"].limits)["expected_ground_error_median_m"]
+GROUND_LIMIT_M: Final = GATES["static_calibration"].limits["expected_ground_error_median_m"]
 """Expected error on the pitch above which a run asks about a camera [m]."""
 
 

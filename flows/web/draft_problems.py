@@ -55,6 +55,9 @@ def form_problems(
 ) -> list[Problem]:
     """Return the problems of a form, and of files as the pages show them."""
     found = [describe(error) for error in list_problems(MatchSpec, dict(content), "match.yaml")]
+    for problem in found:
+        if problem["place"] in ("cameras", "clips") and not content.get(problem["place"]):
+            problem["message"] = "none yet: add at least one"
     cameras = content.get("cameras")
     used = {
         str(camera.get(key))
@@ -132,7 +135,7 @@ def build(
     try:
         taken = take_given(given, folder, indexes) if given.is_dir() else []
         # No paths of this machine, no options of commands.
-        notes = [re.sub(r"; --\w+ states another", "", it.replace(str(given), "")) for it in taken]
+        notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
         match = read_match(folder)
     except InputError as error:
         return [describe(error, folder, given)], notes
@@ -161,7 +164,8 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     """Write what other tools' files say into a match folder; return sentences about it.
 
     A calibration is told by its form. Any other file has 2D poses, clicks or a lens of the camera
-    with whose id its name begins; clicks may also be in images that are named after cameras.
+    with whose id, or as the only one with whose first word, its name begins; clicks may also be in
+    images that are named after cameras.
 
     Args:
         given: folder of the files.
@@ -178,13 +182,19 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     lenses: dict[str, list[Path]] = {}
     notes: list[str] = []
     for file in sorted({*given.iterdir()} - posed):
-        named = [each for each in owners if _begins_with(file.stem.lower(), each.lower())]
-        owner = max(named, key=len, default=None)
-        kind = _kind_of(file)
+        owner, kind = _owner_of(file.stem.lower(), owners), _kind_of(file)
         if kind == "calibration":
             posed.add(file)
         elif kind == "clicks":
-            found = import_clicks(file, folder, owner)
+            try:
+                found = import_clicks(file, folder, owner)
+            except InputError as error:
+                if owner is not None:
+                    raise
+                todo = (
+                    "Rename the file, so that it begins with its camera's name, and add it again."
+                )
+                raise InputError(error.where, error.expected, error.found, todo) from error
             notes += [f"{file.name}: {n} clicks in {name}" for name, n in found.clicks.items()]
             notes += found.notes
         elif owner is None:
@@ -219,9 +229,14 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     return notes
 
 
-def _begins_with(name: str, owner: str) -> bool:
-    """Return whether a file's name is that of a camera, or continues it with another word."""
-    return name.startswith(owner) and not name[len(owner) : len(owner) + 1].isalnum()
+def _owner_of(stem: str, owners: Sequence[str]) -> str | None:
+    """Return the camera that a file's name names; None if none or several can be meant."""
+    # The name of another camera can begin in the same way: `cam10` and `cam1`.
+    begun = [each for each in owners if stem.startswith(each.lower())]
+    named = [each for each in begun if not stem[len(each) : len(each) + 1].isalnum()]
+    first = re.split(r"[\W_]", stem, maxsplit=1)[0]
+    alike = [each for each in owners if re.split(r"[\W_]", each.lower(), maxsplit=1)[0] == first]
+    return max(named, key=len) if named else alike[0] if len(alike) == 1 else None
 
 
 def _kind_of(file: Path) -> str:

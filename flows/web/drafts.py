@@ -28,6 +28,8 @@ from pydantic import Field, JsonValue
 from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
+from flows.service.inbox import note_whole
+from flows.service.layout import served_state
 from flows.web.draft_problems import (
     GIVEN,
     GIVEN_ENDINGS,
@@ -256,8 +258,7 @@ class Drafts:
             InputError: there is no such video or frame, or the frame is damaged.
         """
         _, file = self._find(draft_id, file_id)
-        is_whole = self._whole(draft_id, file).exists()
-        index = self._index(draft_id, file) if is_whole else None
+        index = self._index(draft_id, file) if self._whole(draft_id, file).exists() else None
         if not isinstance(index, FrameIndex) or not 0 <= number < len(index):
             raise _refusal(file.title, f"a video with frame {number}", "none", "Choose another.")
         with VideoReader(self._whole(draft_id, file), index) as video:
@@ -291,15 +292,13 @@ class Drafts:
         """
         with self._hold(draft_id):
             draft = self.read(draft_id)
-            problems = self._view(draft)["problems"]
-            if problems:
+            if problems := self._view(draft)["problems"]:
                 raise _refusal(
                     "match", "nothing missing", problems[0]["message"], "Complete it, then finish."
                 )
             match_id = str(draft.content["match_id"])
             name = match_id if priority == "normal" else f"{priority}/{match_id}"
-            folder = self._folder(draft_id)
-            target = self.inbox / name
+            folder, target = self._folder(draft_id), self.inbox / name
             target.parent.mkdir(parents=True, exist_ok=True)
             self._write(draft.model_copy(update={"finished_as": name}))
             try:
@@ -308,6 +307,7 @@ class Drafts:
                 self._write(draft)
                 raise
             shutil.rmtree(folder, ignore_errors=True)
+            note_whole(served_state(self.store.url), target, name, priority)
             return name
 
     def continue_copies(self) -> None:

@@ -150,8 +150,8 @@ def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
     cameras = static_cameras(run, match.folder.spec, "triangulation")
     png = camera_evidence(store, run, match, camera, cameras[camera])
     caption = (
-        "The projected pitch. Circles are inlier clicks, crosses are outliers. Below: the expected "
-        "error on the ground."
+        "The projected pitch. Circles are clicks that agree, crosses are clicks that contradict "
+        "them and are not used. Below: the expected error on the ground."
     )
     return Evidence((CaptionedImage(caption, png),))
 

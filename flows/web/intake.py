@@ -29,7 +29,7 @@ CHUNK_BYTES: Final = 1 << 23
 CHUNK_SUFFIX: Final = "/bytes"
 """Suffix of the paths that take chunks; all others take JSON."""
 FRAME_PX: Final = 960
-"""Maximum width of the frames that a page compares [px]."""
+"""Maximum width of the frames that a page compares, unless it looks at one close up [px]."""
 
 
 @dataclass(frozen=True)
@@ -184,8 +184,10 @@ def _add_files(router: APIRouter, drafts: Drafts, intake: Intake) -> None:
         return JSONResponse({"received": received}, status_code=200 if is_taken else 409)
 
     @router.get("/{draft}/files/{file}/frames/{number}")
-    def frame(draft: str, file: str, number: int) -> Response:
-        return image_response(drafts.frame(draft, file, number, FRAME_PX), "jpeg")
+    def frame(
+        draft: str, file: str, number: int, width: Annotated[int, Query(ge=1, le=8192)] = FRAME_PX
+    ) -> Response:
+        return image_response(drafts.frame(draft, file, number, width), "jpeg")
 
     @router.post("/{draft}/files/{file}/removal")
     def remove(draft: str, file: str) -> dict[str, Any]:

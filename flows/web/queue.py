@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Container, Sequence
 from math import isfinite
@@ -31,6 +32,8 @@ ORDER: Final = (
     *("running", "new", "ready", ""),
 )
 """Kinds of states, the most urgent first; the last one is that of a match not read yet."""
+
+_ABOUT: Final = {stage.name: stage.about for stage in METHOD}
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -73,7 +76,11 @@ def routes(context: PageContext) -> APIRouter:
                 {**each.model_dump(), "message": " ".join(in_browser(each.message).split())}
                 for each in (() if latest is None else latest.failed)
             ],
-            "stages": [stage.name for stage in METHOD if stage.units(opened)],
+            "stages": [
+                {"name": stage.name, "about": stage.about}
+                for stage in METHOD
+                if stage.units(opened)
+            ],
             "left_out": {} if latest is None else latest.left_out,
             "warnings": [] if latest is None else [in_browser(each) for each in latest.warnings],
         }
@@ -174,7 +181,11 @@ def _local_run(context: PageContext, match_id: str) -> dict[str, Any] | None:
     state = context.continuing.state(match_id)
     if state is None:
         return None
-    return {**state, "lines": [in_browser(line) for line in state["lines"]]}
+    lines = [in_browser(line) for line in state["lines"]]
+    if about := _ABOUT.get(state.get("stage", "")):
+        begin = state["stage"].replace("_", "[_ ]")
+        lines = [re.sub(f"^{begin}\\b", about, line) for line in lines]
+    return {**state, "lines": lines}
 
 
 def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:

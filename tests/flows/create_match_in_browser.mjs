@@ -55,7 +55,7 @@ await page.waitForSelector("text=✓ picked");
 await page.click("dialog >> text=Close");
 await page.waitForFunction(() => document.querySelectorAll('li[data-state="ready"]').length === 2);
 await page.click("text=Add cameras for 2 videos");
-await page.fill('[data-field="match_id"]', "cup final");
+await page.fill('[data-field="match_id"]', "cup/final");
 await page.waitForSelector("label.wrong >> text=letters, digits");
 seen.message = await page.locator("label.wrong .said").innerText();
 await shoot(page, "wrong");
@@ -66,7 +66,8 @@ await page.route("**/form", async (route) => {
 });
 await page.fill('[data-field="match_id"]', "cup");
 await page.waitForTimeout(900);
-await page.fill('[data-field="match_id"]', "cup_final");
+await page.fill('[data-field="match_id"]', "cup final");
+seen.name = await page.inputValue('[data-field="match_id"]');
 await page.waitForSelector('[data-saving="saved"]');
 await page.unroute("**/form");
 seen.refused = await page.locator("text=saved this form first").count();
@@ -89,6 +90,9 @@ for (const [width, height] of [[1440, 900], [390, 844]]) {
   await shoot(page, `offsets_${width}`);
 }
 await page.setViewportSize({ width: 1366, height: 900 });
+await page.click("dialog .look >> nth=1"); // close up, in all its pixels, and back
+seen.close = await page.locator("dialog img").nth(1).getAttribute("src");
+await page.click("dialog .look >> nth=1");
 await page.click("[data-use]");
 
 // A still of a camera, and a roster from a list.

@@ -129,7 +129,7 @@ def test_a_verdict_holds_for_the_bytes_whatever_key_gives_them(store):
 def test_what_was_approved_is_asked_again_only_if_it_got_worse(store, monkeypatch):
     key = store.run(TINY, "0001").results[WRONG]
     manifest = store.manifest(TINY, "static_calibration", "cam03", key)
-    good = {name: 0.0 for name, _ in GATES["static_calibration"].limits}
+    good = dict.fromkeys(GATES["static_calibration"].limits, 0.0)
 
     def shown(self, name, key):
         """A result whose error is in the last letter of its key, in tenths of a metre."""

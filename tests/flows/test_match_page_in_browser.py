@@ -38,5 +38,5 @@ def test_a_left_out_camera_and_groups_of_corrections_are_seen(tiny, tmp_path):
     assert (seen["stays"], seen["dismissed"]) == (1, 0)
     assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]
     assert seen["progress"] == "Running, 42 % tracking, 18 s left"
-    assert (seen["cancel"], seen["steps"]) == (1, "▶ tracking")
+    assert (seen["cancel"], seen["steps"]) == (1, "▶ identify people across cameras and over time")
     assert (seen["who"], seen["run_buttons"]) == ("Ada, viewer", 0)

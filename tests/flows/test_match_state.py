@@ -59,7 +59,7 @@ def fail(store, state):
 
 
 def test_corrections_make_a_match_out_of_date_and_names_do_not(store):
-    assert (state(store).name, state(store).words) == ("ready", "ready")
+    assert (state(store).name, state(store).words) == ("ready", "usable with reservations")
     say(store, name=NamedTrack(clip="clip", person=0, name="Ann"))
     assert state(store).name == "ready"
     say(store, split=SplitTrack(clip="clip", person=0, first_frame_of_new=12))

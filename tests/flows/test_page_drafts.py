@@ -13,7 +13,8 @@ import pytest
 
 from data_contracts.cameras import CameraCalibration
 from flows.registering import register
-from flows.service.inbox import entries, fingerprint_of, missing_of
+from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
+from flows.service.layout import served_state
 from flows.web.access import access_for
 from flows.web.app import create_app
 from flows.web.draft_problems import take_given
@@ -138,6 +139,9 @@ def test_an_uploaded_match_arrives_whole(place, footage):
     assert match.videos["near_left"].read_bytes() == footage.read_bytes()
     assert ada.get(DRAFTS).json() == {"drafts": []}
     assert list((place / "inbox" / ".drafts").iterdir()) == []
+    # It came in one step: the first scan takes it in.
+    state = served_state(str(place / "project"))
+    assert len(watch_once(state, place / "inbox", 30.0)) == 1
 
 
 def test_videos_of_a_known_match_are_no_second_match(place, footage):
@@ -304,6 +308,21 @@ def test_files_of_other_tools_become_calibration_clicks_and_poses(place, footage
     assert match.calibrations["near_left"].focal_px == (100.0, 100.0)
     assert match.clicked["near_left"].points[0].xy == (39.5, 29.5)  # the image begins at a corner
     assert not (place / "inbox" / "final" / "given").exists()
+
+
+def test_files_named_by_the_first_word_of_a_camera_are_its_own(place, footage):
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    empty = {each["place"]: each["message"] for each in view["problems"]}
+    assert empty["cameras"] == empty["clips"] == "none yet: add at least one"
+    named = add(ada, draft, "near-keypoints.xml", CLICKS)
+    view = save(ada, settle(ada, draft), a_match(view["files"][0]["name"])).json()
+    assert view["problems"] == []
+    assert view["notes"] == ["near-keypoints.xml: 1 clicks in near_left"]
+    ada.post(f"{DRAFTS}/{draft}/files/{named}/removal", json={})
+    add(ada, draft, "far.xml", CLICKS)
+    (problem,) = ada.get(f"{DRAFTS}/{draft}").json()["problems"]
+    assert "begins with its camera's name" in problem["message"]
 
 
 def test_frames_of_an_uploaded_video_are_shown(place, footage):

@@ -36,7 +36,10 @@ def test_a_complete_run_gives_its_report_and_its_exports(reader):
     of_static_cameras = [form for form in EXPORT_FORMATS if form not in BROADCAST_FORMATS]
     assert (found["run"], found["formats"]) == ("0001", of_static_cameras)
     judged = reader.get(MATCH).json()["run"]["usability"]
-    assert judged == {"verdict": "usable", "reservations": []}
+    assert judged["verdict"] == "usable with reservations"
+    assert [text.partition(" contradict")[0] for text in judged["reservations"]] == [
+        "clicks of cam03"
+    ]
     assert found["purposes"]["bvh"].startswith("a skeleton in motion for Blender")
     clip = {"id": "clip", "video": None, "without_joints": None}
     assert found["clips"] == [clip]  # given keypoints: nothing is filmed

@@ -39,7 +39,11 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     assert str(heard.run_progress) == "0 %"  # nothing was to be computed so far
     heard.stage_started("ingest", "take in", units=4, missing=4)
     assert heard.run_progress.share == 0.0 and heard.run_progress.seconds_left is None
-    clock[0] += 5.0
+    clock[0] += 1.0  # of the 2.5 s of the first unit
+    assert heard.run_progress.share == pytest.approx(1.0 / 40.0)
+    clock[0] += 4.0  # it is late
+    assert heard.run_progress.share == pytest.approx(2.0 / 40.0)
+    assert heard.run_progress.seconds_left == pytest.approx(38.0 * 65.0 / 62.0)
     heard.unit_done("ingest/a", 5.0, {})
     assert (heard.stage_progress.share, heard.stage_progress.seconds_left) == (0.25, 15.0)
     assert heard.run_progress.share == pytest.approx(2.5 / 40.0)

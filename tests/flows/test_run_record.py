@@ -6,7 +6,6 @@ import pytest
 from command_line import TINY, succeed, worldpose
 
 from data_contracts.review import MergedTracks
-from data_contracts.usability import Usability
 from flows import iterate
 from flows.gates import Gatekeeper
 from flows.iterate import Iteration, iterate_match
@@ -83,11 +82,13 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
 
 
 def test_a_run_is_judged_by_the_limits_of_its_match_and_anew_when_they_change(store):
-    assert store.run(TINY).usability == Usability(verdict="usable")
+    click = "clicks of cam03 contradict the others and are not used: 1. Correct or remove them."
+    assert store.run(TINY).usability.reservations == (click,)
     succeed("settings", TINY, "--set", "max_ray_distance_m=0.001", "--project", store.url)
     done = worldpose("run", TINY, "--project", store.url, "--json")
     assert (done.code, done.json["executed"]) == (0, 0)
-    (said,) = done.json["usability"]["reservations"]
+    also, said = done.json["usability"]["reservations"]
+    assert also == click
     assert done.json["usability"]["verdict"] == "usable with reservations"
     assert "cameras disagree about the people in clip by 5.89 cm" in said
     assert "(limit 0.1 cm)" in said

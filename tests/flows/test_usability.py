@@ -80,7 +80,12 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             {"filled_share": 0.1},
             "no camera sees 10 % (limit 5 %) of the joints in clip: motion alone places them.",
         ),
-        ("tracking/clip", {"corrections_refused": 2.0}, "2 (limit 0) corrections of clip do not"),
+        ("tracking/clip", {"corrections_refused": 2.0}, "2 corrections of clip do not"),
+        (
+            "static_calibration/cam1",
+            {"clicks_wrong": 5.0},
+            "clicks of cam1 contradict the others and are not used: 5.",
+        ),
         (
             "broadcast_tracking/clip",
             {"unmatched_share": 0.1, "plane_std_m": 9.0},
@@ -160,3 +165,26 @@ def test_results_that_are_not_there_are_not_usable(outcome, said):
     found = judge(**{"unit": "x/y", **outcome})
     assert found.verdict == "not usable"
     assert found.reservations[0].startswith(said)
+
+
+def test_people_who_are_not_in_3d_are_places_that_can_be_used():
+    figures = {"triangulation/clip": {"joints": 0.0}}
+    found = judge_run(RunOutcome(figures=figures, lacks_joints=True), UsableLimits())
+    assert found.verdict == "usable with reservations"
+    assert found.reservations[0].startswith("no person is in 3D: people have places on the pitch")
+    assert "could not be computed" not in str(found.reservations)  # there are no joints to judge
+
+
+def test_people_whom_the_nets_do_not_know_are_a_reservation_and_a_clip_not_filmed_is_none():
+    warnings = {
+        "detection/cam1.clip": ["cam1.clip: people are 833 px tall in the images."],
+        "detection/cam2.clip": ["cam2.clip: the camera does not film this clip."],
+    }
+    found = judge_run(RunOutcome(warnings=warnings), UsableLimits())
+    assert found.reservations == ("cam1.clip: people are 833 px tall in the images.",)
+
+
+def test_results_are_not_usable_where_most_detections_belong_to_nobody():
+    found = judge("tracking/clip", figures={"unmatched_share": 0.63})
+    assert found.verdict == "not usable"
+    assert found.reservations[0].startswith("more than 50 % of the detections in clip belong to no")

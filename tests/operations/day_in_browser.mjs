@@ -88,7 +88,7 @@ async function answer() {
   await shootSizes(page, seen, "question");
 }
 
-// The wrong click is taken out; the question needs no verdict, and the run continues.
+// The wrong click is taken out; the question needs no verdict, and the match is out of date.
 async function correct() {
   await page.goto(matchPage);
   await page.click("text=Correct its clicks");
@@ -101,8 +101,14 @@ async function correct() {
   await page.goto(matchPage);
   await page.waitForSelector("text=Corrected, will be computed again");
   await shootSizes(page, seen, "corrected");
-  await page.click("button >> text=Recompute");
-  await until("the run at work", async () => (await state()).at_work?.state === "running");
+  await again();
+}
+
+// Run again what is out of date.
+async function again() {
+  const last = (await state()).run.id;
+  await page.click("[data-now=outdated] button");
+  await until("the next run", async () => (await state()).run.id !== last || (await state()).at_work?.state === "running");
 }
 
 // Whatever else waits is approved, until the run is complete.
@@ -149,9 +155,7 @@ async function mend() {
   await page.keyboard.press("Enter");
   await page.waitForSelector(".row >> text=Harry Kane");
   await page.goto(matchPage);
-  const last = (await state()).run.id;
-  await page.click("[data-now=outdated] button");
-  await until("the next run", async () => (await state()).run.id !== last || (await state()).at_work?.state === "running");
+  await again();
   await complete();
 }
 

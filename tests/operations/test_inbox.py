@@ -217,7 +217,7 @@ def test_a_match_that_ends_the_process_stops_no_other_and_is_refused(desk, drop)
     desk.look()
     first = watch_once(desk.state, desk.inbox, 0.0)
     assert die(desk) == 137
-    assert desk.known()["aaa"] == ("arriving", "being taken in, try 1")
+    assert desk.known()["aaa"] == ("arriving", "being taken in")
     assert desk.store.matches() == (), "it was the first"
     again = watch_once(desk.state, desk.inbox, 0.0)
     assert len(again) == 2

@@ -98,7 +98,7 @@ def test_a_summary_is_used_until_something_changes_that_it_was_made_from(
 ):
     monkeypatch.setenv("WORLDPOSE_BODY_FOLDER", "")
     first = make_summary(store, TINY)
-    assert first.made_from and first.words == "ready"
+    assert first.made_from and first.kind == "ready"
     monkeypatch.setattr(overview, "make_summary", lambda store, match_id: "made again")
     assert read_summary(store, TINY) == first
     change(store)
@@ -156,7 +156,7 @@ def test_what_changes_while_a_summary_is_made_leaves_none_behind(store, monkeypa
 def test_a_changed_match_that_was_not_read_yet_is_shown_as_such(project_copy, store):
     copy_match(project_copy, TINY, 2)
     all_read = Overview(store)
-    assert [each.words for each in all_read.look()] == ["ready"] * 3
+    assert [each.kind for each in all_read.look()] == ["ready"] * 3
     for name in store.matches():
         run = store.run(name)
         store.finish_run(run.model_copy(update={"run_id": store.reserve_run(name)}))
@@ -177,7 +177,7 @@ def test_lists_have_pages_of_fifty_and_the_server_searches(project_copy):
     found = ada.get("/api/matches", params={"search": " COPY017"}).json()
     assert [each["match"] for each in found["matches"]] == [f"{TINY}-copy017"]
     assert ada.get("/api/matches", params={"kind": "failed"}).json()["matches"] == []
-    assert ada.get(MATCH).json()["state"]["words"] == "ready"
+    assert ada.get(MATCH).json()["state"]["name"] == "ready"
     assert ada.get("/status").text.count("/#/match/") == PAGE
     assert ada.get("/status", params={"page": 2}).text.count("/#/match/") == 1
     for page, count in ((2, 1), (9, 1), (0, PAGE), (-3, PAGE)):

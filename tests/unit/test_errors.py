@@ -3,9 +3,15 @@
 import ast
 import inspect
 import pickle
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.method import METHOD
 from worldpose import pipeline
 from worldpose.errors import InputError, InternalError, MemoryLimitError, WorldposeError
@@ -61,3 +67,44 @@ def test_the_pipeline_has_the_order_of_the_method():
     order = [left[name].pop(0) for name in names if name in left]
     assert not any(left.values())
     assert order == [stage.name for stage in METHOD if stage.name in order]
+
+
+@pytest.mark.parametrize(("fps", "images"), [(25.0, [900, 919]), (50.0, [1800, 1838])])
+def test_people_of_a_video_are_placed_on_match_frames(monkeypatch, fps, images):
+    """Camera b has a video; its pictures are (their number,), and so is what our nets find."""
+
+    class Video:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def frames(self, start, stop):
+            assert [start, stop - 1] == images
+            return ((n, np.float32(n)) for n in range(start, stop))
+
+    def find(pictures):
+        shown = np.array(list(pictures))
+        points = np.broadcast_to(shown[:, None, None, None], (len(shown), 1, 17, 2))
+        frame = np.arange(len(shown))
+        return KeypointDetections.from_keypoints(points, points[..., 0] > 0, frame=frame)
+
+    size = {"width": 64, "height": 48}
+    spec = MatchSpec(
+        match_id="m",
+        fps=25.0,
+        cameras=[CameraSpec(id="a", **size), CameraSpec(id="b", fps=fps, **size)],
+        clips=[ClipSpec(id="c", first_frame=900, frame_count=20)],
+    )
+    given = find(range(900, 920))
+    monkeypatch.setattr(pipeline, "open_video", lambda _: Video())
+    monkeypatch.setattr(pipeline, "detect_people", find)
+    monkeypatch.setattr(
+        pipeline, "read_unit", lambda *_: (replace(given, frame=np.arange(900, 920)), None)
+    )
+    match = SimpleNamespace(spec=spec, detections={"a": 1}, videos={"b": Path("b.mp4")})
+    found = pipeline.find_people(match, "c")
+    assert found.frame.tolist() == list(range(900, 920))
+    shown = found.keypoints[:, :, 0, 0, 0]
+    np.testing.assert_array_equal(shown[:, 1], shown[:, 0] * fps / 25.0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -265,3 +265,33 @@ class BodyModel:
         turned = np.einsum("nvab,nvb->nva", blended[..., :3], unposed)
         surface: NDArray[np.float64] = turned + blended[..., 3] + parameters.transl[:, None]
         return surface
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the unit normals (vertices, 3) of a surface, by the areas of the faces around."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit: NDArray[np.float64] = normals / np.maximum(length, 1e-12)
+    return unit
+
+
+def cluster_vertices(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], keys: NDArray[Any]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return one vertex for each cell, nearest to the cell's mean, and the faces between these.
+
+    `keys` (vertices, k) tell the cell of each vertex.
+    """
+    _, cell = np.unique(keys, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    count = np.bincount(cell)
+    mean = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / count[:, None]
+    order = np.lexsort((np.linalg.norm(vertices - mean[cell], axis=1), cell))
+    kept = order[np.cumsum(count) - count]
+    merged = cell[faces]
+    a, b, c = merged.T
+    return kept, merged[(a != b) & (b != c) & (c != a)]

@@ -13,8 +13,8 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17, COCO17_SPREAD
 from worldpose.body.model import BodyModel
 from worldpose.body_fitting.point_equations import invert_symmetric
-from worldpose.body_fitting.pose_space import cross
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.geometry.rigid import cross
 
 JOINT_SPREAD: Final = np.array(COCO17_SPREAD)
 

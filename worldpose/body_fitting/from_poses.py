@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel
@@ -18,6 +19,7 @@ from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import row_rate
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.limb_lengths import undo_swaps
@@ -47,7 +49,7 @@ class ReconstructedBodies:
 
 
 def reconstruct_bodies(
-    cameras: Camera | Mapping[str, Camera],
+    cameras: Camera | Sequence[Camera] | Mapping[str, Camera],
     detections: KeypointDetections | Sequence[KeypointDetections],
     fps: float,
     *,
@@ -61,21 +63,28 @@ def reconstruct_bodies(
     triangulated, and a body is fitted to every person in every frame.
 
     Args:
-        cameras: batch (cameras,), or the cameras of `read_cameras`; at least two.
-        detections: of all cameras (frames, cameras, detections), or of each camera in this order;
-            frames that are missing between others show nobody.
-        fps: frames per second [1/s].
+        cameras: batch (cameras,), each camera, or the cameras of `read_cameras`; at least two.
+        detections: of all cameras (frames, cameras, detections), or of each camera in this order.
+            Their frame numbers rise; frames that are missing between others show nobody. Numbers
+            0, 5, 10, ... are every fifth frame of the recording.
+        fps: frame numbers per second [1/s].
         body: None = the body of `find_body`.
         ground: height [m] of the ground at x, y (n,) [m]; None where unknown.
         camera_covariance: (cameras, 12, 12) of the calibration on a pitch; None = unknown.
 
     Raises:
-        InputError: numbers of cameras differ, or the shapes do not fit together.
+        InputError: numbers of cameras differ, the shapes do not fit together, or frames or `fps`
+            are invalid.
     """
-    if isinstance(cameras, Mapping):
-        cameras = Camera.stack(list(cameras.values()))
+    if not isinstance(cameras, Camera):
+        each = list(cameras.values() if isinstance(cameras, Mapping) else cameras)
+        cameras = Camera.stack(each)
     if not isinstance(detections, KeypointDetections):
-        detections = KeypointDetections.stack(detections)
+        for camera in detections:
+            _require_rising(camera.frame)
+        given = list(detections)
+        detections = KeypointDetections.stack(given) if given else KeypointDetections.empty()
+    _require_rising(detections.frame)
     if cameras.batch_shape != detections.score.shape[1:2] or len(cameras.focal) < 2:
         raise InputError(
             "reconstruct_bodies",
@@ -84,6 +93,7 @@ def reconstruct_bodies(
             todo="Give the detections of all cameras in the order of the cameras.",
         )
     detections = _fill_frames(detections)
+    rate = row_rate("reconstruct_bodies", fps, detections.frame)
     person = np.arange(detections.detection_index.shape[2], dtype=np.int64)
     if not len(person):
         tracks = track_people(cameras, detections, fps, camera_covariance=camera_covariance)
@@ -92,24 +102,32 @@ def reconstruct_bodies(
     joints = reconstruct_joints(cameras, detections, fps, camera_covariance=camera_covariance)
     placed = joints.triangulation
     rays = find_ray_constraints(cameras, undo_swaps(detections, placed.exchanged), placed.joints)
-    evidence = ClipEvidence(
-        placed.joints,
-        placed.covariance,
-        fps,
-        placed.common_bias,
-        [rays],
-        shared_covariance=placed.shared_covariance,
-    )
-    bodies = fit_bodies(body or find_body(), evidence, ground=ground)
+    bodies = fit_bodies(body or find_body(), ClipEvidence.of(placed, rate, rays), ground=ground)
     return ReconstructedBodies(detections.frame, person, joints, bodies)
+
+
+def _require_rising(frame: Integers) -> None:
+    most = 200_000  # frames of a clip, as match.yaml has at most
+    if len(frame) and (np.diff(frame) < 1).any():
+        found = "numbers that repeat or fall"
+    elif len(frame) and frame[-1] - frame[0] >= most:
+        found = f"{frame[0]} to {frame[-1]}"
+    else:
+        return
+    raise InputError(
+        "reconstruct_bodies: frame",
+        expected=f"frame numbers that rise, at most {most} from first to last",
+        found=found,
+        todo="Give each row the number of its frame, not a time.",
+    )
 
 
 def _fill_frames(detections: KeypointDetections) -> KeypointDetections:
     """Return the detections with the frames between others, in which nobody was seen."""
     frame, index = detections.frame, detections.detection_index
-    if len(frame) < 2:
-        return detections
-    every = np.arange(frame[0], frame[-1] + 1, np.gcd.reduce(np.diff(frame)))
+    if not len(frame):
+        return replace(detections, frame=np.arange(len(detections.score)))
+    every = np.arange(frame[0], frame[-1] + 1, max(1, np.gcd.reduce(np.diff(frame))))
     if len(every) == len(frame):
         return detections
     filled = detections.reindex(every)

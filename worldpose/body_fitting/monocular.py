@@ -27,7 +27,7 @@ from worldpose.errors import InputError
 from worldpose.formats.archives import read_npz
 from worldpose.formats.files import require_file
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, shortest_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,23 +221,15 @@ def place_monocular_poses(
         at = camera[int(place)]
         turned = estimates.rotations[row, 0]
         if estimates.cropped:
-            turned = _rotate_axis_to(at.normalize(estimates.center[row])) @ turned
+            ahead = np.insert(at.normalize(estimates.center[row]), 2, 1.0, axis=-1)
+            ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+            turned = shortest_rotation(np.array([0.0, 0.0, 1.0]), ahead) @ turned
         orient[place, person] = at.cam_from_world.rotation.T @ turned
         bend = Rigid(estimates.rotations[row, 1:], np.zeros(3)).rotvec
         angles[place, person] = bend.reshape(len(row), GATHER.shape[1]) @ GATHER.T
     bad = ~(np.isfinite(orient).all((-1, -2)) & np.isfinite(angles).all(-1))
     orient[bad], angles[bad] = np.nan, np.nan
     return MonocularPoses(orient, angles, np.where(bad, np.nan, height))
-
-
-def _rotate_axis_to(plane: Floats) -> Floats:
-    """Return the smallest rotations (n, 3, 3) from straight ahead to points (n, 2) at z = 1."""
-    ahead = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
-    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
-    across = np.cross([0.0, 0.0, 1.0], ahead)
-    sine = np.linalg.norm(across, axis=-1, keepdims=True)
-    angle = np.arctan2(sine, ahead[:, 2:])
-    return Rigid.from_rotvec(across / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation
 
 
 PRIOR_SPREAD: Final = 0.25

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.compiled import compile_kernel
+from worldpose.geometry.optimize.banded import factorize_block
 
 
 @compile_kernel
@@ -31,7 +32,12 @@ def invert_symmetric(matrices: Floats) -> Floats:
 
 @compile_kernel
 def accumulate_points(
-    rows: Floats, own: Floats, next_frame: Floats, second_frame: Floats, force: Floats
+    rows: Floats,
+    own: Floats,
+    next_frame: Floats,
+    second_frame: Floats,
+    force: Floats,
+    tied: bool,
 ) -> tuple[Floats, Floats]:
     """Return the blocks (3, frames, 36, 36) and the gradient (frames, 36) of point terms.
 
@@ -44,9 +50,11 @@ def accumulate_points(
         next_frame: (frames, points), weight of the product with the point in the next frame.
         second_frame: (frames, points), the same with the frame after.
         force: (frames, points, 3), derivative of the cost by the points.
+        tied: whether terms tie frames; without them there are only the blocks (1, frames, 36, 36).
     """
     frames, points, _, size = rows.shape
-    blocks, gradient = np.zeros((3, frames, size, size)), np.zeros((frames, size))
+    blocks = np.zeros((3 if tied else 1, frames, size, size))
+    gradient = np.zeros((frames, size))
     scaled = np.empty((3, size))
     # In all frames: a derivative may be zero in one of them by chance.
     moving = np.zeros((points, size))
@@ -77,7 +85,8 @@ def accumulate_points(
                 f0, f1, f2 = r[0, i], r[1, i], r[2, i]
                 for j in range(_round_up(i + 1, end)):
                     blocks[0, t, i, j] += f0 * scaled[0, j] + f1 * scaled[1, j] + f2 * scaled[2, j]
-            if last > t and (next_frame[t, p] != 0.0 or second_frame[t, p] != 0.0):
+            ahead = next_frame[t, p] != 0.0 or second_frame[t, p] != 0.0
+            if tied and last > t and ahead:
                 after, later = rows[t + 1, p], rows[last, p]
                 one = next_frame[t, p]
                 # In the last but one frame, whose second block is not used.
@@ -139,6 +148,46 @@ def propagate(rows: Floats, covariance: Floats) -> Floats:
             target[0, 1] = target[1, 0] = xy
             target[0, 2] = target[2, 0] = xz
             target[1, 2] = target[2, 1] = yz
+    return spread
+
+
+@compile_kernel
+def propagate_alone(rows: Floats, information: Floats) -> Floats:
+    """Return the covariance of points (frames, points, 3, 3) [m^2], each frame by itself.
+
+    With the factor L of a frame's information L L^T, and Y = L^-1 R^T, the covariance R (L L^T)^-1
+    R^T of all points is Y^T Y, whose blocks on the diagonal are those of the points. It is infinite
+    where rounding leaves no factor.
+
+    Args:
+        rows: (frames, points, 3, n), derivatives R of points by n unknowns.
+        information: (frames, n, n), of the unknowns, valid in the lower triangle. Overwritten.
+    """
+    frames, points, _, size = rows.shape
+    spread = np.empty((frames, points, 3, 3))
+    turned, solved = np.empty((size, size)), np.empty((size, 3 * points))
+    for t in range(frames):
+        lower = information[t]
+        if not factorize_block(lower, turned):
+            spread[t] = np.inf
+            continue
+        solved[:] = rows[t].reshape(3 * points, size).T
+        for i in range(size):
+            own = solved[i]
+            for k in range(i):
+                factor, before = lower[i, k], solved[k]
+                for column in range(3 * points):
+                    own[column] -= factor * before[column]
+            scale = 1.0 / lower[i, i]
+            for column in range(3 * points):
+                own[column] *= scale
+        target = spread[t]
+        target[:] = 0.0
+        for i in range(size):
+            for p in range(points):
+                for a in range(3):
+                    for b in range(3):
+                        target[p, a, b] += solved[i, 3 * p + a] * solved[i, 3 * p + b]
     return spread
 
 

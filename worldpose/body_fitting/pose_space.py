@@ -21,7 +21,7 @@ from data_contracts.conventions import COCO17_TORSO
 from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.body.model import BODY_POSE, BodyModel
 from worldpose.compiled import compile_kernel
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, cross, orthonormal_frame, unit
 from worldpose.parsing import read_npz_members
 
 COORDINATES: Final = (
@@ -244,14 +244,14 @@ def start_poses(
         axis = (
             np.array((1.0, 0.0, 0.0))
             if hinge == "knee"
-            else _unit(cross(first, np.array((0.0, 0.0, 1.0))))
+            else unit(cross(first, np.array((0.0, 0.0, 1.0))))
         )
         usual = Rigid.from_rotvec(prior.mean[places[0]], np.zeros(3)).rotation @ axis
         # The bend of the limb determines the hinge, with a weight that grows with the bend.
-        across = cross(_unit(upper), _unit(lower)) + 0.1 * (turns @ usual)
+        across = cross(unit(upper), unit(lower)) + 0.1 * (turns @ usual)
         outer = turns
         for bone, along, own in ((first, upper, places[0]), (second, lower, places[1])):
-            turned = _frame(along, across) @ _frame(bone, axis).T
+            turned = orthonormal_frame(along, across) @ orthonormal_frame(bone, axis).T
             local = np.swapaxes(outer, -1, -2) @ turned
             coordinates[:, own] = Rigid(local, np.zeros(3)).rotvec
             outer = turned
@@ -278,26 +278,6 @@ def level_feet(rotations: Floats, clear: Floats) -> Floats:
     u, _, vt = np.linalg.svd(mixed)
     turned: Floats = rotations.swapaxes(-1, -2) @ u @ vt
     return turned
-
-
-def cross(first: Floats, second: Floats) -> Floats:
-    """Return the cross products (..., 3); for few vectors `np.cross` takes far longer."""
-    after, before = (1, 2, 0), (2, 0, 1)
-    product: Floats = first[..., after] * second[..., before]
-    product -= first[..., before] * second[..., after]
-    return product
-
-
-def _unit(vectors: Floats) -> Floats:
-    unit: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-    return unit
-
-
-def _frame(first: Floats, second: Floats) -> Floats:
-    """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
-    along = _unit(first)
-    third = _unit(cross(along, second))
-    return np.stack([along, cross(third, along), third], axis=-1)
 
 
 def _spread_terms(spread: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:

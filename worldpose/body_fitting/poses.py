@@ -19,7 +19,7 @@ from worldpose.body_fitting.evidence import (
     find_contacts,
 )
 from worldpose.body_fitting.monocular import MonocularPrior
-from worldpose.body_fitting.point_equations import propagate
+from worldpose.body_fitting.point_equations import propagate, propagate_alone
 from worldpose.body_fitting.pose_space import (
     PosePrior,
     interpolate_gaps,
@@ -187,11 +187,9 @@ def pose_covariance(
     body = equations.points
     random = propagate(body.pose, factor(equations.blocks).inverse_blocks())
     alone = replace(objective, acceleration=np.inf, contacts=None)
-    blocks = alone.equations(pose, offsets, bordered=False, points=body).blocks[:1]
+    blocks = alone.equations(pose, offsets, bordered=False, points=body).blocks
     blocks *= objective.settings.repeated(objective.fps)
-    lower = np.tril(_damp(blocks)[0])  # what factors read
-    whole = lower + np.tril(lower, -1).swapaxes(1, 2)
-    single = propagate(body.pose, np.linalg.inv(whole))
+    single = propagate_alone(body.pose, _damp(blocks)[0])
     smaller = np.einsum("tpii->tp", single) < np.einsum("tpii->tp", random)
     return body.keypoints, np.where(smaller[..., None, None], single, random)
 

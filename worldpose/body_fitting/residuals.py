@@ -107,7 +107,8 @@ class NormalEquations:
     points: KeypointJacobian
     """Points (frames, points) and their derivatives by the unknowns."""
     blocks: Floats
-    """(3, frames, 36, 36), those on the diagonal valid in the lower triangle."""
+    """(3, frames, 36, 36), those on the diagonal valid in the lower triangle; (1, frames, 36, 36)
+    of frames by themselves."""
     gradient: Floats
     """(frames, 36)"""
     border: Floats
@@ -129,7 +130,7 @@ class PersonObjective:
     settings: BodyFittingSettings
     fps: float
     acceleration: float
-    """Standard deviation of the hips' acceleration [m/s^2]."""
+    """Standard deviation of the hips' acceleration [m/s^2]; infinite for frames by themselves."""
     pose_weight: float
     """Weight of the pose prior in each frame [1]."""
     contacts: Contacts | None = None
@@ -161,14 +162,16 @@ class PersonObjective:
         perceived = body.keypoints + np.einsum("fab,jb->fja", axes, offsets)
 
         sums = PointSums.empty(frames, count)
-        std = self.acceleration * acceleration_scale(count) / self.fps**2
-        tail = 3.0 * given.acceleration_loss_scale**2
-        add_smoothness(sums, body.keypoints, std, tail, self.starts)
+        tied = bool(np.isfinite(self.acceleration)) or self.contacts is not None
+        if tied:
+            std = self.acceleration * acceleration_scale(count) / self.fps**2
+            tail = 3.0 * given.acceleration_loss_scale**2
+            add_smoothness(sums, body.keypoints, std, tail, self.starts)
         if self.contacts is not None:
             add_slip(sums, body.keypoints, self.contacts, given.slip_std_m)
             add_contact(sums, body.keypoints, self.contacts, given.contact_std_m)
         data = add_data(sums, perceived, self.evidence, given.loss_scale)
-        blocks, gradient = sums.by_unknowns(body.pose)
+        blocks, gradient = sums.by_unknowns(body.pose, tied)
         by_pose = pose_term(pose.angles, self.prior, self.pose_weight)
         limits = limit_term(pose.angles, given.limit_std_rad)
         gradient[:, 6:] += by_pose.gradient + limits.gradient
@@ -231,13 +234,16 @@ class PointSums:
         none = np.zeros((frames, len(ANKLES)))
         return cls(np.zeros((frames, points, 3)), bands, np.empty(0), none, none)
 
-    def by_unknowns(self, rows: Floats) -> tuple[Floats, Floats]:
-        """Return blocks (3, frames, 36, 36) and gradient (frames, 36) by derivatives of points."""
+    def by_unknowns(self, rows: Floats, tied: bool) -> tuple[Floats, Floats]:
+        """Return blocks (3, frames, 36, 36) and gradient (frames, 36) by derivatives of points.
+
+        Only the first blocks, if no term ties frames.
+        """
         stiff = self.information.copy()
         stiff[..., np.arange(3), np.arange(3)] += self.bands[0][..., None]
         stiff[:, ANKLES, 2, 2] += self.held
         self.force[:, ANKLES, 2] += self.held * self.above
-        return accumulate_points(rows, stiff, self.bands[1], self.bands[2], self.force)
+        return accumulate_points(rows, stiff, self.bands[1], self.bands[2], self.force, tied)
 
 
 def add_data(

@@ -18,7 +18,9 @@ from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.residuals import Pose
 from worldpose.body_fitting.shapes import Shapes
 from worldpose.errors import InputError
-from worldpose.triangulation.results import ExtraJoints
+from worldpose.geometry.rows import join_rows, take_rows
+from worldpose.ingest.clock import row_rate
+from worldpose.triangulation.results import ExtraJoints, Triangulation
 
 
 class EvidenceSource(Protocol):
@@ -58,7 +60,7 @@ class ClipEvidence:
         extra: points besides COCO-17 of the same frames and persons; None = none.
 
     Raises:
-        InputError: the shapes do not match.
+        InputError: the shapes do not match, or `fps` is not positive.
     """
 
     joints: Floats
@@ -79,6 +81,20 @@ class ClipEvidence:
                 found=f"{shape} and {self.covariance.shape}",
                 todo="Give triangulated joints with their covariance.",
             )
+        row_rate("body fitting", self.fps)
+
+    @staticmethod
+    def of(placed: Triangulation, fps: float, rays: RayConstraints) -> ClipEvidence:
+        """Return the evidence of triangulated joints and points, and of lines of sight."""
+        return ClipEvidence(
+            placed.joints,
+            placed.covariance,
+            fps,
+            placed.common_bias,
+            [rays],
+            shared_covariance=placed.shared_covariance,
+            extra=placed.extra,
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -189,25 +205,19 @@ class BodyFit:
 
     @staticmethod
     def _join(parts: Sequence[BodyFit], frames: slice) -> BodyFit:
-        def join(name: str, of: Sequence[object] = parts) -> NDArray[Any]:
-            return np.concatenate([getattr(part, name)[frames] for part in of])
+        def join(name: str) -> Any:  # noqa: ANN401
+            return np.concatenate([getattr(part, name)[frames] for part in parts])
 
-        first = parts[0]
-        moving = [part.parameters for part in parts]
-        names = ("betas", "global_orient", "body_pose", "transl")
-        points = [part.extra for part in parts if part.extra is not None]
+        points = [
+            take_rows(part.extra, frames, "points", "offsets")
+            for part in parts
+            if part.extra is not None
+        ]
         return replace(
-            first,
-            parameters=BodyParameters(*(join(name, moving) for name in names)),
-            joints=join("joints"),
-            covariance=join("covariance"),
-            filled=join("filled"),
-            guided=join("guided"),
-            extra=replace(
-                points[0], joints=join("joints", points), covariance=join("covariance", points)
-            )
-            if points
-            else None,
+            parts[0],
+            parameters=join_rows([take_rows(part.parameters, frames) for part in parts]),
+            extra=join_rows(points, "points", "offsets") if points else None,
+            **{name: join(name) for name in ("joints", "covariance", "filled", "guided")},
         )
 
 

@@ -47,6 +47,7 @@ from worldpose.broadcast_calibration.solver import ClipSolution, solve
 from worldpose.broadcast_calibration.tracking import Chain, Followed, chain, follow
 from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
 from worldpose.errors import InputError
+from worldpose.ingest.clock import row_rate
 from worldpose.pitch.template import PitchTemplate
 from worldpose.reference_method import require_torch
 
@@ -85,6 +86,9 @@ class BroadcastClip:
     proposed: bool = False
     smooth_weight: float = 1.0
     given: GivenCamera | None = None
+
+    def __post_init__(self) -> None:
+        row_rate(self.where, self.fps)
 
     @property
     def moving_boxes(self) -> Floats | None:

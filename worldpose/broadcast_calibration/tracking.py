@@ -21,6 +21,7 @@ from worldpose.broadcast_calibration.moving_camera import (
 from worldpose.broadcast_calibration.priors import LENS_POWERS
 from worldpose.broadcast_calibration.residuals import flow_residuals, flow_row
 from worldpose.compiled import compile_kernel
+from worldpose.errors import InputError
 from worldpose.geometry.lens_models import load_camera
 from worldpose.geometry.optimize.arrow import ArrowSystem
 from worldpose.geometry.rigid import Rigid
@@ -225,6 +226,14 @@ def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list
     followed: list[Followed] = []
     before: Image | None = None
     for number, picture in enumerate(pictures):
+        size = picture.shape if before is None else before.shape
+        if picture.ndim != 2 or picture.dtype != np.uint8 or picture.shape != size:
+            raise InputError(
+                "pictures",
+                expected="grey images of one size, uint8 (height, width)",
+                found=f"{picture.dtype} {picture.shape} as image {number}",
+                todo="Read them with `frames(grey=True)`.",
+            )
         if before is not None:
             people = None if boxes is None else boxes[number - 1]
             followed.append(_follow(before, picture, people, points))

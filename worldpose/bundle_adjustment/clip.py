@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rows import take_rows
+from worldpose.ingest.clock import row_rate
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.triangulation.estimate import triangulate_joints
@@ -70,6 +72,9 @@ class Clip:
         pitch: the pitch as surveyed; None = not known.
         on_lines: (cameras,) bool, whether it was calibrated on painted lines; None = no camera.
         names: names of the cameras, for messages; empty = not known.
+
+    Raises:
+        InputError: the shapes do not fit together, or `fps` is not positive.
     """
 
     cameras: Camera
@@ -83,6 +88,23 @@ class Clip:
     pitch: PitchTemplate | None = None
     on_lines: Flags | None = None
     names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        row_rate("bundle adjustment", self.fps)
+        (count,), (frames, _, persons) = (
+            self.cameras.batch_shape,
+            self.detections.detection_index.shape,
+        )
+        found = (self.covariance.shape, len(self.clicks), self.joints.shape, self.views.shape)
+        wanted = ((count, 12, 12), count, (frames, persons, 17, 3), (frames, persons, 17))
+        if found != wanted:
+            raise InputError(
+                "bundle adjustment",
+                expected="covariance, number of clicks, joints and views of all cameras, frames "
+                f"and persons: {wanted}",
+                found=f"{found}",
+                todo="Give arrays of the same clip and cameras.",
+            )
 
     @cached_property
     def given(self) -> Flags:

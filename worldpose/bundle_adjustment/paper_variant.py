@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from data_contracts.arrays import Integers
 from worldpose.bundle_adjustment.clip import Clip, learn_confidence, select_observations
@@ -15,16 +14,19 @@ from worldpose.bundle_adjustment.report import (
     describe_motion,
     refuse_all,
 )
-from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.geometry.cameras import Camera
-from worldpose.reference_method.cameras import K1_K2, TensorCameras
-from worldpose.reference_method.reprojection import Views, minimize_reprojection
+from worldpose.bundle_adjustment.residuals import AdjustmentProblem, markings_problem
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
+from worldpose.bundle_adjustment.solver import solve
+from worldpose.geometry.camera_model import STEP
+from worldpose.reference_method.cameras import K1_K2
 
 
 def adjust_unguarded(
     clip: Clip, settings: BundleAdjustmentSettings, proposed: Integers, used: Integers
 ) -> BundleAdjustment:
-    """Return cameras adjusted to S, or to S and P, without prior, robust loss or validation.
+    """Return arg min of sum I ||Pi(X; Lambda) - x||^2 over cameras, and P if it is used.
+
+    It has no prior, robust loss or validation (section "Bundle Adjustment").
 
     S are the clicks that calibration uses, and P the joints in the chosen frames. The paper states
     no covariance: that of calibration stays.
@@ -36,28 +38,33 @@ def adjust_unguarded(
         used: chosen frames, indices into the clip.
     """
     clip, count = learn_confidence(clip, used), len(clip.clicks)
-    marks = [clicks.points_world[clicks.inlier] for clicks in clip.clicks]
-    points, image = list(marks), [c.points_image[c.inlier] for c in clip.clicks]
-    camera = [np.full(len(each), c) for c, each in enumerate(marks)]
-    still = sum(map(len, marks))
-    row = [np.arange(still)]
+    marks = markings_problem(clip, np.zeros(count, dtype=np.bool_), settings)
+    still = len(marks.points)
+    parts = [(marks.points, marks.point_of, marks.camera_of, marks.image)]
     if settings.evidence == "markings_and_players":
         everyone = np.ones(clip.joints.shape[1], dtype=np.bool_)
         seen = select_observations(clip, used, everyone, clip.cameras, settings.min_views)
-        points.append(seen.points)
-        image.append(seen.image)
-        camera.append(seen.camera_of)
-        row.append(still + seen.point_of)
+        parts.append((seen.points, still + seen.point_of, seen.camera_of, seen.image))
+    points, point_of, camera_of, image = map(np.concatenate, zip(*parts, strict=True))
     unchanged = refuse_all(clip, "it has no observation", proposed, used, used)
-    changed = np.isin(np.arange(count), np.concatenate(camera))
+    changed = np.isin(np.arange(count), camera_of)
     if not changed.any():
         return unchanged
-    views = Views(*(torch.tensor(np.concatenate(each)) for each in (row, camera, image)))
-    places = torch.tensor(np.concatenate(points))
-    moving = torch.arange(len(places)) >= still
-    solved = minimize_reprojection(TensorCameras.of(clip.cameras), places, views, moving, K1_K2)
-    found = solved.cameras.camera()
-    cameras = Camera.stack([found[c] if changed[c] else clip.cameras[c] for c in range(count)])
+    problem = AdjustmentProblem(
+        cameras=clip.cameras,
+        free=changed[:, None] & np.isin(np.arange(STEP), K1_K2),
+        camera_information=np.zeros((count, STEP, STEP)),
+        points=points,
+        point_information=np.where(np.arange(len(points)) < still, np.inf, 0.0),
+        point_of=point_of,
+        camera_of=camera_of,
+        image=image,
+        weight=np.ones(len(image)),
+        scale=np.full(len(image), np.inf),
+        names=clip.names,
+    )
+    stopping = SolverSettings(max_iterations=100, min_cost_change=1e-9)
+    cameras = solve(problem, stopping, covariance=False).cameras
     motion = np.where(changed[:, None], camera_motion(clip.cameras, cameras), 0.0)
     reasons = tuple(
         f"accepted: method=paper has no validation{describe_motion(motion[c])}"

@@ -25,6 +25,7 @@ from worldpose.dataset.faults import (
     point_faults,
 )
 from worldpose.formats.release_cameras import CameraRows
+from worldpose.geometry.rigid import unit
 
 BONES = {
     "upper arms": ("shoulder", "elbow"),
@@ -363,8 +364,8 @@ def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
         if known.sum() < min_points:
             continue
         plane = plane[known]
-        rays = _unit(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))
-        ways = _unit(there[known] - center)
+        rays = unit(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))
+        ways = unit(there[known] - center)
         turned = ways @ _turn(ways, rays).T
         ahead = turned[:, 2:] > 0.0
         away = np.where(ahead, turned[:, :2] / np.where(ahead, turned[:, 2:], 1.0) - plane, np.inf)
@@ -377,7 +378,3 @@ def _turn(ways: Floats, rays: Floats) -> Floats:
     u, _, vt = np.linalg.svd(rays.T @ ways)
     straight = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
     return np.asarray(u @ straight @ vt)
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

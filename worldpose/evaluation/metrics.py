@@ -23,6 +23,7 @@ from worldpose.evaluation.matching import (
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
+from worldpose.ingest.clock import row_rate
 
 LIMBS: Final = {
     "left upper arm": ((5,), (7,)),
@@ -286,9 +287,12 @@ def evaluate_joints(
             do not project there; None = around the joints.
 
     Raises:
-        InputError: camera and reference have different numbers of frames.
+        InputError: camera and reference have different numbers of frames, or `fps` is not
+            positive.
     """
     settings = settings or EvaluationSettings()
+    if fps is not None:
+        row_rate("evaluate_joints", fps)
     people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate_m)
@@ -400,13 +404,18 @@ def _track_figures(
     compared = np.asarray(np.isfinite(free.shared).any(-1))
     lengths = path_lengths(true, compared)
     figures: dict[str, float | None] = {}
-    for errors, suffix in ((free, ""), (rigid, "_rigid")):
-        figures[f"g_mpjpe{suffix}_mm"] = _mean(errors.shared, 1000.0)
-        figures[f"per_person_g_mpjpe{suffix}_mm"] = _mean(errors.per_person, 1000.0)
-        figures[f"pa_mpjpe{suffix}_mm"] = _mean(errors.per_frame, 1000.0)
-        for name, values in (("meter", errors.shared), ("person", errors.per_person)):
-            drift = drift_per_meter(values, lengths, settings.min_trajectory_m)
-            figures[f"per_{name}_drift{suffix}_cm_per_m"] = None if drift is None else 100.0 * drift
+    for values, error, drift in (
+        (free.shared, "g_mpjpe_mm", "per_meter_drift_cm_per_m"),
+        (free.per_person, "per_person_g_mpjpe_mm", "per_person_drift_cm_per_m"),
+        (free.per_frame, "pa_mpjpe_mm", ""),
+        (rigid.shared, "g_mpjpe_rigid_mm", "per_meter_drift_rigid_cm_per_m"),
+        (rigid.per_person, "per_person_g_mpjpe_rigid_mm", "per_person_drift_rigid_cm_per_m"),
+        (rigid.per_frame, "pa_mpjpe_rigid_mm", ""),
+    ):
+        figures[error] = _mean(values, 1000.0)
+        if drift:
+            share = drift_per_meter(values, lengths, settings.min_trajectory_m)
+            figures[drift] = None if share is None else 100.0 * share
     whole, local = challenge_errors(predicted, true)
     figures["challenge_global_m"], figures["challenge_local_m"] = _mean(whole), _mean(local)
     if figures["challenge_global_m"] is not None and figures["challenge_local_m"] is not None:

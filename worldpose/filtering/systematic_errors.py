@@ -14,7 +14,6 @@ to follow both.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.body_fitting.evidence import body_axes
-from worldpose.compiled import compile_kernel, map_in_threads
+from worldpose.compiled import map_in_threads
 from worldpose.filtering.judging import (
     BodyViews,
     Places,
@@ -311,7 +310,7 @@ class ClockEquations:
             seen.append(own)
         used = normal[:, 0, 0] > min_information
         flat = mixed[used].reshape(-1, 3, count * width)
-        follow = _solve_points(normal[used], flat).reshape(-1, count * width)
+        follow = (np.linalg.inv(normal[used]) @ flat).reshape(-1, count * width)
         reduced = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
         return cls(tuple(seen), used, follow, reduced)
 
@@ -325,33 +324,6 @@ class ClockEquations:
             pulled[seen.place] += np.einsum("nai,na->ni", seen.held_points, missed)
         side = right.reshape(-1) - self.follow.T @ pulled[self.used].reshape(-1)
         return _solve_clock_offsets(self.matrix, side, len(self.seen))
-
-
-@compile_kernel
-def _solve_points(normal: Floats, right: Floats) -> Floats:
-    """Return the solutions (n, 3, columns) of symmetric equations of three unknowns each.
-
-    Numpy's `solve` takes six times as long for many columns.
-
-    Args:
-        normal: (n, 3, 3), positive definite.
-        right: (n, 3, columns).
-    """
-    solution = np.empty(right.shape)
-    for n in range(len(normal)):
-        own, given, found = normal[n], right[n], solution[n]
-        a = math.sqrt(own[0, 0])
-        b, d = own[1, 0] / a, own[2, 0] / a
-        c = math.sqrt(own[1, 1] - b * b)
-        e = (own[2, 1] - d * b) / c
-        f = math.sqrt(own[2, 2] - d * d - e * e)
-        for k in range(given.shape[1]):
-            x = given[0, k] / a
-            y = (given[1, k] - b * x) / c
-            z = (given[2, k] - d * x - e * y) / f / f
-            y = (y - e * z) / c
-            found[0, k], found[1, k], found[2, k] = (x - b * y - d * z) / a, y, z
-    return solution
 
 
 def _solve_clock_offsets(matrix: Floats, right: Floats, count: int) -> Floats:

@@ -39,6 +39,7 @@ from worldpose.formats.calibration_programs import (
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.calibration_unit import require_metres
 from worldpose.formats.files import SETTINGS_BYTES, require_file
+from worldpose.formats.lens_files import read_opencap
 from worldpose.formats.opencv_storage import read_file_storage
 from worldpose.video.names import is_video
 
@@ -259,31 +260,15 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
 
 
 def _read_pickle(file: Path) -> dict[str, Any]:
-    """Return the entries of an OpenCap pickle as numbers and lists, width before height."""
-    from worldpose.pickles import read_pickle  # late: it imports scipy
-
-    require_file(file, SETTINGS_BYTES)
-    try:
-        content = read_pickle(file)
-    except (OSError, ValueError) as error:
-        expected = "OpenCap's pickle of one camera: arrays alone"
-        todo = (
-            "Give cameraIntrinsicsExtrinsics.pickle, as OpenCap wrote it. Nothing in this "
-            "file was run."
-        )
-        raise InputError(str(file), expected, say_failure(error), todo) from error
-    if not isinstance(content, dict):
-        raise calibration_error(str(file), "a dictionary", type(content).__name__)
+    """Return the entries of an OpenCap pickle with a pose, as numbers and lists."""
+    content = read_opencap(file)
     if "intrinsicMat" in content and "rotation" not in content:
         todo = "Give cameraIntrinsicsExtrinsics.pickle, not cameraIntrinsics.pickle."
         raise InputError(f"{file}: rotation", "the pose of the camera", "a lens alone", todo)
-    table = {
+    return {
         key: np.squeeze(value).tolist() if isinstance(value, np.ndarray) else value
         for key, value in content.items()
-        if isinstance(key, str)
     }
-    image = table.get("imageSize")
-    return {**table, "imageSize": image[::-1] if isinstance(image, list) else image}
 
 
 def _downward(file: Path, table: Mapping[str, Any]) -> NDArray[np.float64]:

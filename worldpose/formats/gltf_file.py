@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import COEFFICIENTS
 from worldpose.body.keypoints import SKELETONS
-from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body.model import BodyModel, BodyParameters, vertex_normals
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
@@ -248,12 +248,7 @@ class _Writer:
         model = self.model
         order, weights = skin_weights(model)
         joints = np.where(weights > 0.0, order, 0).astype(np.uint8)
-        corners = model.template[model.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals = np.zeros_like(model.template)
-        for corner in range(3):
-            np.add.at(normals, model.faces[:, corner], normal)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = vertex_normals(model.template, model.faces)
         add = self.file.accessor
         self.attributes = {"NORMAL": add(normals.astype(np.float32), _VERTICES)}
         for half in range(INFLUENCES // 4):

@@ -197,7 +197,7 @@ def _read_file(file: Path) -> dict[str, Any]:
     if suffix in (".yml", ".yaml", ".json", ".toml"):
         return read_file_storage(file) if is_storage(file) else _read_mapping(file)
     if suffix in (".pkl", ".pickle"):
-        return _read_pickled_lens(file)
+        return read_opencap(file)
     if suffix == ".xml":
         return read_file_storage(file)
     expected = "a lens file: .toml, .xml, .yml, .yaml, .json, .npy, .npz, or OpenCap's .pickle"
@@ -205,19 +205,27 @@ def _read_file(file: Path) -> dict[str, Any]:
     raise InputError(str(file), expected, repr(file.suffix), todo)
 
 
-def _read_pickled_lens(file: Path) -> dict[str, Any]:
-    """Return the arrays of OpenCap's cameraIntrinsics.pickle; its size has the height first."""
+def read_opencap(file: Path) -> dict[str, Any]:
+    """Return the entries of OpenCap's pickle of one camera, of which nothing is run.
+
+    Its image size has the height first; here the width is first.
+
+    Raises:
+        InputError: the file is none.
+    """
     from worldpose.pickles import read_pickle  # late: it imports scipy
 
+    require_file(file, SETTINGS_BYTES)
     try:
         content = read_pickle(file)
     except (OSError, ValueError) as error:
-        found = say_failure(error)
-        raise calibration_error(str(file), "OpenCap's pickle, arrays alone", found) from error
+        expected = "OpenCap's pickle of one camera: arrays alone"
+        todo = "Give it as OpenCap wrote it. Nothing in this file was run."
+        raise InputError(str(file), expected, say_failure(error), todo) from error
     if not isinstance(content, dict):
         raise calibration_error(str(file), "a dictionary", type(content).__name__)
     given = {str(key): value for key, value in content.items()}
-    if "imageSize" in given and np.size(given["imageSize"]) == 2:
+    if np.size(given.get("imageSize", ())) == 2:
         given["imageSize"] = np.ravel(given["imageSize"])[::-1]
     return given
 

@@ -20,7 +20,7 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import write_rows
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, shortest_rotation
 
 PIXEL_DECIMALS: Final = 2
 """Decimals of all pixel values: a hundredth of a pixel is far below any detector's error."""
@@ -381,7 +381,8 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
             mirror @ turn(f"{side}_{name}") @ mirror for name in ("hip", "knee", "ankle")
         )
         places = [rest[_JOINT[f"{side}_{name}"]] @ mirror for name in ("hip", "knee", "ankle")]
-        thigh, shank = (_hanging_axes(b - a) for a, b in pairwise(places))
+        bones = [(b - a) / np.linalg.norm(b - a) for a, b in pairwise(places)]
+        thigh, shank = shortest_rotation(np.array([0.0, -1.0, 0.0]), np.array(bones))
         hip, knee, ankle = hip @ thigh, thigh.T @ knee @ shank, shank.T @ ankle
         # Knees bend backwards: about -z, as the model counts flexion.
         leg = [_angles(hip), -_angles(knee)[:, :1], _angles(ankle)[:, :1]]
@@ -389,17 +390,6 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
     trunk = _angles(turn("spine1", "spine2", "spine3"))
     parts = [_angles(pelvis), place, *columns["right"][0], *columns["left"][0], trunk]
     return np.concatenate([*parts, *columns["right"][1], *columns["left"][1]], axis=-1)
-
-
-def _hanging_axes(bone: Floats) -> Floats:
-    """Return the smallest rotation (3, 3) of -y to the direction of a bone."""
-    down, along = np.array([0.0, -1.0, 0.0]), bone / np.linalg.norm(bone)
-    axis = np.cross(down, along)
-    sine = np.linalg.norm(axis)
-    angle = np.arctan2(sine, down @ along)
-    turned = Rigid.from_rotvec(axis * (angle / max(sine, 1e-12)), np.zeros(3))
-    matrix: Floats = turned.rotation
-    return matrix
 
 
 def write_opensim_motion(

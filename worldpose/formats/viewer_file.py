@@ -35,7 +35,13 @@ from scipy.spatial.transform import Rotation
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17_BONES
 from worldpose.body.body_file import is_open_body
-from worldpose.body.model import BodyModel, BodyParameters, articulate
+from worldpose.body.model import (
+    BodyModel,
+    BodyParameters,
+    articulate,
+    cluster_vertices,
+    vertex_normals,
+)
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.geometry.cameras import Camera
@@ -415,9 +421,10 @@ def _rest_arrays(clip: ViewerClip) -> Arrays:
     shares /= shares.sum(axis=1, keepdims=True)
     # Size of the cells in which the vertices of the two reduced surfaces merge [m].
     coarse_cell_m, rough_cell_m = 0.08, 0.16
+    normals = vertex_normals(model.template, model.faces)
     return arrays | {
         "surface": np.round(surface / SURFACE_UNIT).astype("<i2"),
-        "normals": _normals(model),
+        "normals": np.pad(np.round(127 * normals), ((0, 0), (0, 1))).astype(np.int8),
         "faces": model.faces.astype("<u2"),
         "coarse_faces": _reduce_faces(model, coarse_cell_m).astype("<u2"),
         "rough_faces": _reduce_faces(model, rough_cell_m).astype("<u2"),
@@ -448,30 +455,11 @@ def _reduce_faces(model: BodyModel, cell: float) -> NDArray[np.int64]:
     """
     cells = np.floor(model.template / cell).astype(np.int64)
     keys = np.column_stack([model.weights.argmax(axis=1), cells])
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    count = np.bincount(group)
-    middle = np.stack([np.bincount(group, axis) for axis in model.template.T], axis=1)
-    away = np.linalg.norm(model.template - (middle / count[:, None])[group], axis=1)
-    order = np.lexsort((away, group))
-    nearest = order[np.searchsorted(group[order], np.arange(len(count)))]
-    faces = nearest[group[model.faces]]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
+    kept, merged = cluster_vertices(model.template, model.faces, keys)
+    faces = kept[merged]
     # The same triangle twice is one.
     turned = np.stack([np.roll(face, -face.argmin()) for face in faces])
     return np.unique(turned, axis=0)
-
-
-def _normals(model: BodyModel) -> NDArray[np.int8]:
-    """Return the normals of the mean body in rest (vertices, 4), 127 = 1."""
-    corners = model.template[model.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(model.template)
-    for corner in range(3):
-        np.add.at(normals, model.faces[:, corner], across)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return np.pad(np.round(127 * normals), ((0, 0), (0, 1))).astype(np.int8)
 
 
 def _camera_rows(camera: Camera) -> Floats:

@@ -148,7 +148,8 @@ class Camera:
 
         Raises:
             InputError: an array has the wrong shape, K has a skew or another last row than (0, 0,
-                1), or a rotation is not orthonormal with determinant 1 within six decimals.
+                1), a focal length or an image size is not positive, or a rotation is not
+                orthonormal with determinant 1 within six decimals.
         """
         k = check_shape("Camera.from_matrices: matrix", matrix, (3, 3))
         known = np.isfinite(k).all(axis=(-2, -1))
@@ -158,6 +159,14 @@ class Camera:
                 expected="fx 0 cx, 0 fy cy, 0 0 1",
                 found=f"{k.tolist()}",
                 todo="Give K without skew, not transposed.",
+            )
+        sizes = np.asarray(image_size, dtype=np.int64)
+        if np.any(np.diagonal(k[known], axis1=-2, axis2=-1) <= 0.0) or np.any(sizes <= 0):
+            raise InputError(
+                "Camera.from_matrices",
+                expected="positive focal lengths and image size",
+                found=f"matrix {k.tolist()}, image_size {sizes.tolist()}",
+                todo="Give K in pixels, and width and height of the image.",
             )
         where = "Camera.from_matrices: rotation"
         given = check_shape(where, rotation, (3, 3))
@@ -171,7 +180,7 @@ class Camera:
             principal_point=k[..., :2, 2],
             distortion=_spread_coefficients("Camera.from_matrices", distortion, lens_model),
             cam_from_world=pose,
-            image_size=np.asarray(image_size, dtype=np.int64),
+            image_size=sizes,
             lens_model=lens_model,
         )
 

@@ -23,6 +23,28 @@ Index: TypeAlias = (
 )
 """Index types of numpy; an index addresses the batch dimensions only."""
 
+
+def unit(vectors: NDArray[Any]) -> NDArray[Any]:
+    """Return vectors (..., n) of length 1 in the same direction."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-9))
+
+
+def cross(first: Floats, second: Floats) -> Floats:
+    """Return the cross products (..., 3); for few vectors `np.cross` takes far longer."""
+    after, before = (1, 2, 0), (2, 0, 1)
+    product: Floats = first[..., after] * second[..., before]
+    product -= first[..., before] * second[..., after]
+    return product
+
+
+def orthonormal_frame(first: Floats, second: Floats) -> Floats:
+    """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
+    along = unit(first)
+    third = unit(cross(along, second))
+    return np.stack([along, cross(third, along), third], axis=-1)
+
+
 # Six decimals, truncated rather than rounded, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
 # Rotations with all digits of float64 read back within this error and need no correction.
 
@@ -254,6 +276,14 @@ class Similarity:
         scaled = self.scale[..., None, None] * np.swapaxes(self.rotation, -1, -2)
         moved: Floats = source @ scaled + self.translation[..., None, :]
         return moved
+
+
+def shortest_rotation(start: Floats, end: Floats) -> Floats:
+    """Return the smallest rotations (..., 3, 3) of unit vectors (..., 3) to others."""
+    axis = np.cross(start, end)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (start * end).sum(axis=-1, keepdims=True))
+    return Rigid.from_rotvec(axis / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation
 
 
 def align(

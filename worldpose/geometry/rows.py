@@ -31,10 +31,18 @@ def take_rows(record: Record, index: Index, *shared: str) -> Record:
     )
 
 
-def join_rows(parts: Sequence[Record]) -> Record:
-    """Return one record with the arrays of one or more records, one after another."""
+def join_rows(parts: Sequence[Record], *shared: str) -> Record:
+    """Return one record with the arrays of one or more records, one after another.
+
+    `shared` are fields that all records have in common.
+    """
     return type(parts[0])(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in _names(parts[0]))
+        *(
+            getattr(parts[0], name)
+            if name in shared
+            else np.concatenate([getattr(part, name) for part in parts])
+            for name in _names(parts[0])
+        )
     )
 
 

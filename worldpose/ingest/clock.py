@@ -5,7 +5,7 @@ A camera's `offset_frames` o(f) says that match frame f is its frame
     n(f) = f r + o(f),
 
 with the ratio r of its frame rate and the match's. It is a number, or rising pairs [match frame,
-offset] with linear change between them: a clock that runs fast. It is constant before the first
+offset] with linear change between them: a clock that drifts. It is constant before the first
 pair and after the last; two pairs at neighbouring frames are a step, of frames that a recorder lost
 or repeated. The nearest whole frame is read; the rest is corrected in the people's 2D poses.
 """
@@ -20,6 +20,29 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.match import ClockOffset
+from worldpose.errors import InputError
+
+
+def row_rate(where: str, fps: float, frame: Integers | None = None) -> float:
+    """Return the rows per second of rows with these frame numbers (n,), `fps` numbers a second.
+
+    Without numbers, a row is a frame.
+
+    Raises:
+        InputError: `fps` is no positive number, or the frames do not rise in equal steps.
+    """
+    if not isinstance(fps, int | float | np.number) or not 0.0 < fps < np.inf:
+        todo = "Give the frame rate of the recording, such as 25.0."
+        raise InputError(f"{where}: fps", "frames per second, above 0", repr(fps), todo)
+    steps = np.unique(np.diff([] if frame is None else frame))
+    if len(steps) > 1 or (len(steps) and steps[0] < 1):
+        raise InputError(
+            f"{where}: frame",
+            expected="frame numbers that rise in equal steps",
+            found=f"steps from {steps[0]} to {steps[-1]}",
+            todo="Add the frames in which nobody was seen (`KeypointDetections.reindex`).",
+        )
+    return float(fps) / float(steps[0]) if len(steps) else float(fps)
 
 
 def exact_frames(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Floats:

@@ -268,6 +268,7 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     size = require_file(path)
     content = np.fromfile(path, dtype=np.uint8) if size <= still_bytes else np.empty(0, np.uint8)
     declared = declared_size(content)
+    image_size = (image_size[0], image_size[1])
     if declared is not None and declared != image_size:
         found = f"{declared[0]} x {declared[1]} as shown, with the turn of its EXIF tag"
         todo = "Export the still at the size of the video, or correct match.yaml."

@@ -137,9 +137,9 @@ def refine_energy(
     omega: Omega,
     cameras: TensorCameras,
     aligned: Tensor,
-    weights: Weights = Weights(),  # noqa: B008
 ) -> Tensor:
     """Return E_refine = lambda_1 E_data + lambda_2 E_smooth + lambda_3 E_shape."""
+    weights = Weights()
     joints = body.keypoints(*omega)
     return (
         weights.data * data_energy(joints, cameras, aligned)

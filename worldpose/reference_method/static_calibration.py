@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,10 +13,11 @@ from torch import Tensor
 from data_contracts.arrays import Floats, Image
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.optimize.levenberg_marquardt import Damping, minimize
 from worldpose.pitch.template import PitchTemplate
 from worldpose.reference_method.cameras import K1_K2, TensorCameras
-from worldpose.reference_method.reprojection import Views, minimize_reprojection
 from worldpose.static_calibration.initialization import camera_from_homography, plane_from_image
+from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
 from worldpose.static_calibration.report import StaticCalibration
 
 
@@ -54,20 +55,53 @@ def camera_from_plane(points: Floats, image: Floats, image_size: tuple[int, int]
     return camera
 
 
+@dataclass(frozen=True, eq=False)
+class _Reached:
+    """A camera, Pi(X') - x (2 n,) [px], its derivatives (2 n, 11) by a step, and the cost."""
+
+    camera: Camera
+    off: Floats
+    by_step: Floats
+    cost: float
+
+
 def refine_on_points(start: Camera, points: Floats, image: Floats) -> Camera:
     """Return Lambda* = arg min of sum ||Pi(X'; Lambda) - x||^2 (Stage 2), with k1 and k2.
+
+    The paper names no solver: ours takes damped steps of Gauss-Newton.
 
     Args:
         start: of stage 1.
         points: (n, 3) X' [m], world, on the crowned pitch.
         image: (n, 2) x [px].
+
+    Raises:
+        InputError: a point lies behind the camera of stage 1.
     """
-    cameras, every = TensorCameras.of(Camera.stack([start])), torch.arange(len(points))
-    seen = Views(every, torch.zeros_like(every), torch.tensor(image))
-    still = torch.zeros(len(points), dtype=torch.bool)
-    return minimize_reprojection(
-        cameras, torch.tensor(points), seen, still, K1_K2
-    ).cameras.camera()[0]
+
+    def reach(camera: Camera) -> _Reached:
+        pixels, by_step = project_with_jacobian(camera, points)
+        off = (pixels - image).ravel()
+        return _Reached(camera, off, by_step[..., K1_K2].reshape(len(off), -1), float(off @ off))
+
+    def step(state: _Reached, damping: float) -> _Reached:
+        normal = state.by_step.T @ state.by_step
+        damped = normal + np.diag(damping * np.diag(normal))
+        moved = np.linalg.solve(damped, -state.by_step.T @ state.off)
+        return reach(step_camera(state.camera, np.append(moved, 0.0)))
+
+    first = reach(start)
+    if not np.isfinite(first.cost):
+        raise InputError(
+            "method=paper",
+            expected="initial cameras that image every point that they are said to see",
+            found="a point behind its camera",
+            todo="Click more points of the markings, or use method=worldpose.",
+        )
+    course = Damping(start=1e-4, decrease=8.0, lowest=1e-12, highest=1e8)
+    return minimize(
+        first, step, course, 100, lambda a, b: 0.0 <= a.cost - b.cost <= 1e-9 * a.cost
+    ).state.camera
 
 
 def distance_map(picture: Image, camera: Camera, points: Floats) -> NDArray[np.float32]:
@@ -109,9 +143,7 @@ def look_up(away: Tensor, pixels: Tensor) -> Tensor:
     return away[row, column] + (slope * (pixels - pixels.detach())).sum(-1)
 
 
-def refine_on_distance_map(
-    start: Camera, away: NDArray[np.float32], points: Floats, iterations: int = 300
-) -> Camera:
+def refine_on_distance_map(start: Camera, away: NDArray[np.float32], points: Floats) -> Camera:
     """Return Lambda* = arg min over Lambda of the sum over X' of D[Pi(X'; Lambda)] (Stage 3).
 
     The paper names no solver: Adam takes steps of at most 1e-4 in each parameter, a fifth of a
@@ -121,7 +153,6 @@ def refine_on_distance_map(
         start: of stage 2.
         away: (height, width) D [px].
         points: (n, 3) X' [m], world, sampled from the markings; those that the start images count.
-        iterations: number of steps.
     """
     pixels = start.project(points)
     kept = ((pixels >= 0.0) & (pixels <= start.image_size - 1.0)).all(axis=-1)
@@ -134,7 +165,7 @@ def refine_on_distance_map(
     free = torch.zeros_like(values)
     free[:, list(K1_K2)] = 1.0
     best, least = cameras.values, torch.inf
-    for _ in range(iterations):
+    for _ in range(300):
         solver.zero_grad()
         cost = look_up(table, cameras.with_values(values).project(places)).sum()
         if float(cost.detach()) < least:

@@ -23,6 +23,7 @@ from worldpose.geometry.rasters import (
     outline_surfaces,
     resolve,
 )
+from worldpose.geometry.rigid import unit
 from worldpose.reports.drawing import WIDTH, draw_label, markings, person_color, picture_panels, png
 
 
@@ -121,19 +122,13 @@ def _light(
     """Return the light at each vertex (vertices,); 1 = unchanged colour."""
     ambient, sunlit, from_camera = 0.45, 0.3, 0.25  # together 1, where a face meets both
     a, b, c = (surface[faces[:, k]] for k in range(3))
-    normals = _unit(corners @ np.cross(b - a, c - a))
-    facing = np.einsum("vc,vc->v", normals, _unit(eye - surface))
+    normals = unit(corners @ np.cross(b - a, c - a))
+    facing = np.einsum("vc,vc->v", normals, unit(eye - surface))
     # Direction to the light, world: high, from the main camera's side.
     to_sun = np.array([0.35, -0.45, 0.82], dtype=np.float32)
-    sun = normals @ _unit(to_sun)
+    sun = normals @ unit(to_sun)
     light = ambient + sunlit * np.maximum(sun, 0.0) + from_camera * np.maximum(facing, 0.0)
     return np.asarray(light, dtype=np.float32)
-
-
-def _unit(vectors: Singles) -> Singles:
-    """Return vectors (..., 3) normalized to length 1."""
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, np.float32(1e-12)), dtype=np.float32)
 
 
 def plot_bodies(

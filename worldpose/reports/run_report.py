@@ -3,159 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
 
-from data_contracts.evaluation import Evaluation
+from data_contracts.evaluation import CameraErrors, Evaluation
+from data_contracts.records import Record
 from data_contracts.run import RunRecord
 from worldpose.reports.html_page import Failure, Folded, Section, Table, whole_page
-
-MEANINGS: Final = {
-    "mpjpe_mm": (
-        "Mean joint error",
-        "mm",
-        "mean distance between estimated and true joints in world coordinates, without alignment",
-    ),
-    "g_mpjpe_mm": (
-        "G-MPJPE",
-        "mm",
-        "joint error after one translation, rotation and scaling of all people's trajectories",
-    ),
-    "g_mpjpe_rigid_mm": ("G-MPJPE, no scaling", "mm", "the same without scaling"),
-    "per_person_g_mpjpe_mm": (
-        "G-MPJPE per person",
-        "mm",
-        "joint error after a translation, rotation and scaling of each person's trajectory",
-    ),
-    "per_person_g_mpjpe_rigid_mm": ("per person, no scaling", "mm", "the same without scaling"),
-    "pa_mpjpe_mm": (
-        "PA-MPJPE",
-        "mm",
-        "joint error after a translation, rotation and scaling of each person in each frame",
-    ),
-    "pa_mpjpe_rigid_mm": ("PA-MPJPE, no scaling", "mm", "the same without scaling"),
-    "per_meter_drift_cm_per_m": (
-        "Drift",
-        "cm/m",
-        "error of G-MPJPE per metre of a person's true path, mean over people",
-    ),
-    "per_meter_drift_rigid_cm_per_m": ("Drift, no scaling", "cm/m", "the same without scaling"),
-    "per_person_drift_cm_per_m": (
-        "Drift per person",
-        "cm/m",
-        "error of G-MPJPE per person, per metre of the person's true path",
-    ),
-    "per_person_drift_rigid_cm_per_m": (
-        "Drift per person, no scaling",
-        "cm/m",
-        "the same without scaling",
-    ),
-    "g_scale": ("Scaling", "", "factor by which G-MPJPE scales the prediction; 1 is the true size"),
-    "challenge_score": (
-        "Challenge score",
-        "m",
-        "global joint error plus five times the joint error relative to the hips; without big toes",
-    ),
-    "challenge_global_m": ("global part of it", "m", "joint error of tracks in world coordinates"),
-    "challenge_local_m": ("local part of it", "m", "joint error relative to the hips"),
-    "acceleration_error_m_s2": (
-        "Acceleration error",
-        "m/s²",
-        "difference to the true acceleration of joints: jitter or too much smoothing",
-    ),
-    "track_coverage": (
-        "People followed",
-        "%",
-        "share of true people in all frames that the metrics of tracks include",
-    ),
-    "pcp3d": (
-        "Correct limbs",
-        "%",
-        "limbs whose ends have a mean error of at most half the limb's length; missing ones are "
-        "wrong",
-    ),
-    "coverage": (
-        "People found",
-        "%",
-        "recall: share of true people in all frames with a matched prediction",
-    ),
-    "joint_coverage": ("Joints found", "%", "share of true joints with an estimated joint"),
-    "false_persons_per_frame": (
-        "False positives",
-        "per frame",
-        "mean number of predicted people without a true person",
-    ),
-    "idf1": (
-        "IDF1",
-        "%",
-        "share of true and predicted people in all frames that have the right id",
-    ),
-    "hota": ("HOTA", "%", "geometric mean of detection and association accuracy"),
-    "detection_accuracy": (
-        "detection part of it",
-        "%",
-        "true positives among all true and predicted people",
-    ),
-    "association_accuracy": ("association part of it", "%", "how pure and complete the tracks are"),
-    "switches": ("Switches", "", "times that a true person continues under another id"),
-    "switches_per_minute": ("Switches", "per minute", "of the match, all people together"),
-    "fragmentations": ("Fragmentations", "", "times that a track of a true person is interrupted"),
-    "persons": ("True people", "", "people with enough visible joints to count"),
-    "frames": ("Frames scored", "", "all frames of the reference"),
-    "cameras": ("Cameras", "", "errors of the estimated cameras by kind"),
-}
-"""Label, unit and description of every metric; shares are shown in per cent."""
-
-CAMERA_MEANINGS: Final = {
-    "ground_error_median_m": (
-        "ground error",
-        "m",
-        "distance on the pitch between a point and the ground position of its pixel, median",
-    ),
-    "ground_error_p95_m": ("ground error, 95 %", "m", "the same, 95th percentile"),
-    "reprojection_error_median_px": (
-        "reprojection error",
-        "px",
-        "distance in the image, for points at player height above the pitch, median",
-    ),
-    "reprojection_error_p95_px": ("reprojection error, 95 %", "px", "the same, 95th percentile"),
-    "center_error_m": ("centre", "m", "distance from the true position, mean"),
-    "rotation_error_deg": ("rotation", "deg", "angle to the true orientation, mean"),
-    "focal_error_percent": ("focal length", "%", "difference to the true focal length, mean"),
-    "coverage": ("frames", "%", "share of the frames that have an estimate"),
-    "cameras": ("number", "", "cameras compared"),
-}
-"""Label, unit and description of every camera metric."""
-
-SHARES: Final = (
-    "coverage",
-    "joint_coverage",
-    "track_coverage",
-    "idf1",
-    "hota",
-    "detection_accuracy",
-    "association_accuracy",
-)
-"""Metrics that are shares of a whole [0..1]."""
 
 
 def score_rows(scores: Evaluation) -> list[tuple[str, str, str, str]]:
     """Return name, label, value with unit, and description of every available metric."""
     figures = scores.model_dump(exclude_none=True)
     groups = figures.pop("cameras", {})
-    rows = [(name, *_score_row(MEANINGS[name], name, value)) for name, value in figures.items()]
+    rows = [(name, *_score_row(Evaluation, name, value)) for name, value in figures.items()]
     for kind, errors in groups.items():
         for name, value in errors.items():
-            label, shown, meaning = _score_row(CAMERA_MEANINGS[name], name, value)
+            label, shown, meaning = _score_row(CameraErrors, name, value)
             rows.append(
                 (f"cameras.{kind}.{name}", f"{kind.capitalize()} cameras: {label}", shown, meaning)
             )
     return rows
 
 
-def _score_row(meaning: tuple[str, str, str], name: str, value: float) -> tuple[str, str, str]:
-    label, unit, words = meaning
-    shown = format_number(100.0 * value if name in SHARES else value)
-    return label, f"{shown} {unit}".strip(), words
+def _score_row(record: type[Record], name: str, value: float) -> tuple[str, str, str]:
+    """Return label, value with the unit that ends the description, and description."""
+    field = record.model_fields[name]
+    words, _, unit = (field.description or "").removesuffix("]").partition(" [")
+    is_share = unit == "0..1"
+    shown = format_number(100.0 * value if is_share else value)
+    return field.title or name, f"{shown} {'%' if is_share else unit}".strip(), words
 
 
 def format_number(value: float) -> str:

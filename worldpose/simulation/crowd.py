@@ -10,6 +10,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.body.model import BODY_POSE, BodyParameters
+from worldpose.geometry.rigid import unit
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.movements import play, run_through, take_corner, wander
 from worldpose.simulation.paths import Clip, GroundPath
@@ -22,7 +23,6 @@ from worldpose.simulation.skeletons import (
     draw_body,
     level_axes,
     solve_body,
-    unit,
 )
 
 STRIDES: Final = (

@@ -20,7 +20,7 @@ from data_contracts.records import Record
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.body.occlusions import facing_axes, find_hiders
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, shortest_rotation
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.crowd import walk
 from worldpose.simulation.paths import STEP, GroundPath, bursts, drift, sample_times
@@ -356,8 +356,9 @@ def estimate_bodies(
 
     found = turns[frame, person] @ Rigid.from_rotvec(off[frame, person], np.zeros(3)).rotation
     seen_at = camera[frame].normalize(center[frame, person][:, None])[:, 0]
-    ray = np.concatenate([seen_at, np.ones((len(frame), 1))], axis=-1)
-    to_crop = _rotations_to_front(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+    ray = np.insert(seen_at, 2, 1.0, axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    to_crop = shortest_rotation(ray, np.array([0.0, 0.0, 1.0]))
     found[:, 0] = to_crop @ camera.cam_from_world.rotation[frame] @ found[:, 0]
     # Scale 2 / (1.7 m) is a crop as high as an adult of 1.7 m.
     scale = 2.0 * size[frame, person] / (1.2 * 1.7)
@@ -373,11 +374,3 @@ def estimate_bodies(
         "box_size": side[frame, person],
         "img_size": camera.image_size[frame],
     }
-
-
-def _rotations_to_front(ahead: Floats) -> Floats:
-    """Return the smallest rotations (n, 3, 3) from directions (n, 3) to straight ahead."""
-    across = np.cross(ahead, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(across, axis=-1, keepdims=True)
-    angle = np.arctan2(sine, ahead[:, 2:])
-    return Rigid.from_rotvec(across / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from worldpose.body.body_file import load_open_body
-from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body.model import BodyModel, BodyParameters, cluster_vertices, vertex_normals
 from worldpose.simulation.settings import PATTERNS, CrowdSettings, Pattern
 
 TEXEL: Final = 0.0125
@@ -71,8 +71,13 @@ class Surfaces:
 def open_mannequin() -> Mannequin:
     """Return the mannequin of the open body."""
     body = load_open_body()
-    outward = _normals(body.template, body.faces)
-    kept, faces = _cluster_vertices(body.template, body.faces)
+    outward = vertex_normals(body.template, body.faces)
+    hand = 0.76  # fingers are beyond that x of the T-pose; they become one mitten [m]
+    # Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px. No cell crosses
+    # the middle of the body, so legs stay apart.
+    size = np.where(np.abs(body.template[:, :1]) > hand, 0.06, 0.03)
+    keys = np.concatenate([np.floor(body.template / size), size], axis=1)
+    kept, faces = cluster_vertices(body.template, body.faces, keys)
     template = body.template[kept]
     weights = body.weights[kept]
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
@@ -120,38 +125,6 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
     normals = np.einsum("pvij,vj->pvi", blend[..., :3], mannequin.outward)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return Surfaces(vertices, normals / np.maximum(length, np.float32(1e-6)))
-
-
-def _normals(vertices: Floats, faces: Integers) -> Floats:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], across)
-    unit: Floats = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return unit
-
-
-def _cluster_vertices(vertices: Floats, faces: Integers) -> tuple[Integers, Integers]:
-    """Return the kept vertices and the faces between them: one per cell, nearest to its mean.
-
-    No cell crosses the middle of the body, so legs stay apart.
-    """
-    hand = 0.76  # fingers are beyond that x of the T-pose; they become one mitten [m]
-    # Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px.
-    cell_m = 0.03
-    size = np.where(np.abs(vertices[:, :1]) > hand, 2.0 * cell_m, cell_m)
-    key = np.concatenate([np.floor(vertices / size), size], axis=1)
-    _, cell = np.unique(key, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    count = np.bincount(cell)
-    mean = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / count[:, None]
-    away = np.linalg.norm(vertices - mean[cell], axis=1)
-    order = np.lexsort((away, cell))
-    kept = order[np.concatenate([[0], np.cumsum(count)[:-1]])]
-    merged = cell[faces]
-    a, b, c = merged.T
-    return kept, merged[(a != b) & (b != c) & (c != a)]
 
 
 def _cloth_thickness(template: Floats, outward: Floats) -> Floats:

@@ -15,6 +15,7 @@ from scipy.interpolate import interp1d
 from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Flags, Floats
+from worldpose.geometry.rigid import unit
 from worldpose.simulation.paths import STEP, GroundPath, drift, sample_times
 from worldpose.simulation.settings import CrowdSettings
 
@@ -121,10 +122,6 @@ def _limit(vectors: Floats, most: float) -> Floats:
     return np.asarray(vectors * np.minimum(1.0, most / np.maximum(size, 1e-9)))
 
 
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
-
-
 def wander(
     crowd: CrowdSettings, duration: float, rngs: Sequence[np.random.Generator]
 ) -> list[GroundPath]:
@@ -208,7 +205,7 @@ def take_corner(
         else:
             top[attackers] = 2.0
         marked = attackers[: len(markers)]
-        toward = _unit(goal - position[marked])
+        toward = unit(goal - position[marked])
         # Distance at which a defender marks an attacker, towards the goal [m]: in contact.
         marking_distance = 0.35
         target[markers] = position[marked] + marking_distance * toward + REACTION * velocity[marked]
@@ -219,7 +216,7 @@ def take_corner(
 
     start = np.tile(goal - [out * 0.8, 0.0], (count, 1))
     start[attackers] = homes
-    start[markers] = homes[: len(markers)] + 0.5 * _unit(goal - homes[: len(markers)])
+    start[markers] = homes[: len(markers)] + 0.5 * unit(goal - homes[: len(markers)])
     return _steer(time, start, wish)
 
 
@@ -256,7 +253,7 @@ def run_through(
         ahead = center + miss - reach * np.stack([np.cos(state), np.sin(state)], axis=-1)
         there = np.linalg.norm(ahead - position, axis=-1) < 1.5
         state[there] += np.pi + 0.5 * np.sin(7.0 * state[there])
-        aside = _unit(np.stack([-velocity[:, 1], velocity[:, 0]], axis=-1))
+        aside = unit(np.stack([-velocity[:, 1], velocity[:, 0]], axis=-1))
         ahead[partners] = position[partners - 1] + beside * aside[partners - 1]
         ahead[partners] += velocity[partners - 1] / KEEN  # the follower aims ahead to keep up
         return ahead, speed, center

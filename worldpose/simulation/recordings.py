@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Floats
+from worldpose.geometry.rigid import unit
 from worldpose.simulation.paths import STEP, Clip, GroundPath, sample_times
 from worldpose.simulation.recorded_files import (
     LIMBS,
@@ -19,7 +20,7 @@ from worldpose.simulation.recorded_files import (
     read_tracking,
     refuse,
 )
-from worldpose.simulation.skeletons import Body, Ground, unit
+from worldpose.simulation.skeletons import Body, Ground
 
 SMOOTHING: Final = 0.15
 """Standard deviation of the smoothing in time [s]: tracking jitters by decimetres between samples,

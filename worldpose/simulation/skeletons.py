@@ -18,7 +18,7 @@ from data_contracts.conventions import COCO17
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import VERTEX_OF_POINT
 from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
-from worldpose.geometry.rigid import Rigid
+from worldpose.geometry.rigid import Rigid, cross, orthonormal_frame, unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +110,6 @@ def _reference_points() -> tuple[BodyModel, Floats, Floats]:
     upright = model.template[:, 1]
     vertices = [*named, int(upright.argmax()), int(upright.argmin())]
     return model, model.template[vertices], model.shape_directions[vertices]
-
-
-def unit(vectors: Floats) -> Floats:
-    """Return vectors (..., 3) of length one in the same direction."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def level_axes(heading: Floats) -> tuple[Floats, Floats]:
@@ -213,7 +208,7 @@ def solve_body(body: Body, joints: Floats, ground: Ground, courses: Floats) -> P
         hinge = _elbow_axis(body, side, turns[:, 9], upper, fore)
         for joint, along in ((16 + side, upper), (18 + side, fore)):
             bone = rest[joint + 2] - rest[joint]
-            turns[:, joint] = _rotations(bone, _cross(bone, _Z), along, hinge)
+            turns[:, joint] = _rotations(bone, cross(bone, _Z), along, hinge)
         turns[:, 20 + side] = turns[:, 22 + side] = turns[:, 18 + side]
 
         hip = pelvis + turns[:, 0] @ (rest[1 + side] - rest[0])
@@ -237,7 +232,7 @@ def _elbow_axis(body: Body, side: int, chest: Floats, upper: Floats, fore: Float
     ahead, both = chest @ _Z, straight + upper
     # Both cancel only in an arm that points straight through the chest.
     share = (ahead * both).sum(-1) / np.maximum(0.5 * (both**2).sum(-1), 0.1)
-    return _cross(upper, fore + BIAS * (ahead - share[:, None] * both))
+    return cross(upper, fore + BIAS * (ahead - share[:, None] * both))
 
 
 def _solve_leg(
@@ -257,7 +252,7 @@ def _solve_leg(
     front = (joints[:, 13 + side] - hip) / upper + BIAS * forward
     front = unit(front - (front * along).sum(-1, keepdims=True) * along)
     thigh = down * along + aside * front
-    return thigh, reach * along - thigh, _cross(front, along)
+    return thigh, reach * along - thigh, cross(front, along)
 
 
 def _rotate_foot(
@@ -290,7 +285,7 @@ def _rotate_foot(
     turns = []
     for slope in (rise, toe_rise):
         pointing = np.sqrt(1.0 - slope**2)[:, None] * ahead + slope[:, None] * _UP
-        left = (1.0 - level) * (turned @ _X) + level * _cross(_UP, ahead)
+        left = (1.0 - level) * (turned @ _X) + level * cross(_UP, ahead)
         turns.append(_rotations(_Z, _X, pointing, left))
     return turns[0], turns[1]
 
@@ -303,7 +298,7 @@ def _turn_towards(ahead: Floats, course: Floats, share: Floats) -> Floats:
     """
     sine = np.sin(course) * ahead[:, 0] - np.cos(course) * ahead[:, 1]
     angle = share * (sine + sine**3 / 6.0)
-    return np.cos(angle)[:, None] * ahead + np.sin(angle)[:, None] * _cross(_UP, ahead)
+    return np.cos(angle)[:, None] * ahead + np.sin(angle)[:, None] * cross(_UP, ahead)
 
 
 def _soft_limit(value: Floats, below: Floats, above: Floats | float) -> Floats:
@@ -329,22 +324,9 @@ def _face_vectors(head: Floats) -> tuple[Floats, Floats]:
 def _interpolate_rotations(first: Floats, second: Floats, share: float) -> Floats:
     """Return rotations (frames, 3, 3) between first and second, less than half a turn apart."""
     mixed = (1.0 - share) * first + share * second
-    return _orthonormal_frame(mixed[..., 0], mixed[..., 1])
+    return orthonormal_frame(mixed[..., 0], mixed[..., 1])
 
 
 def _rotations(bone: Floats, side: Floats, to_bone: Floats, to_side: Floats) -> Floats:
     """Return rotations (frames, 3, 3) of one direction to others, and a second to that side."""
-    return _orthonormal_frame(to_bone, to_side) @ _orthonormal_frame(bone, side).T
-
-
-def _orthonormal_frame(first: Floats, second: Floats) -> Floats:
-    """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
-    along = unit(first)
-    third = unit(_cross(along, second))
-    return np.stack([along, _cross(third, along), third], axis=-1)
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    u, v, w = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    return orthonormal_frame(to_bone, to_side) @ orthonormal_frame(bone, side).T

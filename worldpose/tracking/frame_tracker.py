@@ -27,7 +27,7 @@ from worldpose.tracking.pair_births import (
     group_pairs,
     judge_pairs,
 )
-from worldpose.tracking.person import Person, Sighting, separations
+from worldpose.tracking.person import Person, Sighting, measure_doubt, separations
 from worldpose.tracking.ray_matching import (
     drop_inconsistent_views,
     intersect_people,
@@ -153,9 +153,9 @@ class FrameTracker:
         weights: Floats,
     ) -> None:
         """Update visibility statistics with new groups, and every few frames with known people."""
-        seen = [(joints[n], index[:, n] >= 0) for n in np.flatnonzero(known).tolist()]
         # Interval between frames in which visibility statistics use known people.
-        seen = seen if frame % 5 == 0 else []
+        used = np.flatnonzero(known).tolist() if frame % 5 == 0 else []
+        seen = [(joints[n], index[:, n] >= 0) for n in used]
         seen += [(group.joints, group.index >= 0) for group in groups]
         seen = [each for each in seen if np.isfinite(each[0]).any()]
         if seen:
@@ -182,9 +182,7 @@ class FrameTracker:
         self.active.sort(key=lambda person: (not self._is_confirmed(person), person.number))
         confirmed = sum(map(self._is_confirmed, self.active))
         poses = np.array([person.pose for person in self.active])
-        doubt = np.stack(
-            [person.uncertainty(frame, self.fps, settings) for person in self.active], axis=1
-        )
+        doubt = measure_doubt(self.active, frame, self.fps, settings)
         usual = np.maximum(
             settings.gate_factor * self.gates.usual[:, None],
             settings.gate_growth * np.array([person.misfit for person in self.active]),
@@ -246,12 +244,14 @@ class FrameTracker:
                 index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
         gain = 1.0 - math.exp(-1.0 / (self.fps * self.settings.velocity_time_s))
         # The same for mean distances, and the motion between images half a frame apart.
-        speed = np.array([np.linalg.norm(person.velocity) for person in self.active])
+        speed = np.linalg.norm([person.velocity for person in self.active], axis=1)
         shares = apart / (2.5 * noise + 0.5 * speed[:, None, None] / self.fps)
         moved = self._find_moved_cameras(shares, gain)
         shares[:, moved] = shares[:, :, moved] = math.inf
-        for n, person in enumerate(self.active):
-            drop_inconsistent_views(shares[n], index[:, n], person.departure, gain)
+        departure = np.array([person.departure for person in self.active])
+        drop_inconsistent_views(shares, index, departure, gain)
+        for person, each in zip(self.active, departure, strict=True):
+            person.departure = each
 
     def _find_moved_cameras(self, shares: Floats, gain: float) -> Flags:
         """Return the cameras (cameras,) that depart for most people: they moved.
@@ -358,13 +358,13 @@ class FrameTracker:
         """End or lose people unseen for too long; unconfirmed ones have a shorter limit."""
         settings = self.settings
         for person in list(self.active):
-            patience, since = settings.min_track_s, person.last_fixed
-            if self._is_confirmed(person):
-                patience, since = settings.max_coast_s, person.last_followed(self.fps)
+            known, since = self._is_confirmed(person), person.last_fixed
+            patience = settings.max_coast_s if known else settings.min_track_s
+            if known and (frame - since) / self.fps > patience:
+                since = person.last_followed(self.fps)
             if (frame - since) / self.fps > patience:
                 self.active.remove(person)
-                back = settings.causal and self._is_confirmed(person)
-                (self.lost if back else self.ended).append(person)
+                (self.lost if known and settings.causal else self.ended).append(person)
         for person in list(self.lost):
             if (frame - person.last_fixed) / self.fps > settings.max_lost_s:
                 self.lost.remove(person)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Iterator, MutableMapping, Sequence
 from dataclasses import InitVar, dataclass, field
 from typing import Final
 
@@ -198,17 +198,6 @@ class Person:
             self.pose, self.velocity = self.pose + shift, self.velocity + gain * fps * shift
             self.followed[camera] = frame
 
-    def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> Floats:
-        """Return the standard deviation (cameras,) of the predicted position at `frame` [m].
-
-        A camera that followed the person alone knows the position across its rays.
-        """
-        unseen = (frame - np.maximum(self.followed, self.last_fixed)) / fps
-        wander = settings.velocity_change_std_m_s * np.sqrt(unseen**3 / 3.0)
-        # The velocity estimate needs a few frames; before, a person may be running.
-        known = 1.0 - math.exp(-self.fixed / (fps * settings.velocity_time_s))
-        return np.hypot(wander, (1.0 - known) * settings.rms_speed_m_s * unseen)
-
     def absorb(self, other: Person, since: int) -> None:
         """Move the other's sightings from frame `since` on to this person."""
         for frame in [frame for frame in other.sightings if frame >= since]:
@@ -217,6 +206,25 @@ class Person:
             self.sightings[frame] = theirs if own is None else own.fill_from(theirs)
             other.fixed -= bool(np.isfinite(theirs.joints).any())
         other.evidence = min(other.evidence, float(other.fixed))
+
+
+def measure_doubt(
+    people: Sequence[Person], frame: int, fps: float, settings: TrackingSettings
+) -> Floats:
+    """Return standard deviations (cameras, people) of the positions predicted at `frame` [m].
+
+    A camera that followed the person alone knows the position across its rays.
+    """
+    seen = np.maximum(
+        np.array([person.followed for person in people]).T.copy(),
+        [person.last_fixed for person in people],
+    )
+    unseen = (frame - seen) / fps
+    wander = settings.velocity_change_std_m_s * np.sqrt(unseen**3 / 3.0)
+    # The velocity estimate needs a few frames; before, a person may be running.
+    known = [1.0 - math.exp(-each.fixed / (fps * settings.velocity_time_s)) for each in people]
+    away = (1.0 - np.array(known)) * settings.rms_speed_m_s * unseen
+    return np.asarray(np.hypot(wander, away))
 
 
 @compile_kernel

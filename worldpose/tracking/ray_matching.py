@@ -131,24 +131,43 @@ def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floa
         (persons, cameras, cameras) [m]; infinite without a common joint.
     """
     cameras, persons = index.shape
+    joint_count = directions.shape[2]
     apart = np.full((persons, cameras, cameras), np.inf)
+    views, rays = np.empty(cameras, np.int64), np.empty((cameras, 3, joint_count))
+    away, known = np.empty(joint_count), np.empty(joint_count)
     for person in range(persons):
-        for a in range(cameras):
-            for b in range(a + 1, cameras):
-                i, j = index[a, person], index[b, person]
-                if i >= 0 and j >= 0:
-                    baseline = centers[b] - centers[a]
-                    total, _, count = rays_apart(
-                        baseline, directions[a, i], directions[b, j], math.inf
-                    )
-                    if count:
-                        apart[person, a, b] = apart[person, b, a] = total / count
+        count = 0
+        for c in range(cameras):
+            if index[c, person] >= 0:
+                rays[count] = directions[c, index[c, person]].T
+                views[count] = c
+                count += 1
+        for first in range(count):
+            a, p = views[first], rays[first]
+            for second in range(first + 1, count):
+                b, q = views[second], rays[second]
+                x, y = centers[b, 0] - centers[a, 0], centers[b, 1] - centers[a, 1]
+                z = centers[b, 2] - centers[a, 2]
+                # Vector instructions take several joints; sums in order give the same bits.
+                for joint in range(joint_count):
+                    nx = p[1, joint] * q[2, joint] - p[2, joint] * q[1, joint]
+                    ny = p[2, joint] * q[0, joint] - p[0, joint] * q[2, joint]
+                    nz = p[0, joint] * q[1, joint] - p[1, joint] * q[0, joint]
+                    sine = math.sqrt(nx * nx + ny * ny + nz * nz)
+                    seen = sine > 0.0  # also False for NaN
+                    known[joint] = 1.0 if seen else 0.0
+                    away[joint] = abs(x * nx + y * ny + z * nz) / sine if seen else 0.0
+                total, shared = 0.0, 0.0
+                for joint in range(joint_count):
+                    total, shared = total + away[joint], shared + known[joint]
+                if shared > 0.0:
+                    apart[person, a, b] = apart[person, b, a] = total / shared
     return apart
 
 
 @compile_kernel
 def drop_inconsistent_views(apart: Floats, index: Integers, departure: Floats, gain: float) -> None:
-    """Remove a person's views whose rays are lastingly apart from those of the others.
+    """Remove people's views whose rays are lastingly apart from those of the others.
 
     The departure of view c is the running mean of the mean distance to the other views S,
 
@@ -158,29 +177,32 @@ def drop_inconsistent_views(apart: Floats, index: Integers, departure: Floats, g
     decide; of the last two, the one that departed more before is left out.
 
     Args:
-        apart: (cameras, cameras) distance of rays over its limit [1]; infinite = unknown.
-        index: (cameras,) detections; -1 = not seen. Written.
-        departure: (cameras,) [1]. Written.
+        apart: (persons, cameras, cameras) distance of rays over its limit [1]; infinite = unknown.
+        index: (cameras, persons) detections; -1 = not seen. Written.
+        departure: (persons, cameras) [1]. Written.
         gain: of the running mean [1].
     """
-    matched, mean = index >= 0, departure.copy()
-    while True:
-        worst = -1
-        for c in range(len(index)):
-            if not matched[c]:
-                continue
-            total, count = 0.0, 0
-            for other in range(len(index)):
-                if other != c and index[other] >= 0 and apart[c, other] < math.inf:
-                    total, count = total + apart[c, other], count + 1
-            if count:
-                mean[c] = departure[c] + gain * (total / count - departure[c])
-                if index[c] >= 0 and mean[c] > (1.0 if worst < 0 else mean[worst]):
-                    worst = c
-        if worst < 0:
-            break
-        index[worst] = -1
-    departure[:] = mean
+    cameras = len(index)
+    for person in range(len(apart)):
+        matched, mean = index[:, person] >= 0, departure[person].copy()
+        while True:
+            worst = -1
+            for c in range(cameras):
+                if not matched[c]:
+                    continue
+                total, count = 0.0, 0
+                for other in range(cameras):
+                    away = apart[person, c, other]
+                    if other != c and index[other, person] >= 0 and away < math.inf:
+                        total, count = total + away, count + 1
+                if count:
+                    mean[c] = departure[person, c] + gain * (total / count - departure[person, c])
+                    if index[c, person] >= 0 and mean[c] > (1.0 if worst < 0 else mean[worst]):
+                        worst = c
+            if worst < 0:
+                break
+            index[worst, person] = -1
+        departure[person] = mean
 
 
 @compile_kernel

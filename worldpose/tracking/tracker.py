@@ -16,6 +16,7 @@ from data_contracts.tracking import Join, Track
 from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import row_rate
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.joins import Candidate, Takeover, lasting_takeovers
@@ -98,9 +99,9 @@ def track_people(
 
     Args:
         cameras: batch (cameras,).
-        detections: (frames, cameras, detections), read in blocks of frames; a confidence of NaN, 0
-            or less excludes a keypoint.
-        fps: frames per second [1/s].
+        detections: (frames, cameras, detections), read in blocks of frames, whose numbers rise in
+            equal steps; a confidence of NaN, 0 or less excludes a keypoint.
+        fps: frame numbers per second [1/s].
         settings: gates, least views and times.
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
@@ -109,11 +110,12 @@ def track_people(
             `static_calibration.parameters.PARAMETERS`; None = all cameras are equally accurate.
 
     Raises:
-        InputError: the shapes do not fit together.
+        InputError: the shapes do not fit together, or frames or `fps` are invalid.
 
     Note:
         T1, T2, D2. Constant velocity between frames departs from the paper (`predict_motion`).
     """
+    fps = row_rate("tracking", fps, detections.frame)
     keypoints, confidence = detections.keypoints, detections.confidence
     if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
         raise InputError(

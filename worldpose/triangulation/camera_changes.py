@@ -403,6 +403,11 @@ def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:
     return same and near and other.is_explained
 
 
+def is_by_chance(change: CameraChange) -> bool:
+    """Return whether a change is more than a knock: people who agree nowhere seem to show it."""
+    return abs(change.zoom) > 0.1 or abs(change.roll_rad) > np.radians(10.0)
+
+
 def join_changes(first: CameraChange, then: CameraChange) -> CameraChange:
     """Return a change of a view with the little that was found after its correction."""
     x, y, zoom, roll = (_view_amount(first) + _view_amount(then)).tolist()
@@ -449,8 +454,8 @@ def describe_change(change: CameraChange) -> str:
     if change.kind == "clock":
         rate = late / max(1.0, change.frame_count - 1.0)
         return (
-            f"camera {camera}: its offset changes by {-late:+.1f} frames within the clip: its "
-            f"clock runs {abs(rate):.2%} {'fast' if rate > 0.0 else 'slow'}. {todo}"
+            f"camera {camera}: its offset changes by {-late:+.1f} frames within the clip: it "
+            f"takes {abs(rate):.3%} {'fewer' if rate > 0.0 else 'more'} images. {todo}"
         )
     parts = [f"{math.hypot(*change.shift_px):.0f} px"]
     if abs(change.zoom) > 0.003:

@@ -132,7 +132,7 @@ def shift_by_courses(
     for name, array in detections.arrays().items():
         arrays[name] = array[row, np.arange(count)].astype(np.float64)
         arrays[name][outside] = np.nan
-    rest = row + np.take_along_axis(course, row, axis=0) - frame[:, None]
+    rest = row + course - frame[:, None]
     rest = np.where(np.abs(rest) < 1.0, rest, 0.0)
     return detections.with_arrays(arrays, frame), rest
 

@@ -26,6 +26,7 @@ from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import row_rate
 from worldpose.reference_method import require_torch
 from worldpose.triangulation.clocks import estimate_clocks, read_frames
 from worldpose.triangulation.limb_lengths import (
@@ -84,15 +85,16 @@ def reconstruct_joints(
 
     Args:
         cameras: batch (cameras,).
-        detections: detections of all tracked people.
-        fps: frames per second [1/s].
+        detections: detections of all tracked people; their frame numbers rise in equal steps.
+        fps: frame numbers per second [1/s].
         settings: settings of the stage.
         camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
 
     Raises:
-        InputError: the shapes do not match.
+        InputError: the shapes do not match, or frames or `fps` are invalid.
     """
     check_shapes(cameras, detections, camera_covariance)
+    fps = row_rate("reconstruct_joints", fps, detections.frame)
     model = learn_clip(cameras, detections, fps, settings, camera_covariance)
     chunks = reconstruct_chunks(
         cameras, detections, model, fps, settings, camera_covariance, len(detections.keypoints)
@@ -164,6 +166,8 @@ def reconstruct_chunks(
     """
     every = np.arange(0, detections.confidence.shape[0], stride)
     frames, fps = len(every), fps / stride
+    # Errors last for a time: frames that are farther apart share less of them.
+    motion = replace(model.motion, repeated=1.0 + (model.motion.repeated - 1.0) / stride)
     margin = round(MARGIN * fps)
     # Joints of a tile share their number of steps: equal tiles give bit-identical joints.
     length = LANES * -(-max(1, length, margin) // LANES)
@@ -196,7 +200,7 @@ def reconstruct_chunks(
             add_margins(before, here, after, margin),
             fps,
             settings,
-            model.motion,
+            motion,
             slice(part.start - first, part.stop - first),
         )
         placed = here

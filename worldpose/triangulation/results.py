@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from worldpose.geometry.rows import join_rows, take_rows
 from worldpose.triangulation.clocks import CameraClocks
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.report import (
@@ -83,21 +84,9 @@ class ExtraJoints:
     views: NDArray[np.uint8]
     common_bias: Floats
 
-    @classmethod
-    def concatenate(cls, parts: Sequence[ExtraJoints]) -> ExtraJoints:
-        """Return the points of consecutive parts of a clip."""
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("joints", "covariance", "views")
-        }
-        return replace(parts[0], **arrays)
-
     def __getitem__(self, frames: slice) -> ExtraJoints:
         """Return the points in some frames."""
-        arrays: dict[str, Any] = {
-            name: getattr(self, name)[frames] for name in ("joints", "covariance", "views")
-        }
-        return replace(self, **arrays)
+        return take_rows(self, frames, "points", "common_bias")
 
 
 @dataclass(frozen=True)
@@ -171,7 +160,7 @@ def concatenate_frames(parts: Sequence[Triangulation]) -> Triangulation:
         parts[0],
         **arrays,
         agreement=reduce(add, (part.agreement for part in parts)),
-        extra=ExtraJoints.concatenate(extra) if extra else None,
+        extra=join_rows(extra, "points", "common_bias") if extra else None,
     )
 
 
@@ -180,22 +169,15 @@ def add_margins(
 ) -> Triangulation:
     """Return the triangulation of a chunk with `margin` frames on either side."""
 
-    def join(name: str) -> NDArray[Any]:
+    def join(name: str) -> Any:  # noqa: ANN401
         parts = [getattr(before, name)[-margin:]] if before is not None and margin else []
         parts.append(getattr(here, name))
         if after is not None:
             parts.append(getattr(after, name)[:margin])
         return np.concatenate(parts)
 
-    return replace(
-        here,
-        joints=join("joints"),
-        covariance=join("covariance"),
-        lasting_covariance=join("lasting_covariance"),
-        bias_variance=join("bias_variance"),
-        exchanged=join("exchanged"),
-        offsets=join("offsets"),
-    )
+    smoothed = ("joints", "covariance", "lasting_covariance", "bias_variance")
+    return replace(here, **{name: join(name) for name in (*smoothed, "exchanged", "offsets")})
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,30 @@ export async function openSession() {
 export const get = (path) => ask("GET", path);
 export const post = (path, body) => ask("POST", path, body);
 
+let isAway = false; // the server did not answer the last request
+const returns = new Set();
+
+// Call a function whenever the server answers again; returns how to end that.
+export function onReturn(call) {
+  returns.add(call);
+  return () => returns.delete(call);
+}
+
+// What a browser says of a server that does not answer differs, and is not plain.
+async function reach(path, what) {
+  const answer = await fetch(path, what).catch(() => {
+    isAway = true;
+    throw new Error((what?.method ?? "GET") === "GET" ? "The server does not answer; trying again." : "The server does not answer. Try again when it does.");
+  });
+  if (isAway) {
+    isAway = false;
+    for (const call of returns) call();
+  }
+  return answer;
+}
+
 async function ask(method, path, body) {
-  const answer = await fetch(path, {
+  const answer = await reach(path, {
     method,
     headers:
       method === "GET"
@@ -37,7 +59,8 @@ async function ask(method, path, body) {
 }
 
 export async function getBytes(path) {
-  const answer = await fetch(path);
+  let answer = null;
+  while (!answer) answer = await reach(path).catch(() => new Promise((next) => setTimeout(next, 2000)));
   if (answer.status === 401) location.assign("/login");
   if (!answer.ok) throw new Refusal(answer.status, await answer.json().catch(() => ({})));
   return answer.arrayBuffer();

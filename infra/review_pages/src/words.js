@@ -1,6 +1,9 @@
 // How numbers and moments are written.
 
-export const spoken = (name) => name.replaceAll("_", " ");
+// A point that only its place names, `at_52.50_19.16`, is (52.5, 19.2) m.
+export const spoken = (name) =>
+  name.replace(/^at_(-?[\d.]+)_(-?\d+\.\d+)/, (_, ...place) => `(${place.slice(0, 2).map((text) => Number(Number(text).toFixed(1))).join(", ")}) m`)
+    .replace(/\.again\w*$/, ", once more").replaceAll("_", " ");
 
 export function shown(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
@@ -60,6 +63,9 @@ export function result(unit) {
   const [stage, name] = parts(unit);
   return `${RESULTS[stage] ?? spoken(stage)} ${name.replace(".", ", ")}`;
 }
+
+// A message that names results as the journal does, `tracking/clip`.
+export const plain = (text) => text.replace(/\b([a-z_]+)\/[\w.-]*\w/g, (unit, stage) => (stage in RESULTS ? result(unit) : unit));
 
 export function bytes(count) {
   if (count < 1e6) return `${Math.ceil(count / 1e3)} kB`;

@@ -116,7 +116,38 @@ def test_one_call_places_bodies_better_than_triangulation(known):
     assert errors[2] < 0.02
 
 
-def test_one_call_refuses_cameras_without_detections():
-    seen = filmed(ring(3), 1.5, 7, frames=3)
+def test_one_call_takes_rows_for_frames_where_no_numbers_are_given():
+    seen = filmed(ring(3), 1.5, 7, people=1, frames=12)
+    found = reconstruct_bodies(list(ring(3)), seen, 50.0)
+    assert found.tracks.frames.tolist() == list(range(12))
+
+
+def test_every_second_frame_is_half_the_frame_rate():
+    seen = filmed(ring(3), 1.5, 7, people=1, frames=24)
+    every = replace(seen, frame=np.arange(24))[np.arange(0, 24, 2)]
+    rows = replace(every, frame=np.arange(12))
+    one, other = (reconstruct_bodies(ring(3), *given) for given in ((every, 50.0), (rows, 25.0)))
+    assert one.frame.tolist() == list(range(0, 24, 2))
+    np.testing.assert_array_equal(one.bodies.joints, other.bodies.joints)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "frame", "fps", "words"),
+    [
+        (4, [0, 1, 2], 50.0, "detections of each of them"),
+        (3, [2, 1, 0], 50.0, "found numbers that repeat or fall"),
+        (3, [0, 0, 1], 50.0, "found numbers that repeat or fall"),
+        (3, [0, 40, 10**9], 50.0, "at most 200000 from first to last"),
+        (3, [0, 1, 2], 0.0, "frames per second, above 0"),
+        (3, [0, 1, 2], "25", "frames per second, above 0"),
+    ],
+)
+def test_one_call_refuses_what_it_cannot_place(cameras, frame, fps, words):
+    seen = replace(filmed(ring(3), 1.5, 7, frames=3), frame=np.array(frame))
+    with pytest.raises(InputError, match=words):
+        reconstruct_bodies(ring(cameras), seen, fps)
+
+
+def test_one_call_refuses_no_detections():
     with pytest.raises(InputError, match="detections of each of them"):
-        reconstruct_bodies(ring(4), seen, 50.0)
+        reconstruct_bodies(ring(3), [], 50.0)

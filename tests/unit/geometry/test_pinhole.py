@@ -166,6 +166,7 @@ def test_matrix_that_is_no_rotation_is_refused(rotation, found):
         (np.diag([1000.0, 1000.0, 1.0]) + np.eye(3, k=1), np.eye(3), "matrix"),
         (np.diag([1000.0, 1000.0, 1.0]), np.diag([1.0, 1.0, -1.0]), "rotation"),
         (np.diag([1000.0, 1000.0, 1.0]), 1.01 * np.eye(3), "rotation"),
+        (np.diag([1000.0, -1000.0, 1.0]), np.eye(3), "expected positive focal lengths"),
     ],
 )
 def test_matrices_that_no_camera_has_are_refused(matrix, rotation, where):

@@ -14,7 +14,7 @@ from worldpose.camera_consistency.changes import find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import correct_views, explain_changes, triangulate_views
-from worldpose.triangulation.clock_courses import add_slow_drifts, trace_clocks
+from worldpose.triangulation.clock_courses import add_slow_drifts, shift_by_courses, trace_clocks
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -203,6 +203,21 @@ def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     rows, values = np.array(courses[BAD]).T
     assert rows.tolist() == [0, FRAMES - 1]
     np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
+
+
+def test_what_is_left_of_a_drifting_clock_is_counted_by_match_frames():
+    """A camera 40 frames late that takes 0.6 % fewer images: f shows as its frame f - o(f)."""
+    rows = np.arange(200.0)
+    seen = KeypointDetections.from_keypoints(
+        np.tile(rows[:, None, None, None, None], (1, 1, 1, 17, 2)), np.ones((200, 1, 1, 17))
+    )
+    course = 40.0 + 0.006 * rows
+    shifted, rest = shift_by_courses(seen, [[(0, 40.0), (199, float(course[-1]))]])
+    shown = shifted.keypoints[:, 0, 0, 0, 0]
+    there = np.isfinite(shown)
+    assert there.sum() == 160
+    np.testing.assert_allclose(rest[there, 0], (shown + course - rows)[there], atol=1e-9)
+    assert np.abs(rest).max() <= 0.5
 
 
 CAMERA = Camera.from_matrices(

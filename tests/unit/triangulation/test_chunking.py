@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from running_samples import FPS, MIRRORED, detections, runner
@@ -65,6 +67,15 @@ def test_parts_give_what_the_whole_clip_gives(clip):
     filled = np.concatenate([part.smoothing.filled for part in parts])
     np.testing.assert_array_equal(filled, whole.smoothing.filled)
     assert filled.sum() == 15 * 17
+
+
+def test_frames_that_are_farther_apart_share_less_of_their_errors(clip):
+    camera, arrays = clip
+    seen = as_detections(*arrays)
+    model = learn_clip(camera, seen, FPS, SETTINGS)
+    model = replace(model, motion=replace(model.motion, repeated=9.0))
+    (part,) = reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=FRAMES, stride=4)
+    assert part.smoothing.motion.repeated == 3.0
 
 
 def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):

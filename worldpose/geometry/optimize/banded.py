@@ -68,7 +68,7 @@ def _factorize(lower: Floats) -> bool:
         if t >= 1 and t + 1 < frames:
             _subtract(lower[1, t], lower[2, t - 1], lower[1, t - 1], False)
         block = lower[0, t]
-        if not _factorize_block(block, turned):
+        if not factorize_block(block, turned):
             return False
         for ahead in (1, 2):
             if t + ahead < frames:
@@ -79,7 +79,7 @@ def _factorize(lower: Floats) -> bool:
 
 
 @compile_kernel
-def _factorize_block(block: Floats, turned: Floats) -> bool:
+def factorize_block(block: Floats, turned: Floats) -> bool:
     """Factorise a block in place, with room `turned`; False when it is not positive definite.
 
     Four columns at a time, so that the rest is read and written a quarter as often; inner loops run

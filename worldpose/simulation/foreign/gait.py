@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Floats
+from worldpose.geometry.rigid import unit
 from worldpose.simulation.foreign.skeletons import Posture
 
 _WALK: Final = np.array(
@@ -149,10 +150,10 @@ def walk_posture(
     planted = np.abs(part - middle) <= 0.5 * hold[:, None]
     planted |= (pace < still)[:, None]
     posture = Posture(
-        hips=_unit(hips),
-        trunk=_unit(np.stack([np.sin(lean), 0.02 * swing, np.cos(lean)], axis=-1)),
+        hips=unit(hips),
+        trunk=unit(np.stack([np.sin(lean), 0.02 * swing, np.cos(lean)], axis=-1)),
         shoulders=_lateral_axis(-np.radians(8.0) * swing),
-        head_up=_unit(np.stack([np.sin(-nod), 0.0 * nod, np.cos(nod)], axis=-1)),
+        head_up=unit(np.stack([np.sin(-nod), 0.0 * nod, np.cos(nod)], axis=-1)),
         gaze=np.stack([np.cos(look) * np.cos(nod), np.sin(look) * np.cos(nod), np.sin(nod)], -1),
         upper_arm=_sagittal(arm[..., 0], splay),
         forearm=_sagittal(arm[..., 0] + arm[..., 1], 0.2 * splay),
@@ -215,7 +216,7 @@ def _curve(table: Floats, part: Floats) -> Floats:
 def _sagittal(angle: Floats, outward: Floats) -> Floats:
     """Return directions (frames, 2, 3) from hanging, swung forward, and outward on both sides."""
     out = np.broadcast_to(outward, angle.shape)
-    return _unit(np.stack([np.sin(angle), np.tan(out), -np.cos(angle)], axis=-1))
+    return unit(np.stack([np.sin(angle), np.tan(out), -np.cos(angle)], axis=-1))
 
 
 def _lateral_axis(angle: Floats) -> Floats:
@@ -275,8 +276,4 @@ def _add_gesture(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
 def _blend(vectors: Floats, goal: Floats, share: Floats) -> Floats:
     """Return unit vectors turned towards a goal by a share (frames,) of the way."""
     mixed = (1.0 - share)[:, None] * vectors + share[:, None] * goal / np.linalg.norm(goal)
-    return _unit(mixed)
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+    return unit(mixed)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from data_contracts.arrays import Flags, Floats
+from worldpose.geometry.rigid import unit
 
 Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground [m] at x and y [m], world."""
@@ -207,7 +208,7 @@ def place_joints(
     elbows = shoulders + np.array(skeleton.upper_arm)[:, None] * limbs["upper_arm"]
     wrists = elbows + np.array(skeleton.forearm)[:, None] * limbs["forearm"]
     up = world["head_up"]
-    gaze = _unit(world["gaze"] - (world["gaze"] * up).sum(-1, keepdims=True) * up)
+    gaze = unit(world["gaze"] - (world["gaze"] * up).sum(-1, keepdims=True) * up)
     axes = np.stack([gaze, np.cross(up, gaze), up], axis=1)
     ears = neck + skeleton.neck * (world["trunk"] + neck_forward * gaze)
     face = ears[:, None] + skeleton.head * FACE @ axes
@@ -277,11 +278,7 @@ def _solve_knees(
     far = np.linalg.norm(line, axis=-1, keepdims=True)
     along = line / far
     far = np.clip(far, 1.05 * np.abs(thigh - shank) + 0.05, 0.9995 * (thigh + shank))
-    across = _unit(pole - (pole * along).sum(-1, keepdims=True) * along)
+    across = unit(pole - (pole * along).sum(-1, keepdims=True) * along)
     part = (far**2 + thigh**2 - shank**2) / (2.0 * far)
     out = np.sqrt(np.maximum(thigh**2 - part**2, 0.0))
     return hips + part * along + out * across, hips + far * along
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

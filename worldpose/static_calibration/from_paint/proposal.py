@@ -41,6 +41,7 @@ from worldpose.static_calibration.from_paint.ranking import (
     FINE,
     MIN_MARGIN,
     ON_PAINT,
+    RankedCameras,
     rank_under_lenses,
     runner_up,
     share_on_paint,
@@ -188,7 +189,9 @@ def propose_camera(
 ) -> Proposal:
     """Return the camera that explains the paint of an image best.
 
-    If the image as it is has no clear one, the search is repeated with restored colors.
+    If the image as it is has no clear one, the search is repeated with restored colors. There the
+    cameras of the first search remain rivals: colors do not decide between cameras that explain the
+    same paint.
 
     `picture` (height, width, 3) is RGB; the camera stands at `side`. Messages begin with `where`.
 
@@ -202,21 +205,30 @@ def propose_camera(
     height, width = picture.shape[:2]
     given = None if lens is None else Camera.from_lens(lens, (width, height))
 
-    def search(shown: Image) -> Proposal | None:
-        paints = find_paint(shown, given, where)
-        return propose_from_paint(paints, pitch, side=side, prior=prior, lens=given)
+    likely = (prior or CameraPrior()).beside(pitch.spec)
 
-    found, refused = None, None
+    def search(
+        shown: Image, rivals: RankedCameras | None = None
+    ) -> tuple[RankedCameras | None, Proposal | None]:
+        paints = find_paint(shown, given, where)
+        ranked = rank_under_lenses(paints, pitch, likely, given, rivals)
+        return ranked, None if ranked is None else _propose_first(ranked, pitch, side)
+
+    ranked, found, refused = None, None, None
     try:
-        found = search(picture)
+        ranked, found = search(picture)
     except InputError as error:
         if picture.ndim != 3:
             raise
         refused = error
     if found is None or not found.is_clear:
         with suppress(InputError):
-            again = search(restore_colors(picture))
-            if again is not None and (found is None or again.is_clear):
+            _, again = search(restore_colors(picture), ranked)
+            # What the first search found unclear has to be clear beyond doubt: on a real still both
+            # found one camera, with margins of 23 and 25; where colors helped, 50 to 126.
+            if again is not None and (
+                found is None or (again.is_clear and again.margin >= 2.0 * MIN_MARGIN)
+            ):
                 found = again
     if found is None:
         raise refused or InputError(
@@ -241,9 +253,13 @@ def propose_from_paint(
     The paint is that under every lens that the image may have, the likely one first; `lens` is the
     known one. The camera stands on a side of the pitch.
     """
-    found = rank_under_lenses(paints, pitch, (prior or CameraPrior()).beside(pitch.spec), lens)
-    if found is None:
-        return None
+    likely = (prior or CameraPrior()).beside(pitch.spec)
+    found = rank_under_lenses(paints, pitch, likely, lens)
+    return None if found is None else _propose_first(found, pitch, side)
+
+
+def _propose_first(found: RankedCameras, pitch: PitchTemplate, side: Side) -> Proposal:
+    """Return the proposal of the first of an image's cameras, on a side of the pitch."""
     paint, ranked, scores = found
     samples, best = sample_markings(pitch, FINE[0]), stand_on(ranked[:1], side)
     seen = project_markings(paint, samples, best)

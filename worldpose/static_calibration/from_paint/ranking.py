@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -39,13 +40,32 @@ _MAX_SCORED: Final = 8000
 """Candidates to judge on closer samples [1]."""
 ON_PAINT: Final = 4.0
 """Maximum distance of a marking from its paint [px]."""
+_POLISHING: Final = (15.0, 8.0, 5.0, 5.0)
+"""Distances within which paint attracts a marking of a good camera, with k1 free [px]."""
+
+
+class RankedCameras(NamedTuple):
+    """Different cameras that explain the paint of an image, the best first."""
+
+    paint: PaintMap
+    cameras: Candidates
+    scores: Floats
+    """(k,) log probability ratios to an image without a pitch [1]."""
 
 
 def rank_under_lenses(
-    paints: Iterable[PaintMap], pitch: PitchTemplate, prior: CameraPrior, lens: Camera | None
-) -> tuple[PaintMap, Candidates, Floats] | None:
-    """Return the paint under the lens that explains it best, its cameras and their scores."""
-    best: tuple[PaintMap, Candidates, Floats] | None = None
+    paints: Iterable[PaintMap],
+    pitch: PitchTemplate,
+    prior: CameraPrior,
+    lens: Camera | None,
+    rivals: RankedCameras | None = None,
+) -> RankedCameras | None:
+    """Return the paint under the lens that explains it best, its cameras and their scores.
+
+    `rivals` are the cameras of another search of the image, which this one may have missed: they
+    are refined on this paint and ranked with the others.
+    """
+    best: RankedCameras | None = None
     samples = sample_markings(pitch, FINE[0])
     for paint in paints:
         focals = np.array([paint.focal / paint.size[0]])
@@ -53,13 +73,19 @@ def rank_under_lenses(
             focals = np.geomspace(0.45, 5.0, 13)  # in image widths
         ranked, scores = _rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
-            best = (paint, ranked, scores)
+            best = RankedCameras(paint, ranked, scores)
         # Under a wrong lens a camera may be clear though a third of its markings misses the paint.
         if best is not None:
-            found, _ = _shares_if_clear(best[0], samples, best[1], best[2])
+            found, _ = _shares_if_clear(best.paint, samples, best.cameras, best.scores)
             if found >= _CLEAR_SHARES[0]:
                 break
-    return best
+    if best is None or rivals is None:
+        return best
+    paint, focals = best.paint, rivals.cameras.focals * (best.paint.focal / rivals.paint.focal)
+    others = replace(rivals.cameras, focals=focals)
+    others = refine_candidates(paint, samples, others, _POLISHING, (lens is None, lens is None))
+    scores = np.append(best.scores, score_with_prior(paint, samples, others, prior, FINE[1]))
+    return RankedCameras(paint, *_rank(paint, samples, join_rows([best.cameras, others]), scores))
 
 
 def _shares_if_clear(
@@ -112,8 +138,7 @@ def _rank_rolled(
 ) -> tuple[Candidates, Floats]:
     """Return different cameras near some rolls, the best first, and their scores (k,)."""
     stages = (25.0, 12.0, 6.0, 5.0)  # distances within which paint attracts a marking [px]
-    # The best different ones are refined once more, with k1 free from the start.
-    polished = (10, (15.0, 8.0, 5.0, 5.0))
+    polished = (10, _POLISHING)  # the best different ones are refined once more
     most = 60
     medium = (2.5, 6.0)
     coarse = (6.0, 8.0)  # spacing of samples [m], deviation from paint [px]; the same for good ones
