@@ -326,10 +326,10 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
 
 
 MODEL_NAMES: Final = (
-    *("fisheye", "fisheyemodel", "distortionmodel", "distortiontype", "lensmodel", "modeltype"),
-    *("projection", "projectionmodel", "model", "cameramodel", "cameratype", "type"),
+    *("fisheye", "fisheyemodel", "distortionmodel", "distortiontype", "modeltype"),
+    *("projectionmodel", "projection", "lensmodel", "model", "cameramodel", "cameratype", "type"),
 )
-"""Names of entries that may name the lens model; the last four may name the device as well."""
+"""Names of entries that may name the lens model; the last six may be something else as well."""
 FISHEYE_WORDS: Final = (
     *("1", "1.0", "true", "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye"),
     *("pinhole_equi", "kb4"),
@@ -338,6 +338,7 @@ OTHER_WORDS: Final = (
     *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
     *("rational_polynomial", "rational", "full_opencv", "none", "perspective", "thin_prism"),
     *("tilted", "brown_conrady", "pinhole_radtan", "simple_radial", "radial", "simple_pinhole"),
+    *("radial_tangential", "radialtangential", "brown3t2", "polynomial"),
 )
 """Values of `MODEL_NAMES`, in lower case with underscores; coefficients tell these apart."""
 
@@ -353,18 +354,22 @@ def is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
     Raises:
         InputError: one names another lens model than those of OpenCV, or two contradict.
     """
-    # Parts of names of lens models, which names of devices do not have.
-    lens_part = r"fish|omni|equi|kannala|ucm|fov|spher|mei|division|poly|radial|^ds$|^eq$"
+    # Names of lens models, and parts of them, which names of devices do not have.
+    lens_part = r"fish|omnidir|equidist|equisolid|kannala|spher|division|polynom|radial|ographic"
+    lens_part += r"|^(pinhole_)?(omni|equi|e?ucm|fov|mei|poly\d*|ds|eq)(_none|_radtan)?$"
     said = {}
     for key in [key for key in given if plain_key(key) in MODEL_NAMES]:
-        word = re.sub(r"[ -]+", "_", "".join(map(str, np.ravel(given[key])[:1])).lower())
-        is_device = plain_key(key) in MODEL_NAMES[-4:] and not re.search(lens_part, word)
-        if word not in FISHEYE_WORDS + OTHER_WORDS and not is_device:
+        values = np.ravel(np.asarray(given[key], object))
+        is_word = len(values) == 1 and isinstance(values[0], str | int | float | None)
+        word = re.sub(r"[ -]+", "_", str(values[0] if is_word else given[key]).lower())
+        is_other = not is_word or not re.search(lens_part, word)
+        if word in FISHEYE_WORDS + OTHER_WORDS:
+            said[word] = key
+        elif not (plain_key(key) in MODEL_NAMES[-6:] and is_other):
             words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
-            raise calibration_error(f"{where}: {key}", f"one of {words}", repr(word))
-        said[word] = key
+            raise calibration_error(f"{where}: {key}", f"one of {words}", f"{word!r:.60}")
     yes = said.keys() & set(FISHEYE_WORDS)
-    no = said.keys() & set(OTHER_WORDS) - {"pinhole"}
+    no = said.keys() & set(OTHER_WORDS) - {"pinhole", "none", "opencv", "standard"}
     if yes and no:
         found = ", ".join(f"{key} {word}" for word, key in said.items())
         raise calibration_error(where, "one lens model", found)

@@ -110,9 +110,27 @@ def test_a_fisheye_is_known_by_every_usual_name(said, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("said", "model"),
+    [
+        ("projection: [[4, 0, 3, 0], [0, 4, 2, 0], [0, 0, 1, 0]]\nlens_model: Sigma 24mm", "brown"),
+        ("projection: rectilinear\ntype: RadialTangential\nmodel: Meike 25mm", "brown"),
+        ("distortion_model: radial_tangential\nmodel: GoPro HERO12 wide FOV", "brown"),
+        ("distortion_type: polynomial\nmodel: OmniVision OV9281", "brown"),
+        ("fisheye: true\nmodel: opencv\ndistortion_model: none", "fisheye"),
+    ],
+)
+def test_devices_and_other_things_are_no_lens_models(said, model, tmp_path):
+    file = tmp_path / "lens.yaml"
+    file.write_text(f"K: [[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]\nD: [0, 0, 0, 0]\n{said}\n")
+    assert read_lenses([file], "a", SIZE)["a"].lens_model == model
+
+
+@pytest.mark.parametrize(
     ("lens", "said"),
     [
         ("distortion_model: fov\nD: [0.9]", "distortion_model: expected one of .* found 'fov'"),
+        ("model: FOV\nD: [0.9]", "model: expected one of .* found 'fov'"),
+        ("projection: stereographic\nD: [0.9]", "projection: expected one of"),
         ("D: [-0.05, 0.01, -0.2, 0.05]", "p1 and p2 up to 0.01.*fisheye_model: 1"),
         ("D: [-0.2, 0.05, 0.0, 0.0]\nxi: 1.1", "xi: .* found that of cv2.omnidir"),
         ("fisheye_model: 1\nD: [-0.1, 0.0, 0.0, 0.0, 0.3]", "k1 k2 k3 k4 of a fisheye"),
