@@ -18,7 +18,7 @@ from worldpose.bundle_adjustment.residuals import AdjustmentProblem, markings_pr
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
 from worldpose.bundle_adjustment.solver import solve
 from worldpose.geometry.camera_model import STEP
-from worldpose.reference_method.cameras import K1_K2
+from worldpose.reference_method.cameras import K1_K2, require_radial
 
 
 def adjust_unguarded(
@@ -36,7 +36,11 @@ def adjust_unguarded(
         settings: evidence, and minimum views of a joint.
         proposed: frames best suited, indices into the clip.
         used: chosen frames, indices into the clip.
+
+    Raises:
+        InputError: a lens has more than k1, k2 and k3.
     """
+    require_radial(clip.cameras)
     clip, count = learn_confidence(clip, used), len(clip.clicks)
     marks = markings_problem(clip, np.zeros(count, dtype=np.bool_), settings)
     still = len(marks.points)

@@ -355,7 +355,9 @@ def is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
         InputError: one names another lens model than those of OpenCV, or two contradict.
     """
     # Names of lens models, and parts of them, which names of devices do not have.
-    lens_part = r"fish|omnidir|equidist|equisolid|kannala|spher|division|polynom|radial|ographic"
+    lens_part = (
+        r"fish|omnidir|equidist|equisolid|kannala|spher|division|polynom|radial|ographic|lensmodel"
+    )
     lens_part += r"|^(pinhole_)?(omni|equi|e?ucm|fov|mei|poly\d*|ds|eq)(_none|_radtan)?$"
     said = {}
     for key in [key for key in given if plain_key(key) in MODEL_NAMES]:

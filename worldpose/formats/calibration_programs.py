@@ -109,7 +109,8 @@ def read_kalibr(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibra
     Raises:
         InputError: the file is no camchain, or an entry is missing or invalid.
     """
-    return _read_tables(path, dict(kalibr_tables(path, read_yaml(path))), Keys(), left_out)
+    tables = dict(kalibr_tables(path, read_yaml(path), posed=True))
+    return _read_tables(path, tables, Keys(), left_out)
 
 
 def _read_tables(

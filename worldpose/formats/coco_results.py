@@ -64,14 +64,14 @@ def read_coco_results(path: Path) -> PeopleFile:
     json_bytes = 1 << 30
     keep = ("images", "meta_info")
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
-    names, others = _categories(path, json_bytes)
+    categories = _categories(path, json_bytes)
     entries = plain_entries(str(path), items)
     batches, pointless, foreign = [], 0, 0
     for first, given in _batches(path, entries):
         results = given
         if items.is_mapping:
             for each in given:
-                if each.get("keypoints") and each.get("category_id") in others:
+                if categories.are_other(each.get("keypoints"), each.get("category_id")):
                     each["keypoints"], foreign = None, foreign + 1
             results, without = _with_points(given)
             pointless += without
@@ -85,6 +85,10 @@ def read_coco_results(path: Path) -> PeopleFile:
     points = found.points
     if pointless and pointless == len(points):
         there, todo = f"{pointless} annotations without keypoints", "Export poses, not boxes alone."
+        if foreign:
+            share = "all" if foreign == pointless else foreign
+            there = f"{pointless} annotations, {share} of categories other than {categories.called}"
+            todo = "Give people the category that names their keypoints."
         raise InputError(f"{path}: annotations", "keypoints of people", there, todo)
     if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
@@ -93,7 +97,7 @@ def read_coco_results(path: Path) -> PeopleFile:
     confidence_todo = "Scale the detector's scores so that 1 is certain and 0 is missing."
     _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", confidence_todo)
     where = f"{path}: categories"
-    names = names or _model_names(items.kept.get("meta_info"))
+    names = categories.names or _model_names(items.kept.get("meta_info"))
     if names and len(names) != points.shape[1] and len(points):
         raise _wrong(where, f"names of {points.shape[1]} keypoints", f"{len(names)} names")
     order = order_by_names(where, names) if names else order_by_points(str(path), points)
@@ -244,27 +248,46 @@ def _require_distinct(
         raise _wrong(f"{path}: {key}", "names of one camera's images whose numbers differ", found)
 
 
-def _categories(path: Path, limit: int) -> tuple[list[str], list[Any]]:
-    """Return the names of people's points in `categories`, and the ids of other categories.
+class _Categories(NamedTuple):
+    """Categories of a data set: the names of people's points, of these categories, other ids."""
 
-    It reads the file once more: a data set has its categories after the annotations. Both are empty
-    without names of points.
+    names: Sequence[str] = ()
+    called: str = ""
+    others: Sequence[Any] = ()
+    nameless: Sequence[Any] = ()
+
+    def are_other(self, points: object, category: object) -> bool:
+        """Return whether points are of a category that names others, or none and has others."""
+        has_others = isinstance(points, list) and len(points) not in (0, 3 * len(self.names))
+        return bool(points) and (
+            category in self.others or (category in self.nameless and has_others)
+        )
+
+
+def _categories(path: Path, limit: int) -> _Categories:
+    """Return the categories of a data set; empty without names of points.
+
+    It reads the file once more: a data set has its categories after the annotations.
     """
     items = JsonItems(path, "categories", limit)
     given = [each for each in takewhile(lambda _: items.is_mapping, items) if type(each) is dict]
-    names = {
-        index: tuple(map(str, each["keypoints"]))
-        for index, each in enumerate(given)
-        if isinstance(each.get("keypoints"), list) and each["keypoints"]
-    }
-    chosen = set(names.values())
-    if len(chosen) > 1:
-        people = [name for index, name in names.items() if given[index].get("name") == "person"]
-        if len(people) != 1:
-            raise _wrong(f"{path}: categories", "the keypoints of one category", f"{len(names)}")
-        chosen = set(people)
-    others = [each.get("id", ()) for n, each in enumerate(given) if names.get(n) not in chosen]
-    return [name for each in chosen for name in each], others if chosen else []
+    lists = [each.get("keypoints") for each in given]
+    names = [tuple(map(str, each)) if isinstance(each, list) else () for each in lists]
+    of: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for own, each in zip(names, given, strict=True):
+        of.setdefault(own, []).append(each)
+    nameless = of.pop((), [])
+    if not of:
+        return _Categories()
+    chosen = [key for key in of if any(each.get("name") == "person" for each in of[key])]
+    chosen = list(of) if len(of) == 1 else chosen
+    if len(chosen) != 1:
+        count = sum(map(len, of.values()))
+        raise _wrong(f"{path}: categories", "the keypoints of one category", f"{count}")
+    people = of.pop(chosen[0])
+    called = ", ".join(str(each.get("name", each.get("id"))) for each in people)
+    others = [each.get("id", ()) for each in chain.from_iterable(of.values())]
+    return _Categories(chosen[0], called, others, [each.get("id", ()) for each in nameless])
 
 
 def _model_names(about: object) -> list[str]:

@@ -244,18 +244,19 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
             todo = "Estimate poses with a model of COCO, or write COCO's joints."
             raise InputError(where, "the 17 joints in COCO's order", found, todo)
     misfit = misfits[orders.index(chosen)]
-    # Landmarks of a face, such as 300-W's, are 68 points too.
-    is_doubtful = chosen.name in ("MPI-15", "HALPE-68") or (
-        named is None and (stated or "").strip() != ""
-    )
-    if (len(points) and is_doubtful and not misfit <= plausible) or (
-        len(points) >= fewest and misfit > wrong
+    is_doubtful = chosen.name == "MPI-15" or (named is None and (stated or "").strip() != "")
+    # Landmarks of a face, such as 300-W's, are 68 points too, of which none is hidden.
+    most = plausible if is_doubtful or chosen.name == "HALPE-68" else wrong
+    is_unknown = is_doubtful and np.isnan(misfit)
+    if (is_unknown and len(points)) or (
+        misfit > most and len(points) >= (1 if most == plausible else fewest)
     ):
         model = f" of model {stated.strip()!r:.40}" if stated and named is None else ""
+        found = f"others: the points{model} have another order"
         raise InputError(
             where,
             expected=f"limbs of usual lengths in the order of {chosen.name}",
-            found=f"others: the points{model} have another order",
+            found=f"too few limbs to tell the points{model}" if is_unknown else found,
             todo="Name the points in `categories` of COCO's JSON, or in Pose2Sim state pose_model: "
             + ", ".join(MODELS),
         )

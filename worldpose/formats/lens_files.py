@@ -243,7 +243,7 @@ def _read_named(file: Path) -> list[tuple[str, dict[str, Any]]] | None:
         return None
     content = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
     if is_kalibr(content):
-        return list(kalibr_tables(file, content))
+        return list(kalibr_tables(file, content, posed=False))
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(cameras, list):
         cameras = [(each.get("name") if isinstance(each, dict) else None, each) for each in cameras]
@@ -270,8 +270,10 @@ def is_kalibr(content: object) -> bool:
     return any("intrinsics" in each for each in cameras)
 
 
-def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the name of each camera of a camchain, and its table in the form of Anipose.
+def kalibr_tables(
+    path: Path, content: object, *, posed: bool
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the name of each camera of a camchain, and its table in Anipose's form, perhaps posed.
 
     Raises:
         InputError: the content is no camchain, or a camera has another model than the pinhole with
@@ -302,6 +304,9 @@ def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, 
             "distortions": given.get("distortion_coeffs") or [0.0] * 4,
             **({"fisheye": True} if lens == "equidistant" else {}),
         }
+        if not posed:
+            yield name, table
+            continue
         if not index and "T_cn_cnm1" in given:
             expected = "none in the first camera, from which the others are counted"
             raise calibration_error(f"{where}.T_cn_cnm1", expected, "a pose of it")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -32,7 +32,7 @@ def find_videos(
     """Return the video of each camera in a folder: a file, or a folder of numbered images.
 
     A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
-    folder of the camera, as may be its only video.
+    folder of the camera, as may be its only video, unless a file beside that folder has its name.
 
     Args:
         folder: holds them.
@@ -50,14 +50,17 @@ def find_videos(
         inside = [[place]] if _has_images(place) else _recordings_in(place)
         groups += [group for group in inside if len(group) > 1 or len(inside) == 1]
     found: dict[str, Path] = {}
+    first: dict[str, Path] = {}
     for group in groups:
         place = group[0].parent if group[0].parent != folder else group[0]
         name = camera_id(place.stem if place.is_file() else place.name)
         if name in found:
-            both = f"{found[name].relative_to(folder)} and {group[0].relative_to(folder)}"
+            if len(group) == 1 and group[0].parent != folder == first[name].parent:
+                continue
+            both = f"{first[name].relative_to(folder)} and {group[0].relative_to(folder)}"
             todo = "Name each video after its camera."
             raise InputError(str(folder), "one video of each camera", both, todo)
-        found[name] = group[0]
+        found[name] = first[name] = group[0]
         if len(group) > 1:
             if workshop is None or not _is_whole(group):
                 raise _chapters_error(folder, group)
@@ -66,14 +69,30 @@ def find_videos(
     return found
 
 
+def without_strays(
+    folder: Path, found: Mapping[str, Path], cameras: Collection[str]
+) -> dict[str, Path]:
+    """Return the videos of `find_videos` that are of cameras, perhaps not all of these cameras.
+
+    Beside videos in the folder itself, the only video of a subfolder may be anything.
+    """
+    is_mixed = any(map(is_video, folder.glob("[!.]*")))
+    return {
+        name: file
+        for name, file in found.items()
+        if name in cameras or not is_mixed or file.parent.parent != folder
+    }
+
+
 def _recordings_in(place: Path) -> list[list[Path]]:
     return _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
 
 
-def describe_unused(folder: Path) -> list[str]:
+def describe_unused(folder: Path, used: Collection[Path]) -> list[str]:
     """Return sentences about files and videos in a folder that are of no camera."""
     others: list[str] = []
     inner: list[Path] = []
+    strays: list[Path] = []
     for place in sorted(folder.glob("[!.]*")):
         if place.is_file() and not is_video(place):
             others.append(place.name)
@@ -81,10 +100,15 @@ def describe_unused(folder: Path) -> list[str]:
             inner += [each for each in place.glob("[!.]*") if each.suffix.lower() not in SUFFIXES]
         elif place.is_dir() and len(groups := _recordings_in(place)) > 1:
             inner += [group[0] for group in groups if len(group) == 1]
+        elif place.is_dir() and [*map(len, groups)] == [1] and groups[0][0] not in used:
+            strays += groups[0]
     reasons = {
         "they have no ending of a video": others,
         "a camera's folder has one video, or images": [
             f"{each.parent.name}/{each.name}" for each in sorted(inner)
+        ],
+        "videos of cameras are beside their folders": [
+            f"{each.parent.name}/{each.name}" for each in strays
         ],
     }
     return [f"left out, as {why}: {', '.join(them):.200}" for why, them in reasons.items() if them]
@@ -131,7 +155,8 @@ def require_cameras(folder: Path, found: Mapping[str, Path]) -> None:
     if len(found) < 2:
         there = ", ".join(place.name for place in sorted(folder.glob("[!.]*")))
         expected = f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)}), or "
-        todo = "Name each video after its camera."
+        todo = "Name each video after its camera, and put all into the folder itself or each into "
+        todo += "a folder of its own."
         raise InputError(str(folder), expected + "a folder of images", there or "no video", todo)
 
 

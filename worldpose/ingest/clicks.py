@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -97,18 +97,23 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
             has another size; or clicks exist already.
     """
     every = read_marked_images(file)
-    images = [image for image in every if image.points or image.lines]
     spec = read_spec(folder)
     pitch = read_pitch(folder, spec)
     if pitch is None:
         expected = "a pitch, whose markings were clicked"
         todo = "Remove the line `pitch: none`."
         raise InputError(f"{folder / 'match.yaml'}: pitch", expected, "pitch: none", todo)
+    markings = [*PitchTemplate.from_spec(pitch).marking_names, *SOCCERNET_MARKINGS]
+    every = [_leave_out_areas(image, markings) for image in every]
+    images = [image for image in every if image.points or image.lines]
     by_owner = _assign_images(file, images, spec, owner)
     report = ImportedClicks()
     unread = Counter(shape for image in every for shape in image.left_out)
     if listed := ", ".join(f"{count} {shape}" for shape, count in sorted(unread.items())):
         report.notes.append(f"shapes are left out that are no labelled points or lines: {listed}")
+    if not images:
+        todo = "Rename the labels; docs/reference/match_folder.md lists the names."
+        raise InputError(str(file), "names of markings of the pitch", listed[:200], todo)
     labels = _Labels(file, images, pitch, report)
     records: dict[str, Record] = {}
     for name, (camera, given) in by_owner.items():
@@ -143,6 +148,20 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
             draft.write_text(text + "\n", encoding="utf-8")
         report.files.append(name)
     return report
+
+
+def _leave_out_areas(image: MarkedImage, markings: Sequence[str]) -> MarkedImage:
+    """Return an image without polygons whose labels resemble no name of a marking."""
+    other = [
+        label
+        for label, _ in image.lines
+        if label in image.areas
+        and _find_name(label, markings) is None
+        and not get_close_matches(label, markings)
+    ]
+    lines = tuple(line for line in image.lines if line[0] not in other)
+    left_out = (*image.left_out, *(f"polygon of {label}" for label in other))
+    return replace(image, lines=lines, left_out=left_out)
 
 
 def _assign_images(

@@ -30,6 +30,7 @@ from worldpose.ingest.camera_videos import (
     require_cameras,
     shared_length,
     video_name,
+    without_strays,
 )
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.registration import file_state, require_settled
@@ -201,9 +202,10 @@ def detections_by_camera(
     suffixes = (".json", ".npz")
     there = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in suffixes]
     found: dict[str, Path] = {}
-    for place in [*pose_folders(folder), *(each for each in there if each.is_file())]:
-        name = camera_of(place)
-        found[place.name if name in found else name] = place  # a second one fits no camera
+    for place in [*(each for each in there if each.is_file()), *pose_folders(folder)]:
+        first = found.setdefault(camera_of(place), place)
+        if first != place:
+            left_out.notes.append(f"{place.name}: {first.name} is of the same camera; left out")
     endings = (*suffixes, "or a folder of .json")
     return pick_cameras(folder, found, cameras, calibration, endings, left_out)
 
@@ -398,6 +400,7 @@ def _import_found(
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with these videos; see `import_videos`."""
     if calibration is None:
+        found = without_strays(folder, found, ())
         require_cameras(folder, found)
     states = {file: file_state(file) for file in found.values()}
     indices = {name: index_video(file) for name, file in found.items()}
@@ -408,6 +411,7 @@ def _import_found(
         left_out = LeftOut()
         shown = {name: index.size for name, index in indices.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
+        found = without_strays(folder, found, {*cameras, *left_out})
         is_joined = any(not file.is_relative_to(folder) for file in found.values())
         if found.keys() - left_out.keys() != cameras.keys() and not is_joined:
             find_videos(folder)  # raises for chapters
@@ -421,7 +425,7 @@ def _import_found(
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)
-    notes += describe_unused(folder)
+    notes += describe_unused(folder, found.values())
     sizes = {name: index.size for name, index in indices.items()}
     count = shared_length(map(len, clocks.values()))
     spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)

@@ -33,6 +33,7 @@ from worldpose.ingest.camera_videos import (
     fit_to_video,
     require_cameras,
     shared_length,
+    without_strays,
 )
 from worldpose.ingest.importing import (
     Placing,
@@ -86,7 +87,8 @@ def import_pose2sim(
     calibration = _find_pose2sim_calibration(project)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = {camera_of(each): each for each in pose_folders(folder)}
-    films = find_videos(project / "videos")
+    films_in = project / "videos"
+    films = find_videos(films_in)
     if not places and not films:
         expected = f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4"
         todo = "Run Pose2Sim.poseEstimation() first, or add the videos."
@@ -94,23 +96,26 @@ def import_pose2sim(
     known = {file: index_video(file) for file in films.values()}
     left_out = LeftOut()
     cameras: dict[str, CameraCalibration] = {}
+    if calibration is not None:
+        shown = {name: known[file].size for name, file in films.items()}
+        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
+    films = without_strays(films_in, films, {*cameras, *left_out})
+    used = set(films.values())
     if calibration is None:
         notes = [
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        require_cameras(project / "videos", films)
-        names, source = list(films), project / "videos"
+        require_cameras(films_in, films)
+        names, source = list(films), films_in
     else:
-        shown = {name: known[file].size for name, file in films.items()}
-        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
         places = {name: each for name, each in places.items() if name not in left_out}
         films = {name: each for name, each in films.items() if name not in left_out}
     is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
-    poses = _assign(places, names, source, notes) if places else {}
-    videos = _assign(films, names, source, notes) if films else {}
+    poses = _assign(folder, places, names, source, notes) if places else {}
+    videos = _assign(films_in, films, names, source, notes) if films else {}
     names = [name for name in names if name in (poses or videos)]
     cameras = {name: camera for name, camera in cameras.items() if name in names}
     videos = {name: file for name, file in videos.items() if name in names}
@@ -122,7 +127,7 @@ def import_pose2sim(
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
     if clocks:
-        notes += describe_videos(videos, indices, clocks) + describe_unused(project / "videos")
+        notes += describe_videos(videos, indices, clocks) + describe_unused(films_in, used)
     length = shared_length(map(len, clocks.values()))
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
@@ -286,9 +291,9 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
 
 
 def _assign(
-    named: dict[str, Path], cameras: list[str], calibration: Path, notes: list[str]
+    folder: Path, named: dict[str, Path], cameras: list[str], calibration: Path, notes: list[str]
 ) -> dict[str, Path]:
-    """Return the folder or file of each camera: by name, or else by the last number in its name.
+    """Return the place in a folder of each camera: by name, or else by the last number in its name.
 
     Names without a number are in alphabetical order.
     """
@@ -296,15 +301,15 @@ def _assign(
     both = [camera for camera in cameras if camera in named]
     if len(both) > 1 or len(both) == len(cameras):
         if lacking := [camera for camera in cameras if camera not in named]:
-            notes.append(f"{places[0].parent.name} lacks {', '.join(lacking)}")
+            notes.append(f"{folder.name} lacks {', '.join(lacking)}")
         if others := [place.name for name, place in named.items() if name not in both]:
             notes.append(f"{calibration.name} lacks {', '.join(others)}")
         return {camera: named[camera] for camera in both}
     if len(named) != len(cameras):
         expected = f"one for each camera in {calibration.name}: {', '.join(cameras)}"
         found = ", ".join(place.name for place in places)
-        raise InputError(str(places[0].parent), expected, found, "Name them after the cameras.")
+        raise InputError(str(folder), expected, found, "Name them after the cameras.")
     pairs = dict(zip(cameras, by_last_number(named).values(), strict=True))
     listed = ", ".join(f"{place.name} is {camera}" for camera, place in pairs.items())
-    notes.append(f"{places[0].parent.name}: in the order of the names, {listed}")
+    notes.append(f"{folder.name}: in the order of the names, {listed}")
     return pairs

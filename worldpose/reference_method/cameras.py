@@ -49,14 +49,7 @@ class TensorCameras:
         Raises:
             InputError: a lens has more than k1, k2 and k3.
         """
-        brown = np.asarray(camera.lens_model == LensModel.BROWN)
-        if not brown.all() or np.nan_to_num(camera.distortion[:, (2, 3, 5, 6, 7)]).any():
-            raise InputError(
-                "method=paper",
-                expected="lenses with k1, k2 and k3 alone, as the paper's",
-                found="tangential or other coefficients",
-                todo="Use method=worldpose for this camera.",
-            )
+        require_radial(camera)
         parts = [
             np.zeros_like(camera.center),
             camera.center,
@@ -95,6 +88,18 @@ class TensorCameras:
     def project(self, points: Tensor, of: Tensor | slice = slice(None)) -> Tensor:
         """Return the pixels of points (..., 3) [m] in cameras, which broadcast."""
         return project(points, self.values[of], self.rotation[of], self.aspect[of])
+
+
+def require_radial(camera: Camera) -> None:
+    """Raise InputError if a lens in a batch (cameras,) has more than k1, k2 and k3."""
+    brown = np.asarray(camera.lens_model == LensModel.BROWN)
+    if not brown.all() or np.nan_to_num(camera.distortion[:, (2, 3, 5, 6, 7)]).any():
+        raise InputError(
+            "method=paper",
+            expected="lenses with k1, k2 and k3 alone, as the paper's",
+            found="tangential or other coefficients",
+            todo="Use method=worldpose for this camera.",
+        )
 
 
 def project(points: Tensor, values: Tensor, rotation: Tensor, aspect: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from rigs import errors
 from worldpose.bundle_adjustment.clip import Clicks
 from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
+from worldpose.errors import InputError
 
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 
@@ -85,3 +86,23 @@ def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case)
     assert not adjusted.accepted.any()
     np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
     assert all(reason in said for said in adjusted.reasons)
+
+
+@pytest.mark.parametrize("evidence", ["markings_and_players", "markings"])
+def test_the_papers_adjustment_finds_the_cameras_of_exact_markings_and_people(clip, evidence):
+    pytest.importorskip("torch")
+    from worldpose.bundle_adjustment.paper_variant import adjust_unguarded
+
+    made, true, _ = clip(noise=0.0, clicked=14)
+    exact = tuple(
+        replace(one, points_image=true[c].project(one.points_world))
+        for c, one in enumerate(made.clicks)
+    )
+    made = replace(made, clicks=exact)
+    settings, frames = BundleAdjustmentSettings(evidence=evidence), np.arange(8)
+    found = adjust_unguarded(made, settings, frames, frames)
+    assert found.accepted.all()
+    np.testing.assert_allclose(found.cameras.center, true.center, atol=1e-3)
+    tangential = replace(made.cameras, distortion=made.cameras.distortion + 0.001)
+    with pytest.raises(InputError, match="tangential"):
+        adjust_unguarded(replace(made, cameras=tangential), settings, frames, frames)

@@ -218,6 +218,9 @@ def test_landmarks_of_two_faces_are_no_bodies(tmp_path):
     file.write_text(json.dumps([{"image_id": n, "keypoints": row} for n in (0, 1)]))
     with pytest.raises(InputError, match="limbs of usual lengths in the order of HALPE-68"):
         read_coco_results(file)
+    row[3 * 11 : 3 * 17] = [0.0] * 18  # no hips and legs in the image
+    file.write_text(json.dumps([{"image_id": 0, "keypoints": row}]))
+    assert read_coco_results(file).kind == "HALPE-68"
 
 
 @pytest.mark.parametrize(

@@ -97,6 +97,7 @@ def test_a_camchain_counts_by_the_numbers_of_its_cameras(tmp_path):
     path.write_text("\n".join(lines[5:]) + "\n")
     with pytest.raises(InputError, match=r"cam1\.T_cn_cnm1: expected none in the first camera"):
         read_cameras(path)
+    assert len(read_lenses([path], None, dict.fromkeys(found, (1280, 720)))) == 11
 
 
 def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):

@@ -90,22 +90,27 @@ def test_data_set_annotations_may_carry_visibility(read):
 
 
 def test_annotations_are_of_the_category_of_people_with_its_names(tmp_path):
+    """A category that names no points has people if it has as many."""
     people = {"id": 1, "name": "person", "keypoints": list(COCO17)}
     others = [
-        {"id": 0, "name": "ball"},
+        {"id": 0, "name": "referee", "keypoints": []},
         {"id": 2, "name": "mascot", "keypoints": list(COCO17[::-1])},
         {"id": 5, "name": "post", "keypoints": ["top"]},
     ]
     marks = [person(category_id=1), person(category_id=2), person(category_id=0)]
-    marks += [{"image_id": 0, "category_id": 5, "keypoints": [1, 1, 2]}]
+    marks += [{"image_id": 0, "category_id": n, "keypoints": [1, 1, 2]} for n in (0, 5)]
     file = tmp_path / "cam1.json"
     file.write_text(
         json.dumps({"annotations": marks, "categories": [others[0], people, *others[1:]]})
     )
     found = read_coco_results(file)
     assert found.kind == "COCO-17"
-    assert np.isfinite(found.people.confidence).any(axis=-1).sum() == 1
+    assert np.isfinite(found.people.confidence).any(axis=-1).sum() == 2
     assert (found.changes.foreign, found.changes.pointless) == (3, 0)
+    foreign = {"annotations": [person(category_id=2)], "categories": [people, others[1]]}
+    file.write_text(json.dumps(foreign))
+    with pytest.raises(InputError, match="1 annotations, all of categories other than person"):
+        read_coco_results(file)
 
 
 def test_a_confidence_just_below_zero_is_a_missing_joint(read):

@@ -303,7 +303,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
 LEFT_OUT = {
     "cvat.xml": """<annotations><image name="east.png" width="1920" height="1080">
 <points label="corner_left_near" points="100.5,200.5"/><box label="b"/>
-<ellipse label="center_circle"/>
+<polygon label="adboard" points="1,2;3,4;5,6"/><ellipse label="center_circle"/>
 <polygon label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
     "studio.json": json.dumps(
         [
@@ -348,7 +348,7 @@ LEFT_OUT = {
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("cvat.xml", "lines: 1 box of b, 1 ellipse of center_circle"),
+        ("cvat.xml", "lines: 1 box of b, 1 ellipse of center_circle, 1 polygon of adboard"),
         ("studio.json", "lines: 1 brushlabels of halfway_line"),
         (
             "coco.json",

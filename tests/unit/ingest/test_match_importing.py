@@ -176,16 +176,19 @@ def test_cameras_and_videos_without_each_other_are_left_out_by_name(tmp_path, so
     assert [camera.id for camera in run(source, tmp_path / "n").cameras] == ["right", "left"]
 
 
-def test_openpose_folders_of_some_cameras_and_folders_of_others_are_read(tmp_path, make_camera):
+def test_openpose_folders_are_read_beside_files_and_folders_of_others(tmp_path, make_camera):
     calibration = calibrate(tmp_path, make_camera, ["one", "two", "three"])
     for name in ("one", "two"):
         (tmp_path / "d" / f"{name}_json").mkdir(parents=True)
         people = json.dumps({"people": [{"pose_keypoints_2d": [300.0, 300.0, 0.9] * 17}]})
         (tmp_path / "d" / f"{name}_json" / "0003.json").write_text(people)
     (tmp_path / "d" / "images").mkdir()
+    (tmp_path / "d" / "three").mkdir()
+    (tmp_path / "d" / "three" / "settings.json").write_text("{}")
+    (tmp_path / "d" / "three.json").write_text(json.dumps(results(3)))
     spec, notes = import_match(calibration, tmp_path / "d", 25.0, tmp_path / "m")
-    assert [camera.id for camera in spec.cameras] == ["one", "two"]
-    assert notes[-1] == f"camera three is left out: {tmp_path / 'd'} has no file of it"
+    assert [camera.id for camera in spec.cameras] == ["one", "two", "three"]
+    assert "three: three.json is of the same camera; left out" in notes
 
 
 def test_a_camera_without_a_common_frame_is_said(tmp_path, source):

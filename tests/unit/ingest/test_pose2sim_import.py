@@ -102,6 +102,17 @@ def test_a_resized_video_scales_the_calibration(trial, tmp_path):
     )
 
 
+def test_a_calibrated_camera_without_a_video_is_named_with_the_folder_of_videos(trial, tmp_path):
+    film(trial, (1088, 1920))
+    cameras = {name: camera(name, x) for x, name in enumerate((*CAMERAS, "cam03"))}
+    write_calibration_toml(trial / "calibration" / "Calib.toml", cameras)
+    for name in CAMERAS:
+        (trial / "videos" / name).mkdir()
+        (trial / "videos" / f"{name}.mp4").rename(trial / "videos" / name / "take.mp4")
+    _, notes = import_pose2sim(trial, tmp_path / "m")
+    assert "videos lacks cam03" in notes
+
+
 XCP = """<Cameras><Camera DEVICEID="{}" ISDV="1" SENSOR_SIZE="1088 1920"><KeyFrames>
 <KeyFrame FOCAL_LENGTH="1500" ORIENTATION="0 0 0 1" POSITION="{} 0 0" PRINCIPAL_POINT="540 960"
  VICON_RADIAL="0 0"/></KeyFrames></Camera>{}</Cameras>"""

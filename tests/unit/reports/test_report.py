@@ -77,6 +77,8 @@ def test_units_say_what_happened_to_them():
 
 
 def test_every_score_has_a_meaning():
+    fields = {**Evaluation.model_fields, **CameraErrors.model_fields}
+    assert all(each.title and each.description for each in fields.values())
     errors = CameraErrors(ground_error_p95_m=0.25, coverage=0.5)
     scores = Evaluation(g_mpjpe_mm=80.04, cameras=CameraEvaluation(broadcast=errors))
     assert [row[:3] for row in score_rows(scores)] == [

@@ -103,7 +103,7 @@ def test_folders_of_images_are_videos_of_cameras(tmp_path):
 
 def test_the_only_video_of_a_folder_is_its_camera_and_the_rest_is_named(tmp_path):
     videos = tmp_path / "videos"
-    film(videos, ("cam01",), (0,))
+    film(videos / "cam01", ("video",), (0,))
     film(videos / "cam02", ("video",), (0,))
     film(videos / "cam03", ("video",), (0,))
     film(videos / "cam04", ("a", "b"))
@@ -111,10 +111,14 @@ def test_the_only_video_of_a_folder_is_its_camera_and_the_rest_is_named(tmp_path
     assert [each.id for each in spec.cameras] == ["cam01", "cam02", "cam03"]
     assert len(set(read_match(tmp_path / "m").videos.values())) == 3
     assert "has one video, or images: cam04/a.MP4, cam04/b.MP4" in str(notes)
-    film(tmp_path / "more", ("cam02",), (0,))
-    (tmp_path / "more" / "cam02.MP4").rename(videos / "cam02.mp4")
-    with pytest.raises(InputError, match=r"cam02\.mp4 and cam02/video\.MP4"):
-        find_videos(videos)
+    film(tmp_path / "more", ("cam02", "cam05"))
+    for file in (tmp_path / "more").iterdir():
+        file.rename(videos / file.name)
+    spec, notes = import_videos(None, videos, tmp_path / "n")
+    assert [each.id for each in spec.cameras] == ["cam02", "cam05"]
+    strays = ", ".join(f"cam0{n}/video.MP4" for n in (1, 2, 3))
+    assert f"left out, as videos of cameras are beside their folders: {strays}" in notes
+    assert read_match(tmp_path / "n").videos["cam02"].suffix == ".MP4"
 
 
 def test_images_that_begin_at_other_numbers_and_what_is_beside_them_are_said(tmp_path):

@@ -47,6 +47,7 @@ class MarkedImage:
         points: label and (2,) pixel of every click, in the order of the file.
         lines: label and (points, 2) pixels of every drawn line.
         answers: people who marked the image, of whom one is read.
+        areas: labels of lines that are polygons, which may outline other things than markings.
         left_out: kind and label of every shape that is not read.
     """
 
@@ -55,6 +56,7 @@ class MarkedImage:
     points: tuple[tuple[str, Floats], ...]
     lines: tuple[tuple[str, Floats], ...]
     answers: int = 1
+    areas: frozenset[str] = frozenset()
     left_out: tuple[str, ...] = ()
 
     def of_size(self, size: tuple[int, int]) -> MarkedImage:
@@ -109,6 +111,7 @@ def _marked(
     """Return an image with the points and lines among labelled shapes of CVAT."""
     points: list[tuple[str, Floats]] = []
     lines: list[tuple[str, Floats]] = []
+    areas: list[str] = []
     left_out: list[str] = []
     for label, shape in shapes:
         if shape.tag in ("box", "ellipse", "cuboid", "mask") and shape.get("outside") != "1":
@@ -124,11 +127,13 @@ def _marked(
             points += [(label, pixel) for pixel in pixels]
         else:
             lines.append((label, pixels))
+            areas += [label] * (shape.tag == "polygon")
     try:
         width, height = (int(side or "") for side in size)
     except ValueError:
         raise ContentError(f"{name}: an image without width and height") from None
-    return MarkedImage(name, (width, height), tuple(points), tuple(lines), left_out=tuple(left_out))
+    marked = MarkedImage(name, (width, height), tuple(points), tuple(lines))
+    return replace(marked, areas=frozenset(areas), left_out=tuple(left_out))
 
 
 def _read_tracks(root: Element) -> Iterator[MarkedImage]:
@@ -227,7 +232,8 @@ def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
         points = ((label, at[0]) for kind, label, at in shapes if kind == "keypointlabels")
         lines = ((label, at) for kind, label, at in shapes if kind != "keypointlabels")
         size = sizes.pop() if sizes else None
-        yield MarkedImage(name, size, tuple(points), tuple(lines), len(answers), left_out)
+        areas = frozenset(label for kind, label, _ in shapes if kind == "polygonlabels")
+        yield MarkedImage(name, size, tuple(points), tuple(lines), len(answers), areas, left_out)
 
 
 def _describe_other(region: dict[str, Any]) -> str:
