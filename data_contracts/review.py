@@ -107,17 +107,23 @@ class Sighting(Record):
     """Its index among the camera's detections of the frame; a free one for an added detection."""
 
 
+Box = tuple[PixelCoordinate, PixelCoordinate, PixelCoordinate, PixelCoordinate]
+"""x0, y0, x1, y1 [px]."""
+
+
 class DeletedDetection(Sighting):
     """A detection that is no person of the match."""
 
     kind: Literal["deleted_detection"] = "deleted_detection"
+    was: Box | None = None
+    """Its box [px]; None in entries without it, which delete whatever has the index."""
 
 
 class AddedDetection(Sighting):
     """A person that the detector missed."""
 
     kind: Literal["added_detection"] = "added_detection"
-    box: tuple[PixelCoordinate, PixelCoordinate, PixelCoordinate, PixelCoordinate]
+    box: Box
     """x0, y0, x1, y1 [px]."""
     keypoints: tuple[Pixel | None, ...] = Field(default=(None,) * 17, min_length=17, max_length=17)
     """[px], in the order of COCO-17; None for an invisible joint."""

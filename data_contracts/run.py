@@ -89,6 +89,8 @@ class Reservation(Record):
     """Name of the run's machine."""
     pid: ProcessId
     """Process id on that machine."""
+    process: str = ""
+    """The machine's boot, and the process's start since then; empty where neither is told."""
 
 
 class WaitingUnit(Record):

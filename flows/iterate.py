@@ -117,12 +117,14 @@ def _pass(
     request: RunRequest,
     machines_for: Callable[[Iterable[PlannedUnit]], RunRequest],
 ) -> Iteration:
-    """Return the run that has all results of an iteration, or a new run."""
+    """Return the complete or latest run that has all results of an iteration, or a new run."""
     latest = latest_run(store, match.match_id)
     gatekeeper = Gatekeeper(store, match, request.gate_policy(latest))
     plan = plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
     record = _recorded_run(store, match, plan)
-    if record is None:
+    is_latest = record is not None and latest is not None and record.run_id == latest.run_id
+    # Questions and failures are those of the latest run.
+    if record is None or (record.state != "complete" and not is_latest):
         reporter().say(f"iteration {request.iteration}")
         machines = machines_for(plan.missing)
         record = run_match(store, match, replace(machines, iteration=request.iteration))

@@ -33,6 +33,7 @@ from flows.method import METHOD
 from flows.registering import open_for_review
 from flows.results.timings import Cost
 from flows.review.descriptions import is_first_click
+from flows.review.identities import lost_names
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import reviews_of, still_waiting
 from flows.run_record import latest_run, runs_at_work
@@ -40,14 +41,14 @@ from flows.run_status import run_status
 from flows.settings import resolve
 from flows.stage import Match
 from worldpose.body.body_file import body_folder
-from worldpose.errors import InputError, StoreError, WorldposeError
+from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
 from worldpose.review.journal import last_decision, read_journal, requests_by_id
 from worldpose.store.blobs import changed_at
 from worldpose.store.documents import seal, unseal
 from worldpose.store.paths import record_path, registration_path, summary_path
 from worldpose.store.recipes import libraries
 from worldpose.store.runs import run_order
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 PAGE: Final = 50
 """Matches of a page."""
@@ -312,13 +313,14 @@ def _summarize(store: Store, draft: MatchSummary) -> MatchSummary:
     except (OSError, WorldposeError) as error:  # a setting can name a missing file
         now = describe_problem(error)
     first = sum(map(is_first_click, match.corrections))
+    lost = 0 if latest is None else len(lost_names(Run(store, latest)))
     found |= {
         "waiting": tuple(_questions(store, match, latest)),
         "to_click": match.folder.to_click,
         "has_image": bool({*match.folder.stills, *match.folder.videos}),
         "corrections": len(match.corrections) - first,
         "first_clicks": first,
-        "outdated": len(match.stale),
+        "outdated": len(match.stale) + lost,
         "damage": match.journal.damage,
         "settings": resolve(match.layers).overrides,
         "is_settled": _is_settled(store, match_id),
@@ -398,7 +400,12 @@ def _result(
     asked: Mapping[str, ReviewRequest],
 ) -> UnitSummary:
     stage, _, unit = name.partition("/")
-    manifest = store.manifest(run.match_id, stage, unit, run.results[name])
+    try:
+        manifest = store.manifest(run.match_id, stage, unit, run.results[name])
+    except CorruptionError:
+        raise
+    except StoreError:  # a run computes it again
+        return UnitSummary(unit=unit, state="failed", why="its result was withdrawn or removed")
     decision = last_decision(records, name, manifest.content)
     is_approved = decision is not None and decision.verdict == "approve"
     gate = GATES.get(stage)

@@ -8,6 +8,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
+from data_contracts.pitch import PitchSpec
+from flows.layers import read_layers
 from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
@@ -16,6 +18,7 @@ from worldpose.ingest.footage import read_still, read_unit, require_footage
 from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec, require_calibrated
 from worldpose.ingest.registration import READERS, register_match
 from worldpose.ingest.validation import reachable
+from worldpose.review.journal import read_journal
 from worldpose.store.paths import is_name
 from worldpose.store.store import Store
 
@@ -68,6 +71,40 @@ def open_match(store: Store, match_id: str) -> Match:
 def open_for_review(store: Store, match_id: str) -> Match:
     """Open a registered match like `open_match`, even if cameras are missing."""
     return register(store, _registered_folder(store, match_id), unfinished=True)[0]
+
+
+def open_stored(store: Store, name: str) -> Match:
+    """Open a registered match, given by folder or id, to show its results.
+
+    If its folder is away or invalid, the match is as the project knows it: without images and
+    clicks.
+
+    Raises:
+        InputError: there is no such match.
+    """
+    registration = find_registration(store, name)
+    match_id = registration.spec.match_id
+    try:
+        return open_for_review(store, match_id)
+    except (InputError, OSError):
+        spec, pitch = registration.spec, _pitch_of_run(store, match_id)
+        paths = [Path(registration.folder, file.path) for file in registration.files]
+        given = {path.stem: path for path in paths if path.parent.name == "detections"}
+        folder = MatchFolder(Path(registration.folder), spec, {}, given, pitch, {}, {}, {}, {})
+        journal, layers = read_journal(store, match_id), read_layers(store, spec)
+        return Match(folder, registration, journal, layers=layers)
+
+
+def _pitch_of_run(store: Store, match_id: str) -> PitchSpec | None:
+    """Return the pitch that the latest run used; None if none of its results has one."""
+    results = store.run(match_id).results if store.runs(match_id) else {}
+    for name, key in results.items():
+        place = (match_id, *name.split("/", 1), key)
+        if name.startswith(("static_calibration/", "broadcast_calibration/")) and store.has(*place):
+            pitch = store.manifest(*place).recipe.sources.get("pitch")
+            if pitch is not None:
+                return PitchSpec.model_validate(pitch)
+    return None
 
 
 def _registered_folder(store: Store, match_id: str) -> Path:

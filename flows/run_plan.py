@@ -21,6 +21,7 @@ from flows.stage import Match, Stage
 from flows.usability import usable_limits
 from worldpose.errors import StoreError, UsageError
 from worldpose.sources import code_version
+from worldpose.store.paths import ResultId
 from worldpose.store.recipes import libraries, recipe_key
 from worldpose.store.store import Store
 
@@ -107,20 +108,23 @@ class RunPlan:
     ) -> Self:
         """Return the plan of a run of `stages` before its first stage.
 
-        A run from the method's first stage uses the previous iteration with its own settings. Any
-        other run continues the latest run: it takes that run's results of earlier stages, stale or
-        not, and the previous iteration that they were computed from.
+        A part of the method continues the latest run's iteration, or begins the first one if the
+        previous iteration's results are gone, as after an edit. A run from the method's first stage
+        uses the previous iteration with its own settings. Any other run takes the latest run's
+        results of earlier stages, stale or not, and the previous iteration that they come from.
         """
         store, match = gatekeeper.store, gatekeeper.match
         results: dict[str, str] = {}
         before: Mapping[str, str] | None = None
         earlier = METHOD[: METHOD.index(stages[0])]
+        is_part = stages != METHOD
+        if is_part:
+            iteration = 1 if latest is None else latest.iteration
         if not earlier:
             before = results_before(store, match, overrides, iteration)
-        elif latest is None:
-            iteration = 1
-        else:
-            iteration = latest.iteration
+            if is_part and before is not None and lost_inputs(store, match, stages, before):
+                iteration, before = 1, None
+        elif latest is not None:
             names = {stage.name for stage in earlier}
             results = {
                 name: key for name, key in latest.results.items() if name.partition("/")[0] in names
@@ -225,7 +229,12 @@ class RunPlan:
         """Return whether the latest run's record equals that of a run made now."""
         if latest is None or latest.failed or latest.state == "failed" or self.missing:
             return False
-        if self.overrides != latest.overrides:  # the next run is to know them
+        earlier = {stage.name for stage in METHOD[: METHOD.index(self.stages[0])]}
+        ours, theirs = (
+            {name: values for name, values in each.items() if name not in earlier}
+            for each in (self.overrides, latest.overrides)
+        )
+        if ours != theirs:  # the next run is to know them
             return False
         if latest.usability.limits != usable_limits(self.match):  # it judges by them
             return False
@@ -286,6 +295,25 @@ def results_before(
         return None
     planned = plan_run(store, match, overrides, iteration=iteration - 1)
     return {unit.name: unit.key for unit in planned}
+
+
+def lost_inputs(
+    store: Store, match: Match, stages: tuple[Stage, ...], before: Mapping[str, str]
+) -> list[str]:
+    """Return the inputs of stages from the previous iteration that the store lacks."""
+    used = {
+        name
+        for each in stages
+        for unit in each.units(match)
+        for name in each.previous_pass_inputs(match, unit)
+    }
+    return [
+        name
+        for name in sorted(used & before.keys())
+        if not store.blobs.exists(
+            ResultId.from_name(match.match_id, name, before[name]).manifest_path
+        )
+    ]
 
 
 def without_waiting(results: Mapping[str, str], waiting: Iterable[WaitingUnit]) -> dict[str, str]:

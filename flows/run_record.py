@@ -27,7 +27,7 @@ from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD, unit_order
 from flows.progress import reporter
 from flows.review.edit_conflicts import EditedMeanwhileError
-from flows.run_plan import PlannedUnit, RunPlan, without_waiting
+from flows.run_plan import PlannedUnit, RunPlan, lost_inputs, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
@@ -36,6 +36,7 @@ from tasks.tracing import add_unit_span, stage_span
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.recipes import libraries
+from worldpose.store.runs import identify_process
 from worldpose.store.store import Store
 
 ComputeUnits = Callable[
@@ -67,7 +68,7 @@ def describe_end(record: RunRecord) -> str:
 
 
 CLOCK_SECONDS: Final = 5.0
-"""Tolerance between the clocks of a process table and of records [s]."""
+"""Tolerance between the clocks of a process table and of records without `process` [s]."""
 
 
 def runs_at_work(store: Store, match_id: str) -> tuple[Reservation, ...]:
@@ -78,8 +79,10 @@ def runs_at_work(store: Store, match_id: str) -> tuple[Reservation, ...]:
             return False
         try:  # a later process may have got the number of a killed run's process
             process = psutil.Process(run.pid)
-            is_older = process.create_time() <= run.started_at.timestamp() + CLOCK_SECONDS
-            return bool(is_older and process.status() != psutil.STATUS_ZOMBIE)
+            is_same = identify_process(run.pid) == run.process
+            if not run.process:
+                is_same = process.create_time() <= run.started_at.timestamp() + CLOCK_SECONDS
+            return bool(is_same and process.status() != psutil.STATUS_ZOMBIE)
         except psutil.Error:
             return False
 
@@ -366,6 +369,7 @@ class RunLog:
         if self.latest is not None:
             for stage in METHOD[:first]:
                 settings[stage.name] = self.latest.settings[stage.name]
+                overrides.pop(stage.name, None)
                 if stage.name in self.latest.overrides:
                     overrides[stage.name] = self.latest.overrides[stage.name]
         return settings, overrides
@@ -398,17 +402,7 @@ def _require_inputs(
     store: Store, match: Match, stages: tuple[Stage, ...], before: Mapping[str, str]
 ) -> None:
     """Refuse an iteration if the previous one has other results than its inputs."""
-    used = {
-        name
-        for each in stages
-        for unit in each.units(match)
-        for name in each.previous_pass_inputs(match, unit)
-    }
-    lost = []
-    for name in sorted(used & before.keys()):
-        stage, _, unit = name.partition("/")
-        if not store.has(match.match_id, stage, unit, before[name]):
-            lost.append(name)
+    lost = lost_inputs(store, match, stages, before)
     if lost:
         raise EditedMeanwhileError(
             f"another iteration of {match.match_id}",

@@ -217,8 +217,8 @@ def run_status(
     is_recorded = False
     for number in range(1, passes + 1):
         plan = plan_ahead(gatekeeper, stages, found.overrides, latest, number)
-        is_kept = number == latest.iteration
-        record = latest if is_kept else _run_of_iteration(store, latest, number)
+        is_kept = plan.iteration == latest.iteration
+        record = latest if is_kept else _run_of_iteration(store, latest, plan.iteration)
         is_recorded = is_recorded or plan.is_recorded_by(latest)
         stale = _stale_units(store, plan, record, hopeless)
         # Only the results of other iterations count: their records can have other settings.

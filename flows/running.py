@@ -17,7 +17,7 @@ from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.settings import IterationCount
 from flows.gates import Gatekeeper
 from flows.layers import ENVIRONMENT, check_general, write_layer
-from flows.method import task_modules
+from flows.method import METHOD, task_modules
 from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
     keep_workers,
@@ -29,7 +29,7 @@ from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.overview import make_summary
 from flows.progress import reporter
-from flows.run_plan import PlannedUnit, plan_ahead
+from flows.run_plan import PlannedUnit, plan_ahead, plan_run
 from flows.run_record import RunLog, expected_work, latest_run
 from flows.settings import Overrides, ResolvedSettings, as_text, flatten, resolve, selected_stages
 from flows.stage import Match
@@ -62,8 +62,8 @@ class RunRequest:
             work for them.
         gates: when results need review; None = as the layers say, or as in the latest run while
             that waits, or never.
-        iteration: iteration number, unless `from_stage` continues the latest run's; the previous
-            iterations have their results.
+        iteration: iteration number of the whole method, whose previous iterations have results; a
+            part continues the latest run's.
         time_limits: stage to the time limit of a unit [min], if not the default.
         security: TLS certificate for the scheduler at `dask`; None = Dask's configuration.
         default_settings: whether the match forgets what earlier runs stated.
@@ -110,7 +110,7 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     """
     if request.is_settled:
         return match, request
-    is_part = request.from_stage is not None or request.until_stage is not None
+    is_part = selected_stages(request.from_stage, request.until_stage) != METHOD
     if request.iterations not in (None, 1):
         require_whole(request)
     before = match.layers
@@ -140,10 +140,13 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
         # Another shell, or the service, may not have the variable.
         values = {**layers[-1].values, "body_folder": folder.values["body_folder"]}
         layers = (*layers[:-1], replace(layers[-1], values=values))
+    settled = replace(match, layers=layers)
     if layers[-1].values != match.layers[-1].values:
+        stages = selected_stages(None, request.until_stage)
+        plan_run(store, settled, found.overrides, stages)  # a value that no run can use is not kept
         write_layer(store, layers[-1].name, layers[-1].values)
     _report_settings(found, {*stated}, latest_run(store, match.match_id))
-    return replace(match, layers=layers), replace(
+    return settled, replace(
         request,
         settings=found.overrides,
         gates=request.gates or found.general.gates,
@@ -158,7 +161,7 @@ def require_whole(request: RunRequest) -> None:
     Raises:
         UsageError: only a part of the method was requested.
     """
-    if request.from_stage is not None or request.until_stage is not None:
+    if selected_stages(request.from_stage, request.until_stage) != METHOD:
         raise UsageError(
             "--iterations",
             expected="the whole method",

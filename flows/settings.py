@@ -222,9 +222,7 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
                 todo="Write it as in: --set triangulation.min_views=3.",
             )
         _place(f"--set {assignment}", stage_name, list(by_name))
-        value = parse_value(text)
-        if stage_name == "detection":
-            value = _absolute_weights(value)
+        value = parse_value(text, name)
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:
@@ -233,11 +231,16 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
 
 
 def parse_value(text: str, name: str = "") -> JsonValue:
-    """Return the value of a setting, given as JSON or else as text; venues can be numbers."""
+    """Return the value of a setting, given as JSON or else as text.
+
+    Venues can be numbers; files of weights of `detection` get absolute paths.
+    """
     try:
         value: JsonValue = json.loads(text)
     except (ValueError, RecursionError):  # not JSON, or unclosed brackets
-        return text
+        value = text
+    if name.startswith("detection."):
+        return _absolute_weights(value)
     return text if name == "venue" and isinstance(value, int | float) else value
 
 

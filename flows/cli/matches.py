@@ -122,7 +122,7 @@ def import_command(
         "--template": template,
         "--unit": unit,
         "--up": up,
-        "--join": join,
+        "--join": join and not videos,
     }
     given = {name for name, value in options.items() if value}
     kind = next((name for name in ALONE if name in given), None)
@@ -201,6 +201,8 @@ ALONE: Final = {
     "--zoom-table": ("with --camera-data", ()),
     "--pitch": ("with --out alone", ("--left-handed", "--template")),
     "--template": ("with --pitch", ()),
+    "--left-handed": ("with --pitch", ()),
+    "--join": ("with --videos", ()),
 }
 """Options that decide what is imported, the first given one; and the others that each may have."""
 
@@ -209,7 +211,8 @@ def _require_alone(kind: str, given: set[str]) -> None:
     """Refuse options of another import."""
     with_what, allowed = ALONE[kind]
     others = sorted(given - {kind, *allowed})
-    if others or with_what in ("with --pitch", ALONE["--camera"][0], ALONE["--zoom-table"][0]):
+    parts = ("with --pitch", "with --videos", ALONE["--camera"][0], ALONE["--zoom-table"][0])
+    if others or with_what in parts:
         raise UsageError(
             kind,
             expected=f"{kind} {with_what}",

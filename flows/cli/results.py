@@ -77,6 +77,7 @@ def export(
     from flows.results.export import LENS_ERRORS
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
+    from flows.review.identities import lost_names
 
     changed = "--filled" if filled else "--definition detector"
     if release is not None and (licence is None or filled or definition == "detector"):
@@ -101,6 +102,8 @@ def export(
         line(later, to=errors)
     for text in opened.record.usability.reservations:
         line(f"reservation: {text}", to=errors)
+    for text in lost_names(opened).values():
+        line(f"warning: {text}", to=errors)
     origin = Origin(
         opened,
         registration,
@@ -172,13 +175,17 @@ def report(
         camera: Static camera of a video; the one with most people by default.
         figures: Also write the page's figures as SVG and PDF, with their data as JSON.
     """
-    from flows.registering import find_match
+    from flows.registering import find_match, open_stored
     from flows.reports.report import write_report
     from flows.results.best_results import describe_later_run, open_results
     from flows.results.outputs import record_owner, require_own
 
     store = Store.open(project)
-    known = find_match(store, match)
+    try:
+        known = find_match(store, match)
+    except InputError as error:
+        known = open_stored(store, match)
+        line(f"warning: the report has no images: {error}", to=errors)
     clips = [clip.id for clip in known.folder.spec.clips] if videos else []
     films = [f for c in clips for f in out.parent.glob(f"{escape(out.stem)}-{c}*.mp4")]
     places = {out.parent: [out, *films]}

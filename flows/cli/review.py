@@ -16,12 +16,13 @@ from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
 from flows.review.descriptions import describe_corrections, in_words, review_json, when
+from flows.review.identities import lost_names
 from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, WorldposeError
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 commands = typer.Typer(name="review", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
@@ -100,21 +101,23 @@ def show(
         _print_review(known[request], as_json)
         return
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
+    lost = lost_names(Run(store, latest)) if latest else {}
+    applied = [each for each in opened.corrections if each.id not in lost]
+    gone = ((each, lost[each.id]) for each in opened.corrections if each.id in lost)
+    stale = [*opened.stale, *gone]
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
     if as_json:
         console.print_json(
             {
                 "match": match,
-                "corrections": [each.model_dump(mode="json") for each in opened.corrections],
-                "stale": [
-                    each.model_dump(mode="json") | {"reason": why} for each, why in opened.stale
-                ],
+                "corrections": [each.model_dump(mode="json") for each in applied],
+                "stale": [each.model_dump(mode="json") | {"reason": why} for each, why in stale],
                 "origins": origins,
                 "damage": list(opened.journal.damage),
             }
         )
         return
-    states = [*((each, "applied") for each in opened.corrections), *opened.stale]
+    states = [*((each, "applied") for each in applied), *stale]
     for correction, state in states:
         console.line(f"{correction.id}  {correction.who}, {when(correction.made_at)}")
         console.line(f"  {in_words(correction)}")

@@ -27,6 +27,7 @@ from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
 from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
+from flows.review.identities import lost_names
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
 from flows.run_record import require_no_other_run
@@ -34,7 +35,7 @@ from flows.running import RunRequest, run_match, settle
 from flows.settings import parse_overrides, selected_stages
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
     from flows.results.comparison import Mark
@@ -109,6 +110,7 @@ def run(
     seconds = time.monotonic() - started
     warned = [
         *record.warnings,
+        *lost_names(Run(store, record)).values(),
         *clock_advice(record.figures, opened.folder.spec),
         *click_advice(record.figures, record.settings),
     ]

@@ -81,11 +81,14 @@ def _origin(attributes: Mapping[Any, Any]) -> str:
 
 
 def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
-    """Return why a person should check a camera: the reason it was left out, or why it is weak."""
-    left_out = run.record.left_out.get(camera_id)
+    """Return why a person should check a camera: it was left out, failed, or is weak."""
+    left_out, unit = run.record.left_out.get(camera_id), f"static_calibration/{camera_id}"
     if left_out is not None:
         return (f"left out: {left_out}",)
-    return tuple(run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ())
+    if unit not in run:
+        failed = (each.message for each in run.record.failed if each.unit == unit)
+        return (next(failed, "not calibrated"),)
+    return tuple(run[unit].attrs.get("reasons") or ())
 
 
 def health_picture(run: Run, match: Match, clip: str) -> list[CaptionedImage]:

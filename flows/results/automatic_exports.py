@@ -6,6 +6,7 @@ from pathlib import Path
 
 from data_contracts.run import RunRecord
 from flows.layers import merge_general
+from flows.progress import reporter
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.store.store import Run, Store
@@ -14,8 +15,8 @@ from worldpose.store.store import Run, Store
 def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path]:
     """Write the exports that the layers of a match state; return their files.
 
-    Only a run that has results of its last stage is exported. Files of an earlier run of the match
-    are replaced.
+    Only a run that has results of its last stage, and people, is exported. Files of an earlier run
+    of the match are replaced.
 
     Raises:
         InputError: no folder is known, or a format needs what the run has not.
@@ -23,9 +24,12 @@ def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path
     settings = merge_general(match.layers)
     if not settings.exports or record.state not in ("complete", "partial"):
         return []
-    from flows.results.best_results import Origin  # late: few runs are exported
+    from flows.results.best_results import Origin, find_clips  # late: few runs are exported
     from flows.results.export import export
 
+    if not find_clips(record):
+        reporter().say(f"run {record.run_id} has no people yet: nothing is exported")
+        return []
     origin = Origin(Run(store, record), match.registration, None)
     folder = settings.exports_folder or f"{store.url}/exports"
     if "://" in folder:

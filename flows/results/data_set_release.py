@@ -23,6 +23,7 @@ from flows.results.dataset import check, count
 from flows.results.export import keep_run
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyModel
 from worldpose.body.occlusions import visible_shares
 from worldpose.dataset import manifest as manifests
 from worldpose.dataset.contents import camera_files
@@ -85,13 +86,17 @@ def write_data_set(
                 undo.callback(unpin_run, store.blobs, origin.spec.match_id, f"release-{name}")
         draft, truth = Path(workshop) / "public", Path(workshop) / "hidden"
         clips: dict[str, contracts.ReleasedSequence] = {}
+        models: dict[str, BodyModel] = {}
         for origin, split in origins:
             for clip in origin.clips:
                 label = f"{origin.spec.match_id}_{clip}".replace(".", "_")
                 if label in clips:
                     todo = "Name each match once, and rename clips whose names differ by dots."
                     raise _refuse(label, "one clip of this name", "two", todo)
-                clips[label] = _write_clip(origin, clip, label, split, Path(workshop), footage)
+                clips[label], model = _write_clip(
+                    origin, clip, label, split, Path(workshop), footage
+                )
+                models[model.name] = model
         clips = _name_subjects(clips, subjects)
         parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
         counted = {part: count([part]) for part in parts}
@@ -114,7 +119,7 @@ def write_data_set(
             raise wrong(f"{out}: {found.where[0]}", "no contradiction", found.says, todo)
         from worldpose.reports.data_set import data_set_page  # late: it loads matplotlib, 0.5 s
 
-        checks = {part.name: check(part, pitch=manifest.pitch) for part in parts}
+        checks = {part.name: check(part, pitch=manifest.pitch, models=models) for part in parts}
         if tested:
             checks[truth.name] = checks[truth.name].model_copy(update={"clips": {}})
         page = data_set_page(name, manifest.statistics, checks, manifest)
@@ -139,8 +144,11 @@ def _listed(folder: Path) -> tuple[StoredFile, ...]:
 
 def _write_clip(
     origin: Origin, clip: str, name: str, split: contracts.Split, root: Path, footage: FootageForm
-) -> contracts.ReleasedSequence:
-    """Write the files of one clip below `root`, the truth of a test part apart from the rest."""
+) -> tuple[contracts.ReleasedSequence, BodyModel]:
+    """Write the files of one clip below `root`, the truth of a test part apart from the rest.
+
+    Returns the entry of the clip, and its body model.
+    """
     public = root / "public" / split
     part = root / "hidden" if split == "test" else public
     model, poses, people = best_results.fitted_bodies(origin.run, clip)
@@ -154,7 +162,7 @@ def _write_clip(
         width, height = camera.image_size.reshape(-1, 2)[0].tolist()
         views[label] = width, height
         release_cameras.write_moving_camera(part / "cameras" / f"{label}.npz", camera)
-        boxes = project_people(part, name, label, views[label])
+        boxes = project_people(part, name, label, views[label], model)
         write_archive(part / "boxes" / f"{label}.npz", boxes)
         if split == "test":
             challenge.write_challenge_camera(public / f"cameras/{label}.npz", camera, 2026)
@@ -164,7 +172,7 @@ def _write_clip(
             images[label] = unit_frames(spec, view).number(spec.clips_of(view)[0].first_frame)
     found = best_results.tracked_people(origin.run, clip)[1]
     named = {person: track.name or f"{clip}/{person}" for person, track in found.items()}
-    return contracts.ReleasedSequence(
+    released = contracts.ReleasedSequence(
         split=split,
         match_id=spec.match_id,
         run_id=origin.run.record.run_id,
@@ -179,6 +187,7 @@ def _write_clip(
         footage=videos,
         first_images=images,
     )
+    return released, model
 
 
 def _write_footage(origin: Origin, view: str, out: Path, form: FootageForm) -> StoredFile:
@@ -201,16 +210,18 @@ def _write_footage(origin: Origin, view: str, out: Path, form: FootageForm) -> S
     return StoredFile(path=source, size=sum(f.stat().st_size for f in files), sha256=digest)
 
 
-def project_people(part: Path, clip: str, view: str, size: tuple[int, int]) -> dict[str, Floats]:
+def project_people(
+    part: Path, clip: str, view: str, size: tuple[int, int], model: BodyModel
+) -> dict[str, Floats]:
     """Return boxes (frames, persons, 4) [px] and visibility (frames, persons) of a clip's files.
 
     Boxes are around the surfaces of bodies, within the image; NaN outside. Visibility is the share
     of joints in the image that no nearer person hides. The image has width and height `size` [px].
     """
-    poses, model = joints_file.read_poses(part / "poses" / f"{clip}.npz")
+    poses, _ = joints_file.read_poses(part / "poses" / f"{clip}.npz")
     camera = release_cameras.read_camera(part / "cameras" / f"{view}.npz", size)
     joints = joints_file.read_joints(part / f"{clip}.joints.npz").joints
-    truth = challenge.challenge_truth(find_body(model or ""), poses, camera)
+    truth = challenge.challenge_truth(model, poses, camera)
     boxes = np.full((*joints.shape[:2], 4), np.nan)
     boxes[:, truth.persons] = truth.clip.boxes
     return {"boxes": boxes, "visibility": visible_shares(joints, camera)}
@@ -394,7 +405,8 @@ def _clip_findings(
     for key, found in {**facts, "first_frame": int(tracks.frames.min(initial=1 << 40))}.items():
         if found != getattr(clip, key):
             yield _damage("statement_differs", f"{key}: {found} in the files", name)
-    mine = fold_keypoints(find_body(model or ""), COCO17)(poses).swapaxes(0, 1)
+    body = find_body(model or "")
+    mine = fold_keypoints(body, COCO17)(poses).swapaxes(0, 1)
     where = f"{clip.split}/{name}.joints.npz"
     if mine.shape != joints.shape or len(clip.subjects) != joints.shape[1]:
         yield _damage("count", "poses, joints and subjects are not of the same people", where)
@@ -404,7 +416,7 @@ def _clip_findings(
     for view, size in clip.views.items():
         where = f"{clip.split}/boxes/{view}.npz"
         stored = _read_boxes(part, view)
-        for key, right in project_people(part, name, view, size).items():
+        for key, right in project_people(part, name, view, size, body).items():
             # Single precision of poses is far below a hundredth of a pixel.
             if not _equal(stored[key], right, 0.01):
                 says = f"{key}: not those of the bodies in the camera, frame by frame"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.release import CheckReport, DataSetStatistics, Finding
 from worldpose.body.body_file import OPEN_BODY, find_body
+from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import camera_files, list_clips, read_clip
 from worldpose.dataset.manifest import (
@@ -50,13 +52,14 @@ def check(
     body: str | None = None,
     pitch: bool = True,
     only: str | None = None,
+    models: Mapping[str, BodyModel] = MappingProxyType({}),
 ) -> CheckReport:
     """Check a data set and return faults and measurements; one clip is in memory at a time.
 
     The folder is one of `worldpose export`, or of the same layout. Without `fps` the rate is the
     one that the data set states, or 50 per second; `body` is the model of pose files that name
-    none. `pitch` says whether the ground is z = 0; a manifest can state otherwise. `only` is the
-    clip to check; None = all.
+    none, and `models` has bodies, by name, that may not be installed. `pitch` says whether the
+    ground is z = 0; a manifest can state otherwise. `only` is the clip to check; None = all.
 
     Raises:
         InputError: a file cannot be read.
@@ -82,7 +85,7 @@ def check(
             folder,
             name,
             clips,
-            lambda model: find_body(model or body or OPEN_BODY),
+            lambda model: models.get(model or "") or find_body(model or body or OPEN_BODY),
             manifest,
             rate or USUAL_FPS,
             pitch and (manifest is None or manifest.pitch),

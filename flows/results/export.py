@@ -38,6 +38,7 @@ from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import LensModel
+from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run, read_pin
@@ -154,14 +155,33 @@ def _filmed(origin: best_results.Origin) -> dict[str, tuple[str, Camera]]:
     """Return the clip and the moving camera of every broadcast view.
 
     Raises:
-        InputError: a clip has no fitted bodies or no such camera.
+        InputError: a clip has no fitted bodies or no such camera, or one of another frame rate.
     """
     found: dict[str, tuple[str, Camera]] = {}
     for clip in origin.clips:
         best_results.fitted_bodies(origin.run, clip)
-        cameras = best_results.filmed_cameras(origin.run, clip)
+        cameras = _of_one_rate(origin, clip)
         found |= {view: (clip, camera) for view, camera in cameras.items()}
     return found
+
+
+def _of_one_rate(origin: best_results.Origin, clip: str) -> dict[str, Camera]:
+    """Return the moving cameras of a clip, by view; the rows of these formats are their images.
+
+    Raises:
+        InputError: a camera has another frame rate than the match.
+    """
+    cameras = best_results.filmed_cameras(origin.run, clip)
+    for view in cameras:
+        if (rate := unit_frames(origin.spec, view).rate) != 1.0:
+            raise InputError(
+                f"view {view}",
+                expected="the frame rate of the match, as the format has a row for each image",
+                found=f"{rate * origin.spec.fps:g} images per second, and {origin.spec.fps:g} "
+                "frames of the match",
+                todo="Set fps of the match to the camera's, or convert its video.",
+            )
+    return cameras
 
 
 def export_tracks(origin: best_results.Origin, out: Path) -> Iterator[Path]:
@@ -171,7 +191,8 @@ def export_tracks(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         model, poses, persons = best_results.fitted_bodies(origin.run, clip)
         truth = challenge.challenge_truth(model, poses, camera)
         path = out / "tracks" / f"{view}.txt"
-        write_tracks(path, truth.clip.boxes, persons[truth.persons].astype(np.int64))
+        number = image_clock(origin.spec, view).number
+        write_tracks(path, truth.clip.boxes, persons[truth.persons].astype(np.int64), number)
         yield path
 
 
@@ -179,7 +200,7 @@ def export_slahmr_cameras(origin: best_results.Origin, out: Path) -> Iterator[Pa
     """Write `slahmr/cameras/<view>/shot-0/cameras.npz`, and the paper's settings."""
     yield _write_baseline_settings(out)
     for clip in best_results.all_clips(origin.run) or origin.clips:
-        for view, camera in best_results.filmed_cameras(origin.run, clip).items():
+        for view, camera in _of_one_rate(origin, clip).items():
             path = out / "slahmr" / "cameras" / view / "shot-0" / "cameras.npz"
             write_slahmr_cameras(path, camera)
             yield path
@@ -267,6 +288,8 @@ EXPORTS: dict[str, Callable[[best_results.Origin, Path], Iterable[Path]]] = {
 """Name in `EXPORT_FORMATS` to function, which writes the source into a folder, file by file."""
 
 
+OF_JOINTS = {"joints", "coco", "trc", "c3d", "csv", "parquet", "viewer", "rerun"}
+"""Formats that have the joints of a chosen stage."""
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
 SHARED = {manifests.FRAME_RATES, manifests.KINDS}
@@ -337,6 +360,13 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
     for form in forms:
         if form not in EXPORTS:
             raise unknown_name(f"--format {form}", form, EXPORTS)
+    if origin.stage is not None and (others := sorted(set(forms) - OF_JOINTS)):
+        raise UsageError(
+            f"--stage {origin.stage}",
+            expected=f"formats of joints: {', '.join(sorted(OF_JOINTS))}",
+            found=f"--format {' --format '.join(others)}, of the best results alone",
+            todo="Export these formats without --stage.",
+        )
     if len(clashing := CLASHING & set(forms)) > 1:
         raise UsageError(
             f"--format {' --format '.join(sorted(clashing))}",

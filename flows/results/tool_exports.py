@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -37,7 +38,8 @@ from worldpose.formats.tables import (
 )
 from worldpose.formats.usd_file import write_usd
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.footage import unit_frames
+from worldpose.ingest.clock import remaining_offset
+from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.store.store import Run
 from worldpose.triangulation.camera_changes import move_on
 
@@ -122,16 +124,17 @@ def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     for clip in origin.clips:
         tracks = origin.tracks(clip)
         frames = tracks.frames.astype(np.int64)
-        for name, camera, number, move in _views(origin, clip, frames):
+        for name, camera, number, late, move in _views(origin, clip, frames):
+            shown = replace(tracks, joints=_at_images(tracks.joints, late))
             if name in origin.static_cameras:
                 placed = best_results.placed_joints(origin.run, clip)
                 seen = placed["inliers"].sel(camera=name).values
             else:
-                seen = ~hidden_joints(tracks.joints, camera)
+                seen = ~hidden_joints(shown.joints, camera)
             path = (out if len(origin.clips) == 1 else out / clip) / f"{name}.json"
             motion_capture.write_json(
                 path,
-                motion_capture.coco_dataset(name, camera, tracks, seen, number=number, move=move),
+                motion_capture.coco_dataset(name, camera, shown, seen, number=number, move=move),
             )
             yield path
 
@@ -140,9 +143,10 @@ def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `alphapose/<clip>/<camera or broadcast view>.json` of fitted bodies."""
     for clip in origin.clips:
         model, poses, persons = best_results.fitted_bodies(origin.run, clip)
-        points = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
+        at_frames = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
         frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
-        for name, camera, number, move in _views(origin, clip, frames.astype(np.int64)):
+        for name, camera, number, late, move in _views(origin, clip, frames.astype(np.int64)):
+            points = _at_images(at_frames, late)
             pixels = camera.project(points.reshape(len(points), -1, 3))
             pixels = move(pixels.reshape(*points.shape[:3], 2))
             hidden = hidden_joints(points, camera)
@@ -156,18 +160,40 @@ def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 
 def _views(
     origin: best_results.Origin, clip: str, frames: Integers
-) -> Iterator[tuple[str, Camera, Integers, Callable[[Floats], Floats]]]:
-    """Yield name, camera, own frames, and where pixels move, of a clip's cameras and views."""
+) -> Iterator[tuple[str, Camera, Integers, Floats, Callable[[Floats], Floats]]]:
+    """Yield name, camera, own frames, how late these are, and where pixels move, of each view.
+
+    The images are later than the match frames [match frame]; a moving camera is that of the image.
+    """
     cameras = origin.static_cameras
     stated = best_results.placed_joints(origin.run, clip).attrs["changes"] if cameras else ()
     changes = [CameraChange.model_validate(each) for each in stated]
     for name, camera in cameras.items():
         own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
+        unit = unit_frames(origin.spec, name)
+        late = remaining_offset(frames, unit.offset, unit.rate)
         move = partial(move_on, frame=frames, camera=camera, changes=own)
-        yield name, camera, unit_frames(origin.spec, name).numbers(frames), move
+        yield name, camera, unit.numbers(frames), late, move
     for view in broadcast_views(origin.run, clip):
-        number = unit_frames(origin.spec, view).numbers(frames)
-        yield view, camera_in_frames(origin.run, view, frames), number, lambda pixels: pixels
+        clock = image_clock(origin.spec, view)
+        row = frames - unit_frames(origin.spec, view).first
+        camera = camera_in_frames(origin.run, view, frames)
+        yield view, camera, clock.number[row], clock.late[row], lambda pixels: pixels
+
+
+def _at_images(points: Floats, late: Floats) -> Floats:
+    """Return points (frames, ...) of consecutive frames `late` (frames,) [frame] after them.
+
+    x(t) = x(f) + (t - f) v, with the step v per frame to the next frame if t > f, else from the one
+    before; the other one, or none, where that is not known.
+    """
+    step = np.diff(points, axis=0)
+    gap = np.full((1, *points.shape[1:]), np.nan)
+    ahead, back = np.concatenate([step, gap]), np.concatenate([gap, step])
+    share = late.reshape(-1, *(1,) * (points.ndim - 1))
+    speed, other = np.where(share > 0, ahead, back), np.where(share > 0, back, ahead)
+    speed = np.where(np.isfinite(speed), speed, other)
+    return np.asarray(points + share * np.where(np.isfinite(speed), speed, 0.0))
 
 
 def export_markers(origin: best_results.Origin, out: Path) -> Iterator[Path]:

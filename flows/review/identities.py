@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
@@ -60,26 +61,52 @@ def names_of(run: Run, clip: str) -> dict[int, str]:
     A name belongs to no result: the journal's names are replayed over the tracks of the run, in
     order with the merges and splits that these contain.
     """
+    return _replay_names(run, clip)[1]
+
+
+def lost_names(run: Run) -> dict[str, str]:
+    """Return why names fit no person of a run any more, by the ids of their corrections.
+
+    A name that a later correction gives again is not lost.
+    """
+    lost: dict[str, str] = {}
+    for unit, key in run.record.results.items():
+        stage, _, clip = unit.partition("/")
+        if stage == "tracking" and run.store.has(run.record.match_id, stage, clip, key):
+            lost |= _replay_names(run, clip)[0]
+    return lost
+
+
+def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
+    """Return lost names with the reasons, by correction, and all others by person."""
     match_id, unit = run.record.match_id, f"tracking/{clip}"
     journal = read_journal(run.store, match_id)
     if unit not in run or not any(
         isinstance(each.edit, NamedTrack) and each.edit.clip == clip
         for each in journal.standing.values()
     ):
-        return {}
+        return {}, {}
     moves = run.manifest(unit).recipe.sources.get("identities") or []
     assert isinstance(moves, list)
-    said = []
+    said: dict[str, IdentityEdit] = {}
     for name, each in journal.corrections.items():
         edit = each.edit
         if not isinstance(edit, IDENTITY_EDITS) or edit.clip != clip:
             continue
         is_name = isinstance(edit, NamedTrack)
         if name in journal.standing if is_name else edit.model_dump(mode="json") in moves:
-            said.append(edit)
+            said[name] = edit
     stored = open_stored(run.store, run.record, unit, "identities")
-    taken = [edit for edit in said if isinstance(edit, TRACK_EDITS)] if stored.edits else []
-    return _replay(stored, said, taken, with_joints=False).identities.names
+    moved = [edit for edit in said.values() if isinstance(edit, TRACK_EDITS)]
+    edits = list(said.values())
+    replay = _replay(stored, edits, moved if stored.edits else [], with_joints=False)
+    names = replay.identities.names
+    lost = {
+        name: f"{edit.name!r} names nobody: {why}. Name the person again, or withdraw the name"
+        for (name, edit), why in zip(said.items(), replay.objections, strict=True)
+        if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
+    }
+    return lost, names
 
 
 def _replay(
@@ -89,8 +116,11 @@ def _replay(
     *,
     with_joints: bool = True,
 ) -> IdentityReplay:
-    """Replay corrections over a result that contains the merges and splits `taken` already."""
-    merged, others = list[IdentityEdit](), list[IdentityEdit]()
+    """Replay corrections over a result that contains the merges and splits `taken` already.
+
+    The objections are in the order of `said`.
+    """
+    merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
     for number, edit in enumerate(said):
         if isinstance(edit, NamedTrack):
             person, seen = edit.person, edit.seen
@@ -100,11 +130,14 @@ def _replay(
                 elif move in taken and isinstance(move, SplitTrack) and move.person == person:
                     seen = None  # it can belong to the new person, and the name does not
             after = edit.model_copy(update={"person": person, "seen": seen})
-            (others if person == edit.person else merged).append(after)
+            (others if person == edit.person else merged)[number] = after
         elif edit not in taken:
-            others.append(edit)
+            others[number] = edit
     tracks = stored_identities(stored.result, with_joints=with_joints)
-    return replay_identities(tracks, [*merged, *others])  # a person's own name counts more
+    order = merged | others  # a person's own name counts more
+    replay = replay_identities(tracks, order.values())
+    found = dict(zip(order, replay.objections, strict=True))
+    return replace(replay, objections=tuple(found.get(number) for number in range(len(said))))
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:

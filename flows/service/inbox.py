@@ -303,7 +303,8 @@ def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arriv
     except (RefusalError, WorldposeError) as refusal:
         return change_state(arrival, "refused", str(refusal))
     except OSError as error:
-        return change_state(arrival, "incomplete", f"{error.filename}: {error.strerror}")
+        reason = f"{error.filename}: {error.strerror}"  # tried again, though nothing changes
+        return change_state(arrival, "incomplete", reason, fingerprint="")
     except Exception as error:  # an unforeseen error; nothing was registered
         return change_state(arrival, "refused", str(InternalError.wrap(arrival.name, error)))
     unclicked = [*match.folder.to_click, *unclicked_clips(match.folder)]

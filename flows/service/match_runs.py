@@ -151,6 +151,9 @@ def match_runs_of(url: str) -> MatchRuns | None:
         return None
     if not is_alive(serving.services["serve"].pid):
         return None
+    with state.only_one("serve", wait=False) as is_free:  # else another process has its number
+        if is_free:
+            return None
     pages = serving.services.get("pages")
     address = "" if pages is None else pages.address or ""
     login = state.client_login(serving)

@@ -23,10 +23,11 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def uncalibrated_warnings(match: Match) -> tuple[str, ...]:
-    """Return sentences about cameras of clips with several whose view is not used."""
+    """Return sentences about views that have a video, or others in their clip, and are not used."""
     folder, said = match.folder, []
     for name, view in folder.spec.broadcast_views.items():
-        if name in folder.calibrated_views or len(view.clip.moving_cameras) < 2:
+        is_alone = name not in folder.videos and len(view.clip.moving_cameras) < 2
+        if name in folder.calibrated_views or is_alone:
             continue
         needed = [] if name in folder.videos else [f"broadcast/{name}.mp4"]
         if folder.pitch is None:

@@ -27,7 +27,7 @@ from flows.orchestration.prefect_environment import (
     without_secrets,
 )
 from flows.overview import Overview
-from flows.registering import open_for_review
+from flows.registering import open_for_review, open_stored
 from flows.review.verdicts import resume
 from flows.run_record import describe_end, latest_run
 from flows.service.match_runs import MatchRuns, match_runs_of
@@ -69,6 +69,16 @@ class PageContext:
         if not is_name(name) or self.store.registration(name) is None:
             raise HTTPException(404, "no such match")
         return open_for_review(self.store, name)
+
+    def stored_match(self, name: str) -> Match:
+        """Return a match to show its results, also while its folder is away.
+
+        Raises:
+            HTTPException: as `match`.
+        """
+        if not is_name(name) or self.store.registration(name) is None:
+            raise HTTPException(404, "no such match")
+        return open_stored(self.store, name)
 
     def review(self, name: str, request: str) -> tuple[Match, ReviewRequest]:
         """Return a match and one of its review requests.
@@ -294,7 +304,7 @@ class LocalRuns:
     _at_work: str | None = None
     _output: Path | None = None
     _process: subprocess.Popen[bytes] | None = None
-    _ended: dict[str, tuple[int, Path]] = field(default_factory=dict)
+    _ended: dict[str, tuple[int, Path | str]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     def go_on(self, match_id: str, gates: str | None) -> dict[str, Any]:
@@ -325,7 +335,8 @@ class LocalRuns:
         if ended is None:
             return None
         code, said = ended
-        lines = said.read_text(errors="replace").splitlines()[-LAST_LINES:]
+        printed = said if isinstance(said, str) else said.read_text(errors="replace")
+        lines = printed.splitlines()[-LAST_LINES:]
         return {"state": "ended", "code": code, "lines": lines}
 
     def running(self) -> set[str]:
@@ -349,30 +360,38 @@ class LocalRuns:
 
     def _run_all(self, match_id: str, gates: str | None) -> None:
         while True:
-            said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
-            said.touch()
-            with self._lock:
-                self._output = said
-            command = [*_COMMAND, match_id, "--project", self.store.url]
-            if gates is not None:
-                command += ["--gates", gates]
-            with said.open("wb") as output:
-                process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                    env=without_secrets(os.environ, keep=STORE_SECRETS),
-                )
-            with self._lock:
-                self._process = process
-            code = process.wait()
+            ended: tuple[int, Path | str]
+            try:
+                ended = self._run(match_id, gates)
+            except Exception as error:  # any, so that the other runs have their turn
+                ended = 1, f"The run could not be started: {error}"
             with self._lock:
                 self._process = None
-                self._ended[match_id], self._output = (code, said), None
+                self._ended[match_id], self._output = ended, None
                 if not self._waiting:
                     self._at_work = None
                     return
                 match_id, gates = self._waiting.pop(0)
                 self._at_work = match_id
+
+    def _run(self, match_id: str, gates: str | None) -> tuple[int, Path]:
+        """Run a match in its own process; return its exit code, and the file of its output."""
+        said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
+        said.touch()
+        with self._lock:
+            self._output = said
+        command = [*_COMMAND, match_id, "--project", self.store.url]
+        if gates is not None:
+            command += ["--gates", gates]
+        with said.open("wb") as output:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env=without_secrets(os.environ, keep=STORE_SECRETS),
+            )
+        with self._lock:
+            self._process = process
+        return process.wait(), said

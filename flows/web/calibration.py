@@ -17,6 +17,7 @@ from pydantic import Field
 
 from data_contracts.arrays import Image
 from data_contracts.match import Side
+from data_contracts.pitch import PitchSpec
 from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
 from flows.gates import GATES
@@ -108,19 +109,19 @@ def routes(context: PageContext) -> APIRouter:
     """Create the routes of one image: of a static camera, or of a frame of a broadcast camera."""
     router = APIRouter(prefix="/api/matches/{match_id}/pictures/{owner}")
     pictures = Pictures()
-    drawings: dict[str, PitchDrawing] = {}
+    drawings: dict[str, tuple[PitchSpec, PitchDrawing]] = {}
 
     def open_picture(match_id: str, owner: str) -> tuple[Match, PitchDrawing, tuple[int, int]]:
-        """Return a match, its pitch, which is fixed, and the size of the camera's images."""
+        """Return a match, its pitch as it is now, and the size of the camera's images."""
         match = context.match(match_id)
         pitch, camera = match.folder.pitch, match.folder.spec.filming_camera(owner)
         if pitch is None:
             raise HTTPException(404, "the match has no pitch")
         if camera is None:
             raise HTTPException(404, "no such camera")
-        if match_id not in drawings:
-            drawings[match_id] = PitchDrawing(PitchTemplate.from_spec(pitch))
-        return match, drawings[match_id], (camera.width, camera.height)
+        if match_id not in drawings or drawings[match_id][0] != pitch:
+            drawings[match_id] = pitch, PitchDrawing(PitchTemplate.from_spec(pitch))
+        return match, drawings[match_id][1], (camera.width, camera.height)
 
     @router.get("")
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:

@@ -16,10 +16,12 @@ from data_contracts.run import GatePolicy
 from flows.layers import merge_general
 from flows.review.corrections import keep_edits, owner_of
 from flows.review.descriptions import in_words, is_first_click
+from flows.review.identities import lost_names
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
+from worldpose.store.store import Run, Store
 
 SESSION_GAP: Final = timedelta(minutes=30)
 """A longer pause of a person begins a new session."""
@@ -105,9 +107,11 @@ class Group:
         return self.corrections[0][0].id
 
 
-def group_corrections(match: Match) -> list[Group]:
+def group_corrections(store: Store, match: Match) -> list[Group]:
     """Return all corrections in force in groups, the latest group first."""
-    objections = {each.id: why for each, why in match.stale}
+    latest = latest_run(store, match.match_id)
+    objections = {} if latest is None else lost_names(Run(store, latest))
+    objections |= {each.id: why for each, why in match.stale}
     groups: list[Group] = []
     open_groups: dict[tuple[str, str, bool], Group] = {}
     for each in match.journal.standing.values():
@@ -120,7 +124,7 @@ def group_corrections(match: Match) -> list[Group]:
     return sorted(groups, key=lambda group: group.corrections[-1][0].made_at, reverse=True)
 
 
-def describe_groups(match: Match) -> list[dict[str, Any]]:
+def describe_groups(store: Store, match: Match) -> list[dict[str, Any]]:
     """Return a summary of each group for the page of a match."""
     return [
         {
@@ -134,7 +138,7 @@ def describe_groups(match: Match) -> list[dict[str, Any]]:
             "first_at": group.corrections[0][0].made_at,
             "last_at": group.corrections[-1][0].made_at,
         }
-        for group in group_corrections(match)
+        for group in group_corrections(store, match)
     ]
 
 
@@ -169,7 +173,7 @@ def routes(context: PageContext) -> APIRouter:
     def list_group(
         match_id: str, group: str, skip: Annotated[int, Query(ge=0)] = 0
     ) -> dict[str, Any]:
-        found = _find(context.match(match_id), group).corrections[::-1]
+        found = _find(context.store, context.match(match_id), group).corrections[::-1]
         return {
             "corrections": [
                 {**each.model_dump(mode="json"), "words": in_words(each), "objection": why}
@@ -183,7 +187,7 @@ def routes(context: PageContext) -> APIRouter:
         match_id: str, group: str, given: WithdrawingGroup, who: Person
     ) -> dict[str, Any]:
         match = context.match(match_id)
-        found = _find(match, group).corrections
+        found = _find(context.store, match, group).corrections
         if len(found) != given.count:
             raise HTTPException(409, f"the group has {len(found)} corrections now: look again")
         ids = [each.id for each, _ in found]
@@ -199,8 +203,8 @@ def routes(context: PageContext) -> APIRouter:
     return router
 
 
-def _find(match: Match, group_id: str) -> Group:
-    for group in group_corrections(match):
+def _find(store: Store, match: Match, group_id: str) -> Group:
+    for group in group_corrections(store, match):
         if group.id == group_id:
             return group
     raise HTTPException(409, "the group is not there any more: look again")

@@ -125,7 +125,8 @@ def _interpolate(
 ) -> list[MovedKeypoint]:
     """Return the edits between the last correction of a person's keypoint and a frame.
 
-    The person's track tells the detections in between; frames without one are skipped.
+    The person's track tells the detections in between; frames without one are skipped, and so are
+    those in which the keypoint was corrected to be invisible.
 
     Raises:
         InputError: the detection has no track, or no earlier correction is of this keypoint.
@@ -143,19 +144,17 @@ def _interpolate(
     index = found.detection_index[:, found.cameras.index(camera)]
     own = np.flatnonzero(index[number[given.frame]] == given.detection)
     known = {} if not len(own) else dict(zip(number, index[:, own[0]].tolist(), strict=True))
-    corrected = [
-        edit
+    corrected = {  # the last correction of each frame counts
+        edit.frame: edit
         for edit in edits_by_camera(match).get(camera, ())
         if isinstance(edit, MovedKeypoint)
         and edit.joint == given.joint
-        and edit.xy is not None
         and given.frame - MAX_INTERPOLATED <= edit.frame < given.frame
         and known.get(edit.frame) == edit.detection
-    ]
-    joint, last = (
-        COCO17.index(given.joint),
-        max(corrected, key=lambda each: each.frame, default=None),
-    )
+    }
+    hidden = {frame for frame, edit in corrected.items() if edit.xy is None}
+    last = corrected.get(max(corrected.keys() - hidden, default=-1))
+    joint = COCO17.index(given.joint)
     now = detections_now(store, match, camera, given.frame).keypoints[0, given.detection, joint]
     if last is None or last.xy is None or not np.isfinite(now).all():
         raise InputError(
@@ -167,7 +166,7 @@ def _interpolate(
     edits = []
     for frame in range(last.frame + 1, given.frame):
         detection = known.get(frame, -1)
-        if detection < 0:
+        if detection < 0 or frame in hidden:
             continue
         place = detections_now(store, match, camera, frame).keypoints[0, detection, joint]
         was = (float(place[0]), float(place[1])) if np.isfinite(place).all() else None

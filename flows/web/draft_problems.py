@@ -208,6 +208,13 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
         elif kind == "lens":
             lenses.setdefault(owner, []).append(file)
         else:
+            if owner in people:
+                raise InputError(
+                    str(file),
+                    expected=f"one file with 2D poses of {owner}",
+                    found="a second one",
+                    todo="Remove one of the two, or rename it after its own camera.",
+                )
             read = read_people(file)
             people[owner] = read.people
             (folder / "detections").mkdir(exist_ok=True)
@@ -224,7 +231,9 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
 
 def _owner_of(stem: str, owners: Sequence[str]) -> str | None:
     """Return the camera that a file's name names; None if none or several can be meant."""
-    named = [each for each in owners if stem.startswith(each.lower())]
+    # The name of another camera can begin in the same way: `cam10` and `cam1`.
+    begun = [each for each in owners if stem.startswith(each.lower())]
+    named = [each for each in begun if not stem[len(each) : len(each) + 1].isalnum()]
     first = re.split(r"[\W_]", stem, maxsplit=1)[0]
     alike = [each for each in owners if re.split(r"[\W_]", each.lower(), maxsplit=1)[0] == first]
     return max(named, key=len) if named else alike[0] if len(alike) == 1 else None
@@ -273,7 +282,15 @@ def _take_calibration(
     placed, changes = place_as_stated(None, None)(
         source, {name: cameras[name] for name in known}, people, spec.fps
     )
-    write_calibration_toml(folder / "calibration.toml", placed)
+    own = folder / "calibration.toml"
+    if own.exists():
+        raise InputError(
+            str(source),
+            expected="one calibration",
+            found=f"this one besides {own.name}",
+            todo="Remove one of the two.",
+        )
+    write_calibration_toml(own, placed)
     return notes + changes
 
 

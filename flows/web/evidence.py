@@ -29,12 +29,13 @@ from flows.stages.detection import seen_by
 from flows.web.app_context import PageContext
 from flows.web.images import encode_image
 from flows.web.results import DrawnFiles
+from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import plot_paths
 from worldpose.reports.html_page import CaptionedImage, Table
 from worldpose.review.clicks import current_value
 from worldpose.review.evidence import Curve, clip_curves
-from worldpose.store.store import Run, Store, open_run
+from worldpose.store.store import Run, Store
 
 CACHED_REVIEWS: Final = 16
 """Review requests whose images are kept in memory; drawing takes one or two seconds each."""
@@ -99,7 +100,7 @@ def routes(context: PageContext) -> APIRouter:
         if evidence_of(match_id, request).video is None:
             raise HTTPException(404, "no camera of this clip has a video")
         match, asked = context.review(match_id, request)
-        run = open_run(context.store.url, match_id, asked.run_id)
+        run = asked_run(context.store, asked)
         (unit,) = asked.keys
         return videos.clip_video(context.store, run, match, unit.partition("/")[2])
 
@@ -112,13 +113,33 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
-    """Draw the evidence for a review request, from the run that created it."""
+    """Draw the evidence for a review request, from the newest run with the results under review."""
     draw = _DRAWN.get(request.gate)
     if draw is None:
         return Evidence()
-    run = open_run(store.url, match.match_id, request.run_id)
+    run = asked_run(store, request)
     (unit,) = request.keys
     return draw(store, run, match, unit.partition("/")[2])
+
+
+def asked_run(store: Store, request: ReviewRequest) -> Run:
+    """Open the newest run that has the results under review.
+
+    The run that asked may have been killed before its record was stored, or removed since.
+
+    Raises:
+        InputError: there is none.
+    """
+    for run_id in reversed(store.runs(request.match_id)):
+        record = store.run(request.match_id, run_id)
+        if request.keys.items() <= record.results.items():
+            return Run(store, record)
+    raise InputError(
+        f"review {request.id}",
+        expected=f"a run with the results under review, {', '.join(request.keys)}",
+        found="none",
+        todo="Run the match again: if its results need review, it asks about them.",
+    )
 
 
 def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
@@ -294,7 +315,7 @@ def _add_outliers(router: APIRouter, context: PageContext) -> None:
     @router.get("/outliers")
     def outliers(match_id: str, request: str) -> list[dict[str, Any]]:
         match, asked = context.review(match_id, request)
-        run = open_run(context.store.url, match_id, asked.run_id)
+        run = asked_run(context.store, asked)
         if ADJUSTED not in asked.keys or ADJUSTED not in run:
             return []
         return [
@@ -341,7 +362,9 @@ def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
         place = {"camera": names[c], "frame": frame, "detection": detection}
         edit: MovedKeypoint | DeletedDetection
         if joint < 0:
-            edit = DeletedDetection(**place)
+            box = seen["boxes"].sel(frame=frame).values[detection]
+            was = tuple(map(float, box)) if np.isfinite(box).all() else None
+            edit = DeletedDetection(**place, was=was)
         else:
             pixel = seen["keypoints"].sel(frame=frame).values[detection, joint]
             x, y = (float(value) for value in pixel)

@@ -44,7 +44,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/runs")
     def runs(match_id: str) -> list[dict[str, Any]]:
-        store, match = context.store, context.match(match_id)
+        store, match = context.store, context.stored_match(match_id)
         pins = list_pins(store.blobs, match_id)
         records = {run_id: store.run(match_id, run_id) for run_id in store.runs(match_id)}
         return [
@@ -64,7 +64,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/runs/{before}/{after}")
     def compare(match_id: str, before: str, after: str) -> list[dict[str, Any]]:
-        context.match(match_id)
+        context.stored_match(match_id)
         a, b = (_find_run(context.store, match_id, name) for name in (before, after))
         return describe_changes(compare_runs(context.store, a, b))
 
@@ -72,7 +72,7 @@ def routes(context: PageContext) -> APIRouter:
     def thumbnail(match_id: str) -> Response:
         import cv2  # imported here: few pages decode an image
 
-        picture = _first_picture(context.match(match_id))
+        picture = _first_picture(context.stored_match(match_id))
         if picture is None:
             raise HTTPException(404, "no camera has an image")
         height = round(THUMBNAIL_WIDTH * picture.shape[0] / picture.shape[1])

@@ -48,7 +48,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
-        opened = context.match(match_id)
+        opened = context.stored_match(match_id)
         latest = latest_run(context.store, match_id)
         folder = opened.folder
         return {
@@ -56,7 +56,7 @@ def routes(context: PageContext) -> APIRouter:
             "reviews": [
                 describe_review(each) for each in reviews_of(context.store, opened, latest)
             ],
-            "groups": describe_groups(opened),
+            "groups": describe_groups(context.store, opened),
             "cameras": [
                 {
                     "id": camera.id,
@@ -192,7 +192,7 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
     latest = latest_run(context.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")
     pick_next = []
-    if key is not None:
+    if key is not None and context.store.has(match.match_id, "broadcast_calibration", clip, key):
         result = context.store.open_result(match.match_id, "broadcast_calibration", clip, key)
         pick_next = [int(frame) for frame in result.attrs["pick_next"]]
     folder = match.folder

@@ -39,7 +39,6 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
-from worldpose.review.journal import read_journal
 from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
@@ -59,17 +58,18 @@ REPORT_POLICY: Final = (
 
 
 class DrawnFiles:
-    """Files that were drawn on request, each once per run and state of its journal."""
+    """Files that were drawn on request, each once per run and what else it shows."""
 
     def __init__(self) -> None:
         self._folder = TemporaryDirectory(prefix="worldpose-pages-")
         self._lock = Lock()  # one at a time: drawing needs memory for all images
 
-    def get(self, run: Run, name: str, draw: Callable[[Path], object]) -> Path:
-        """Return the file `name` of a run, drawn by `draw` if it is not there."""
-        record = run.record
-        said = names_said(read_journal(run.store, record.match_id))
-        given = f"{record.match_id} {record.run_id} {said} {name}"
+    def get(self, run: Run, name: str, draw: Callable[[Path], object], shows: str) -> Path:
+        """Return the file `name` of a run, drawn by `draw` if it is not there.
+
+        `shows` is a text that changes with all else that the file shows.
+        """
+        given = f"{run.record.match_id} {run.record.run_id} {name} {shows}"
         unique = hashlib.sha256(given.encode()).hexdigest()
         file = Path(self._folder.name) / f"{unique}{Path(name).suffix}"
         with self._lock:
@@ -86,7 +86,10 @@ class DrawnFiles:
     def clip_video(self, store: Store, run: Run, match: Match, clip: str) -> FileResponse:
         """Return the response with the overlay video of a clip."""
         file = self.get(
-            run, f"{clip}.mp4", lambda file: write_clip_video(store, run, match, clip, file)
+            run,
+            f"{clip}.mp4",
+            lambda file: write_clip_video(store, run, match, clip, file),
+            names_said(match.journal),
         )
         return FileResponse(file, media_type="video/mp4")
 
@@ -96,11 +99,11 @@ class _Clips:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._key: tuple[str, str, str, str] | None = None
+        self._key: tuple[str, str, str] | None = None
         self._clip: ViewerClip | None = None
 
     def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
-        key = (run.record.match_id, run.record.run_id, clip, names_said(match.journal))
+        key = (run.record.run_id, clip, _people_said(match))
         with self._lock:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)
@@ -108,6 +111,11 @@ class _Clips:
                 self._clip = viewer_clip(origin, clip, match.folder.pitch, video)
                 self._key = key
             return self._clip
+
+
+def _people_said(match: Match) -> str:
+    """Return a text that changes with a match's id, roster and names of people."""
+    return f"{match.registration.model_dump_json()} {names_said(match.journal)}"
 
 
 def _player_names(match: Match, run: Run) -> dict[str, str]:
@@ -139,7 +147,7 @@ def routes(context: PageContext) -> APIRouter:
     files, shown = DrawnFiles(), _Clips()
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
-        match = context.match(match_id)
+        match = context.stored_match(match_id)
         return match, open_results(context.store, match_id)
 
     def open_clip(match_id: str, clip: str) -> ViewerClip:
@@ -178,7 +186,7 @@ def routes(context: PageContext) -> APIRouter:
             write_report(context.store, match, file, run_id=run_id, videos=False)
 
         return FileResponse(
-            files.get(run, "report.html", draw),
+            files.get(run, "report.html", draw, f"{_people_said(match)} {match.journal.tip}"),
             media_type="text/html; charset=utf-8",
             headers={"content-security-policy": REPORT_POLICY},
         )
@@ -212,7 +220,9 @@ def routes(context: PageContext) -> APIRouter:
 
         name = f"{match.match_id}-{run.record.run_id}-{form}.zip"
         return FileResponse(
-            files.get(run, f"{form}.zip", draw), media_type="application/zip", filename=name
+            files.get(run, f"{form}.zip", draw, _people_said(match)),
+            media_type="application/zip",
+            filename=name,
         )
 
     return router

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from threading import Lock
 from typing import Any
 
 from fastapi import APIRouter, HTTPException
@@ -37,7 +38,7 @@ class SavedLayer(Record):
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the settings page."""
     router = APIRouter(prefix="/api/settings")
-    store = context.store
+    store, lock = context.store, Lock()
 
     def layers_of(match: str | None) -> tuple[Layer, ...]:
         if match is None:
@@ -75,6 +76,11 @@ def routes(context: PageContext) -> APIRouter:
         is_venue = kind == VENUES and is_name(name)
         if not (given.layer == PROJECT or is_match or is_venue):
             raise HTTPException(404, "no such layer of settings")
+        with lock:  # of two saves of one revision, the second is refused
+            save_revision(given, name if is_match else None)
+        return settings(match)
+
+    def save_revision(given: SavedLayer, match: str | None) -> None:
         before = read_layer(store, given.layer)
         if before.revision != given.revision:
             raise HTTPException(409, "another person changed these settings: load the page again")
@@ -86,9 +92,7 @@ def routes(context: PageContext) -> APIRouter:
                 found=repr(changed[key]),
                 todo=f"On the server: worldpose settings --set {key}=...",
             )
-        layers = layers_of(name if is_match else None)
-        save_layer(store, layers, given.layer, given.values)
-        return settings(match)
+        save_layer(store, layers_of(match), given.layer, given.values)
 
     return router
 

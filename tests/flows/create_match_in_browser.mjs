@@ -59,8 +59,18 @@ await page.fill('[data-field="match_id"]', "cup/final");
 await page.waitForSelector("label.wrong >> text=letters, digits");
 seen.message = await page.locator("label.wrong .said").innerText();
 await shoot(page, "wrong");
+// A change while a slow save is under way is saved after it.
+await page.route("**/form", async (route) => {
+  await page.waitForTimeout(1500);
+  await route.continue();
+});
+await page.fill('[data-field="match_id"]', "cup");
+await page.waitForTimeout(900);
 await page.fill('[data-field="match_id"]', "cup final");
 seen.name = await page.inputValue('[data-field="match_id"]');
+await page.waitForSelector('[data-saving="saved"]');
+await page.unroute("**/form");
+seen.refused = await page.locator("text=saved this form first").count();
 await page.waitForSelector("text=Nothing is missing");
 await page.locator("select[data-side]").first().selectOption("far");
 await page.waitForSelector("text=Nothing is missing");

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -177,6 +178,13 @@ def test_the_command_says_one_thing_and_writes_nothing(
     assert re.search(message, answer.err)
     assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
     assert {path.name for path in tmp_path.iterdir()} == {"empty.txt"}
+
+
+@pytest.mark.parametrize("form", ["worldpose", "gltf", "positions"])
+def test_a_stage_of_joints_is_refused_for_other_formats(match_folder, tmp_path, form):
+    run = replace(origin(match_folder, **whole()), stage="triangulation")
+    with pytest.raises(UsageError, match=f"--stage triangulation: .* found --format {form}, of"):
+        export(run, ["joints", form], tmp_path / "out")
 
 
 @pytest.mark.parametrize("left", ["triangulation", "broadcast_tracking"])

@@ -136,6 +136,30 @@ def test_boxes(filmed, content, told):
     assert "found c.txt" in refuse(*given)
 
 
+def test_boxes_have_an_ending_in_any_case(filmed):
+    (filmed / "boxes").mkdir()
+    (filmed / "boxes/a.TXT").write_bytes(b"1,1,5,5,5,5,1\n")
+    given = ("--videos", filmed / "videos", "--boxes", filmed / "boxes", "--out", filmed / "out")
+    assert run(*given).exit_code == 0
+    assert [file.name for file in (filmed / "out/boxes").iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("option", "owner"), [("--left-handed", "--pitch"), ("--join", "--videos")]
+)
+def test_an_option_of_another_import_is_refused(lab, option, owner):
+    result = run(*CALIBRATED.replace("LAB", str(lab)).split(), option)
+    assert isinstance(result.exception, UsageError)
+    assert f"expected {option} with {owner}" in str(result.exception)
+    assert not (lab / "out").exists()
+
+
+def test_videos_of_two_rates_are_refused_without_a_file_that_is_not_there(filmed):
+    write_video(filmed / "videos/b.mp4", [np.zeros((48, 64, 3), np.uint8)] * 10, 50.0)
+    told = refuse("--videos", filmed / "videos", "--out", filmed / "out")
+    assert "b.mp4: expected 25 frames per second, the rate of the match, found 50. Conv" in told
+
+
 def test_places_for_a_match(lab):
     cases = {
         lab / "match": "nothing, or an empty folder",

@@ -23,6 +23,7 @@ def kit(tmp_path_factory):
 
 def test_the_kit_becomes_a_scored_submission_with_the_given_rows(server, kit, tmp_path):
     inputs = shutil.copytree(kit, tmp_path / "kit")
+    (inputs / "videos" / f"{NAME}.mp4").rename(inputs / "videos" / f"{NAME}.MP4")
     true = inputs / "true.zip"
     true.rename(tmp_path / "true.zip")
     # Rows in another order, so that a tracker's own numbers would not do.

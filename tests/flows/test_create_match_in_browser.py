@@ -94,6 +94,7 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     assert seen["restarted"]
     assert seen["kept"] >= 0.4 * size  # nothing that was sent before is sent again
     assert "letters, digits" in seen["message"]
+    assert seen["refused"] == 0
     assert seen["name"] == "cup_final"  # a blank of a name is written as ids have it
     assert seen["close"].endswith("/8?width=4096")
     assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]

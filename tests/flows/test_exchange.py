@@ -8,6 +8,7 @@ from flows.registering import open_match
 from flows.review.annotation_exchange import export_people, import_people
 from flows.review.detections import detections_now
 from flows.review.edit_conflicts import StaleEditError
+from flows.review.verdicts import withdraw
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
 from worldpose.store.store import Store
@@ -42,6 +43,7 @@ def test_what_people_annotate_elsewhere_is_corrected_here_once(project_copy, tmp
     write_annotations(edited, [type(first)(first.name, first.size, first.people[1:]), second], form)
     _, corrections = take_in(edited)
     assert [each.edit.kind for each in corrections] == ["deleted_detection", "moved_keypoint"]
+    assert corrections[0].edit.was == tuple(gone.box.tolist())
     assert all(
         each.who == "Ada" and f"annotated in {edited.name}" in each.note for each in corrections
     )
@@ -54,6 +56,11 @@ def test_what_people_annotate_elsewhere_is_corrected_here_once(project_copy, tmp
     # The same file again is the same corrections; another one of the same export comes too late.
     assert take_in(edited)[1] == corrections
     assert len(open_match(store, TINY).corrections) == 2
+    # One that was undone is made again, once.
+    withdraw(store, open_match(store, TINY), [corrections[0].id], who="Bob", why="")
+    (again, _), second_time = take_in(edited)[1], take_in(edited)[1]
+    assert again.id == f"{corrections[0].id}.2" and second_time[0] == again
+    assert {*open_match(store, TINY).journal.standing} == {again.id, corrections[1].id}
     kept.keypoints[joint] += 1.0
     write_annotations(edited, [type(first)(first.name, first.size, first.people[1:]), second], form)
     with pytest.raises(StaleEditError):

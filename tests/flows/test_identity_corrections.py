@@ -1,19 +1,22 @@
 """Identity corrections override the tracker's output, however the run produced it."""
 
+import page_client
 import pytest
-from command_line import TINY
+from command_line import TINY, succeed
+from page_client import MATCH
 
 from data_contracts.review import Correction, MergedTracks, NamedTrack, SplitTrack
 from flows.registering import open_match
 from flows.results.best_results import clip_positions
 from flows.review.corrections import keep_edits
 from flows.review.edit_conflicts import StaleEditError
-from flows.review.identities import identities_now, names_of
-from flows.review.verdicts import origins_of
+from flows.review.identities import identities_now, lost_names, names_of
+from flows.review.verdicts import origins_of, withdraw
 from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from tasks.tracking import tracking
 from worldpose.review.identities import find_sighting
+from worldpose.review.journal import append, read_journal
 from worldpose.store.paths import ResultId
 from worldpose.store.store import Run
 
@@ -114,3 +117,29 @@ def test_a_name_recomputes_nothing_and_is_in_the_tables_at_once(store):
     # Later iterations have no tracks without corrections.
     store.withdraw(ResultId(TINY, "tracking", clip, run.record.results[f"tracking/{clip}"]))
     assert names_of(after, clip) == {1: names[1], new: "late"}
+
+
+def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(store, project_copy):
+    found = identities_now(store, open_match(store, TINY), "clip").identities
+    one, other = found.person.tolist()[:2]
+    seen = find_sighting(found, one)
+    say(store, a=NamedTrack(clip="clip", person=one, seen=seen, name="Ann"))
+    run = Run(store, store.run(TINY))
+    assert lost_names(run) == {}
+    wrong = find_sighting(found, other)  # as after a run whose tracks have another detection there
+    say(store, b=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
+    journal = read_journal(store, TINY)
+    moved = journal.standing["b"].edit.model_copy(update={"seen": seen})
+    record = journal.standing["b"].model_copy(update={"id": "c", "edit": moved})
+    withdraw(store, open_match(store, TINY), ["b"], who="Ada", why="")
+    append(store, read_journal(store, TINY), [record])
+    (said,) = lost_names(run).values()
+    assert "'Bea' names nobody" in said and names_of(run, "clip") == {one: "Ann"}
+    ada = page_client.log_in(page_client.served(project_copy), "Ada")
+    page = ada.get(MATCH).json()
+    (group,) = page["groups"]
+    assert (page["stale"], group["stale"]) == (1, 1)
+    (listed,) = succeed("review", "show", TINY, "--project", store.url, "--json").json["stale"]
+    assert (listed["id"], listed["reason"]) == ("c", said)
+    say(store, d=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
+    assert lost_names(run) == {}

@@ -196,3 +196,23 @@ def test_the_command_runs_two_iterations_on_the_workers_of_one_run(tmp_path):
     assert again["kept"] == answer.json["kept"]
     status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
     assert not status["stale"] and not status["missing"] and not status["ready"]
+
+
+def test_questions_of_an_earlier_run_are_asked_by_a_new_one(monkeypatch):
+    def run(number, state):
+        return record(number, None, state)
+
+    latest = run(2, "complete")
+    monkeypatch.setattr(iterate, "Gatekeeper", lambda *_: None)
+    monkeypatch.setattr(iterate, "plan_ahead", lambda *_: SimpleNamespace(missing=[]))
+    monkeypatch.setattr(iterate, "latest_run", lambda *_: latest)
+    monkeypatch.setattr(iterate, "run_match", lambda *_: run(3, "waiting"))
+    match, request = SimpleNamespace(match_id="m"), RunRequest({})
+    for recorded, expected in (
+        (run(1, "waiting"), "0003"),  # nobody can answer them: they are not the latest run's
+        (run(1, "complete"), "0001"),
+        (run(2, "waiting"), "0002"),
+    ):
+        monkeypatch.setattr(iterate, "_recorded_run", lambda *_, found=recorded: found)
+        found = iterate._pass(None, match, request, lambda missing: request)
+        assert found.record.run_id == expected

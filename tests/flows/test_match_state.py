@@ -4,12 +4,14 @@ import shutil
 import subprocess
 
 import page_client
+import psutil
 import pytest
 from command_line import TINY, succeed
 from page_client import MATCH
 
 from data_contracts.review import NamedTrack, SplitTrack
 from data_contracts.run import UnitFailure
+from flows import run_record
 from flows.layers import write_layer
 from flows.match_state import match_state
 from flows.method import METHOD
@@ -20,6 +22,7 @@ from flows.review.verdicts import decide, withdraw
 from flows.run_plan import plan_run
 from flows.run_record import describe_end
 from flows.running import RunRequest, run_match
+from worldpose.store.paths import ResultId
 
 
 def say(store, **edits):
@@ -115,3 +118,27 @@ def test_a_match_is_not_ready_while_iterations_are_set_that_were_not_run(store):
     assert not read_summary(store, TINY).is_settled  # reprocessing runs it
     write_layer(store, f"matches/{TINY}", {"iterations": "auto"})
     assert state(store).name == "ready"
+
+
+def test_a_run_is_at_work_whatever_becomes_of_the_clock(store, monkeypatch):
+    with subprocess.Popen(["sleep", "60"]) as work:
+        with monkeypatch.context() as patched:
+            patched.setattr("os.getpid", lambda: work.pid)
+            store.reserve_run(TINY)
+        begun = psutil.Process.create_time
+        monkeypatch.setattr(psutil.Process, "create_time", lambda self: begun(self) + 7200.0)
+        assert state(store).name == "running"
+        # A later process has the number of a killed one.
+        monkeypatch.setattr(run_record, "identify_process", lambda pid: "another")
+        assert state(store).name == "stopped"
+        work.kill()
+
+
+def test_a_result_that_was_removed_makes_a_match_out_of_date_everywhere(store):
+    key = store.run(TINY).results["triangulation/clip"]
+    store.withdraw(ResultId.from_name(TINY, "triangulation/clip", key))
+    found, summary = state(store), read_summary(store, TINY)
+    assert (found.name, found.words) == ("outdated", "out of date because results were removed")
+    assert (summary.kind, summary.words, summary.problem) == (found.name, found.words, "")
+    (unit,) = summary.stages["triangulation"]
+    assert (unit.state, unit.why) == ("failed", "its result was withdrawn or removed")

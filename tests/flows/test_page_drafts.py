@@ -11,13 +11,17 @@ import numpy as np
 import page_client
 import pytest
 
+from data_contracts.cameras import CameraCalibration
 from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
 from flows.service.layout import served_state
 from flows.web.access import access_for
 from flows.web.app import create_app
+from flows.web.draft_problems import take_given
 from flows.web.drafts import SPARE_BYTES
 from flows.web.intake import CHUNK_BYTES, Intake
+from worldpose.errors import InputError
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
@@ -455,3 +459,37 @@ def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, 
     assert ada.get(DRAFTS).json() == {"drafts": []}
     assert not folder.exists()
     assert (place / "inbox" / "final" / "match.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("cam00_half1.npz", "cam00_half2.npz"), "one file with 2D poses of cam00"),
+        (("cam00.npz", "cam001.npz"), "with a name that begins"),
+        (("calibration.toml",), "one calibration"),
+    ],
+)
+def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
+    folder, given = tmp_path / "match", tmp_path / "given"
+    for each in (folder, given):
+        each.mkdir()
+    shutil.copy(tiny / "match.yaml", folder)
+    for name in names:
+        source = tiny / "detections" / "cam00.npz"
+        if name.endswith(".toml"):
+            camera = CameraCalibration(
+                id="cam00",
+                image_size=(1920, 1080),
+                focal_px=(1500.0, 1500.0),
+                principal_point_px=(960.0, 540.0),
+                distortion=(0.0,) * 5,
+                rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+                translation=(0.0, 10.0, 50.0),
+            )
+            source = folder / name
+            write_calibration_toml(source, {"cam00": camera})
+        shutil.copy(source, given / name)
+    before = {file: file.read_bytes() for file in folder.glob("*.toml")}
+    with pytest.raises(InputError, match=expected):
+        take_given(given, folder, {})
+    assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before

@@ -1,6 +1,7 @@
 """A correction on a page is stored, shown to all users, and overwrites no other user's edit."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from page_client import MATCH, a_click, moved
 
 from flows.registering import open_match, register
 from flows.review import corrections
+from flows.web import app_context
 from worldpose.errors import StoreError
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
@@ -124,3 +126,13 @@ def test_a_match_that_nobody_clicked_is_clicked_from_nothing(
     clicked["points"][name] = [place[0] + 0.5, place[1]]
     ada.post(f"{pictures}/preview", json=clicked)  # while it is dragged
     assert expected()["cam01"] == {}
+
+
+def test_a_page_shows_the_pitch_as_it_was_corrected(ada, project_copy, monkeypatch):
+    store, path = Store.open(str(project_copy)), f"{MATCH}/pictures/cam00"
+    opened = open_match(store, TINY)
+    for length in (105.0, 101.0):
+        pitch = opened.folder.pitch.model_copy(update={"length": length, "points": {}})
+        match = replace(opened, folder=replace(opened.folder, pitch=pitch))
+        monkeypatch.setattr(app_context, "open_for_review", lambda *_, match=match: match)
+        assert ada.get(path).json()["pitch"]["length"] == length

@@ -59,6 +59,27 @@ def test_a_run_is_cancelled(ada, monkeypatch):
         time.sleep(0.2)
 
 
+def test_a_run_that_cannot_start_has_its_reason_and_delays_no_other(store, monkeypatch):
+    full, real = ["first"], app_context.tempfile.mkdtemp
+
+    def make(**given):
+        if full.pop() if full else "":
+            raise OSError(28, "No space left on device")
+        return real(**given)
+
+    monkeypatch.setattr(app_context.tempfile, "mkdtemp", make)
+    monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", "print('ran')"])
+    runs = app_context.LocalRuns(store)
+    begun = time.monotonic()
+    for name in ("first", "second"):
+        runs.go_on(name, None)
+        while runs.state(name)["state"] == "running":
+            assert time.monotonic() - begun < 40
+            time.sleep(0.05)
+    assert "No space left" in runs.state("first")["lines"][0]
+    assert runs.state("second")["lines"] == ["ran"]
+
+
 def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
     store = Store.open(str(project_copy))
     match = open_match(store, TINY)
@@ -74,13 +95,17 @@ def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
 
     joint = int(np.isfinite(np.stack([place(n)[1] for n in range(5)])).all(axis=(0, 2)).argmax())
     assert ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).status_code == 422
-    for offset, xy in ((0, (100.0, 200.0)), (4, (140.0, 208.0))):
+    for number, (offset, xy) in enumerate(
+        # The last correction of a frame counts.
+        ((0, (700.0, 20.0)), (0, (100.0, 200.0)), (3, None), (4, (140.0, 208.0)))
+    ):
         at, was = place(offset)
         edit = {"kind": "moved_keypoint", "camera": camera, **at, "joint": COCO17[joint], "xy": xy}
         edit["was"] = [float(value) for value in was[joint]]
-        edits = {"edits": [{"id": f"moved_keypoint.{offset}", "edit": edit}]}
+        edits = {"edits": [{"id": f"moved_keypoint.{number}", "edit": edit}]}
         ada.post(f"{MATCH}/corrections", json=edits).raise_for_status()
     kept = ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).json()["kept"]
-    assert len(kept) == 3
-    filled = [place(n)[1][joint].tolist() for n in range(5)]
-    assert filled == [[100, 200], [110, 202], [120, 204], [130, 206], [140, 208]]
+    assert len(kept) == 2
+    filled = [place(n)[1][joint].tolist() for n in (0, 1, 2, 4)]
+    assert filled == [[100, 200], [110, 202], [120, 204], [140, 208]]
+    assert np.isnan(place(3)[1][joint]).all()  # it was said to be invisible there

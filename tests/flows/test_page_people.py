@@ -1,5 +1,11 @@
 """Whom a camera saw is corrected on a page, with what the other cameras say."""
 
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 from command_line import TINY
@@ -149,3 +155,56 @@ def test_who_is_certain_is_accepted_at_once_and_the_rest_one_by_one(ada, bob, pr
     for beyond in ([10**30, 0], [0, 10**30], [0, -1]):  # the journal's limits
         assert ada.post(f"{path}/acceptances", json={"people": [beyond]}).status_code == 422
     assert ada.get(f"{MATCH}/detections/nowhere/queue").status_code == 422
+
+
+DECIDING = """
+import { People } from "./people.mjs";
+import { posted } from "./api.mjs";
+const people = new People("m", "cam");
+await people.load(10);
+people.move(0, 0, [10, 0], [5, 5]);
+people.choose(1, 0);
+people.hide();
+people.drop();
+people.drop();
+await people.load(11);
+await new Promise((done) => setTimeout(done, 400));
+console.log(JSON.stringify({ posted, shown: people.info.frame }));
+"""
+ANSWERS = """
+export const posted = [];
+const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+export const newId = (kind) => kind;
+export const matchPath = (match) => `/${match}`;
+export async function get(path) {
+  const frame = Number(new URL(`http://x${path}`).searchParams.get("frame"));
+  const box = [0, 0, 1, frame];
+  const seen = (detection) => ({ detection, keypoints: [[frame, detection]], box });
+  await wait(frame === 10 ? 20 : 5);
+  return { frame, joints: ["nose"], people: [seen(0), seen(1)], next: [] };
+}
+export async function post(path, body) {
+  posted.push(body.edits[0].edit);
+  await wait(50);
+}
+export const messages = { tell: (text) => posted.push(text) };
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node on this machine")
+def test_a_correction_is_of_the_frame_in_which_a_person_made_it(tmp_path):
+    source = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "people.svelte.js"
+    text = re.sub(r"\$state\((.*)\);", r"\1;", source.read_text())
+    text = re.sub(r'"\./(api|messages\.svelte)\.js"', '"./api.mjs"', text)
+    for name, content in (("people", text), ("api", ANSWERS), ("main", DECIDING)):
+        (tmp_path / f"{name}.mjs").write_text(content)
+    done = subprocess.run(["node", tmp_path / "main.mjs"], capture_output=True, check=True)
+    found = json.loads(done.stdout)
+    assert found["shown"] == 11
+    place = {"camera": "cam", "frame": 10}
+    moved = {**place, "kind": "moved_keypoint", "joint": "nose"}
+    assert found["posted"] == [
+        {**moved, "detection": 0, "was": [10, 0], "xy": [5, 5]},
+        {**moved, "detection": 1, "was": [10, 1], "xy": None},
+        {**place, "kind": "deleted_detection", "detection": 1, "was": [0, 0, 1, 10]},
+    ]

@@ -12,13 +12,17 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
-from data_contracts.run import WaitingUnit
+from data_contracts.review import SplitTrack
+from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli.app import app
+from flows.registering import open_match
+from flows.reports.cameras import camera_table
 from flows.results.best_results import fitted_bodies
 from flows.results.evaluation import score
+from flows.review.corrections import keep_edits
 from flows.web.results import BROADCAST_FORMATS
 from worldpose.formats.viewer_file import decode_bodies, decode_part, read_viewer
-from worldpose.store.store import Store, open_run
+from worldpose.store.store import Run, Store, open_run
 
 
 def test_every_listed_export_is_written_or_names_the_extra_that_it_needs(reader):
@@ -161,3 +165,44 @@ def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
         assert answer.status_code == 422, path
         assert "run 0001 of" in answer.json()["error"]
         assert "found results of ingest" in answer.json()["error"]
+
+
+def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tmp_path):
+    away = {"folder": str(tmp_path / "away")}
+    store.register(store.registration(TINY).model_copy(update=away))
+    page = ada.get(MATCH)
+    assert page.status_code == 200
+    assert "registered as" in page.json()["problem"]
+    paths = ["results", "results/metrics", "results/scenes/clip", "results/exports/joints", "runs"]
+    assert {path: ada.get(f"{MATCH}/{path}").status_code for path in paths} == dict.fromkeys(
+        paths, 200
+    )
+    out = tmp_path / "report.html"
+    given = ["report", TINY, "--out", str(out), "--no-videos", "--project", store.url]
+    done = CliRunner().invoke(app, given)
+    assert (done.exit_code, "the report has no images" in done.stderr) == (0, True), done.output
+    assert out.stat().st_size > 100_000
+
+
+def test_a_camera_that_failed_has_its_reason_in_the_table(store):
+    record, unit = store.run(TINY), "static_calibration/cam03"
+    failure = UnitFailure(unit=unit, error="TaskTimeoutError", message="was stopped", key=None)
+    kept = {name: key for name, key in record.results.items() if name != unit}
+    failed = record.model_copy(update={"results": kept, "failed": (failure,)})
+    table = camera_table(Run(store, failed), open_match(store, TINY).folder.spec)
+    (row,) = (row for row in table.rows if row[0] == "cam03")
+    assert row[-1] == "was stopped"
+
+
+def test_the_report_changes_with_the_journal_and_else_is_drawn_once(ada, store, monkeypatch):
+    drawn = []
+
+    def draw(store, match, file, **given):
+        drawn.append(match)
+        file.write_text(f"report {len(drawn)}")
+
+    monkeypatch.setattr("flows.web.results.write_report", draw)
+    assert [ada.get(f"{MATCH}/results/report").text for _ in range(2)] == ["report 1"] * 2
+    edits = {"split": SplitTrack(clip="clip", person=0, first_frame_of_new=12)}
+    keep_edits(store, lambda: open_match(store, TINY), edits, who="Ada", note="")
+    assert ada.get(f"{MATCH}/results/report").text == "report 2"

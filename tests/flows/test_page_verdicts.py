@@ -16,6 +16,8 @@ from flows.reports.clip_video import clip_view
 from flows.running import RunRequest, run_match
 from flows.web import app_context
 from flows.web.app_context import Continuing, PageContext
+from flows.web.evidence import asked_run
+from worldpose.errors import InputError
 from worldpose.review.journal import say
 from worldpose.store.store import Store, open_run
 from worldpose.video.files import VideoReader
@@ -149,3 +151,22 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     assert len(pictures) == len(range(0, clip.frame_count, every))
     drawn = [np.ptp(picture.astype(int), axis=2).max() for picture in pictures]
     assert min(drawn) > 40  # coloured lines over grey
+
+
+def test_evidence_is_of_the_newest_run_with_the_results_asked_about(store):
+    keys = {"tracking/clip": store.run(TINY).results["tracking/clip"]}
+    request = ReviewRequest(
+        id="tracking.clip.1",
+        match_id=TINY,
+        run_id="0009",  # killed before its record was stored
+        gate="tracking",
+        keys=keys,
+        contents={},
+        reasons=(),
+        figures={},
+        created_at=datetime.now(UTC),
+    )
+    assert asked_run(store, request).record.run_id == "0001"
+    gone = request.model_copy(update={"keys": {"tracking/clip": "0" * 32}})
+    with pytest.raises(InputError, match="Run the match again"):
+        asked_run(store, gone)

@@ -29,6 +29,8 @@ from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.formats.challenge import read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
 from worldpose.formats.release_cameras import read_camera
+from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.geometry.rigid import Rigid
 
 FRAMES = np.arange(100, 104)
 
@@ -117,6 +119,55 @@ def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
         assert f"| `{name}` |" in page
 
 
+def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, tmp_path):
+    moving = bodies()
+    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+    run = origin(match_folder, body_fitting__A_1=moving, broadcast_calibration__A_1=broadcast())
+    places = {}
+    for late in (0.0, 0.4):
+        clip = run.spec.clips[0].model_copy(update={"broadcast_offset_frames": 1.0 - late})
+        spec = run.spec.model_copy(update={"clips": (clip,)})
+        shifted = replace(run, registration=SimpleNamespace(spec=spec))
+        (results,) = write("alphapose", shifted, tmp_path / str(late))
+        entries = json.loads(results.read_text())
+        assert [each["image_id"] for each in entries if each["idx"] == 3] == [
+            f"{n}.jpg" for n in (1, 2, 3)
+        ]
+        places[late] = np.array([each["keypoints"][::3] for each in entries])
+    # 0.4 of a step of 0.1 m, at 4000 px and 70 m.
+    np.testing.assert_allclose(places[0.4] - places[0.0], 0.4 * 0.1 * 4000 / 70, rtol=0.02)
+
+
+def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
+    moving = bodies()
+    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+    pose = Rigid(
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.r_[0.0, 2.0, 70.0]
+    )
+    camera = Camera([4000.0, 4000.0], [959.5, 539.5], np.zeros(8), pose, [1920, 1080])
+    arrays = camera_arrays(Camera.stack([camera])).items()
+    cameras = {
+        name: ((f"{name}_0", *(f"{name}_{n + 1}" for n in range(each.ndim - 1))), each)
+        for name, each in arrays
+    }
+    static = xr.Dataset(cameras, coords={"camera": ["north"]})
+    known = tracked()
+    results = {name: known[name] for name in ("tracking__A_1", "triangulation__A_1")}
+    results["triangulation__A_1"].attrs["changes"] = []
+    results |= {"body_fitting__A_1": moving, "bundle_adjustment__cameras": static}
+    run = origin(match_folder, **results)
+    places = {}
+    for offset in (0.0, [[0, 0.25]]):
+        north = run.spec.cameras[0].model_copy(update={"offset_frames": offset})
+        spec = run.spec.model_copy(update={"cameras": (north, *run.spec.cameras[1:])})
+        shifted = replace(run, registration=SimpleNamespace(spec=spec))
+        (results,) = write("alphapose", shifted, tmp_path / str(bool(offset)))
+        entries = json.loads(results.read_text())
+        places[bool(offset)] = np.array([e["keypoints"][::3] for e in entries if e["idx"] == 3])
+    # Image 100 is a quarter of a frame before match frame 100: 0.025 m, at 4000 px and 70 m.
+    np.testing.assert_allclose(places[True] - places[False], -0.025 * 4000 / 70, rtol=0.02)
+
+
 def test_alphapose_results_are_the_projected_bodies(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
     (results,) = write("alphapose", run, tmp_path)
@@ -193,6 +244,17 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     x0, y0, x1, y1 = boxes[0, 1]
     # Pixels count from 1, at corners, there; texts hold hundredths.
     assert rows[1, 2:6] == pytest.approx([x0 + 1.5, y0 + 1.5, x1 - x0, y1 - y0], abs=0.006)
+    clip = run.spec.clips[0].model_copy(update={"broadcast_offset_frames": 12})
+    spec = run.spec.model_copy(update={"clips": (clip,)})
+    run = replace(run, registration=SimpleNamespace(spec=spec))
+    later = np.loadtxt(write("tracks", run, tmp_path / "later")[1], delimiter=",")
+    assert later[:, 0].tolist() == [13, 13, 14, 14, 15]
+    cameras = tuple(each.model_copy(update={"fps": 25.0}) for each in spec.cameras)
+    spec = spec.model_copy(update={"cameras": cameras})
+    run = replace(run, registration=SimpleNamespace(spec=spec))
+    for form in ("tracks", "challenge", "slahmr-cameras"):
+        with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
+            write(form, run, tmp_path / "slower")
     settings = BaselineSettings.model_validate_json(written[0].read_bytes())
     assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
 

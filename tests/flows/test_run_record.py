@@ -1,18 +1,22 @@
 """A run's record when units fail, and when the match is edited during the run."""
 
+import shutil
+
 import pytest
 from command_line import TINY, succeed, worldpose
 
 from data_contracts.review import MergedTracks
 from flows import iterate
+from flows.gates import Gatekeeper
 from flows.iterate import Iteration, iterate_match
 from flows.method import METHOD
 from flows.registering import open_match
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.review.verdicts import correct
+from flows.run_plan import RunPlan
 from flows.run_record import RunLog
 from flows.run_status import run_status
-from flows.running import RunRequest
+from flows.running import RunRequest, settle
 
 
 def merge(store):
@@ -110,3 +114,29 @@ def test_no_person_is_placed_whatever_else_fails(store, monkeypatch, failing):
     record = recorded(store, METHOD, failing)
     assert (record.state, record.usability.verdict) == ("partial", "not usable")
     assert record.usability.reservations[0].startswith("no person is placed.")
+
+
+def test_a_part_continues_the_iteration_of_the_latest_run(store):
+    first, stages = store.run(TINY), METHOD[: [each.name for each in METHOD].index("tracking") + 1]
+    later = {"run_id": store.reserve_run(TINY), "iteration": 2}
+    store.finish_run(first.model_copy(update=later))
+    latest = store.run(TINY)
+    gatekeeper = Gatekeeper(store, open_match(store, TINY), "never")
+    plan = RunPlan.begin(gatekeeper, stages, {}, latest, 1)
+    assert (plan.iteration, plan.before["filtering/clip"]) == (2, first.results["filtering/clip"])
+    assert RunPlan.begin(gatekeeper, METHOD, {}, latest, 1).iteration == 1
+    # The last stage ends the whole method, however it is asked for.
+    match, asked = open_match(store, TINY), RunRequest({}, until_stage="filtering", iterations=2)
+    assert settle(store, match, asked)[1].iterations == 2
+    # Without the results of the first iteration, as after an edit, a part begins there.
+    shutil.rmtree(f"{store.url}/results/{TINY}/filtering")
+    plan = RunPlan.begin(gatekeeper, stages, {}, latest, 1)
+    assert (plan.iteration, plan.before) == (1, None)
+
+
+def test_a_record_names_no_setting_of_a_stage_that_its_run_took_over(store):
+    given = {"static_calibration": {"click_noise_px": 3.0}, "filtering": {}}
+    log = RunLog.begin(store, open_match(store, TINY), METHOD[-1:], given)
+    record = log.run_stages(lambda stage, units: ())
+    assert record.overrides == {"filtering": {}}
+    assert log.plan.is_recorded_by(record)

@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import replace
+from threading import Barrier, BrokenBarrierError
 from types import SimpleNamespace
 
 import pytest
@@ -16,12 +18,14 @@ from flows.cli import run as run_command
 from flows.cli.app import app as worldpose
 from flows.layers import read_layer, write_layer
 from flows.registering import open_match, register
+from flows.results.automatic_exports import export_after_run
 from flows.run_plan import plan_run
 from flows.running import RunRequest, settle
 from flows.service import deployed
 from flows.service.plan import ServePlan
 from flows.settings import parse_overrides, resolve
 from flows.web import app_context
+from flows.web import settings as page_settings
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.errors import InputError, UsageError
 from worldpose.store.run_queue import queue_of
@@ -337,3 +341,39 @@ def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
     given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
     path = f"onnx-rtmdet:{tmp_path / 'net.onnx'}"
     assert given["detection"] == {"detector": path, "pose": "embedded"}
+    store = Store.create(str(tmp_path / "project"))
+    given = "detection.detector=onnx-rtmdet:net.onnx"
+    command("settings", "--set", given, "--project", store.url)
+    assert read_layer(store, "project").values == {"detection.detector": path}
+
+
+def test_a_value_that_no_run_can_use_is_not_kept(store, tmp_path):
+    typo = {"detection": {"detector": f"onnx:{tmp_path}/none.onnx"}}
+    with pytest.raises(InputError, match=r"none\.onnx"):
+        settle(store, open_match(store, TINY), RunRequest(typo))
+    assert not read_layer(store, f"matches/{TINY}").values
+
+
+def test_of_two_saves_of_one_revision_one_is_refused(store, ada, bob, monkeypatch):
+    both, save = Barrier(2), page_settings.save_layer
+
+    def save_late(*given):
+        with suppress(BrokenBarrierError):
+            both.wait(timeout=0.5)
+        save(*given)
+
+    monkeypatch.setattr(page_settings, "save_layer", save_late)
+
+    def post(who, values):
+        sent = {"layer": "project", "revision": "", "values": values}
+        return who.post("/api/settings", json=sent).status_code
+
+    with ThreadPoolExecutor(2) as pool:
+        codes = pool.map(post, (ada, bob), ({"iterations": 2}, {"gates": "auto"}))
+        assert sorted(codes) == [200, 409]
+
+
+def test_a_run_without_people_exports_nothing(store):
+    write_layer(store, "project", {"exports": ["joints"]})
+    record = store.run(TINY).model_copy(update={"results": {}})
+    assert export_after_run(store, open_match(store, TINY), record) == []

@@ -1,10 +1,13 @@
 """A match whose camera is calibrated without clicks, from its folder to the report."""
 
 import shutil
+from dataclasses import replace
 
 import yaml
-from command_line import succeed
+from command_line import TINY, succeed
 
+from flows.registering import open_match
+from flows.stages.broadcast_calibration import uncalibrated_warnings
 from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate
@@ -28,3 +31,11 @@ def test_a_camera_without_clicks_has_its_place_in_the_report(tiny, tmp_path):
     succeed("report", folder, *project, "--out", tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "proposed markings" in page
+
+
+def test_a_broadcast_video_that_nothing_calibrates_is_reported(store):
+    match = open_match(store, TINY)
+    assert uncalibrated_warnings(match) == ()
+    videos = {"clip": match.folder.folder / "broadcast" / "clip.mp4"}
+    (said,) = uncalibrated_warnings(replace(match, folder=replace(match.folder, videos=videos)))
+    assert "of clip clip is not used: it needs clicks in" in said

@@ -10,6 +10,7 @@ from flows.orchestration.prefect_environment import CLIENT_LOGIN
 from flows.service import health
 from flows.service.health import check
 from flows.service.layout import StateFolder
+from flows.service.match_runs import match_runs_of
 
 
 @pytest.fixture
@@ -40,6 +41,10 @@ def test_what_was_never_started_or_killed_is_said(state, tmp_path):
     state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
     (finding,) = check(state)
     assert "killed" in finding.state
+    # Another process can have its number: the lock alone tells that it serves.
+    assert match_runs_of(str(tmp_path)) is None
+    with state.only_one("serve", wait=False):
+        assert match_runs_of(str(tmp_path)) is not None
     assert "worldpose serve" in finding.remedy
 
 

@@ -387,3 +387,19 @@ def test_more_files_than_any_match_has_are_refused(drop, monkeypatch):
     monkeypatch.setattr("flows.service.inbox.MOST_FILES", 3)
     with pytest.raises(RefusalError, match="more than 3 files"):
         fingerprint_of(folder)
+
+
+def test_an_arrival_whose_disk_failed_once_is_taken_in_later(desk, drop, monkeypatch):
+    drop("aaa")
+    desk.look()
+
+    def fail(*_, **__):
+        raise OSError(5, "Input/output error", "match.yaml")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("flows.service.inbox.register", fail)
+        desk.take_in()
+    assert desk.known()["aaa"] == ("incomplete", "match.yaml: Input/output error")
+    desk.look()
+    desk.take_in()
+    assert desk.known()["aaa"][0] == "taken"

@@ -26,6 +26,7 @@ from pydantic import ValidationError
 
 from data_contracts.cameras import COEFFICIENTS, CameraCalibration, LensName
 from worldpose.errors import InputError, describe_value
+from worldpose.formats.calibration_unit import toml_unit_m
 from worldpose.formats.files import read_toml
 
 NUMBER_LIMIT: Final = 1e9
@@ -34,19 +35,6 @@ NUMBER_LIMIT: Final = 1e9
 
 ROTATION_TOLERANCE: Final = 1e-4
 """Maximum rounding error of R R^T = I [1]; four decimals give less."""
-
-MILLIMETRE: Final = 1e-3
-"""[m]"""
-
-FREEMOCAP: Final = (
-    "charuco_square_size",
-    "charuco_board_object",
-    "groundplane_calibration",
-    "groundplane_applied",
-    "recording_info",
-    "path_to_recorded_videos",
-)
-"""Keys of `metadata` that FreeMoCap alone writes."""
 
 
 class LeftOut(dict[str, str]):
@@ -276,28 +264,6 @@ def _lacks_pose(table: Mapping[str, Any]) -> bool:
     return _has_lens_alone(table) or ("matrix" in table and "nan" in pose)
 
 
-def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
-    """Return the unit of a TOML file [m]: FreeMoCap's has millimetres, and the ground as z = 0.
-
-    Raises:
-        InputError: FreeMoCap's file has no ground plane.
-    """
-    content = read_toml(path) if content is None else content
-    metadata = content.get("metadata")
-    if not isinstance(metadata, dict) or not any(key in metadata for key in FREEMOCAP):
-        return 1.0
-    if not (metadata.get("groundplane_calibration") or metadata.get("groundplane_applied")):
-        raise InputError(
-            f"{path}: metadata.groundplane_calibration",
-            expected="true: the world's z axis points up from the ground",
-            found="no ground plane: the world is that of the first camera",
-            todo="Process the calibration again in FreeMoCap with the board on the ground ('Use "
-            "Charuco as groundplane'), or import the lenses (worldpose import --lens) and locate "
-            "the cameras from people (worldpose locate-cameras).",
-        )
-    return MILLIMETRE
-
-
 def camera_tables(
     path: Path, content: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
@@ -348,17 +314,61 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
     """
     matrix = _read_numbers(table, where, keys.matrix, (3, 3))
     size = _read_numbers(table, where, keys.size, (2,))
-    fisheye = table.get("fisheye", False)
-    if fisheye not in (False, True):
-        raise calibration_error(f"{where}.fisheye", "true or false", describe_value(fisheye))
+    fisheye = is_fisheye(where, table)
     numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))
-    distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, fisheye=bool(fisheye))
+    distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, fisheye=fisheye)
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
     if np.any(np.abs(off_diagonal) > 1e-9):
         raise calibration_error(
             f"{where}.{keys.matrix}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", str(matrix.tolist())
         )
     return Optics(size, np.diag(matrix)[:2], matrix[:2, 2], distortion, model)
+
+
+MODEL_NAMES: Final = (
+    *("fisheye", "fisheyemodel", "distortionmodel", "distortiontype", "lensmodel", "modeltype"),
+    *("projection", "projectionmodel", "model", "cameramodel", "cameratype", "type"),
+)
+"""Names of entries that may name the lens model; the last four may name the device as well."""
+FISHEYE_WORDS: Final = (
+    *("1", "1.0", "true", "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye"),
+    *("pinhole_equi", "kb4"),
+)
+OTHER_WORDS: Final = (
+    *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
+    *("rational_polynomial", "rational", "full_opencv", "none", "perspective", "thin_prism"),
+    *("tilted", "brown_conrady", "pinhole_radtan", "simple_radial", "radial", "simple_pinhole"),
+)
+"""Values of `MODEL_NAMES`, in lower case with underscores; coefficients tell these apart."""
+
+
+def plain_key(key: str) -> str:
+    """Return a name without underscores and capitals, which do not matter in longer ones."""
+    return key if len(key) == 1 else key.replace("_", "").lower()
+
+
+def is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
+    """Return whether the entries of a lens say, under any usual name, that it is a fisheye.
+
+    Raises:
+        InputError: one names another lens model than those of OpenCV, or two contradict.
+    """
+    # Parts of names of lens models, which names of devices do not have.
+    lens_part = r"fish|omni|equi|kannala|ucm|fov|spher|mei|division|poly|radial|^ds$|^eq$"
+    said = {}
+    for key in [key for key in given if plain_key(key) in MODEL_NAMES]:
+        word = re.sub(r"[ -]+", "_", "".join(map(str, np.ravel(given[key])[:1])).lower())
+        is_device = plain_key(key) in MODEL_NAMES[-4:] and not re.search(lens_part, word)
+        if word not in FISHEYE_WORDS + OTHER_WORDS and not is_device:
+            words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
+            raise calibration_error(f"{where}: {key}", f"one of {words}", repr(word))
+        said[word] = key
+    yes = said.keys() & set(FISHEYE_WORDS)
+    no = said.keys() & set(OTHER_WORDS) - {"pinhole"}
+    if yes and no:
+        found = ", ".join(f"{key} {word}" for word, key in said.items())
+        raise calibration_error(where, "one lens model", found)
+    return bool(yes)
 
 
 def _read_lens(

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
-    MILLIMETRE,
     Keys,
     LeftOut,
     calibration_error,
@@ -27,7 +26,6 @@ from worldpose.formats.calibration_files import (
     index_by_name,
     read_calibration_toml,
     read_camera_table,
-    toml_unit_m,
 )
 from worldpose.formats.calibration_programs import (
     is_openpose,
@@ -37,7 +35,7 @@ from worldpose.formats.calibration_programs import (
     read_openpose_cameras,
 )
 from worldpose.formats.calibration_systems import read_calibration_xml
-from worldpose.formats.calibration_unit import require_metres
+from worldpose.formats.calibration_unit import MILLIMETRE, require_metres, toml_unit_m
 from worldpose.formats.files import SETTINGS_BYTES, require_file
 from worldpose.formats.lens_files import read_opencap
 from worldpose.formats.opencv_storage import read_file_storage

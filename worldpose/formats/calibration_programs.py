@@ -99,8 +99,7 @@ def _read_multical(
     tables = {}
     for name, table in cameras.items():
         pose = by_camera.get(name)
-        fisheye = {"fisheye": True} if table.get("model") == "fisheye" else {}
-        tables[name] = {**table, **(pose if isinstance(pose, dict) else {}), **fisheye}
+        tables[name] = {**table, **(pose if isinstance(pose, dict) else {})}
     return _read_tables(path, tables, Keys("image_size", "K", "dist", "R", "T"), left_out)
 
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from data_contracts.cameras import COEFFICIENTS, CameraCalibration
 from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import (
-    MILLIMETRE,
     NUMBER_LIMIT,
     LeftOut,
     Optics,
@@ -22,6 +21,7 @@ from worldpose.formats.calibration_files import (
     calibration_error,
     index_by_name,
 )
+from worldpose.formats.calibration_unit import MILLIMETRE
 from worldpose.formats.files import SETTINGS_BYTES, parse_xml, require_file
 from worldpose.parsing import decimal_point
 

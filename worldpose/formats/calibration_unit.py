@@ -1,16 +1,20 @@
-"""Unit of length of a calibration, by the distances of its cameras, and size of its images."""
+"""Unit of length of a calibration: what its file says, what its cameras say; size of its images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import MILLIMETRE
+from worldpose.formats.files import read_toml
+
+MILLIMETRE: Final = 1e-3
+"""[m]"""
 
 
 def require_metres(
@@ -61,3 +65,27 @@ def scaled(
             "principal_point_px": tuple(middle.tolist()),
         }
     )
+
+
+def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
+    """Return the unit of a TOML file [m]: FreeMoCap's has millimetres, and the ground as z = 0.
+
+    Raises:
+        InputError: FreeMoCap's file has no ground plane.
+    """
+    content = read_toml(path) if content is None else content
+    # Keys of `metadata` that FreeMoCap alone writes.
+    own = {"charuco_square_size", "charuco_board_object", "groundplane_calibration"}
+    own |= {"groundplane_applied", "recording_info", "path_to_recorded_videos"}
+    metadata = content.get("metadata")
+    if not isinstance(metadata, dict) or not own & metadata.keys():
+        return 1.0
+    if not (metadata.get("groundplane_calibration") or metadata.get("groundplane_applied")):
+        where = f"{path}: metadata.groundplane_calibration"
+        expected = "true: the world's z axis points up from the ground"
+        todo = "Process the calibration again in FreeMoCap with the board on the ground ('Use "
+        todo += "Charuco as groundplane'), or import the lenses (worldpose import --lens) and "
+        todo += "locate the cameras from people (worldpose locate-cameras)."
+        found = "no ground plane: the world is that of the first camera"
+        raise InputError(where, expected, found, todo)
+    return MILLIMETRE

@@ -175,7 +175,7 @@ def write_submission(path: Path, joints: Mapping[str, Floats]) -> None:
 
     The ending decides the form: zip, npz, or a table as of 2025 (parquet).
     """
-    if path.suffix == PARQUET:
+    if path.suffix.lower() == PARQUET:
         import pandas as pd  # late: it takes 0.3 s
 
         from worldpose.formats.tables import write_parquet
@@ -191,7 +191,7 @@ def write_submission(path: Path, joints: Mapping[str, Floats]) -> None:
         table.insert(0, "row_id", ["_".join(row) for row in zip(*ids, strict=True)])
         write_parquet(path, table, {})
         return
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         write_archive(path, {clip: array.astype(np.float32) for clip, array in joints.items()})
         return
     single = {clip: array.astype(np.float32) for clip, array in joints.items()}
@@ -292,7 +292,7 @@ def submission_clips(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: there is no such file, or no submission in it.
     """
-    if path.suffix == PARQUET:
+    if path.suffix.lower() == PARQUET:
         return tuple(_read_table(path, None))
     with _npz_of(path) as file:
         return _clips_of(file)
@@ -300,9 +300,9 @@ def submission_clips(path: Path) -> tuple[str, ...]:
 
 def is_submission(path: Path) -> bool:
     """Return whether a file has a submission's layout: a zip with one, an npz or a table."""
-    if not path.is_file() or path.suffix not in (".zip", ".npz", PARQUET):
+    if not path.is_file() or path.suffix.lower() not in (".zip", ".npz", PARQUET):
         return False
-    if path.suffix == PARQUET:
+    if path.suffix.lower() == PARQUET:
         return True
     try:
         return "joints" not in submission_clips(path)  # a joints file is an npz, too
@@ -323,7 +323,7 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
     Raises:
         InputError: there is no such file, no submission in it, or arrays of another type or shape.
     """
-    if path.suffix == PARQUET:
+    if path.suffix.lower() == PARQUET:
         return _read_table(path, only)
     with _npz_of(path) as file:
         return _by_clip(file, ("persons", "frames", 15, 3), only)

@@ -14,7 +14,7 @@ The frame is a whole `image_id`, or the number in an `image_id` that is a file's
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -62,40 +62,37 @@ def read_coco_results(path: Path) -> PeopleFile:
     # Maximum size of a JSON file [byte], about two million people; npz holds more and is
     # faster.
     json_bytes = 1 << 30
-    keep = ("images", "categories", "meta_info")
+    keep = ("images", "meta_info")
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
+    names, others = _categories(path, json_bytes)
     entries = plain_entries(str(path), items)
-    batches, pointless = [], 0
+    batches, pointless, foreign = [], 0, 0
     for first, given in _batches(path, entries):
         results = given
         if items.is_mapping:
+            for each in given:
+                if each.get("keypoints") and each.get("category_id") in others:
+                    each["keypoints"], foreign = None, foreign + 1
             results, without = _with_points(given)
             pointless += without
         batches.append(_read_batch(path, results, first))
     if not items.has_list:
-        expected = (
-            "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
-            "results of MMPose or Ultralytics"
-        )
-        todo = "Export the poses as COCO keypoint results."
-        raise InputError(
-            str(path), expected, describe_value(items.other or ", ".join(items.seen)), todo
-        )
+        expected = "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
+        expected += "results of MMPose or Ultralytics"
+        there = describe_value(items.other or ", ".join(items.seen))
+        raise InputError(str(path), expected, there, "Export the poses as COCO keypoint results.")
     found = _join(path, batches)
     points = found.points
     if pointless and pointless == len(points):
-        expected = "keypoints of people"
-        todo = "Export the poses, not the boxes alone."
-        raise InputError(
-            f"{path}: annotations", expected, f"{pointless} annotations without keypoints", todo
-        )
+        there, todo = f"{pointless} annotations without keypoints", "Export poses, not boxes alone."
+        raise InputError(f"{path}: annotations", "keypoints of people", there, todo)
     if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
-    wrong_scale = (sure < 0) | (sure > MAX_CONFIDENCE)  # NaN is a missing point
+    wrong_scale = np.abs(sure) > MAX_CONFIDENCE  # NaN is a missing point, as below 0
     confidence_todo = "Scale the detector's scores so that 1 is certain and 0 is missing."
     _require_right(path, points, ~wrong_scale, 0, "a confidence from 0 to 1", confidence_todo)
-    names, where = _point_names(path, items.kept.get("categories")), f"{path}: categories"
+    where = f"{path}: categories"
     names = names or _model_names(items.kept.get("meta_info"))
     if names and len(names) != points.shape[1] and len(points):
         raise _wrong(where, f"names of {points.shape[1]} keypoints", f"{len(names)} names")
@@ -103,7 +100,8 @@ def read_coco_results(path: Path) -> PeopleFile:
     points, changed = clean_points(order.select(points))
     frames = _frames(path, found.images, items.kept.get("images"))
     people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, _limit(path))
-    changed = changed._replace(nobody=nobody - pointless, pointless=pointless)
+    nobody, pointless = nobody - pointless, pointless - foreign
+    changed = changed._replace(nobody=nobody, pointless=pointless, foreign=foreign)
     return PeopleFile(people, order.name, changed)
 
 
@@ -246,18 +244,27 @@ def _require_distinct(
         raise _wrong(f"{path}: {key}", "names of one camera's images whose numbers differ", found)
 
 
-def _point_names(path: Path, categories: object) -> list[str]:
-    """Return the names of the points in `categories`; none where it has none."""
-    listed = categories if isinstance(categories, list) else []
-    given = [each for each in listed if isinstance(each, dict)]
-    names = [tuple(each["keypoints"]) for each in given if isinstance(each.get("keypoints"), list)]
-    names = [each for each in names if each]
-    if len(set(names)) > 1:
-        people = [n for each, n in zip(given, names, strict=False) if each.get("name") == "person"]
+def _categories(path: Path, limit: int) -> tuple[list[str], list[Any]]:
+    """Return the names of people's points in `categories`, and the ids of other categories.
+
+    It reads the file once more: a data set has its categories after the annotations. Both are empty
+    without names of points.
+    """
+    items = JsonItems(path, "categories", limit)
+    given = [each for each in takewhile(lambda _: items.is_mapping, items) if type(each) is dict]
+    names = {
+        index: tuple(map(str, each["keypoints"]))
+        for index, each in enumerate(given)
+        if isinstance(each.get("keypoints"), list) and each["keypoints"]
+    }
+    chosen = set(names.values())
+    if len(chosen) > 1:
+        people = [name for index, name in names.items() if given[index].get("name") == "person"]
         if len(people) != 1:
             raise _wrong(f"{path}: categories", "the keypoints of one category", f"{len(names)}")
-        names = people
-    return list(names[0]) if names else []
+        chosen = set(people)
+    others = [each.get("id", ()) for n, each in enumerate(given) if names.get(n) not in chosen]
+    return [name for each in chosen for name in each], others if chosen else []
 
 
 def _model_names(about: object) -> list[str]:

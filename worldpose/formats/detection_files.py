@@ -45,16 +45,14 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
         InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
             unknown or a changing number of keypoints; the error names file and key.
     """
-    files = _frame_files(folder)
+    files = frame_files(folder)
     read = {frame: _read_frame(files[frame]) for frame in sorted(files)}
     sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
         (one, file), (two, other) = list(sizes.items())[:2]
-        expected = "the same keypoints in all frames"
+        said = f"{one} in {file.name}, {two} in {other.name}"
         todo = "Use the files of one estimator, and remove older ones."
-        raise InputError(
-            str(folder), expected, f"{one} in {file.name}, {two} in {other.name}", todo
-        )
+        raise InputError(str(folder), "the same keypoints in all frames", said, todo)
     empty = sum(people is None for people in read.values())
     found = [one for people in read.values() for one in people or ()]
     frames = np.repeat(list(read), [len(people or ()) for people in read.values()])
@@ -67,7 +65,8 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     return PeopleFile(people, kind, changed._replace(nobody=nobody, empty=empty))
 
 
-def _frame_files(folder: Path) -> dict[int, Path]:
+def frame_files(folder: Path) -> dict[int, Path]:
+    """Return the JSON file of each frame of a camera; errors as of `read_openpose_folder`."""
     there = {file.name: file for file in sorted(folder.glob("*.[jJ][sS][oO][nN]"))}
     numbers = frame_numbers(there)
     files: dict[int, Path] = {}
@@ -98,12 +97,10 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
     if content == []:
         return None
     if not isinstance(people, list) or len(people) > PEOPLE_LIMIT:
-        raise InputError(
-            f"{file}: people",
-            expected=f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it",
-            found=f"{len(people)} people" if isinstance(people, list) else type(people).__name__,
-            todo="Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose').",
-        )
+        expected = f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it"
+        found = f"{len(people)} people" if isinstance(people, list) else type(people).__name__
+        todo = "Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose')."
+        raise InputError(f"{file}: people", expected, found, todo)
     return [_read_person(f"{file}: people[{n}]", person) for n, person in enumerate(people)]
 
 
@@ -124,7 +121,7 @@ def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN40
             f"{where}.{key}", f"x, y, confidence of each point, of {KNOWN_SETS} points", found, todo
         )
     values = np.array(numbers, dtype=np.float64).reshape(-1, 3)
-    off = (np.abs(values) > COORDINATE_LIMIT).any(axis=1) | (values[:, 2] > MAX_CONFIDENCE)
+    off = (np.abs(values) > COORDINATE_LIMIT).any(axis=1) | (np.abs(values[:, 2]) > MAX_CONFIDENCE)
     if off.any():
         expected = f"pixels up to {COORDINATE_LIMIT:g}, and confidences from 0 to 1"
         todo = "Estimate the poses of this frame again."
@@ -154,8 +151,9 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and, in truth
-    of nine numbers, the class, of which 1 is a person. Frames begin at 1, and (1, 1) is the upper
-    left corner of the image. Trackers follow people out of the image: such boxes are left out.
+    of nine numbers, the class, of which 1 is a person and -1 is not known. Frames begin at 1, and
+    (1, 1) is the upper left corner of the image. Trackers follow people out of the image: such
+    boxes are left out.
 
     Args:
         file: the text.
@@ -167,17 +165,16 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
             video lacks, an id twice in a frame, an empty box, an impossible confidence, or most
             boxes are outside of the image; the error names the line.
     """
-    if file.suffix == ".npy":
+    if file.suffix.lower() == ".npy":
         return _read_identified(file, frames)
-    pedestrian = 1  # class of people in MOTChallenge's truth
+    people = (1, -1)  # class of people in MOTChallenge's truth, and none
     lines, rows = _read_rows(file)
     frame, person, box = rows[:, 0], rows[:, 1], rows[:, 2:6]
     corner = box[:, :2] - 1.5
     boxes = np.concatenate([corner, corner + box[:, 2:]], axis=1)
     score = rows[:, 6] if rows.shape[1] > 6 else np.full(len(rows), -1.0)
-    kept = score != 0.0
-    if rows.shape[1] == 9:
-        kept &= rows[:, 7] == pedestrian
+    is_person = np.isin(rows[:, 7], people) if rows.shape[1] == 9 else np.ones(len(rows), np.bool_)
+    kept = (score != 0.0) & is_person
     pairs = np.stack([frame, person], axis=1)
     order = np.lexsort((np.arange(len(rows)), person, frame))
     again = np.zeros(len(rows), np.bool_)
@@ -209,7 +206,14 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
             raise InputError(
                 f"{file}: line {number}{': ' if key else ''}{key}", expected, f"{text!r:.80}", todo
             )
+    if not kept.any():
+        expected = "a box of a person (class 1 or -1) with a confidence above 0"
+        found = f"{len(rows)} boxes, {int((~is_person).sum())} of them of another class"
+        todo = "Write the class of people as 1 or -1, and confidences above 0."
+        raise InputError(str(file), expected, found, todo)
     changes = {
+        "of another class than 1, a person, which are left out": int((~is_person).sum()),
+        "of confidence 0, which are left out": int((is_person & (score == 0.0)).sum()),
         "outside of the image, which are left out": int((kept & outside).sum()),
         "of a confidence above 1, which counts as 1": int((kept & (score > 1.0)).sum()),
     }

@@ -11,9 +11,10 @@ import codecs
 import errno
 import json
 import os
+import re
 import tempfile
 import tomllib
-from collections.abc import Callable, Collection, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
@@ -31,6 +32,13 @@ CHUNK = 1 << 20
 
 EVENTS = 100_000
 """Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
+
+
+def by_last_number(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return entries by the last numbers in their names; in their order if a name has none."""
+    numbers = {name: re.findall(r"\d+", name) for name in named}
+    key = (lambda name: int(numbers[name][-1])) if all(numbers.values()) else lambda _: 0
+    return {name: named[name] for name in sorted(named, key=key)}
 
 
 @contextmanager

@@ -301,6 +301,8 @@ class Changes(NamedTuple):
     """Empty files of frames."""
     pointless: int = 0
     """Annotations of a data set that have no points, such as of the ball."""
+    foreign: int = 0
+    """Annotations with points, of another category than the people."""
 
 
 class PeopleFile(NamedTuple):

@@ -7,6 +7,7 @@ In the TOML form each table has `size`, `matrix` and `distortions` as in calibra
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -21,12 +22,22 @@ from data_contracts.cameras import LensCalibration
 from worldpose.errors import InputError, describe_value, say_failure
 from worldpose.formats.archives import read_npz
 from worldpose.formats.calibration_files import (
+    MODEL_NAMES,
     calibration_error,
     camera_tables,
+    is_fisheye,
+    plain_key,
     read_optics,
     require_optics,
 )
-from worldpose.formats.files import SETTINGS_BYTES, read_json, read_toml, read_yaml, require_file
+from worldpose.formats.files import (
+    SETTINGS_BYTES,
+    by_last_number,
+    read_json,
+    read_toml,
+    read_yaml,
+    require_file,
+)
 from worldpose.formats.opencv_storage import is_storage, read_file_storage
 from worldpose.parsing import read_npy
 
@@ -42,16 +53,6 @@ SIZE_NAMES: Final = (
     *(("imagewidth", "imageheight"), ("width", "height"), ("imagesize",), ("size",)),
     *(("resolution",), ("imgsize",), ("w", "h")),
 )
-MODEL_NAMES: Final = ("distortionmodel", "lensmodel", "modeltype", "fisheyemodel", "fisheye")
-"""Names of entries, longer ones without underscores and capitals."""
-FISHEYE_WORDS: Final = (
-    *("1", "1.0", "true", "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye"),
-)
-OTHER_WORDS: Final = (
-    *("0", "0.0", "false", "plumb_bob", "radtan", "brown", "pinhole", "opencv", "standard"),
-    *("rational_polynomial", "rational", "full_opencv"),
-)
-"""Values of `MODEL_NAMES`, in lower case."""
 
 
 def read_lenses(
@@ -105,7 +106,7 @@ def read_lenses(
         "size": list(_image_size(given, sizes[camera])),
         "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
         "distortions": distortion.tolist(),
-        "fisheye": _is_fisheye(where, given),
+        "fisheye": is_fisheye(where, given),
     }
     return {camera: _lens(where, camera, table, sizes[camera])}
 
@@ -133,8 +134,10 @@ def _lenses(
     camera: str | None,
 ) -> dict[str, LensCalibration]:
     """Return the lenses of tables with their places and names; see `read_lens_toml`."""
-    found = {}
-    for where, name, table in tables:
+    found: dict[str, LensCalibration] = {}
+    given = list(tables)
+    names = ", ".join(name for _, name, _ in given)
+    for where, name, table in given:
         if camera is not None and name != camera:
             continue
         if name not in sizes:
@@ -143,7 +146,8 @@ def _lenses(
             raise calibration_error(where, "a name of its own", f"{name!r} a second time")
         found[name] = _lens(where, name, table, sizes[name])
     if not found:
-        raise calibration_error(str(file), f"camera {camera}" if camera else "a camera", "none")
+        todo = f"Rename the camera in the file to {camera}." if names and camera else "Correct it."
+        raise InputError(str(file), f"camera {camera or 'NAME'}", names or "none", todo)
     return found
 
 
@@ -172,7 +176,7 @@ def _read_files(files: Sequence[Path]) -> dict[str, Any]:
     given: dict[str, Any] = {}
     for file in files:
         for key, value in _read_file(file).items():
-            other = _key(given, names & {_plain(key)})
+            other = _key(given, names & {plain_key(key)})
             if other is not None and not np.array_equal(given[other], value):
                 raise calibration_error(f"{file}: {key}", f"the value of {other}", "another one")
             given[key] = value
@@ -255,8 +259,7 @@ def _read_named(file: Path) -> list[tuple[str, dict[str, Any]]] | None:
             where = f"{file}: cameras[{index}]"
             raise calibration_error(where, "a lens with a name", describe_value(table))
         lens = {ours.get(str(key), str(key)): value for key, value in table.items()}
-        fisheye = {"fisheye": True} if table.get("model") == "fisheye" else {}
-        found.append((str(name), lens | fisheye))
+        found.append((str(name), lens))
     return found
 
 
@@ -278,17 +281,17 @@ def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, 
         expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
         raise calibration_error(str(path), expected, f"{content!r:.60}")
     pose: NDArray[np.float64] | None = np.eye(4)
-    for index, (name, given) in enumerate(content.items()):
+    tables = {str(name): given for name, given in content.items()}
+    if all(re.fullmatch(r"cam\d+", name) for name in tables):
+        tables = by_last_number(tables)  # Kalibr writes cam0, cam1, cam10, cam2
+    for index, (name, given) in enumerate(tables.items()):
         where = f"{path}: {name}"
         given = given if isinstance(given, dict) else {}
         model, lens = given.get("camera_model"), given.get("distortion_model", "none")
         if model != "pinhole" or lens not in ("radtan", "equidistant", "none"):
-            raise InputError(
-                where,
-                expected="camera_model pinhole with distortion_model radtan, equidistant or none",
-                found=f"{model} with {lens}",
-                todo="Calibrate again with --models pinhole-radtan or pinhole-equi.",
-            )
+            expected = "camera_model pinhole with distortion_model radtan, equidistant or none"
+            todo = "Calibrate again with --models pinhole-radtan or pinhole-equi."
+            raise InputError(where, expected, f"{model} with {lens}", todo)
         numbers = given.get("intrinsics")
         if not isinstance(numbers, list) or len(numbers) != 4:
             raise calibration_error(f"{where}.intrinsics", "fx, fy, cx, cy", f"{numbers!r:.60}")
@@ -299,11 +302,14 @@ def kalibr_tables(path: Path, content: object) -> Iterator[tuple[str, dict[str, 
             "distortions": given.get("distortion_coeffs") or [0.0] * 4,
             **({"fisheye": True} if lens == "equidistant" else {}),
         }
+        if not index and "T_cn_cnm1" in given:
+            expected = "none in the first camera, from which the others are counted"
+            raise calibration_error(f"{where}.T_cn_cnm1", expected, "a pose of it")
         if index:
             pose = _chain(f"{where}.T_cn_cnm1", given.get("T_cn_cnm1"), pose)
         if pose is not None:
             table |= {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
-        yield str(name), table
+        yield name, table
 
 
 def _chain(
@@ -356,13 +362,9 @@ def _has_matrix(given: object) -> bool:
     return _key(plain, MATRIX_NAMES) is not None
 
 
-def _plain(key: str) -> str:
-    return key if len(key) == 1 else key.replace("_", "").lower()
-
-
 def _key(given: Mapping[str, Any], names: Iterable[str]) -> str | None:
     """Return the key with the first of these names that there is, in any spelling."""
-    plain = {_plain(key): key for key in given}
+    plain = {plain_key(key): key for key in given}
     return next((plain[name] for name in names if name in plain), None)
 
 
@@ -374,22 +376,6 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
     todo = "Add it to the file, or give the file that has it: --lens may come twice."
     expected = f"{what} (capitals and underscores of words do not matter)"
     raise InputError(where, expected, ", ".join(sorted(given)) or "nothing", todo)
-
-
-def _is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
-    """Return whether a file says that its lens is a fisheye.
-
-    Raises:
-        InputError: it names another lens model than those of OpenCV.
-    """
-    key = _key(given, MODEL_NAMES)
-    if key is None:
-        return False
-    said = str(np.ravel(given[key])[0]).lower()
-    if said not in FISHEYE_WORDS + OTHER_WORDS:
-        words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
-        raise calibration_error(f"{where}: {key}", f"one of {words}", repr(said))
-    return said in FISHEYE_WORDS
 
 
 def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
@@ -479,5 +465,8 @@ def _scale(where: str, size: Floats, own: tuple[int, int]) -> float:
 
 
 def _unknown_camera(where: str, name: str, sizes: Mapping[str, object]) -> InputError:
-    todo = "Correct the name, or read one camera alone: --camera NAME."
+    todo = (
+        "Rename the cameras in the file as in match.yaml; --camera NAME then reads one alone, and "
+        "the others may have any name."
+    )
     return InputError(where, f"a static camera of match.yaml: {', '.join(sizes)}", repr(name), todo)

@@ -81,10 +81,10 @@ def write_usd(
         writer = _Writer(stage, pxr, model)
         for number, person in enumerate(present):
             writer.add_person(person, number, surface=surface)
-        for name, camera in cameras.items():
-            writer.add_camera(name, camera)
         for number, line in enumerate(markings):
             writer.add_line(number, line)
+        for name, camera in cameras.items():
+            writer.add_camera(name, camera)
         stage.GetRootLayer().Save()
 
 
@@ -188,7 +188,11 @@ class _Writer:
         # Width of a camera's sensor [tenth of a unit]; only its ratio to the focal length
         # counts.
         aperture_mm = 36.0
-        prim = self.UsdGeom.Camera.Define(self.stage, f"/world/{_prim_name(name)}")
+        place, again = f"/world/{_prim_name(name)}", 1
+        while self.stage.GetPrimAtPath(place + f"_{again}" * (again > 1)).IsValid():
+            again += 1
+        prim = self.UsdGeom.Camera.Define(self.stage, place + f"_{again}" * (again > 1))
+        prim.GetPrim().SetCustomData({"camera": name})
         rows, known = known_frames(camera)
         if not len(rows):
             return
@@ -204,6 +208,7 @@ class _Writer:
         prim.CreateClippingRangeAttr(self.Gf.Vec2f(0.1, 1000.0))
         prim.GetPrim().SetCustomData(
             {
+                "camera": name,
                 "image_size_px": self.Gf.Vec2i(int(width), int(height)),
                 "principal_point_px": self.Gf.Vec2d(*known.principal_point[0].tolist()),
                 **{

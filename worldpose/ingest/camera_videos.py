@@ -17,7 +17,7 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import camera_id
 from worldpose.formats.calibration_unit import scaled
 from worldpose.ingest.footage import stretches
-from worldpose.video.folder import SUFFIXES, open_video
+from worldpose.video.folder import SUFFIXES, numbered_images, open_video
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 from worldpose.video.recordings import describe_video, join_videos
@@ -32,7 +32,7 @@ def find_videos(
     """Return the video of each camera in a folder: a file, or a folder of numbered images.
 
     A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
-    folder of the camera.
+    folder of the camera, as may be its only video.
 
     Args:
         folder: holds them.
@@ -44,30 +44,50 @@ def find_videos(
         InputError: two videos have one name, or chapters are not to be joined.
     """
     there = sorted(folder.glob("[!.]*"))
-    groups = [[place] for place in there if place.is_dir() and _has_images(place)]
     videos = [file for file in there if is_video(file)]
-    groups += [[file] for file in videos] if named else _recordings(videos)
-    for place in there:
-        if place.is_dir() and not _has_images(place):
-            groups += _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
+    groups = [[file] for file in videos] if named else _recordings(videos)
+    for place in (each for each in there if each.is_dir()):
+        inside = [[place]] if _has_images(place) else _recordings_in(place)
+        groups += [group for group in inside if len(group) > 1 or len(inside) == 1]
     found: dict[str, Path] = {}
     for group in groups:
-        inside = group[0].parent != folder
-        if inside and len(group) == 1:
-            continue  # an only video in a folder is not named after a camera
-        place = group[0].parent if inside else group[0]
+        place = group[0].parent if group[0].parent != folder else group[0]
         name = camera_id(place.stem if place.is_file() else place.name)
         if name in found:
-            expected = "one video of each camera"
+            both = f"{found[name].relative_to(folder)} and {group[0].relative_to(folder)}"
             todo = "Name each video after its camera."
-            raise InputError(str(folder), expected, f"{found[name].name} and {place.name}", todo)
-        found[name] = place
+            raise InputError(str(folder), "one video of each camera", both, todo)
+        found[name] = group[0]
         if len(group) > 1:
             if workshop is None or not _is_whole(group):
                 raise _chapters_error(folder, group)
             found[name] = workshop / f"{name}{group[0].suffix.lower()}"
             join_videos(group, found[name])
     return found
+
+
+def _recordings_in(place: Path) -> list[list[Path]]:
+    return _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
+
+
+def describe_unused(folder: Path) -> list[str]:
+    """Return sentences about files and videos in a folder that are of no camera."""
+    others: list[str] = []
+    inner: list[Path] = []
+    for place in sorted(folder.glob("[!.]*")):
+        if place.is_file() and not is_video(place):
+            others.append(place.name)
+        elif place.is_dir() and _has_images(place):
+            inner += [each for each in place.glob("[!.]*") if each.suffix.lower() not in SUFFIXES]
+        elif place.is_dir() and len(groups := _recordings_in(place)) > 1:
+            inner += [group[0] for group in groups if len(group) == 1]
+    reasons = {
+        "they have no ending of a video": others,
+        "a camera's folder has one video, or images": [
+            f"{each.parent.name}/{each.name}" for each in sorted(inner)
+        ],
+    }
+    return [f"left out, as {why}: {', '.join(them):.200}" for why, them in reasons.items() if them]
 
 
 def _has_images(folder: Path) -> bool:
@@ -97,29 +117,22 @@ def _is_whole(group: Sequence[Path]) -> bool:
 
 
 def _chapters_error(folder: Path, group: Sequence[Path]) -> InputError:
-    is_whole = _is_whole(group)
-    return InputError(
-        str(folder),
-        expected="one video of each camera" if is_whole else "all chapters of a recording",
-        found=f"chapters of one recording: {', '.join(file.name for file in group)}",
-        todo="Add --join, which joins them, or join them with ffmpeg: -f concat -safe 0 -i LIST -c "
-        "copy OUT.mp4, with a line file 'NAME' for each chapter in LIST."
-        if is_whole
-        else "Add the missing chapter.",
-    )
+    expected, todo = "all chapters of a recording", "Add the missing chapter."
+    if _is_whole(group):
+        expected = "one video of each camera"
+        todo = "Add --join, which joins them, or join them with ffmpeg: -f concat -safe 0 -i LIST "
+        todo += "-c copy OUT.mp4, with a line file 'NAME' for each chapter in LIST."
+    found = f"chapters of one recording: {', '.join(file.name for file in group)}"
+    return InputError(str(folder), expected, found, todo)
 
 
 def require_cameras(folder: Path, found: Mapping[str, Path]) -> None:
     """Raise InputError if a folder has the videos of fewer than two cameras."""
     if len(found) < 2:
-        there = sorted(folder.glob("[!.]*"))
-        raise InputError(
-            str(folder),
-            expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)}), or "
-            "a folder of images",
-            found=", ".join(place.name for place in there) or "no video",
-            todo="Name each video after its camera.",
-        )
+        there = ", ".join(place.name for place in sorted(folder.glob("[!.]*")))
+        expected = f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)}), or "
+        todo = "Name each video after its camera."
+        raise InputError(str(folder), expected + "a folder of images", there or "no video", todo)
 
 
 def describe_videos(
@@ -137,6 +150,14 @@ def describe_videos(
         notes += describe_video(files[name], indices[name])
         if gaps := describe_gaps(clock):
             notes.append(f"{name}: {gaps}")
+    starts = {n: int(index.stamps[0]) for n, index in indices.items() if index.time_base is None}
+    if len(set(starts.values())) > 1:
+        least = min(starts.values())
+        listed = ", ".join(f"{name} at {one} ({least - one})" for name, one in starts.items())
+        said = (
+            "count as one moment; if the numbers are of one clock, set offset_frames as bracketed"
+        )
+        notes.append(f"first images {said}: {listed}")
     counts = {name: len(clock) for name, clock in clocks.items()}
     length = shared_length(counts.values())
     if early := [f"{name} after {count}" for name, count in counts.items() if count < length]:
@@ -184,15 +205,20 @@ def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
     return "; ".join(said)
 
 
+def video_name(camera: str, file: Path) -> str:
+    """Return the name of a camera's video in a match folder: its own, if that is the camera's."""
+    return file.name if camera_id(file.stem) == camera or file.is_dir() else camera + file.suffix
+
+
 def copy_videos(files: Mapping[str, Path], folder: Path) -> None:
     """Copy the videos of cameras into a match folder."""
     if files:
         (folder / "videos").mkdir()
-    for file in files.values():
-        target = folder / "videos" / file.name
+    for name, file in files.items():
+        target = folder / "videos" / video_name(name, file)
         if file.is_dir():
             target.mkdir()
-            for image in sorted(file.glob("[!.]*")):
+            for _, image in numbered_images(file):
                 shutil.copyfile(image, target / image.name)
         else:
             shutil.copyfile(file, target)

@@ -30,7 +30,7 @@ from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import write_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.video.folder import index_video
-from worldpose.video.names import VIDEO_SUFFIXES
+from worldpose.video.names import is_video
 from worldpose.video.pictures import FrameIndex
 
 Lift = Callable[[Floats, float], tuple[Floats, Floats]]
@@ -118,7 +118,7 @@ def _read_sequence(kit: Path, file: Path) -> KitSequence:
         skeletons[kind] = (
             _read_skeleton(path, kind, np.asarray(known.all(-1))) if path.exists() else None
         )
-    videos = [path for path in (kit / "videos").glob(f"{name}.*") if path.suffix in VIDEO_SUFFIXES]
+    videos = [path for path in (kit / "videos").glob(f"{name}.*") if is_video(path)]
     images = kit / "images" / name
     if not videos and not images.is_dir():
         raise _refuse(str(kit), f"videos/{name}.mp4 or images/{name}/", "neither")

@@ -96,7 +96,8 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or
             has another size; or clicks exist already.
     """
-    images = read_marked_images(file)
+    every = read_marked_images(file)
+    images = [image for image in every if image.points or image.lines]
     spec = read_spec(folder)
     pitch = read_pitch(folder, spec)
     if pitch is None:
@@ -105,6 +106,9 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         raise InputError(f"{folder / 'match.yaml'}: pitch", expected, "pitch: none", todo)
     by_owner = _assign_images(file, images, spec, owner)
     report = ImportedClicks()
+    unread = Counter(shape for image in every for shape in image.left_out)
+    if listed := ", ".join(f"{count} {shape}" for shape, count in sorted(unread.items())):
+        report.notes.append(f"shapes are left out that are no labelled points or lines: {listed}")
     labels = _Labels(file, images, pitch, report)
     records: dict[str, Record] = {}
     for name, (camera, given) in by_owner.items():
@@ -117,12 +121,10 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         ]
         for image in own:
             if image.size != (camera.width, camera.height):
-                raise InputError(
-                    f"{file}: {image.name}",
-                    expected=f"{camera.width} x {camera.height} px, as match.yaml has it",
-                    found="{} x {} px".format(*(image.size or ())),
-                    todo="Click in images of the camera's own size, or correct match.yaml.",
-                )
+                expected = f"{camera.width} x {camera.height} px, as match.yaml has it"
+                found = "{} x {} px".format(*(image.size or ()))
+                todo = "Click in images of the camera's own size, or correct match.yaml."
+                raise InputError(f"{file}: {image.name}", expected, found, todo)
         records |= _records(file, name, camera, own, labels)
         report.clicks[name] = sum(len(image.points) + len(image.lines) for image in own)
     for name in records:
@@ -161,13 +163,12 @@ def _assign_images(
         # Label Studio puts eight digits before the name of an uploaded file.
         name = owner or (stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem))
         if name not in static or name in found:
-            raise InputError(
-                f"{file}: {image.name}",
-                expected="one image per static camera, named <camera>.png or the like: "
-                + ", ".join(static),
-                found=f"{len(images)} images, of which this is no camera's or a second one",
-                todo="Rename the images, or import one camera: --camera NAME.",
+            expected = (
+                f"one image per static camera, named <camera>.png or the like: {', '.join(static)}"
             )
+            these = f"{len(images)} images, of which this is no camera's or a second one"
+            todo = "Rename the images, or import one camera: --camera NAME."
+            raise InputError(f"{file}: {image.name}", expected, these, todo)
         found[name] = (static[name], [image])
     return found
 
@@ -181,12 +182,10 @@ def _records(
     for image in images:
         digits = re.findall(r"\d+", PurePosixPath(image.name).stem)
         if not digits or int(digits[-1]) in frames:
-            raise InputError(
-                f"{file}: {image.name}",
-                expected="an image whose name ends in its frame number, such as frame_000084.png",
-                found="no number" if not digits else f"frame {int(digits[-1])} again",
-                todo="Name the images by the frames of the clip's video.",
-            )
+            expected = "an image whose name ends in its frame number, such as frame_000084.png"
+            found = "no number" if not digits else f"frame {int(digits[-1])} again"
+            todo = "Name the images by the frames of the clip's video."
+            raise InputError(f"{file}: {image.name}", expected, found, todo)
         frames[int(digits[-1])] = labels.markings(owner, image)
     return {
         key_frames_file(owner): KeyFrames(
@@ -320,12 +319,10 @@ def _label_frame(file: Path, images: Sequence[MarkedImage], pitch: PitchSpec) ->
         jacobian = np.linalg.det(homography) / depth**3
         signs.append(np.sign(np.median(jacobian[inliers.ravel() > 0])))
     if not signs or len(set(signs)) > 1:
-        raise InputError(
-            f"{file}: labels with places",
-            expected="at least four places per image, not on one line, that agree on the side of y",
-            found="too few" if not signs else "images that contradict each other",
-            todo="Label the clicks by the names of the pitch template instead.",
-        )
+        expected = "at least four places per image, not on one line, that agree on the side of y"
+        told = "too few" if not signs else "images that contradict each other"
+        todo = "Label the clicks by the names of the pitch template instead."
+        raise InputError(f"{file}: labels with places", expected, told, todo)
     mirrored = signs[0] > 0
     shift = np.array([0.5 * pitch.length, 0.5 * pitch.width]) if from_corner else np.zeros(2)
     frame = np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])

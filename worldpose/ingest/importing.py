@@ -23,18 +23,20 @@ from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 from worldpose.ingest.camera_videos import (
     copy_videos,
+    describe_unused,
     describe_videos,
     find_videos,
     fit_to_video,
     require_cameras,
     shared_length,
+    video_name,
 )
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.registration import file_state, require_settled
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
 from worldpose.video.folder import index_video
-from worldpose.video.names import VIDEO_SUFFIXES, is_video
+from worldpose.video.names import VIDEO_SUFFIXES
 from worldpose.video.pictures import FrameIndex
 
 Placing: TypeAlias = Callable[
@@ -117,6 +119,7 @@ _CHANGES: Final = {
     "clamped": "confidences above 1, which count as 1",
     "nobody": "entries without a known joint, which count as no person",
     "pointless": "annotations without keypoints, such as of the ball, which count as no person",
+    "foreign": "annotations of another category, which count as no person",
     "empty": "empty files, which count as frames without people",
 }
 
@@ -172,6 +175,12 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     steps = {name: int(np.gcd.reduce(np.diff(found.people.frame))) for name, found in read.items()}
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
+    spans = {name: seen for name, one in read.items() if (seen := seen_frames(one.people))}
+    for name, (first, last) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(start <= last and first <= stop for start, stop in others):
+            said = f"{name} has people in frames {first} to {last}, where no other camera has any"
+            notes.append(f"warning: {said}")
     return notes
 
 
@@ -189,17 +198,21 @@ def detections_by_camera(
     Raises:
         InputError: fewer than two cameras have a file.
     """
-    places = [each for each in sorted(folder.glob("[!.]*")) if each.is_dir()]
-    folders = {camera_of(each): each for each in places if camera_of(each) not in left_out}
-    if sorted(folders) == sorted(cameras):
-        return {name: folders[name] for name in cameras}
     suffixes = (".json", ".npz")
-    files: dict[str, Path] = {}
-    for file in sorted(folder.glob("[!.]*")):
-        name = camera_id(file.stem)
-        if file.suffix.lower() in suffixes:
-            files[file.name if name in files else name] = file  # a second one fits no camera
-    return pick_cameras(folder, files, cameras, calibration, suffixes, left_out)
+    there = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in suffixes]
+    found: dict[str, Path] = {}
+    for place in [*pose_folders(folder), *(each for each in there if each.is_file())]:
+        name = camera_of(place)
+        found[place.name if name in found else name] = place  # a second one fits no camera
+    endings = (*suffixes, "or a folder of .json")
+    return pick_cameras(folder, found, cameras, calibration, endings, left_out)
+
+
+def pose_folders(folder: Path) -> list[Path]:
+    """Return the folders in a folder that hold 2D poses: JSON, or names `<camera>_json`."""
+    there = [place for place in sorted(folder.glob("[!.]*")) if place.is_dir()]
+    json = "*.[jJ][sS][oO][nN]"
+    return [each for each in there if each.name.endswith("_json") or any(each.glob(json))]
 
 
 def import_lenses(
@@ -262,13 +275,10 @@ def pick_cameras(
     both = [name for name in cameras if name in files]
     if len(both) < max(1, min(2, len(cameras))):
         there = files.values() or sorted(folder.glob("[!.]*"))
-        raise InputError(
-            str(folder),
-            expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
-            + ", ".join(cameras),
-            found=", ".join(file.name for file in there) or "no such file",
-            todo="Rename the files as the cameras.",
-        )
+        expected = f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
+        found_names = ", ".join(file.name for file in there) or "no such file"
+        todo = "Rename the files as the cameras."
+        raise InputError(str(folder), expected + ", ".join(cameras), found_names, todo)
     left_out.update({name: f"{folder} has no file of it" for name in cameras if name not in files})
     if others := [file.name for name, file in files.items() if name not in both]:
         left_out.notes.append(
@@ -285,6 +295,7 @@ def build_spec(
     frames: tuple[int, int],
     *,
     videos: Mapping[str, Path] = MappingProxyType({}),
+    offsets: Mapping[str, int] = MappingProxyType({}),
     pitch: str | None = "none",
 ) -> MatchSpec:
     """Return match.yaml of a match with the one clip `clip`.
@@ -296,6 +307,7 @@ def build_spec(
         sizes: width and height of the cameras' images [px].
         frames: the clip's first frame, and the one after its last.
         videos: file in `videos/` of those cameras that have one.
+        offsets: `offset_frames` of those cameras whose clock is another.
         pitch: entry `pitch`.
 
     Raises:
@@ -306,7 +318,8 @@ def build_spec(
         "fps": fps,
         "cameras": [
             {"id": name, "width": width, "height": height}
-            | ({"video": f"videos/{videos[name].name}"} if name in videos else {})
+            | ({"video": f"videos/{video_name(name, videos[name])}"} if name in videos else {})
+            | ({"offset_frames": offsets[name]} if offsets.get(name) else {})
             for name, (width, height) in sizes.items()
         ],
         "clips": [{"id": "clip", "first_frame": frames[0], "frame_count": frames[1] - frames[0]}],
@@ -408,9 +421,7 @@ def _import_found(
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)
-    there = (file for file in sorted(folder.glob("[!.]*")) if file.is_file())
-    if others := [file.name for file in there if not is_video(file)]:
-        notes.append(f"left out, as they have no ending of a video: {', '.join(others):.200}")
+    notes += describe_unused(folder)
     sizes = {name: index.size for name, index in indices.items()}
     count = shared_length(map(len, clocks.values()))
     spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)

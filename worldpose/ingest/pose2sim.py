@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +21,13 @@ from worldpose.formats.calibration_forms import (
     find_calibration,
     read_calibration,
 )
-from worldpose.formats.detection_files import read_openpose_folder
-from worldpose.formats.files import read_toml
+from worldpose.formats.detection_files import frame_files, read_openpose_folder
+from worldpose.formats.files import by_last_number, read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
 from worldpose.ingest.camera_videos import (
     copy_videos,
+    describe_unused,
     describe_videos,
     find_videos,
     fit_to_video,
@@ -37,6 +42,7 @@ from worldpose.ingest.importing import (
     describe_outside,
     describe_people,
     find_people,
+    pose_folders,
 )
 from worldpose.ingest.writing import write_match
 from worldpose.video.folder import index_video
@@ -56,8 +62,9 @@ def import_pose2sim(
     Pose2Sim's batches, in any form that `read_calibration` reads; without it each video is a
     camera. 2D poses are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each
     camera; without them people are detected in the videos of `videos/`. Poses and videos belong to
-    the cameras of their names, or, as in Pose2Sim, in alphabetical order to the cameras in the
-    calibration's order. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
+    the cameras of their names, or, as in Pose2Sim, in the order of the last numbers in their names
+    to the cameras in the calibration's order. The shift of `pose-sync/` against `pose/` is the
+    clock of a camera's video. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
     smaller or larger than the calibrated images, with or without black bars, its camera is in the
     video's pixels, as the 2D poses are.
 
@@ -78,13 +85,13 @@ def import_pose2sim(
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
-    places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
-    films = list(find_videos(project / "videos").values())
+    places = {camera_of(each): each for each in pose_folders(folder)}
+    films = find_videos(project / "videos")
     if not places and not films:
         expected = f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4"
         todo = "Run Pose2Sim.poseEstimation() first, or add the videos."
         raise InputError(str(project), expected, "neither", todo)
-    known = {file: index_video(file) for file in films}
+    known = {file: index_video(file) for file in films.values()}
     left_out = LeftOut()
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
@@ -92,16 +99,15 @@ def import_pose2sim(
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        require_cameras(project / "videos", {camera_of(file): file for file in films})
-        names = [camera_of(file) for file in films]
-        source = project / "videos"
+        require_cameras(project / "videos", films)
+        names, source = list(films), project / "videos"
     else:
-        shown = {camera_of(file): index.size for file, index in known.items()}
+        shown = {name: known[file].size for name, file in films.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
         notes = [f"cameras: {calibration}", *describe_left_out(left_out)]
         names, source = list(cameras), calibration
-        places = [each for each in places if camera_of(each) not in left_out]
-        films = [each for each in films if camera_of(each) not in left_out]
+        places = {name: each for name, each in places.items() if name not in left_out}
+        films = {name: each for name, each in films.items() if name not in left_out}
     is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
     poses = _assign(places, names, source, notes) if places else {}
     videos = _assign(films, names, source, notes) if films else {}
@@ -112,16 +118,16 @@ def import_pose2sim(
     for name, file in videos.items():
         if name in cameras:
             cameras[name] = fit_to_video(file, cameras[name], indices[name], notes, is_part=is_part)
-    sizes = {name: index.size for name, index in indices.items()}
-    sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
-    notes += describe_videos(videos, indices, clocks) if clocks else []
+    if clocks:
+        notes += describe_videos(videos, indices, clocks) + describe_unused(project / "videos")
     length = shared_length(map(len, clocks.values()))
     model = settings.get("pose_model")
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
+    offsets = _find_shifts(project / "pose", poses, notes) if videos else {}
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     for name, files in poses.items():
@@ -129,13 +135,47 @@ def import_pose2sim(
     if place is not None:
         cameras, notes[:0] = place(calibration or project, cameras, people, rate)
     _require_video_sizes(folder, cameras, indices)
-    sizes |= {name: camera.image_size for name, camera in cameras.items()}
-    sizes = {name: sizes[name] for name in names}
-    spec = build_spec(out, match_id, rate, sizes, (first, stop), videos=videos)
+    sizes = {
+        name: (cameras[name].image_size if name in cameras else indices[name].size)
+        for name in names
+    }
+    spec = build_spec(out, match_id, rate, sizes, (first, stop), videos=videos, offsets=offsets)
+    for name, shift in offsets.items():
+        people[name] = replace(people[name], frame=people[name].frame + shift)
     write_match(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
     return spec, notes + describe_outside(people, sizes) + _describe_poses(folder, read)
+
+
+def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict[str, int]:
+    """Return the frame of each camera's video that its frame 0 of synchronised poses shows.
+
+    Pose2Sim copies the files of `pose/` to `pose-sync/` under shifted numbers: files that are equal
+    tell the shift. Frames of one content, as those without people, tell none.
+    """
+
+    def once(folder: Path) -> dict[bytes, int]:
+        there = frame_files(folder) if any(folder.glob("*.[jJ][sS][oO][nN]")) else {}
+        told = {frame: hashlib.sha256(file.read_bytes()).digest() for frame, file in there.items()}
+        count = Counter(told.values())
+        return {content: frame for frame, content in told.items() if count[content] == 1}
+
+    steps: dict[str, set[int]] = {}
+    for name, folder in poses.items():
+        if folder.parent == raw:
+            return {}
+        before, after = once(raw / folder.name), once(folder)
+        steps[name] = {before[same] - after[same] for same in before.keys() & after.keys()}
+    shifts = {name: min(found) for name, found in steps.items() if len(found) == 1}
+    if listed := ", ".join(f"{name} {shift}" for name, shift in shifts.items() if shift):
+        notes.append(f"the videos follow pose-sync by offset_frames, from pose: {listed}")
+    if unknown := ", ".join(name for name in steps if name not in shifts):
+        notes.append(
+            f"warning: how pose-sync was shifted against pose is not known of {unknown}: set "
+            "offset_frames in match.yaml where a video shows other frames"
+        )
+    return shifts
 
 
 def _require_video_sizes(
@@ -144,16 +184,11 @@ def _require_video_sizes(
     """Raise InputError if the 2D poses in a folder make a camera another size than its video's."""
     for name, camera in cameras.items():
         if name in indices and camera.image_size != indices[name].size:
-            raise InputError(
-                str(folder),
-                expected="2D poses in the pixels of the videos, {} x {} in {}".format(
-                    *indices[name].size, name
-                ),
-                found="people on whom the cameras agree in images of {} x {} px alone".format(
-                    *camera.image_size
-                ),
-                todo="Give the videos in which the poses were estimated, or estimate them again.",
-            )
+            (width, height), (own_width, own_height) = indices[name].size, camera.image_size
+            expected = f"2D poses in the pixels of the videos, {width} x {height} in {name}"
+            agreed = f"people on whom the cameras agree in images of {own_width} x {own_height} px"
+            todo = "Give the videos in which the poses were estimated, or estimate them again."
+            raise InputError(str(folder), expected, f"{agreed} alone", todo)
 
 
 def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:
@@ -168,12 +203,13 @@ def _describe_poses(folder: Path, read: Mapping[str, PeopleFile]) -> list[str]:
 
 
 def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
-    """Return the frame rate of the first video [1/s]; raise InputError without videos."""
-    if not indices:
+    """Return the frame rate of the first video [1/s]; raise InputError if none tells it."""
+    rates = [index.fps for index in indices if isfinite(index.fps)]
+    if not rates:
         expected = "frames per second, as there are no videos to take them from"
         todo = "Write for example frame_rate = 60, or give --fps."
         raise InputError(f"{config}: project.frame_rate", expected, "'auto'", todo)
-    return round(indices[0].fps, 3)
+    return round(rates[0], 3)
 
 
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
@@ -250,10 +286,13 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
 
 
 def _assign(
-    places: list[Path], cameras: list[str], calibration: Path, notes: list[str]
+    named: dict[str, Path], cameras: list[str], calibration: Path, notes: list[str]
 ) -> dict[str, Path]:
-    """Return the folder or file of each camera: by name, or else by alphabetical order."""
-    named = {camera_of(place): place for place in places}
+    """Return the folder or file of each camera: by name, or else by the last number in its name.
+
+    Names without a number are in alphabetical order.
+    """
+    places = list(named.values())
     both = [camera for camera in cameras if camera in named]
     if len(both) > 1 or len(both) == len(cameras):
         if lacking := [camera for camera in cameras if camera not in named]:
@@ -261,11 +300,11 @@ def _assign(
         if others := [place.name for name, place in named.items() if name not in both]:
             notes.append(f"{calibration.name} lacks {', '.join(others)}")
         return {camera: named[camera] for camera in both}
-    if len(places) != len(cameras):
+    if len(named) != len(cameras):
         expected = f"one for each camera in {calibration.name}: {', '.join(cameras)}"
         found = ", ".join(place.name for place in places)
         raise InputError(str(places[0].parent), expected, found, "Name them after the cameras.")
-    pairs = dict(zip(cameras, places, strict=True))
+    pairs = dict(zip(cameras, by_last_number(named).values(), strict=True))
     listed = ", ".join(f"{place.name} is {camera}" for camera, place in pairs.items())
-    notes.append(f"{places[0].parent.name}: in alphabetical order, {listed}")
+    notes.append(f"{places[0].parent.name}: in the order of the names, {listed}")
     return pairs

@@ -241,14 +241,18 @@ def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> d
     """
     match = read_match(folder)
     open_to = {name for name in match.videos if name not in match.detections}
-    known = sorted(name for name in match.boxes if (boxes / f"{name}.txt").exists())
+    known = sorted({file.stem for file in _box_files(boxes)} & match.boxes.keys())
     if known:
         expected = f"no boxes of {known[0]} yet"
         todo = "Remove it first."
         raise InputError(str(folder / "boxes" / f"{known[0]}.txt"), expected, "a file", todo)
-    asked = [file.stem for file in sorted(boxes.glob("*.txt"))]
+    asked = [file.stem for file in _box_files(boxes)]
     indices = {name: index_video(match.videos[name]) for name in asked if name in open_to}
     return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder, notes)
+
+
+def _box_files(boxes: Path) -> list[Path]:
+    return [file for file in sorted(boxes.glob("[!.]*")) if file.suffix.lower() == ".txt"]
 
 
 def copy_boxes(
@@ -268,8 +272,9 @@ def copy_boxes(
     Raises:
         InputError: there are no files, one of an unknown camera, or an invalid one.
     """
-    files = [file for file in sorted(boxes.glob("*.txt")) if not file.name.startswith(".")]
-    other = [file.name for file in files if file.stem not in indices]
+    files = _box_files(boxes)
+    stems = [file.stem for file in files]
+    other = [file.name for file in files if file.stem not in indices or stems.count(file.stem) > 1]
     if not files or other:
         raise InputError(
             str(boxes),
@@ -288,6 +293,6 @@ def copy_boxes(
             notes += [f"{file.name}: {change}" for change in read.changes]
     (folder / "boxes").mkdir(exist_ok=True)
     for file in files:
-        with whole_file(folder / "boxes" / file.name) as draft:
+        with whole_file(folder / "boxes" / f"{file.stem}.txt") as draft:
             shutil.copyfile(file, draft)
     return counts

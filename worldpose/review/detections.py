@@ -86,7 +86,11 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
     if not is_there:
         return f"there is no {place}"
     if isinstance(edit, DeletedDetection):
-        return None
+        box = found.boxes[row, edit.detection].astype(np.float64)
+        if edit.was is None or np.abs(box - edit.was).max() <= TOLERANCE_PX:
+            return None
+        seen = [round(float(value), 2) for value in box]
+        return f"the box of {place} was {list(edit.was)} when it was deleted, and is {seen} now"
     now = found.keypoints[row, edit.detection, COCO17.index(edit.joint)].astype(np.float64)
     if np.isnan(now).any():
         return f"{edit.joint} of {place} is not seen" if edit.was or edit.xy is None else None
@@ -180,7 +184,7 @@ def find_changes(
             assert detection is not None  # an export numbers all people
             at = {"camera": camera, "frame": int(number), "detection": detection}
             if detection not in there:
-                edits.append(DeletedDetection.model_validate(at))
+                edits.append(DeletedDetection.model_validate({**at, "was": person.box.tolist()}))
                 continue
             now = there[detection]
             edits += _list_moved(at, person.keypoints, now.keypoints)

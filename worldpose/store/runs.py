@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 import platform
 import re
+from datetime import UTC, datetime
+from pathlib import Path
 
 from data_contracts.pin import Pin
 from data_contracts.run import Reservation
@@ -134,6 +136,31 @@ def run_files(blobs: Blobs, match_id: str) -> tuple[set[str], set[str], set[str]
             kind = damaged if is_damaged else reserved if is_reservation else finished
             kind.add(run_id)
     return finished, reserved, damaged
+
+
+def begin_run(match_id: str, run_id: str) -> Reservation:
+    """Return the reservation of a run that this process begins now."""
+    return Reservation(
+        run_id=run_id,
+        match_id=match_id,
+        started_at=datetime.now(UTC),
+        host=platform.node(),
+        pid=os.getpid(),
+        process=identify_process(os.getpid()),
+    )
+
+
+def identify_process(pid: int) -> str:
+    """Return the machine's boot and a process's start since then; empty where neither is told.
+
+    Unlike the time of its start, they do not change with the clock.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        told = Path(f"/proc/{pid}/stat").read_text(errors="replace")
+    except OSError:
+        return ""
+    return f"{boot} {told.rpartition(')')[2].split()[19]}"  # the name before it can have anything
 
 
 def run_order(run_id: str) -> tuple[int, str]:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,7 +38,14 @@ from worldpose.store.paths import (
     reservation_path,
 )
 from worldpose.store.recipes import STORE_FORMAT, recipe_key
-from worldpose.store.runs import LATEST, read_document, read_pin, run_files, run_order
+from worldpose.store.runs import (
+    LATEST,
+    begin_run,
+    read_document,
+    read_pin,
+    run_files,
+    run_order,
+)
 from worldpose.store.writer import ResultWriter
 
 if TYPE_CHECKING:
@@ -248,14 +253,7 @@ class Store:
             number = max([number, *(run_order(name)[0] for name in taken)]) + 1
             run_id = f"{number:04d}"
             path = reservation_path(match_id, run_id)
-            reservation = Reservation(
-                run_id=run_id,
-                match_id=match_id,
-                started_at=datetime.now(UTC),
-                host=platform.node(),
-                pid=os.getpid(),
-            )
-            if not self.blobs.put_new(path, seal(reservation)):
+            if not self.blobs.put_new(path, seal(begin_run(match_id, run_id))):
                 continue
             # Another run may have taken this number, finished and dropped its reservation since.
             if not self.blobs.exists(record_path(match_id, run_id)):

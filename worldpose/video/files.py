@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
-from itertools import dropwhile, islice, pairwise
+from itertools import chain, dropwhile, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def index_frames(path: Path) -> FrameIndex:
     It decodes all frames of a file whose packets do not say when each frame is shown.
 
     Raises:
-        InputError: no video, or frames without time stamps.
+        InputError: no video, frames without time stamps, or stamps that start again.
     """
     try:
         with open_file(path) as container:
@@ -65,16 +65,17 @@ def index_frames(path: Path) -> FrameIndex:
                 said = f"frames without a size, or of more than {MAX_FRAME_PIXELS:,} pixels"
                 raise _no_video(path, said)
             size: tuple[int, int] | None = None
-            packets: list[tuple[int | None, bool]] = []
+            packets: list[tuple[int | None, bool, int | None]] = []
             for packet in read_packets(container, stream):
                 size = _shown_size(path, packet) if size is None else size
                 if packet.size and not packet.is_discard:
-                    packets.append((packet.pts, packet.is_keyframe))
+                    packets.append((packet.pts, packet.is_keyframe, packet.dts))
+            _require_one(path, packets)
             size = (stream.width, stream.height) if size is None else size
             _require_square(path, stream)
             base = stream.time_base
             reorders = stream.codec_context.has_b_frames
-        given = [stamp for stamp, _ in packets if stamp is not None]
+        given = [stamp for stamp, _, _ in packets if stamp is not None]
         if not given or base is None:
             raise _no_video(path, f"{len(packets)} pictures without time stamps")
         is_told = len(set(given)) == len(packets)
@@ -90,7 +91,7 @@ def index_frames(path: Path) -> FrameIndex:
         raise _no_video(path, found) from error
     stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
-    key = np.array([key for _, key in packets], dtype=np.bool_)[order]
+    key = np.array([key for _, key, _ in packets], dtype=np.bool_)[order]
     return FrameIndex(stamps[order], key, base, size)
 
 
@@ -201,6 +202,19 @@ def _require_square(path: Path, stream: VideoStream) -> None:
         )
 
 
+def _require_one(path: Path, packets: Sequence[tuple[int | None, bool, int | None]]) -> None:
+    """Raise InputError where the times of decoding, or of key frames, go back."""
+    dts = [(number, time) for number, (_, _, time) in enumerate(packets) if time is not None]
+    keys = [
+        (number, pts) for number, (pts, key, _) in enumerate(packets) if key and pts is not None
+    ]
+    for (_, before), (number, time) in chain(pairwise(dts), pairwise(keys)):
+        if time < before:
+            found = f"they go back at frame {number}, as where two recordings are joined"
+            todo = "Give each recording as a file of its own, or join them by ffmpeg -f concat."
+            raise InputError(str(path), "time stamps that rise", found, todo)
+
+
 def _no_video(path: Path, found: str) -> InputError:
     return InputError(
         str(path),
@@ -259,7 +273,7 @@ class VideoReader(Pictures):
             only: frames to yield; the others are decoded, but not converted. None = all.
 
         Raises:
-            InputError: there are no such frames.
+            InputError: there are no such frames, or one has another size than the first.
         """
         stop = len(self) if stop is None else stop
         if not 0 <= start <= stop <= len(self):
@@ -270,8 +284,18 @@ class VideoReader(Pictures):
                 todo="Ask for frames that the video has.",
             )
         for number, picture in self._sound_pictures(start, stop) if start < stop else ():
+            self._require_size(number, picture)
             if number >= start and (only is None or number in only):
                 yield number, None if picture is None else convert_pixels(picture, grey, width)
+
+    def _require_size(self, number: int, picture: av.VideoFrame | None) -> None:
+        """Raise InputError for a frame of another size than the first one."""
+        shown = self.index.size if picture is None else (picture.width, picture.height)
+        shown = shown[::-1] if picture is not None and picture.rotation % 180 else shown
+        if shown != self.index.size:
+            expected = "images of {} x {} px, as the first one".format(*self.index.size)
+            found, todo = "{} x {}".format(*shown), "Give a video of one camera in one mode."
+            raise InputError(f"{self.path}: frame {number}", expected, found, todo)
 
     def _sound_pictures(self, start: int, stop: int) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """Yield every frame from the last key frame up to `start` on; None if damaged."""

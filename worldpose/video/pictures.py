@@ -104,9 +104,10 @@ class FrameIndex:
         if abs(self.fps - fps) > RATE_SLACK * fps:
             return InputError(
                 where,
-                expected=f"{fps:g} frames per second, the rate in match.yaml",
+                expected=f"{fps:g} frames per second, the rate of the match",
                 found=f"{self.fps:.4g}",
-                todo="Correct fps in match.yaml, or convert the video to that rate.",
+                todo="Convert the video to that rate, or correct the rate: --fps of an import, fps "
+                "in match.yaml, where a camera may have its own.",
             )
         return InputError(
             where,

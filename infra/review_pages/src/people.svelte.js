@@ -14,6 +14,8 @@ export class People {
   busy = $state(false);
 
   #last = Promise.resolve();
+  #pending = 0; // steps that are not done yet
+  #frame = null; // the frame asked for last
   #asking = false;
   #wanted = null;
 
@@ -27,9 +29,11 @@ export class People {
     return this.info?.people.find((each) => each.detection === this.who);
   }
 
-  async load(number) {
+  async load(number = this.#frame) {
+    this.#frame = number;
     try {
       const found = await get(number === null ? this.where : `${this.where}?frame=${number}`);
+      if (number !== this.#frame) return; // another one is wanted now
       this.info = found;
       if (!found.people.some((each) => each.detection === this.who)) this.choose(null);
       else this.ask();
@@ -79,85 +83,86 @@ export class People {
     this.#asking = false;
   }
 
-  // One after the other: each looks at what the one before made of it.
+  // One after the other.
   #inTurn(step) {
+    this.#pending += 1;
     this.#last = this.#last.then(async () => {
       this.busy = true;
       try {
         await step();
       } catch (error) {
         messages.tell(error.message);
-        await this.load(this.info.frame);
+        await this.load();
       } finally {
+        this.#pending -= 1;
         this.busy = false;
       }
     });
     return this.#last;
   }
 
-  #correct(made) {
+  // The edit is of the frame that is shown now, whichever is shown in its turn.
+  #correct(edit) {
+    const id = newId(edit.kind);
+    const whole = { camera: this.owner, frame: this.info.frame, ...edit };
     return this.#inTurn(async () => {
-      const edit = made();
-      if (!edit) return;
-      const id = newId(edit.kind);
-      const whole = { camera: this.owner, frame: this.info.frame, ...edit };
       await post(`${this.path}/corrections`, { edits: [{ id, edit: whole }] });
-      await this.load(this.info.frame);
-      this.done.push(id);
-      this.loadQueue();
+      await this.#show(id);
     });
+  }
+
+  // What is saved; what waits for its turn is on the screen already.
+  async #show(id) {
+    if (this.#pending === 1) await this.load();
+    this.done.push(id);
+    this.loadQueue();
   }
 
   move(detection, joint, was, xy) {
     // On the screen at once, where it was put.
     this.info.people.find((each) => each.detection === detection).keypoints[joint] = xy;
-    return this.#correct(() => this.#moved(detection, joint, was, xy));
+    return this.#correct({ kind: "moved_keypoint", detection, joint: this.info.joints[joint], was, xy });
   }
 
-  #moved = (detection, joint, was, xy) => ({ kind: "moved_keypoint", detection, joint: this.info.joints[joint], was, xy });
-
   hide() {
-    return this.#correct(() => {
-      const was = this.joint === null ? null : this.chosen?.keypoints[this.joint];
-      return was ? this.#moved(this.who, this.joint, was, null) : null;
-    });
+    const was = this.joint === null ? null : this.chosen?.keypoints[this.joint];
+    if (was) return this.move(this.who, this.joint, was, null);
   }
 
   // A joint that is not seen is put where the other cameras expect it.
   putExpected() {
-    return this.#correct(() => {
-      const xy = this.joint === null ? null : this.views?.here?.expected[this.joint];
-      return xy && this.chosen ? this.#moved(this.who, this.joint, this.chosen.keypoints[this.joint], xy) : null;
-    });
+    const xy = this.joint === null ? null : this.views?.here?.expected[this.joint];
+    if (xy && this.chosen) return this.move(this.who, this.joint, this.chosen.keypoints[this.joint], xy);
   }
 
   // The chosen keypoint moves along a straight line from its last correction to here.
   fillIn() {
+    if (this.joint === null || !this.chosen) return;
+    const what = { frame: this.info.frame, detection: this.who, joint: this.info.joints[this.joint] };
     return this.#inTurn(async () => {
-      if (this.joint === null || !this.chosen) return;
-      const what = { frame: this.info.frame, detection: this.who, joint: this.info.joints[this.joint] };
       const { kept } = await post(`${this.where}/interpolation`, what);
-      await this.load(this.info.frame);
-      this.done.push(kept);
-      this.loadQueue();
+      await this.#show(kept);
     });
   }
 
   drop() {
-    return this.#correct(() => (this.chosen ? { kind: "deleted_detection", detection: this.who } : null));
+    const { chosen, who: detection } = this;
+    if (!chosen) return;
+    this.info.people = this.info.people.filter((each) => each.detection !== detection);
+    return this.#correct({ kind: "deleted_detection", detection, was: chosen.box });
   }
 
   async add(box, keypoints) {
     const detection = this.info.free;
-    await this.#correct(() => ({ kind: "added_detection", detection, box, keypoints }));
-    this.choose(detection);
+    await this.#correct({ kind: "added_detection", detection, box, keypoints });
+    if (this.info.people.some((each) => each.detection === detection)) this.choose(detection);
   }
 
   undo() {
     return this.#inTurn(async () => {
       if (!this.done.length) return;
       for (const correction of [this.done.at(-1)].flat()) await post(`${this.path}/withdrawals`, { correction });
-      await this.load(this.info.frame);
+      await this.load();
       this.done.pop();
       this.loadQueue();
     });

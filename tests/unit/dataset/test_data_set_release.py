@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from data_contracts.conventions import COCO17
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.results.best_results import Origin
 from flows.results.data_set_release import ASSETS, check_data_set, write_data_set
+from worldpose.body.body_file import save_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.occlusions import hidden_joints, visible_shares
 from worldpose.dataset.benchmark import score_folders
@@ -114,6 +116,21 @@ def written(origins, tmp_path_factory):
     options = {"hidden": folder / "truth", "footage": "copy", "subjects": registry}
     write_data_set(*origins, folder / "set", "first", LICENCES, **options)
     return folder
+
+
+def test_a_release_has_the_bodies_of_the_folder_of_its_run(model, origins, tmp_path):
+    save_body(tmp_path / "smpl-test.npz", replace(model, name="smpl-test"))
+    store, [(origin, split), *_] = origins
+    about = {**vars(origin.run.record), "body_folder": str(tmp_path)}
+    del about["results"]
+    parts = {name: part.copy() for name, part in origin.run.results.items()}
+    for name in ("body_fitting/A", "body_fitting/B"):
+        parts[name].attrs["body_model"] = "smpl-test"
+    run = StubRun(parts, store, **about)
+    written = write_data_set(
+        store, [(replace(origin, run=run), split)], tmp_path / "set", "own", LICENCES
+    )
+    assert {clip.body_model for clip in written.clips.values()} == {"smpl-test"}
 
 
 def test_a_sound_data_set_passes_and_hides_the_truth(written):

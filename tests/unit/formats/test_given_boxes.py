@@ -34,8 +34,9 @@ def test_our_own_tracks_are_read_back(tmp_path):
     corner = rng.uniform(0, 300, (5, 3, 2))
     boxes = np.concatenate([corner, corner + rng.uniform(5, 100, (5, 3, 2))], axis=-1)
     boxes[2, 1] = np.nan
-    write_tracks(tmp_path / "t.txt", boxes, np.array([0, 4, 9]))
-    found = read_boxes(tmp_path / "t.txt", SIZE, 5)
+    write_tracks(tmp_path / "t.txt", boxes, np.array([0, 4, 9]), np.arange(12, 17))
+    found = read_boxes(tmp_path / "t.txt", SIZE, 17)
+    assert set(found.frame) == set(range(12, 17))
     np.testing.assert_allclose(found.box, boxes[np.isfinite(boxes).all(-1)], atol=0.0101)
     assert found.person.tolist() == [1, 5, 10] * 2 + [1, 10] + [1, 5, 10] * 2
 
@@ -44,9 +45,16 @@ def test_boxes_outside_and_confidences_above_one_are_counted(read):
     found = read("1,1,10,10,5,5,1.26\n1,2,700,10,5,5,1\n2,1,630,10,20,5,1\n2,9,-9,1,5,5,0\n")
     assert (found.person.tolist(), found.score.tolist()) == ([1, 1], [1.0, 1.0])
     assert found.changes == (
+        "1 boxes of confidence 0, which are left out",
         "1 boxes outside of the image, which are left out",
         "1 boxes of a confidence above 1, which counts as 1",
     )
+
+
+def test_boxes_of_another_class_are_counted_and_minus_one_is_no_class(read):
+    found = read("1,1,10,10,5,5,1,-1,-1\n1,2,30,10,5,5,1,1,1\n1,3,50,10,5,5,1,7,1\n")
+    assert found.person.tolist() == [1, 2]
+    assert found.changes == ("1 boxes of another class than 1, a person, which are left out",)
 
 
 @pytest.mark.parametrize(
@@ -66,6 +74,7 @@ def test_boxes_outside_and_confidences_above_one_are_counted(read):
         ("1,1,10,10,0,5,1\n", "line 1: width, height: expected more than 0 px"),
         ("1,1,700,10,5,5,1\n", "line 1: left, .*: expected a box in the image of 640 x 480 px"),
         ("1,1,10,10,5,5,87\n", "line 1: confidence: expected 0 to 1"),
+        ("1,1,9,9,5,5,1,0,-1\n", "expected a box of a person .* found 1 boxes, 1 of them of anoth"),
     ],
 )
 def test_a_bad_line_is_refused_with_its_number(read, text, message):

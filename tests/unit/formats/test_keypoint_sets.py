@@ -289,7 +289,7 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
     content["annotations"] += [ball, nan]
     path.write_text(json.dumps(content))
     found = read_coco_results(path)
-    assert (found.people.score.shape, found.changes) == ((1, 1), (17, 1, 0, 1))
+    assert (found.people.score.shape, found.changes) == ((1, 1), (17, 1, 0, 1, 0))
     assert "annotations without keypoints, such as of the ball" in str(
         describe_changes({"a": found})
     )
@@ -326,7 +326,7 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     (folder / "cam_000000000002_keypoints.json").write_text("")
     (folder / "cam_000000000003_keypoints.json").write_text(json.dumps({"people": [lame]}))
     found = read_openpose_folder(folder)
-    assert found.changes == (17, 1, 1, 0)
+    assert found.changes == (17, 1, 1, 0, 0)
     assert found.people.confidence[1, 0].max() == 1.0
     people = np.isfinite(found.people.score).sum(axis=1)
     np.testing.assert_array_equal(people, [1, 1, 0, 1])
@@ -334,5 +334,5 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     same = [{"image_id": 1, **{"keypoints": one["pose_keypoints_2d"]}} for one in (sure, nobody)]
     (tmp_path / "a.json").write_text(json.dumps(same))
     listed = read_coco_results(tmp_path / "a.json")
-    assert listed.changes == (17, 1, 0, 0)
+    assert listed.changes == (17, 1, 0, 0, 0)
     np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])

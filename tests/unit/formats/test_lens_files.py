@@ -190,6 +190,13 @@ def test_a_file_with_a_matrix_of_its_own_has_one_lens(name, content, tmp_path):
         ({"camera_matrix": {"rows": 3, "cols": 3, "data": None}}, "data nothing"),
         ({"dist": [0.0] * 5}, "camera_matrix, mtx or K .capitals and underscores"),
         ({**LENS, "lensmodel": "LENSMODEL_OPENCV8"}, "found 'lensmodel_opencv8'"),
+        ({**LENS, "camera_model": "omni"}, "camera_model: expected one of .* found 'omni'"),
+        (
+            {**LENS, "model": "fisheye", "fisheye": False},
+            "one lens model, found model fisheye, fisheye fal",
+        ),
+        ({"cameras": {"left": {**ENTRY, "model": "omni"}}}, "model: expected one of .* 'omni'"),
+        ({"cameras": {"cam0": ENTRY, "cam1": ENTRY}}, "camera left, found cam0, cam1.*to left"),
     ],
 )
 def test_entries_that_contradict_or_lack_a_name_are_refused(content, said, tmp_path):

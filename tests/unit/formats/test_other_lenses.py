@@ -87,6 +87,29 @@ def test_every_lens_file_says_which_model_it_has(model, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "said",
+    ["model: Fisheye", "camera_model: OPENCV_FISHEYE", "type: fisheye", "projection: equidistant"],
+)
+def test_a_fisheye_is_known_by_every_usual_name(said, tmp_path):
+    key, _, word = said.partition(": ")
+    numbers = f"[{', '.join(map(str, LENSES['fisheye']))}]"
+    matrix = "[[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]"
+    (tmp_path / "lens.yaml").write_text(f"K: {matrix}\nD: {numbers}\n{said}\n")
+    (tmp_path / "named.json").write_text(
+        f'{{"cameras": [{{"name": "a", "resolution": [640, 480], "K": {matrix}, "{key}": "{word}",'
+        f' "distCoef": {numbers}, "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 500]}}]}}'
+    )
+    (tmp_path / "c.toml").write_text(
+        f'[a]\nsize = [640, 480]\nmatrix = {matrix}\ndistortions = {numbers}\n{key} = "{word}"\n'
+        "rotation = [0, 0, 0]\ntranslation = [0, 0, 5]\n"
+    )
+    for file in sorted(tmp_path.iterdir()):
+        assert read_lenses([file], "a", SIZE)["a"].lens_model == "fisheye", file
+    for name in ("named.json", "c.toml"):
+        assert read_calibration(tmp_path / name)["a"].lens_model == "fisheye"
+
+
+@pytest.mark.parametrize(
     ("lens", "said"),
     [
         ("distortion_model: fov\nD: [0.9]", "distortion_model: expected one of .* found 'fov'"),

@@ -77,6 +77,20 @@ def test_bodies_cameras_and_units_are_read_back(model, tmp_path):
     np.testing.assert_allclose(np.array(curve.GetPointsAttr().Get()), LINE, atol=1e-5)
 
 
+def test_cameras_of_one_plain_name_are_apart_and_keep_their_own(model, tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd
+
+    camera = next(iter(cameras((940.0, 560.0)).values()))
+    names = ("cam-1", "cam.1", "cam_1", "pitch", people()[0].name)
+    given = dict.fromkeys(names, camera)
+    path = tmp_path / "a.usdc"
+    write_usd(path, model, people(), FPS, cameras=given, markings=[LINE], notes=NOTES)
+    stage = Usd.Stage.Open(str(path))
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
+    assert [prim.GetCustomDataByKey("camera") for prim in prims] == list(names)
+
+
 def test_a_clip_without_bodies_is_refused(model, tmp_path):
     with pytest.raises(InputError, match="expected a person with a fitted body, found none"):
         write_usd(tmp_path / "a.usdc", model, [], FPS, cameras={}, markings=[], notes=NOTES)

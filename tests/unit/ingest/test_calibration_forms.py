@@ -77,6 +77,28 @@ def test_a_camchain_counts_from_its_first_camera(tmp_path):
         read_calibration(path)
 
 
+def test_a_camchain_counts_by_the_numbers_of_its_cameras(tmp_path):
+    lines = []
+    for name in (
+        "cam0",
+        "cam1",
+        *(f"cam{n}" for n in (10, 11)),
+        *(f"cam{n}" for n in range(2, 10)),
+    ):
+        lines += [f"{name}:", "  camera_model: pinhole", "  intrinsics: [900, 900, 639.5, 359.5]"]
+        lines += ["  distortion_model: none", "  resolution: [1280, 720]"]
+        if name != "cam0":
+            step = f"[[1, 0, 0, -{name[3:]}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+            lines += [f"  T_cn_cnm1: {step}"]
+    path = tmp_path / "camchain.yaml"
+    path.write_text("\n".join(lines) + "\n")
+    found = {name: one.center[0] for name, one in read_cameras(path).items()}
+    assert found == {f"cam{n}": n * (n + 1) / 2 for n in range(12)}
+    path.write_text("\n".join(lines[5:]) + "\n")
+    with pytest.raises(InputError, match=r"cam1\.T_cn_cnm1: expected none in the first camera"):
+        read_cameras(path)
+
+
 def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):
     path = WRITERS["Panoptic"](tmp_path, rig())
     content = json.loads(path.read_text())

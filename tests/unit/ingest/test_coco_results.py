@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.formats import files
 from worldpose.formats.coco_results import read_coco_results
@@ -88,12 +89,35 @@ def test_data_set_annotations_may_carry_visibility(read):
     assert np.isnan(people.confidence[0, 0, 5])
 
 
+def test_annotations_are_of_the_category_of_people_with_its_names(tmp_path):
+    people = {"id": 1, "name": "person", "keypoints": list(COCO17)}
+    others = [
+        {"id": 0, "name": "ball"},
+        {"id": 2, "name": "mascot", "keypoints": list(COCO17[::-1])},
+        {"id": 5, "name": "post", "keypoints": ["top"]},
+    ]
+    marks = [person(category_id=1), person(category_id=2), person(category_id=0)]
+    marks += [{"image_id": 0, "category_id": 5, "keypoints": [1, 1, 2]}]
+    file = tmp_path / "cam1.json"
+    file.write_text(
+        json.dumps({"annotations": marks, "categories": [others[0], people, *others[1:]]})
+    )
+    found = read_coco_results(file)
+    assert found.kind == "COCO-17"
+    assert np.isfinite(found.people.confidence).any(axis=-1).sum() == 1
+    assert (found.changes.foreign, found.changes.pointless) == (3, 0)
+
+
+def test_a_confidence_just_below_zero_is_a_missing_joint(read):
+    assert np.isnan(read([with_joint(4, 50, 60, -0.01)]).confidence[0, 0, 4])
+
+
 @pytest.mark.parametrize(
     ("content", "place", "words"),
     [
         ([with_joint(16, 1, math.inf, 0.5)], "result 0, keypoints joint 16 (right_ankle)", "inf"),
         ([with_joint(0, 1, 1e300, 0.5)], "result 0, keypoints joint 0 (nose)", "pixels up to"),
-        ([with_joint(0, 1, 1, -0.1)], "result 0, keypoints joint 0 (nose)", "Scale"),
+        ([with_joint(0, 1, 1, -8.5)], "result 0, keypoints joint 0 (nose)", "Scale"),
         ([with_joint(0, 1, 1, 8.5)], "result 0, keypoints joint 0 (nose)", "1 is certain"),
         ([with_joint(2, 1, "x", 1)], "result 0, keypoints[7]", "a number"),
         ([with_joint(2, 1, 10**400, 1)], "result 0, keypoints[7]", "a number"),

@@ -300,6 +300,70 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
     assert {each.name for each in folder.iterdir()} == {"match.yaml"}
 
 
+LEFT_OUT = {
+    "cvat.xml": """<annotations><image name="east.png" width="1920" height="1080">
+<points label="corner_left_near" points="100.5,200.5"/><box label="b"/>
+<ellipse label="center_circle"/>
+<polygon label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
+    "studio.json": json.dumps(
+        [
+            {
+                "data": {"image": "east.png"},
+                "annotations": [
+                    {
+                        "result": [
+                            {
+                                "type": kind,
+                                "original_width": 1920,
+                                "original_height": 1080,
+                                "value": {"x": 50, "y": 50, kind: [label]},
+                            }
+                            for kind, label in (
+                                ("keypointlabels", "corner_left_near"),
+                                ("brushlabels", "halfway_line"),
+                            )
+                        ]
+                    }
+                ],
+            }
+        ]
+    ),
+    "coco.json": json.dumps(
+        {
+            "images": [{"id": 1, "file_name": "east.png", "width": 1920, "height": 1080}],
+            "annotations": [
+                {"image_id": 7, "category_id": 1, "keypoints": [1, 2, 2]},
+                {"image_id": 1, "category_id": 1, "keypoints": [100, 200, 2]},
+                {"image_id": 1, "category_id": 2, "segmentation": [[1, 2, 3, 4, 5, 6]]},
+            ],
+            "categories": [
+                {"id": 1, "name": "spot", "keypoints": ["corner_left_near"]},
+                {"id": 2, "name": "halfway_line"},
+            ],
+        }
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("cvat.xml", "lines: 1 box of b, 1 ellipse of center_circle"),
+        ("studio.json", "lines: 1 brushlabels of halfway_line"),
+        (
+            "coco.json",
+            "lines: 1 annotation of an image not listed, 1 annotation without keypoints of half",
+        ),
+    ],
+)
+def test_shapes_that_are_not_read_are_counted(tmp_path, name, said):
+    folder = match(tmp_path / "m")
+    (tmp_path / name).write_text(LEFT_OUT[name])
+    report = import_clicks(tmp_path / name, folder)
+    assert said in str(report.notes)
+    assert report.clicks == {"east": 2 if name == "cvat.xml" else 1}
+
+
 @pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "c").write_bytes(content)

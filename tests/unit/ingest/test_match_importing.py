@@ -176,6 +176,25 @@ def test_cameras_and_videos_without_each_other_are_left_out_by_name(tmp_path, so
     assert [camera.id for camera in run(source, tmp_path / "n").cameras] == ["right", "left"]
 
 
+def test_openpose_folders_of_some_cameras_and_folders_of_others_are_read(tmp_path, make_camera):
+    calibration = calibrate(tmp_path, make_camera, ["one", "two", "three"])
+    for name in ("one", "two"):
+        (tmp_path / "d" / f"{name}_json").mkdir(parents=True)
+        people = json.dumps({"people": [{"pose_keypoints_2d": [300.0, 300.0, 0.9] * 17}]})
+        (tmp_path / "d" / f"{name}_json" / "0003.json").write_text(people)
+    (tmp_path / "d" / "images").mkdir()
+    spec, notes = import_match(calibration, tmp_path / "d", 25.0, tmp_path / "m")
+    assert [camera.id for camera in spec.cameras] == ["one", "two"]
+    assert notes[-1] == f"camera three is left out: {tmp_path / 'd'} has no file of it"
+
+
+def test_a_camera_without_a_common_frame_is_said(tmp_path, source):
+    (source / "detections" / "left.json").write_text(json.dumps(results(5300, 5302)))
+    folder = source / "detections"
+    _, notes = import_match(source / "calibration.toml", folder, 25.0, tmp_path / "m")
+    assert "left has people in frames 5300 to 5302, where no other camera has any" in str(notes)
+
+
 def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):
     calibration = calibrate(tmp_path, make_camera, ["one", "two", "three"])
     for name, frames in (("one", 9), ("two", 3), ("three", 7)):

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
@@ -138,6 +139,45 @@ def test_a_cropped_video_is_refused(trial, tmp_path, size, bars):
     with pytest.raises(InputError, match=told):
         import_pose2sim(trial, tmp_path / "m")
     assert not (tmp_path / "m").exists()
+
+
+def test_folders_of_other_names_are_in_the_order_of_their_last_numbers(trial, tmp_path):
+    cameras = {f"c{n}": camera(f"c{n}", n) for n in range(1, 12)}
+    write_calibration_toml(trial / "calibration" / "Calib.toml", cameras)
+    shutil.rmtree(trial / "pose")
+    for n in range(1, 12):
+        write_frame(trial / "pose" / f"p{n}_json", 10, [person(26, n)[0]])
+        (trial / "pose" / f"p{n}_img").mkdir()  # pictures of the poses, beside them
+    import_pose2sim(trial, tmp_path / "m")
+    people, _ = read_unit(read_match(tmp_path / "m"), "c10")
+    np.testing.assert_allclose(people.keypoints[0, 0], person(26, 10)[1][:, :2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("has_raw", [True, False])
+def test_synchronised_poses_give_the_clock_of_the_videos(trial, tmp_path, has_raw):
+    film(trial, (1088, 1920))
+    shutil.copytree(trial / "pose", trial / "pose-sync")
+    moved = trial / "pose-sync" / "cam02_json"
+    for number in range(10, 14):
+        (moved / f"cam02_{number:06d}.json").rename(moved / f"cam02_{number - 7:06d}.json")
+    if not has_raw:
+        shutil.rmtree(trial / "pose")
+    spec, notes = import_pose2sim(trial, tmp_path / "m")
+    assert [each.offset_frames for each in spec.cameras] == [0, 7 if has_raw else 0]
+    said = "offset_frames, from pose: cam02 7" if has_raw else "not known of cam01, cam02"
+    assert said in str(notes)
+    people, _ = read_unit(read_match(tmp_path / "m"), "cam02")
+    found = people.keypoints[list(people.frame).index(3), 0]
+    np.testing.assert_allclose(found, person(26, 200)[1][:, :2], rtol=1e-6)
+
+
+def test_images_without_a_rate_are_refused_by_the_file_that_lacks_it(trial, tmp_path):
+    for name in CAMERAS:
+        (trial / "videos" / name).mkdir(parents=True)
+        cv2.imwrite(str(trial / "videos" / name / "0.png"), np.zeros((1920, 1088, 3), np.uint8))
+    (trial / "Config.toml").unlink()
+    with pytest.raises(InputError, match=r"Config.toml: project.frame_rate: expected frames per"):
+        import_pose2sim(trial, tmp_path / "m")
 
 
 def people_of(*values):

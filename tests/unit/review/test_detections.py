@@ -27,8 +27,8 @@ def keypoint(xy, was=(0.0, 1.0), **where):
     return MovedKeypoint(**place, was=was, xy=xy)
 
 
-def deleted(frame=FIRST, detection=0):
-    return DeletedDetection(camera="a", frame=frame, detection=detection)
+def deleted(frame=FIRST, detection=0, was=None):
+    return DeletedDetection(camera="a", frame=frame, detection=detection, was=was)
 
 
 def added(detection, frame=FIRST + 1, nose=(3.0, 4.0)):
@@ -81,6 +81,7 @@ def test_a_keypoint_put_elsewhere_is_certain():
         (keypoint(None, was=(0.0, 1.5)), "was (0.0, 1.5) when it was corrected, and is [0.0, 1.0]"),
         (keypoint((1.0, 1.0), was=None), "was not seen when"),
         (deleted(frame=FIRST + 1, detection=1), "no detection 1"),
+        (deleted(was=(1.0, 1.0, 1.0, 2.0)), "was [1.0, 1.0, 1.0, 2.0] when it was deleted"),
         (added(0), "there is a detection 0"),
         (added(3), "2 is the next"),
     ],

@@ -101,6 +101,33 @@ def test_folders_of_images_are_videos_of_cameras(tmp_path):
         list(video.frames())
 
 
+def test_the_only_video_of_a_folder_is_its_camera_and_the_rest_is_named(tmp_path):
+    videos = tmp_path / "videos"
+    film(videos, ("cam01",), (0,))
+    film(videos / "cam02", ("video",), (0,))
+    film(videos / "cam03", ("video",), (0,))
+    film(videos / "cam04", ("a", "b"))
+    spec, notes = import_videos(None, videos, tmp_path / "m")
+    assert [each.id for each in spec.cameras] == ["cam01", "cam02", "cam03"]
+    assert len(set(read_match(tmp_path / "m").videos.values())) == 3
+    assert "has one video, or images: cam04/a.MP4, cam04/b.MP4" in str(notes)
+    film(tmp_path / "more", ("cam02",), (0,))
+    (tmp_path / "more" / "cam02.MP4").rename(videos / "cam02.mp4")
+    with pytest.raises(InputError, match=r"cam02\.mp4 and cam02/video\.MP4"):
+        find_videos(videos)
+
+
+def test_images_that_begin_at_other_numbers_and_what_is_beside_them_are_said(tmp_path):
+    for camera, first in (("a", 0), ("b", 5)):
+        folder = tmp_path / "videos" / camera
+        (folder / "thumbs").mkdir(parents=True)
+        for n in range(first, 9):
+            cv2.imwrite(str(folder / f"{n:06d}.png"), numbered(n, 1)[0])
+    _, notes = import_videos(None, tmp_path / "videos", tmp_path / "m", fps=25.0)
+    assert "set offset_frames as bracketed: a at 0 (0), b at 5 (-5)" in str(notes)
+    assert "has one video, or images: a/thumbs, b/thumbs" in str(notes)
+
+
 def encode(path, count=30, options=None, name="libx264"):
     with av.open(str(path), "w") as container:
         stream = container.add_stream(name, 25, options=options or {})
@@ -128,6 +155,35 @@ def test_a_file_that_was_cut_off_is_said(tmp_path, ending, words):
     with VideoReader(file) as video:
         (note,) = describe_video(file, video.index)
     assert words in note and "copied" in note
+
+
+def test_recordings_joined_byte_by_byte_are_refused(tmp_path):
+    one, two = (encode(tmp_path / f"{n}.ts", 20, {"g": "10"}) for n in range(2))
+    (tmp_path / "joined.ts").write_bytes(one.read_bytes() + two.read_bytes())
+    with pytest.raises(InputError, match="they go back at frame 20, as where two recordings"):
+        VideoReader(tmp_path / "joined.ts")
+
+
+def test_a_size_that_changes_within_a_video_is_refused(tmp_path):
+    with av.open(str(tmp_path / "a.ts"), "w") as container:
+        for size, first in ((SIZE, 0), ((96, 128), 10)):
+            picture = np.full((*size, 3), 90, np.uint8)
+            coder = av.CodecContext.create("libx264", "w")
+            coder.height, coder.width, coder.pix_fmt = *size, "yuv420p"
+            coder.time_base, coder.options = Fraction(1, 25), {"bf": "0"}
+            if not first:
+                stream = container.add_stream("libx264", 25)
+                stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
+            frames = [av.VideoFrame.from_ndarray(picture, format="rgb24") for _ in range(10)]
+            for number, frame in enumerate(frames):
+                frame.pts, frame.time_base = first + number, Fraction(1, 25)
+            for packet in [each for frame in [*frames, None] for each in coder.encode(frame)]:
+                packet.stream = stream
+                container.mux(packet)
+    with VideoReader(tmp_path / "a.ts") as video:
+        assert len([*video.frames(0, 5)]) == 5
+        with pytest.raises(InputError, match=r"frame 10: expected images of 64 x 48.*128 x 96"):
+            list(video.frames())
 
 
 def test_two_videos_of_one_camera_are_refused(tmp_path):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element
@@ -33,7 +33,8 @@ IMAGE_NAME: Final = re.compile(
     r"([^/\\?&=]+)\.(?:png|jpe?g|tiff?|bmp|webp)(?=$|[?&#])", re.IGNORECASE
 )
 """The name of an image file at the end of a path, or in an address with a query."""
-_PAIRS: Final = re.compile(r"-?[0-9.]+(?:[eE][+-]?\d+)?,-?[0-9.]+(?:[eE][+-]?\d+)?")
+_NUMBER: Final = r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
+_PAIRS: Final = re.compile(f"{_NUMBER},{_NUMBER}", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,7 @@ class MarkedImage:
         points: label and (2,) pixel of every click, in the order of the file.
         lines: label and (points, 2) pixels of every drawn line.
         answers: people who marked the image, of whom one is read.
+        left_out: kind and label of every shape that is not read.
     """
 
     name: str
@@ -53,17 +55,18 @@ class MarkedImage:
     points: tuple[tuple[str, Floats], ...]
     lines: tuple[tuple[str, Floats], ...]
     answers: int = 1
+    left_out: tuple[str, ...] = ()
 
     def of_size(self, size: tuple[int, int]) -> MarkedImage:
         """Return the image with pixels, in a size that the file may lack."""
         if self.size is not None:
             return self
         lines = tuple((label, share * np.array(size)) for label, share in self.lines)
-        return MarkedImage(self.name, size, self.points, lines)
+        return replace(self, size=size, lines=lines)
 
 
 def read_marked_images(path: Path) -> list[MarkedImage]:
-    """Return the images of CVAT's XML, Label Studio's, COCO's or SoccerNet's JSON.
+    """Return the images with shapes of CVAT's XML, Label Studio's, COCO's or SoccerNet's JSON.
 
     Raises:
         InputError: the file has none of these forms, or no labelled point or line.
@@ -79,10 +82,9 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
             found = list(decoders[begin](content))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ContentError(f"no JSON: {error}") from error
-        images = [image for image in found if image.points or image.lines]
-        if not images:
+        if not any(image.points or image.lines for image in found):
             raise ContentError("no labelled point or line")
-        return images
+        return [image for image in found if image.points or image.lines or image.left_out]
 
     expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
     todo = "Export the clicks from the annotator in one of these forms."
@@ -107,17 +109,17 @@ def _marked(
     """Return an image with the points and lines among labelled shapes of CVAT."""
     points: list[tuple[str, Floats]] = []
     lines: list[tuple[str, Floats]] = []
+    left_out: list[str] = []
     for label, shape in shapes:
-        if shape.tag not in ("points", "polyline") or shape.get("outside") == "1":
+        if shape.tag in ("box", "ellipse", "cuboid", "mask") and shape.get("outside") != "1":
+            left_out.append(f"{shape.tag} of {label}")
+        if shape.tag not in ("points", "polyline", "polygon") or shape.get("outside") == "1":
             continue
         text = shape.get("points", "")
         given = text.split(";")
         if not all(_PAIRS.fullmatch(pair.strip()) for pair in given):
             raise ContentError(f"{name}: {label}: points are {text[:60]!r}")
-        try:
-            pixels = np.array([pair.split(",") for pair in given], dtype=np.float64) - CORNER
-        except ValueError:
-            raise ContentError(f"{name}: {label}: points are {text[:60]!r}") from None
+        pixels = np.array([pair.split(",") for pair in given], dtype=np.float64) - CORNER
         if shape.tag == "points":
             points += [(label, pixel) for pixel in pixels]
         else:
@@ -126,7 +128,7 @@ def _marked(
         width, height = (int(side or "") for side in size)
     except ValueError:
         raise ContentError(f"{name}: an image without width and height") from None
-    return MarkedImage(name, (width, height), tuple(points), tuple(lines))
+    return MarkedImage(name, (width, height), tuple(points), tuple(lines), left_out=tuple(left_out))
 
 
 def _read_tracks(root: Element) -> Iterator[MarkedImage]:
@@ -214,19 +216,24 @@ def _read_label_studio(content: bytes) -> Iterator[MarkedImage]:
         names = [value for value in task.data.values() if isinstance(value, str)]
         names.sort(key=lambda name: IMAGE_NAME.search(name) is None)
         name = names[0] if names else f"task {number}"
-        regions = [
-            _Region.model_validate(each)
-            for each in Answer.choose(answers).result
-            if each.get("type") in _LABELS
-        ]
+        given = Answer.choose(answers).result
+        regions = [_Region.model_validate(each) for each in given if each.get("type") in _LABELS]
+        other = [each for each in given if re.search("labels$", str(each.get("type")))]
+        left_out = tuple(_describe_other(each) for each in other if each["type"] not in _LABELS)
         sizes = {(region.original_width, region.original_height) for region in regions}
         if len(sizes) > 1:
             raise ContentError(f"{name}: regions of images of {len(sizes)} sizes")
         shapes = [(region.type, *region.place()) for region in regions]
         points = ((label, at[0]) for kind, label, at in shapes if kind == "keypointlabels")
         lines = ((label, at) for kind, label, at in shapes if kind != "keypointlabels")
-        if sizes:
-            yield MarkedImage(name, sizes.pop(), tuple(points), tuple(lines), len(answers))
+        size = sizes.pop() if sizes else None
+        yield MarkedImage(name, size, tuple(points), tuple(lines), len(answers), left_out)
+
+
+def _describe_other(region: dict[str, Any]) -> str:
+    value = region.get("value")
+    labels = value.get(region["type"]) if isinstance(value, dict) else None
+    return f"{region['type']} of {', '.join(map(str, labels or ['no label']))}"
 
 
 def _full_task(task: Any) -> Any:  # noqa: ANN401
@@ -244,8 +251,8 @@ def _full_task(task: Any) -> Any:  # noqa: ANN401
         if isinstance(entry, list)
         for each in entry
         if isinstance(each, dict)
-        for kind in _LABELS
-        if kind in each
+        for kind in each
+        if str(kind).endswith("labels")
     ]
     names = {key: value for key, value in task.items() if isinstance(value, str)}
     return {"data": names, "annotations": [{"result": regions}]}
@@ -253,6 +260,7 @@ def _full_task(task: Any) -> Any:  # noqa: ANN401
 
 class _Category(Given):
     id: int
+    name: str = ""
     keypoints: tuple[str, ...] = ()
 
 
@@ -280,12 +288,19 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
             return
     dataset = _Dataset.model_validate(given)
     names = {category.id: category.keypoints for category in dataset.categories}
+    called = {category.id: category.name or str(category.id) for category in dataset.categories}
+    listed = {image.id for image in dataset.images}
+    lost = sum(each.image_id not in listed for each in dataset.annotations)
+    yield MarkedImage("", None, (), (), left_out=("annotation of an image not listed",) * lost)
     for image in dataset.images:
         points = []
+        left_out = []
         for each in dataset.annotations:
             if each.image_id != image.id:
                 continue
             labels = names.get(each.category_id, ())
+            if not each.keypoints:
+                left_out.append(f"annotation without keypoints of {called.get(each.category_id)}")
             if len(each.keypoints) != 3 * len(labels):
                 what = f"{len(labels)} keypoints of category {each.category_id}"
                 raise ContentError(f"{image.file_name}: {len(each.keypoints)} numbers for {what}")
@@ -294,7 +309,8 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
             ):
                 if visible > 0:
                     points.append((label, np.array([x, y])))
-        yield MarkedImage(image.file_name, (image.width, image.height), tuple(points), ())
+        size = image.width, image.height
+        yield MarkedImage(image.file_name, size, tuple(points), (), left_out=tuple(left_out))
 
 
 class _Share(Given):

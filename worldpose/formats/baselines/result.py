@@ -25,7 +25,9 @@ from worldpose.geometry.rigid import Rigid
 from worldpose.pickles import read_pickle
 
 
-def write_tracks(path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
+def write_tracks(
+    path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64], number: NDArray[np.integer]
+) -> None:
     """Write boxes as a MOTChallenge text, whole or not at all.
 
     One line for each person and image: image from 1, id, left, top, width, height [px] and
@@ -36,13 +38,14 @@ def write_tracks(path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64])
         path: the file.
         boxes: (frames, persons, 4) x0 y0 x1 y1 [px]; NaN if a person is not in the image.
         ids: (persons,), renumbered from 1.
+        number: (frames,) number of each frame's image in its video, from 0.
     """
     frames, people = np.nonzero(np.isfinite(boxes).all(-1))
     found = boxes[frames, people]
     # (0, 0) is the centre of a pixel here, (1, 1) its upper left corner there.
     corners = np.concatenate([found[:, :2] + 1.5, found[:, 2:] - found[:, :2]], axis=1)
     lines = [
-        f"{frame + 1},{ids[person] + 1},{x:.2f},{y:.2f},{w:.2f},{h:.2f},1,-1,-1,-1"
+        f"{number[frame] + 1},{ids[person] + 1},{x:.2f},{y:.2f},{w:.2f},{h:.2f},1,-1,-1,-1"
         for frame, person, (x, y, w, h) in zip(frames, people, corners.tolist(), strict=True)
     ]
     with whole_file(path) as draft:
