@@ -96,24 +96,15 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or
             has another size; or clicks exist already.
     """
-    every = read_marked_images(file)
     spec = read_spec(folder)
     pitch = read_pitch(folder, spec)
     if pitch is None:
         expected = "a pitch, whose markings were clicked"
         todo = "Remove the line `pitch: none`."
         raise InputError(f"{folder / 'match.yaml'}: pitch", expected, "pitch: none", todo)
-    markings = [*PitchTemplate.from_spec(pitch).marking_names, *SOCCERNET_MARKINGS]
-    every = [_leave_out_areas(image, markings) for image in every]
-    images = [image for image in every if image.points or image.lines]
-    by_owner = _assign_images(file, images, spec, owner)
     report = ImportedClicks()
-    unread = Counter(shape for image in every for shape in image.left_out)
-    if listed := ", ".join(f"{count} {shape}" for shape, count in sorted(unread.items())):
-        report.notes.append(f"shapes are left out that are no labelled points or lines: {listed}")
-    if not images:
-        todo = "Rename the labels; docs/reference/match_folder.md lists the names."
-        raise InputError(str(file), "names of markings of the pitch", listed[:200], todo)
+    images = _read_images(file, pitch, report)
+    by_owner = _assign_images(file, images, spec, owner)
     labels = _Labels(file, images, pitch, report)
     records: dict[str, Record] = {}
     for name, (camera, given) in by_owner.items():
@@ -150,18 +141,31 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
     return report
 
 
-def _leave_out_areas(image: MarkedImage, markings: Sequence[str]) -> MarkedImage:
-    """Return an image without polygons whose labels resemble no name of a marking."""
-    other = [
-        label
-        for label, _ in image.lines
-        if label in image.areas
-        and _find_name(label, markings) is None
-        and not get_close_matches(label, markings)
-    ]
-    lines = tuple(line for line in image.lines if line[0] not in other)
-    left_out = (*image.left_out, *(f"polygon of {label}" for label in other))
-    return replace(image, lines=lines, left_out=left_out)
+def _read_images(file: Path, pitch: PitchSpec, report: ImportedClicks) -> list[MarkedImage]:
+    """Return the images with points or lines, and report the shapes that are left out.
+
+    So are polygons whose labels resemble no name of a marking: they outline other things.
+    """
+    markings = [*PitchTemplate.from_spec(pitch).marking_names, *SOCCERNET_MARKINGS]
+    images: list[MarkedImage] = []
+    unread = Counter[str]()
+    for image in read_marked_images(file):
+        other = {
+            label
+            for label in image.areas
+            if _find_name(label, markings) is None and not get_close_matches(label, markings)
+        }
+        lines = tuple(line for line in image.lines if line[0] not in other)
+        unread.update(image.left_out)
+        unread.update(f"polygon of {label}" for label, _ in image.lines if label in other)
+        if image.points or lines:
+            images.append(replace(image, lines=lines))
+    if listed := ", ".join(f"{count} {shape}" for shape, count in sorted(unread.items())):
+        report.notes.append(f"shapes are left out that are no labelled points or lines: {listed}")
+    if not images:
+        todo = "Rename the labels; docs/reference/match_folder.md lists the names."
+        raise InputError(str(file), "names of markings of the pitch", listed[:200], todo)
+    return images
 
 
 def _assign_images(

@@ -37,14 +37,14 @@ def match(folder, *, pitch=None):
     return folder
 
 
-def cvat(file, clicks, lines=(), *, name="east.png", size=SIZE):
+def cvat(file, clicks, lines=(), *, areas=(), name="east.png", size=SIZE):
     shapes = [
         f'<points label={quoteattr(label)} points="{x + 0.5},{y + 0.5}"/>'
         for label, (x, y) in clicks
     ]
-    for label, pixels in lines:
+    for tag, (label, pixels) in [("polyline", a) for a in lines] + [("polygon", a) for a in areas]:
         text = ";".join(f"{x + 0.5},{y + 0.5}" for x, y in pixels)
-        shapes.append(f'<polyline label={quoteattr(label)} points="{text}"/>')
+        shapes.append(f'<{tag} label={quoteattr(label)} points="{text}"/>')
     file.write_text(
         f'<annotations><image id="0" name="{name}" width="{size[0]}" '
         f'height="{size[1]}">{"".join(shapes)}</image></annotations>'
@@ -289,6 +289,8 @@ def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, 
         ({"name": "still.png"}, "goal", "ends in its frame number"),
         ({}, "north", "goal"),
         ({"clicks": []}, None, "no labelled point"),
+        ({"clicks": [], "areas": [("adboard", LINE)]}, None, "found 1 polygon of adboard"),
+        ({"areas": [("halfway_lin", LINE)]}, None, "did you mean halfway_line"),
         ({"clicks": [("halfway_far", (np.nan, 2.0))]}, None, "points are"),
     ],
 )
