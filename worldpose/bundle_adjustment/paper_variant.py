@@ -68,8 +68,8 @@ def adjust_unguarded(
         names=clip.names,
     )
     stopping = SolverSettings(max_iterations=100, min_cost_change=1e-9)
-    cameras = solve(problem, stopping, covariance=False).cameras
-    motion = np.where(changed[:, None], camera_motion(clip.cameras, cameras), 0.0)
+    found = solve(problem, stopping, covariance=False).cameras
+    motion = np.where(changed[:, None], camera_motion(clip.cameras, found), 0.0)
     reasons = tuple(
         f"accepted: method=paper has no validation{describe_motion(motion[c])}"
         if changed[c]
@@ -77,10 +77,5 @@ def adjust_unguarded(
         for c in range(count)
     )
     return replace(
-        unchanged,
-        cameras=cameras,
-        accepted=changed,
-        reasons=reasons,
-        motion=motion,
-        refused=cameras,
+        unchanged, cameras=found, accepted=changed, reasons=reasons, motion=motion, refused=found
     )
