@@ -111,7 +111,7 @@ def _of_adjustment(figures: Figures) -> Figures:
     before, after = figures.get("held_out_error_before_px"), figures.get("held_out_error_after_px")
     if after is None or not before:
         # Nobody is held out: a question only if a camera was changed all the same.
-        names = ("held_out_error_after_px", "held_out_growth")
+        names = ("held_out_error_after_m", "held_out_growth")
         is_kept = figures.get("cameras_changed") == 0.0
         return {**dict.fromkeys(names, 0.0), **figures} if is_kept else figures
     # Above 1 by chance: the loss of the same people does not rise beyond its standard error.
@@ -201,8 +201,9 @@ GATES: Final[Mapping[str, Gate]] = {
             "bundle_adjustment",
             "Did the adjustment improve the cameras, and are its outliers correct?",
             {
-                # Of held-out people in the adjusted cameras; 1.5 to 2.4 on simulated matches.
-                "held_out_error_after_px": 5.0,
+                # Of held-out people in the adjusted cameras, at their distance: pixels would depend
+                # on how large people are. Usual are 0.03 to 0.05, as far as keypoints err.
+                "held_out_error_after_m": 0.1,
                 # Relative to before the adjustment: above 1 it did harm.
                 "held_out_growth": 1.0,
             },

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite
+from math import isfinite, log1p, sqrt
 from typing import Final
 
 from data_contracts.run import BODY_STAGES, UnitFailure
@@ -233,6 +233,7 @@ def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
 def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> list[str]:
     """Return a sentence for each metric beyond its limit; metrics are given by unit and name."""
     found: list[str] = []
+    figures = {name: _as_normal(own, figures) for name, own in figures.items()}
     for rule in _RULES:
         last = _REPLACED.get(rule.stage, rule.stage)
         for name, own in figures.items():
@@ -241,6 +242,26 @@ def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> lis
                 limit = getattr(limits, rule.limit) if rule.limit else 0.0
                 found += _exceeding(rule, " in ".join(unit.split(".")), own, limit)
     return found
+
+
+def _as_normal(own: Figures, figures: Mapping[str, Figures]) -> Figures:
+    """Return a unit's metrics with motions of cameras in deviations of a normal error.
+
+    Calibration estimates the noise of a camera's clicks from these: the error over the stated
+    deviation has Student's distribution. With n degrees of freedom, t deviations are as improbable
+    as (Wallace 1959)
+
+        z = (8 n + 1) / (8 n + 3) sqrt(n log(1 + t^2 / n))
+    """
+    normal = dict(own)
+    for name, moved in own.items():
+        metric, _, camera = name.partition(".")
+        if metric == "moved_deviations":
+            n = figures.get(f"static_calibration/{camera}", {}).get("click_freedom", 0.0)
+            if n > 0.0:
+                share = (8.0 * n + 1.0) / (8.0 * n + 3.0)
+                normal[name] = share * sqrt(n * log1p(moved**2 / n))
+    return normal
 
 
 def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Iterator[str]:

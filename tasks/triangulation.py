@@ -41,6 +41,7 @@ from worldpose.triangulation.camera_changes import (
     measure_departures,
 )
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
+from worldpose.triangulation.person_offsets import stated_errors
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -93,7 +94,10 @@ def _write_joints(
         for part in chunks:
             spool.add(_part_arrays(part.triangulation, part.smoothing))
             seen = detections[rows[part.frames]]
-            health.add(clip.cameras, seen, part.triangulation.joints, part.frames.start)
+            joints, stated = part.triangulation.joints, None
+            if covariance is not None:
+                stated = stated_errors(clip.cameras, joints, settings, covariance).variance
+            health.add(clip.cameras, seen, joints, part.frames.start, stated)
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
         measured = _health_arrays(inputs, clip, health, rows, result)

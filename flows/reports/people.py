@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.results.best_results import bodies_unit, clip_positions, clip_title, person_kinds
@@ -14,6 +14,9 @@ from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number, format_scaled
 from worldpose.store.store import Run
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 MAX_ROWS = 20
 """Maximum number of rows of the outlier lists, worst first."""

@@ -33,7 +33,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "standard_deviation_m": "uncertainty of the joints",
     "unhealthy_share": "time in which a camera is not healthy",
     "filled_share": "frames in which no camera sees the person",
-    "held_out_error_after_px": "error in people that were kept back",
+    "held_out_error_after_m": "error in people that were kept back",
     "held_out_growth": "error in people that were kept back, relative to before",
     "offset_rms_m": "distance of bodies from the seen joints",
     "held_out_certain_excess_m": "bodies are worse than joints by",

@@ -17,7 +17,7 @@ from starlette.background import BackgroundTask
 
 from data_contracts.operations import Arrival, MatchSummary, UnitSummary
 from flows.method import METHOD
-from flows.overview import PAGE, Overview, age, cost_of, is_late, units_of
+from flows.overview import PAGE, age, cost_of, is_late, units_of
 from flows.review.descriptions import when
 from flows.review.metric_words import in_short, reason_words
 from flows.service.alerts import kept_alerts
@@ -42,12 +42,12 @@ FILES: Final = Path(__file__).with_name("status")
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the status page, and of its JSON."""
     router = APIRouter()
-    overview = Overview(context.store)
+    overview = context.overview
 
     @router.get("/api/status")
     def status(page: int = 1) -> dict[str, Any]:
         found = overview.look(BUDGET_SECONDS)
-        rows = _rows(context, overview, found, min(max(page, 1), _pages(found)))
+        rows = _rows(context, found, min(max(page, 1), _pages(found)))
         return {
             "matches": [_as_json(each) for each in rows],
             "pages": _pages(found),
@@ -67,7 +67,7 @@ def routes(context: PageContext) -> APIRouter:
         kept = kept_alerts(served_state(context.store.url)).values()
         alerts = [each for each in kept if each["alert"] != "digest"]
         text = status_html(
-            _rows(context, overview, found, page),
+            _rows(context, found, page),
             _arrivals(context),
             dashboard,
             inbox=inbox,
@@ -136,15 +136,13 @@ def _pages(found: Sequence[MatchSummary]) -> int:
     return max(1, -(-len(found) // PAGE))
 
 
-def _rows(
-    context: PageContext, overview: Overview, found: Sequence[MatchSummary], page: int
-) -> list[StatusRow]:
+def _rows(context: PageContext, found: Sequence[MatchSummary], page: int) -> list[StatusRow]:
     """Return the matches of a page with their units, and their runs at work and at Prefect."""
     links = context.continuing.links()
     rows = []
     for match in found[PAGE * (page - 1) : PAGE * page]:
         name = match.match_id
-        whole = match if match.is_unseen else overview.read(name)
+        whole = match if match.is_unseen else context.overview.read(name)
         rows.append(StatusRow(whole, context.continuing.state(name), links.get(name, "")))
     return rows
 

@@ -26,6 +26,7 @@ from flows.orchestration.prefect_environment import (
     has_server,
     without_secrets,
 )
+from flows.overview import Overview
 from flows.registering import open_for_review, open_stored
 from flows.review.verdicts import resume
 from flows.run_record import describe_end, latest_run
@@ -52,8 +53,11 @@ class PageContext:
         default_factory=dict
     )
     continuing: Continuing = field(init=False)
+    overview: Overview = field(init=False)
+    """Shared: each has the summaries of all matches in memory."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "overview", Overview(self.store))
         object.__setattr__(self, "continuing", Continuing(self.store))
 
     def match(self, name: str) -> Match:

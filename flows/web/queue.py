@@ -15,7 +15,7 @@ from data_contracts.review import ReviewRequest
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
 from flows.method import METHOD
-from flows.overview import PAGE, Overview
+from flows.overview import PAGE
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
@@ -39,12 +39,12 @@ _ABOUT: Final = {stage.name: stage.about for stage in METHOD}
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
-    overview = Overview(context.store)
+    overview = context.overview
 
     @router.get("")
     def matches(search: str = "", kind: str = "", page: int = 1) -> dict[str, Any]:
         found = overview.look(BUDGET_SECONDS)
-        return _choose(context, overview, found, search.strip().lower(), kind, max(page, 1))
+        return _choose(context, found, search.strip().lower(), kind, max(page, 1))
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
@@ -90,7 +90,6 @@ def routes(context: PageContext) -> APIRouter:
 
 def _choose(
     context: PageContext,
-    overview: Overview,
     found: Sequence[MatchSummary],
     search: str,
     kind: str,
@@ -110,7 +109,7 @@ def _choose(
     shown = (each[3] for each in sought[PAGE * (page - 1) : PAGE * page])
     return {
         "matches": [
-            _glance(context, each if each.is_unseen else overview.glance(each.match_id))
+            _glance(context, each if each.is_unseen else context.overview.glance(each.match_id))
             for each in shown
         ],
         "total": len(found),

@@ -32,6 +32,12 @@ def test_a_run_imports_nothing_that_only_draws():
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
+def test_pages_import_what_opens_results_when_somebody_looks_at_one():
+    # xarray and pandas take 90 MB, of the 500 that a process of a service may have.
+    script = "import sys, flows.web.app\nassert not {'xarray', 'pandas'} & set(sys.modules)\n"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
 @pytest.mark.parametrize("option", ["--help", "--version"])
 def test_the_program_answers_without_an_orchestrator_or_a_numeric_library(option):
     script = (

@@ -29,7 +29,12 @@ WORSE_BODIES |= {"held_out_excess_m.hip": 0.05}  # not certain
 
 
 def held_out(before, after):
-    return {"held_out_error_before_px": before, "held_out_error_after_px": after}
+    """Errors in pixels, of people whom a camera images at 50 px to the metre."""
+    return {
+        "held_out_error_before_px": before,
+        "held_out_error_after_px": after,
+        "held_out_error_after_m": after / 50.0,
+    }
 
 
 @pytest.mark.parametrize(
@@ -43,6 +48,9 @@ def held_out(before, after):
         (PEOPLE, GOOD_VIDEO | {"stride": 2.0}, []),  # filled in between two looks on purpose
         (PEOPLE, GOOD_VIDEO | {"stride": 1.0}, ["bridged_share is 0.5, at most 0.25 passes"]),
         (ADJUSTMENT, held_out(2.0, 1.9), []),
+        (ADJUSTMENT, held_out(6.0, 5.5), ["held_out_error_after_m is 0.11, at most 0.1 passes"]),
+        # As accurate in a hall, where people are nine times as large.
+        (ADJUSTMENT, held_out(18.0, 17.0) | {"held_out_error_after_m": 0.04}, []),
         (ADJUSTMENT, held_out(2.0, 2.1), ["held_out_growth is 1.05, at most 1 passes"]),
         (ADJUSTMENT, held_out(2.0, 2.00035), []),  # a growth that reads as the limit is none
         # Cameras on one mast place people on the pitch alone: there are no joints to judge.
@@ -56,7 +64,7 @@ def held_out(before, after):
             ["held_out_growth is 1.01"],
         ),
         (ADJUSTMENT, {"cameras_changed": 0.0}, []),  # as cameras on one mast
-        (ADJUSTMENT, {"cameras_changed": 1.0}, ["held_out_error_after_px", "held_out_growth"]),
+        (ADJUSTMENT, {"cameras_changed": 1.0}, ["held_out_error_after_m", "held_out_growth"]),
         (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
         (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
         (ACCEPTANCE, GOOD_BODIES | {"held_out_certain_excess_m.knee": 0.01}, []),

@@ -41,9 +41,8 @@ def check_pages(folder, match):
 
     # A question about the tracks shows the paths of the feet.
     store = Store.open(str(project))
-    asked = SimpleNamespace(
-        gate="tracking", run_id=store.run(match).run_id, keys={"tracking/clip": ""}
-    )
+    keys = {"tracking/clip": store.run(match).results["tracking/clip"]}
+    asked = SimpleNamespace(gate="tracking", match_id=match, keys=keys)
     with patch("flows.web.evidence.plot_paths") as plot:
         draw_evidence(store, open_for_review(store, match), asked)
     assert np.isfinite(plot.call_args[0][0].joints).all(axis=-1).any(axis=(0, 2)).sum() >= 10

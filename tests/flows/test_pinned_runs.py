@@ -50,7 +50,7 @@ def test_status_names_a_damaged_pin(command, project_copy):
     file.write_bytes(file.read_bytes()[:20])
     (row,) = json.loads(command("status", "--json").stdout)["matches"]
     assert f"pins/{TINY}/gold.json" in row["problem"]
-    assert row["now"] == "ready"  # its results can still be used
+    assert row["now"] == "usable with reservations"  # its results can still be used
     assert f"pins/{TINY}/gold.json" in command("status").stdout.replace("\n", "")
 
 

@@ -21,6 +21,7 @@ from flows.run_plan import plan_run
 from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
 from flows.web.app_context import read_progress
 from worldpose.store.documents import seal
+from worldpose.store.runs import identify_process
 from worldpose.store.store import Store
 
 
@@ -88,7 +89,8 @@ def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
     path = next(project_copy.rglob(f"{run_id}.open.json"))
     try:
         path.unlink()
-        theirs = mine.model_copy(update={"pid": other.pid, "started_at": datetime.now(UTC)})
+        named = {"pid": other.pid, "process": identify_process(other.pid)}
+        theirs = mine.model_copy(update={**named, "started_at": datetime.now(UTC)})
         store.blobs.put_new(str(path.relative_to(project_copy)), seal(theirs))
         answer = worldpose("run", TINY, "--project", project_copy)
         assert answer.code == 1

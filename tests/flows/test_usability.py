@@ -111,6 +111,23 @@ def test_a_metric_beyond_its_limit_is_a_reservation(unit, figures, said):
     assert text.startswith(said)
 
 
+@pytest.mark.parametrize(
+    ("freedom", "moved", "is_said"),
+    # Of Student's distribution, by tables: beyond 5.5 in 3 % and in 0.03 %, beyond 4.1 in 0.2 %.
+    [(2.0, 5.5, False), (10.0, 5.5, True), (10.0, 4.1, True), (10.0, 3.1, False), (0.0, 3.1, True)],
+)
+def test_few_clicks_know_their_noise_badly_and_cameras_may_move_farther(freedom, moved, is_said):
+    figures = {
+        "static_calibration/cam1": {"click_freedom": freedom, "clicks_wrong": 0.0},
+        "bundle_adjustment/cameras": {"moved_deviations.cam1": moved},
+        "body_fitting/clip": {"offset_rms_m": 0.01},
+    }
+    found = judge_run(RunOutcome(figures=figures), UsableLimits())
+    assert any("contradict the calibration of cam1" in each for each in found.reservations) == (
+        is_said
+    )
+
+
 def test_results_that_end_before_bodies_name_their_last_stage():
     until = {name: HEALTHY[name] for name in ("detection/cam1.clip", "tracking/clip")}
     found = judge_run(RunOutcome(figures=until), UsableLimits())

@@ -190,8 +190,9 @@ def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, 
         By joint, left and right as one: length of the offset and its usual maximum [m].
     """
     length = np.linalg.norm(offsets, axis=-1)
-    # Offsets beyond this are unusual for any detector [standard deviations]: one in 34.
-    max_offset = 3.0
+    # Standard deviations that one of the nine joints exceeds by chance in one clip of a thousand:
+    # each, by chi-square with three degrees of freedom, in one of 9,000.
+    max_offset = 4.57
     far = (length > max_offset * common_bias) & (common_bias > 0.0)
     return {
         COCO17[joint].removeprefix("left_"): (

@@ -89,7 +89,14 @@ class CameraHealth:
         found[sums[..., 1] < 20.0] = np.nan
         return found
 
-    def add(self, cameras: Camera, people: KeypointDetections, joints: Floats, start: int) -> None:
+    def add(
+        self,
+        cameras: Camera,
+        people: KeypointDetections,
+        joints: Floats,
+        start: int,
+        stated: Floats | None = None,
+    ) -> None:
         """Add a chunk of a clip; its first and last frame give velocities only.
 
         Args:
@@ -97,6 +104,8 @@ class CameraHealth:
             people: detections of tracked people, (frames, cameras, detections).
             joints: (frames, persons, 17, 3) triangulated [m], world.
             start: row of the first of these frames in the clip.
+            stated: (frames, cameras, persons) variance per axis by the calibration [px^2]: what it
+                explains is no misfit; None = it explains nothing.
         """
         rows = np.arange(1, len(joints) - 1)
         rows = rows[(start + rows) % self.every == self.every // 2]
@@ -110,10 +119,18 @@ class CameraHealth:
             frame, person = np.nonzero(slot >= 0)
             if len(frame):
                 pixels = people.keypoints[rows[frame], c, slot[frame, person]][:, LIMBS]
-                self._add_departures(c, cameras[c], bins[frame], pixels, points[:, frame, person])
+                own = 0.0 if stated is None else stated[rows[frame], c, person][:, None]
+                there = points[:, frame, person]
+                self._add_departures(c, cameras[c], bins[frame], pixels, there, own)
 
     def _add_departures(
-        self, c: int, camera: Camera, bins: Integers, pixels: Floats, points: Floats
+        self,
+        c: int,
+        camera: Camera,
+        bins: Integers,
+        pixels: Floats,
+        points: Floats,
+        stated: Floats | float,
     ) -> None:
         """Add people (n,) of one camera, in rising bins, at points (3, n, 12, 3) over time."""
         joint_noise, pixel_noise = 0.03, 2.0  # of a detector [m], [px]
@@ -124,11 +141,11 @@ class CameraHealth:
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = focal / depth
             variance = pixel_noise**2 + (joint_noise * scale) ** 2
-            squared = (off**2).sum(axis=-1) / variance
-            weight = cauchy_weight(squared, 5.0) / variance
+            squared = (off**2).sum(axis=-1)
+            weight = cauchy_weight(squared / variance, 5.0) / variance
+            loss = cauchy_loss(squared / (variance + stated), 5.0)
         use = np.isfinite(weight) & np.isfinite(speed).all(axis=-1) & (depth > 0.0)
-        with np.errstate(invalid="ignore"):
-            terms = np.stack([scale, np.ones_like(scale), cauchy_loss(squared, 5.0)], axis=-1)
+        terms = np.stack([scale, np.ones_like(scale), loss], axis=-1)
         terms = np.where(use[..., None], terms, 0.0).sum(axis=1)
         around = image - camera.principal_point
         columns = np.zeros((*off.shape, UNKNOWNS))

@@ -403,7 +403,7 @@ class _Passes:
         self.shift, self.offset_covariance = estimate_offsets(
             self._observations, settings.noise, self.solved, factor * stated.variance
         )
-        self.misplaced = stated.position_std(factor)
+        self.misplaced = stated.position_std(factor, self._detections.detection_index >= 0)
         self._solve("shifted")
         return factor
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17_HIPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
@@ -48,9 +48,13 @@ class StatedErrors:
     variance: Floats
     scale: Floats
 
-    def position_std(self, factor: float) -> tuple[Histogram, ...]:
-        """Return the standard deviation at people [m], variance times `factor`, by camera."""
-        there = self.variance > 0.0
+    def position_std(self, factor: float, shown: Flags) -> tuple[Histogram, ...]:
+        """Return the standard deviation at people [m], variance times `factor`, by camera.
+
+        `shown` (frames, cameras, persons) are the people that a camera detects: beyond its image
+        the derivatives of its lens grow without limit, and displace nobody.
+        """
+        there = shown & (self.variance > 0.0)
         variance = np.where(there, self.variance, 0.0) / np.where(there, self.scale, 1.0) ** 2
         root = np.sqrt(factor * variance)
         return tuple(Histogram.of(root[:, c][there[:, c]]) for c in range(there.shape[1]))

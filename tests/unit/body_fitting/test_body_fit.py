@@ -8,7 +8,7 @@ from worldpose.body.model import BodyParameters
 from worldpose.body_fitting import estimate
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.evidence import JOINT_SPREAD, MIRRORED_OFFSETS, body_axes
-from worldpose.body_fitting.report import report_fit
+from worldpose.body_fitting.report import far_offsets, report_fit
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
@@ -130,3 +130,14 @@ def test_arrays_that_do_not_fit_are_refused():
         fit_bodies(
             MODEL, ClipEvidence(np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0), SETTINGS
         )
+
+
+def test_offsets_are_far_beyond_the_chance_of_all_joints_together():
+    rng, bias = np.random.default_rng(5), np.full(17, 0.018)
+    left = [0, 1, 3, 5, 7, 9, 11, 13, 15]  # both sides have the same offset
+    clips = np.zeros((2000, 17, 3))
+    clips[:, left] = 0.018 * rng.standard_normal((2000, 9, 3))
+    assert sum(bool(far_offsets(clip, bias)) for clip in clips) <= 8  # 2 of 2000 are expected
+    clips[0, 3] = [0.09, 0.0, 0.0]
+    assert far_offsets(clips[0], bias)["ear"] == pytest.approx((0.09, 0.08226))
+    assert not far_offsets(clips[0], np.zeros(17))  # not known

@@ -46,10 +46,10 @@ def explain(cameras, people):
     return explain_changes(cameras, people, FPS, SETTINGS, found) if found else None
 
 
-def measure(cameras, people, **frames):
+def measure(cameras, people, stated=None, **frames):
     """Health of the cameras over time, and in which share of it each one is bad."""
     health = CameraHealth.empty(FRAMES, len(cameras.focal), people.detection_index.shape[2], FPS)
-    health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0)
+    health.add(cameras, people, triangulate_views(cameras, people, SETTINGS), 0, stated)
     values = measure_health(health, frames)
     return dict(zip(HEALTH_MEASURES, np.moveaxis(values, -1, 0), strict=True)), (
         judge_health(values) > 1.0
@@ -70,6 +70,16 @@ def test_health_over_time_shows_a_knock_and_lost_frames_and_no_healthy_camera(ca
     # Of five frames: the camera itself displaces the people.
     lost, _ = measure(cameras, view(cameras, late))
     assert np.nanmedian(lost["clock_frames"][half + 3 :, BAD]) > 1.5
+
+
+def test_a_camera_departs_no_farther_than_its_calibration_states(cameras):
+    people = view(cameras, lambda pixels, *_: pixels + [40.0, 0.0])
+    stated = np.zeros(people.detection_index.shape)
+    _, bad = measure(cameras, people, stated)
+    assert bad[BAD] == 1.0
+    stated[:, BAD] = 40.0**2
+    _, bad = measure(cameras, people, stated)
+    assert (bad == 0.0).all()
 
 
 def test_health_tells_images_that_are_missing_dark_or_blurred(cameras):

@@ -7,6 +7,7 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.person_offsets import StatedErrors
 from worldpose.triangulation.settings import TriangulationSettings
 
 as_detections = KeypointDetections.from_keypoints
@@ -95,3 +96,15 @@ def test_regions_hold_the_truth_of_one_clip():
     # 136 joints, not independent: five standard errors below and everything above.
     assert number > 100
     assert share > 0.86
+
+
+def test_a_calibration_displaces_the_people_whom_its_camera_shows():
+    # 100 px to the metre: 4 px are 4 cm; beyond the image of the camera the lens means nothing.
+    variance, scale = np.array([[[16.0, 1e6, 1e6]]]), np.full((1, 1, 3), 100.0)
+    shown = np.array([[[True, False, False]]])
+    (displacement,) = StatedErrors(variance, scale).position_std(1.0, shown)
+    assert displacement.median == pytest.approx(0.04, rel=0.01)
+    (displacement,) = StatedErrors(variance, scale).position_std(4.0, shown)
+    assert displacement.median == pytest.approx(0.08, rel=0.01)
+    (displacement,) = StatedErrors(variance, scale).position_std(1.0, ~shown & shown)
+    assert displacement.median is None
