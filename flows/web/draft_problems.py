@@ -164,8 +164,8 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     """Write what other tools' files say into a match folder; return sentences about it.
 
     A calibration is told by its form. Any other file has 2D poses, clicks or a lens of the camera
-    with whose id, or as the only one with whose first word, its name begins; clicks may also be in
-    images that are named after cameras.
+    with whose id, or as the only one with whose first word, its name begins; its other words name
+    no other camera. Clicks may also be in images that are named after cameras.
 
     Args:
         given: folder of the files.
