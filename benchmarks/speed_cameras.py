@@ -163,7 +163,7 @@ def refine_on_picture(prior: CameraOnPitch, picture: Image) -> Camera:
 
 
 def refine_on_map(away: NDArray[np.float32], start: Camera, spread: Floats) -> Camera:
-    """Return the camera with the least robust distances to edges, at points of the markings."""
+    """Return the camera with the least robust distances of markings to edges, and to the prior."""
     away = np.minimum(away, np.float32(30.0))
     slopes = [cv2.Sobel(away / 8.0, cv2.CV_32F, *way, ksize=3) for way in ((1, 0), (0, 1))]
     points, moves = line_points(start, 2000), spread > 0.0
@@ -177,8 +177,13 @@ def refine_on_map(away: NDArray[np.float32], start: Camera, spread: Floats) -> C
         pixels, jacobian = project_with_jacobian(moved(values), points)
         # Not as one map and an empty second one: OpenCV 5 then reads arbitrary values.
         x, y = np.ascontiguousarray(pixels.T, dtype=np.float32)[:, None]
-        off, *slope = (cv2.remap(each, x, y, cv2.INTER_LINEAR)[0] for each in (away, *slopes))
-        return off, np.einsum("nk,nkj->nj", np.stack(slope, -1), jacobian)[:, moves]
+        off, *slope = (
+            cv2.remap(each, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+            for each in (away, *slopes)
+        )
+        rows = np.einsum("nk,nkj->nj", np.stack(slope, -1), jacobian)[:, moves]
+        prior = np.diag(3.0 / spread[moves])  # as if a distance to an edge had an error of 3 px
+        return np.concatenate([off, prior @ values]), np.concatenate([rows, prior])
 
     solved = least_squares(
         lambda values: look_up(values)[0],

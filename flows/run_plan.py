@@ -183,9 +183,9 @@ class RunPlan:
         """Plan the units of a stage for a match without the cameras that are left out."""
         before = self.before
         settings = settings_of(stage, self.overrides)
-        outside = stage.external_inputs(match, settings)
-        units = []
-        for unit in stage.units(match):
+        names, units = stage.units(match), []
+        outside = stage.external_inputs(match, settings) if names else {}
+        for unit in names:
             inputs = {name: results.get(name) for name in stage.inputs(match, unit)}
             if before is not None:
                 inputs |= {name: results.get(name) for name in stage.late_inputs(match, unit)}

@@ -29,9 +29,17 @@ from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.overview import make_summary
 from flows.progress import reporter
-from flows.run_plan import PlannedUnit, plan_ahead, plan_run
+from flows.run_plan import PlannedUnit, plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
-from flows.settings import Overrides, ResolvedSettings, as_text, flatten, resolve, selected_stages
+from flows.settings import (
+    Overrides,
+    ResolvedSettings,
+    as_text,
+    flatten,
+    resolve,
+    selected_stages,
+    settings_of,
+)
 from flows.stage import Match
 from tasks.tracing import flush_spans, start_tracing
 from worldpose.body.body_file import is_open_body
@@ -142,8 +150,7 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
         layers = (*layers[:-1], replace(layers[-1], values=values))
     settled = replace(match, layers=layers)
     if layers[-1].values != match.layers[-1].values:
-        stages = selected_stages(None, request.until_stage)
-        plan_run(store, settled, found.overrides, stages)  # a value that no run can use is not kept
+        _require_usable(settled, request, found.overrides)  # else the value is not kept
         write_layer(store, layers[-1].name, layers[-1].values)
     _report_settings(found, {*stated}, latest_run(store, match.match_id))
     return settled, replace(
@@ -168,6 +175,15 @@ def require_whole(request: RunRequest) -> None:
             found="--from or --until",
             todo="Omit --from and --until, or omit --iterations.",
         )
+
+
+def _require_usable(match: Match, request: RunRequest, overrides: Overrides) -> None:
+    """Refuse a missing file that the stages of a request use, or that it states itself."""
+    part = selected_stages(request.from_stage, request.until_stage)
+    for stage in selected_stages(None, request.until_stage):
+        is_used = stage in part and stage.units(match)
+        if is_used or stage.name in request.settings:
+            stage.external_inputs(match, settings_of(stage, overrides))
 
 
 def _needs_bodies(found: ResolvedSettings) -> bool:

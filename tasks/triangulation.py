@@ -215,7 +215,8 @@ def _find_changes(
             clip.cameras, clip.detections, clip.fps, settings, found, kinds
         )
         if not measured:
-            if measured is None and not new and np.median(health.misfit) > 3.0:
+            no_knock = all(map(is_by_chance, new))
+            if measured is None and no_knock and np.median(health.misfit) > 3.0:
                 warnings.append(
                     "no person agrees with the views: all cameras move within the clip, each in "
                     "its own way, as electronic stabilisation does, or the 2D poses or the "
@@ -224,12 +225,10 @@ def _find_changes(
             break
         camera = names[measured.found.camera]
         change = change_record(measured, camera, clip.detections.frame)
+        if is_by_chance(change):  # told, not taken back: the other cameras are searched without it
+            change = change.model_copy(update={"is_explained": False})
         same = [n for n, other in enumerate(new) if is_same_change(other, change, clip.fps)]
-        if (
-            is_by_chance(change)
-            or camera in spoilt
-            or any(is_same_change(one, change, clip.fps) for one in known)
-        ):
+        if camera in spoilt or any(is_same_change(one, change, clip.fps) for one in known):
             break
         if same:  # what other changes had hidden of it
             frame = new[same[0]].frame

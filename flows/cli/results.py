@@ -182,10 +182,15 @@ def report(
 
     store = Store.open(project)
     try:
-        known = find_match(store, match)
+        known = find_match(store, match, unfinished=True)
     except InputError as error:
-        known = open_stored(store, match)
-        line(f"warning: the report has no images: {error}", to=errors)
+        try:
+            known = open_stored(store, match)
+        except InputError:  # it is not registered: the first error says why
+            raise error from None
+        there = known.folder.videos or known.folder.clicked
+        what = "is of the registered folder" if there else "has no images"
+        line(f"warning: the report {what}: {error}", to=errors)
     clips = [clip.id for clip in known.folder.spec.clips] if videos else []
     films = [f for c in clips for f in out.parent.glob(f"{escape(out.stem)}-{c}*.mp4")]
     places = {out.parent: [out, *films]}

@@ -15,8 +15,8 @@ from worldpose.store.store import Run, Store
 def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path]:
     """Write the exports that the layers of a match state; return their files.
 
-    Only a run that has results of its last stage, and people, is exported. Files of an earlier run
-    of the match are replaced.
+    Only a run that has results of its last stage is exported; if it has no people, only in formats
+    of cameras. Files of an earlier run of the match are replaced.
 
     Raises:
         InputError: no folder is known, or a format needs what the run has not.
@@ -25,12 +25,17 @@ def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path
     if not settings.exports or record.state not in ("complete", "partial"):
         return []
     from flows.results.best_results import Origin, find_clips  # late: few runs are exported
-    from flows.results.export import export
+    from flows.results.export import export, forms_without_people
 
+    origin, forms = Origin(Run(store, record), match.registration), list(settings.exports)
     if not find_clips(record):
-        reporter().say(f"run {record.run_id} has no people yet: nothing is exported")
-        return []
-    origin = Origin(Run(store, record), match.registration, None)
+        possible = forms_without_people(origin.run, origin.spec)
+        forms = [form for form in settings.exports if form in possible]
+        left = [form for form in settings.exports if form not in possible]
+        if left:
+            reporter().say(f"run {record.run_id} has no people yet: no export of {', '.join(left)}")
+        if not forms:
+            return []
     folder = settings.exports_folder or f"{store.url}/exports"
     if "://" in folder:
         raise InputError(
@@ -40,4 +45,4 @@ def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path
             todo="Name one: worldpose settings --set exports_folder=/data/exports.",
         )
     place = Path(folder).expanduser() / match.match_id
-    return export(origin, list(settings.exports), place)
+    return export(origin, forms, place)

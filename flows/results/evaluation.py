@@ -200,7 +200,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
     if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
         return reference_side(name)
     store = Store.open(project)
-    match = find_match(store, name)
+    match = find_match(store, name, unfinished=True)
     run = open_results(store, match.match_id, run_id)
     later = describe_later_run(store, run.record) if run_id == LATEST else ""
     spec = match.folder.spec

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from data_contracts.arrays import Floats
+from data_contracts.match import MatchSpec
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results import best_results
@@ -22,6 +23,7 @@ from flows.results.run_cameras import (
     broadcast_views,
     estimated_pitch,
     moving_cameras,
+    static_cameras,
 )
 from flows.results.tool_exports import TOOL_EXPORTS, export_alphapose, export_coco
 from worldpose.dataset import manifest as manifests
@@ -42,7 +44,7 @@ from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run, read_pin
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 from worldpose.video.files import write_video
 
 LENS_ERRORS = "lens_errors.json"
@@ -290,6 +292,8 @@ EXPORTS: dict[str, Callable[[best_results.Origin, Path], Iterable[Path]]] = {
 
 OF_JOINTS = {"joints", "coco", "trc", "c3d", "csv", "parquet", "viewer", "rerun"}
 """Formats that have the joints of a chosen stage."""
+OF_CAMERAS = ("worldpose", "slahmr-cameras")
+"""Formats that hold cameras without people; the second one of broadcast cameras alone."""
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
 SHARED = {manifests.FRAME_RATES, manifests.KINDS}
@@ -341,6 +345,13 @@ def export(
         record_owner(folder, drafts, match_id)
 
     return write_whole(out, write, claim, SHARED)
+
+
+def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
+    """Return the formats for which a run has results even if it has no people."""
+    if broadcast_views(run):
+        return OF_CAMERAS
+    return OF_CAMERAS[:1] if static_cameras(run, spec) else ()
 
 
 def _file_for_folder(out: Path, forms: list[str]) -> UsageError:

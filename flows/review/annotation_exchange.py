@@ -13,7 +13,7 @@ import numpy as np
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Correction, Edit
 from flows.reports.match_pictures import frame_picture
-from flows.review.corrections import keep_edits
+from flows.review.corrections import keep_edits, next_id
 from flows.review.detections import detections_now
 from flows.stage import Match
 from worldpose.errors import UsageError
@@ -104,9 +104,10 @@ def import_people(
     )
     content = hashlib.sha256(exported.read_bytes() + file.read_bytes()).hexdigest()
     edits: dict[str, Edit] = {}
+    journal = open_match().journal
     for number, edit in enumerate(changes.edits):
         digest = hashlib.sha256(f"{content} {number}".encode()).hexdigest()
-        edits[f"{edit.kind}.{digest[:12]}"] = edit
+        edits[next_id(journal, f"{edit.kind}.{digest[:12]}")] = edit  # one withdrawn is made again
     note = f"annotated in {file.name}, SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
     return changes, keep_edits(store, open_match, edits, who=who, note=note) if edits else []
 

@@ -124,8 +124,7 @@ def keep_edits(
     """Record edits as corrections in the journal, all or none; durable on return.
 
     `open_match` returns the match with its current journal; `given` has the edits by id in the
-    order of application. An id of a correction in force counts as resent, and is kept once; an edit
-    whose correction was withdrawn gets a new id.
+    order of application. An id that is already recorded counts as resent, and is kept once.
 
     Raises:
         StaleEditError: the edited value differs from the edit's `was`.
@@ -133,9 +132,8 @@ def keep_edits(
     """
     while True:
         match = open_match()
-        said = match.journal.standing
-        edits = {_next_id(match.journal, name): edit for name, edit in given.items()}
-        fresh = {name: edit for name, edit in edits.items() if name not in said}
+        said = match.journal.corrections
+        fresh = {name: edit for name, edit in given.items() if name not in said}
         require_fitting(store, match, [*fresh.values()])
         require_seen(store, match, [*fresh.values()])
         runs = store.runs(match.match_id)
@@ -150,10 +148,10 @@ def keep_edits(
         )
         made = {each.id: each for each in corrections}
         if not corrections or append(store, match.journal, corrections) is not None:
-            return [made.get(name) or said[name] for name in edits]
+            return [made.get(name) or said[name] for name in given]
 
 
-def _next_id(journal: Journal, name: str) -> str:
+def next_id(journal: Journal, name: str) -> str:
     """Return the id, numbered if corrections with it were withdrawn."""
     given, number = name, 1
     while name in journal.corrections and name not in journal.standing:

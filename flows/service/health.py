@@ -37,9 +37,7 @@ class Finding:
 def check(state: StateFolder) -> list[Finding]:
     """Check everything that `worldpose serve` runs, dependencies first."""
     serving = state.read_serving()
-    with state.only_one("serve", wait=False) as is_free:
-        pass
-    if serving is None or is_free:
+    if serving is None or not state.is_held("serve"):
         was = "it was killed" if serving is not None else "it was not started, or ended"
         begin = "Begin it: worldpose serve, with the project and options that it should have."
         return [Finding("serve", False, f"nothing serves this project: {was}", begin)]

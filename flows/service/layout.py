@@ -126,6 +126,17 @@ class StateFolder:
                 return
             yield True
 
+    def is_held(self, what: str) -> bool:
+        """Return whether a process holds the lock `what`; a reader needs no right to write."""
+        try:
+            with (self.folder / f"{what}.lock").open() as lock:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        except OSError:  # held, or of another user's alone
+            return True
+        return False
+
 
 @lru_cache(maxsize=10_000)
 def _read_arrival(file: Path, changed_ns: int, number: int) -> Arrival | None:

@@ -149,11 +149,9 @@ def match_runs_of(url: str) -> MatchRuns | None:
     serving = state.read_serving()
     if serving is None or "serve" not in serving.services:
         return None
-    if not is_alive(serving.services["serve"].pid):
+    # Another process can have its number: the lock tells.
+    if not is_alive(serving.services["serve"].pid) or not state.is_held("serve"):
         return None
-    with state.only_one("serve", wait=False) as is_free:  # else another process has its number
-        if is_free:
-            return None
     pages = serving.services.get("pages")
     address = "" if pages is None else pages.address or ""
     login = state.client_login(serving)

@@ -7,13 +7,13 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, get_args
 
 import yaml
 from pydantic import JsonValue
 
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import MatchSpec
+from data_contracts.match import MatchSpec, Side
 from flows.web.browser_words import in_browser
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
@@ -164,8 +164,8 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     """Write what other tools' files say into a match folder; return sentences about it.
 
     A calibration is told by its form. Any other file has 2D poses, clicks or a lens of the camera
-    with whose id, or as the only one with whose first word, its name begins; clicks may also be in
-    images that are named after cameras.
+    with whose id, or as the only one with whose first word, its name begins; its other words name
+    no other camera. Clicks may also be in images that are named after cameras.
 
     Args:
         given: folder of the files.
@@ -189,7 +189,7 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
             try:
                 found = import_clicks(file, folder, owner)
             except InputError as error:
-                if owner is not None:
+                if "--camera" not in error.todo:  # the images are named after no cameras
                     raise
                 todo = (
                     "Rename the file, so that it begins with its camera's name, and add it again."
@@ -234,9 +234,20 @@ def _owner_of(stem: str, owners: Sequence[str]) -> str | None:
     # The name of another camera can begin in the same way: `cam10` and `cam1`.
     begun = [each for each in owners if stem.startswith(each.lower())]
     named = [each for each in begun if not stem[len(each) : len(each) + 1].isalnum()]
-    first = re.split(r"[\W_]", stem, maxsplit=1)[0]
-    alike = [each for each in owners if re.split(r"[\W_]", each.lower(), maxsplit=1)[0] == first]
-    return max(named, key=len) if named else alike[0] if len(alike) == 1 else None
+    if named:
+        return max(named, key=len)
+    words = re.split(r"[\W_]+", stem)
+    alike = [each for each in owners if re.split(r"[\W_]+", each.lower())[0] == words[0]]
+    if len(alike) != 1:
+        return None
+    own = re.split(r"[\W_]+", alike[0].lower())
+    return None if any(map(_is_other, words, own)) else alike[0]
+
+
+def _is_other(word: str, own: str) -> bool:
+    """Return whether a word of a file's name stands for another camera than `own` at its place."""
+    is_alike = re.sub(r"\d+", "", word) == re.sub(r"\d+", "", own)  # `cam2` and `cam1`
+    return word != own and (is_alike or word.isdigit() or word in get_args(Side))
 
 
 def _kind_of(file: Path) -> str:

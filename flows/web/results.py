@@ -30,9 +30,9 @@ from flows.results.best_results import (
     tracked_people,
 )
 from flows.results.comparison import SubjectChange, compare_runs
-from flows.results.export import export
+from flows.results.export import export, forms_without_people
 from flows.results.outputs import OWNERS
-from flows.results.run_cameras import static_cameras
+from flows.results.run_cameras import broadcast_views
 from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
@@ -44,8 +44,6 @@ from worldpose.store.store import Run, Store
 BINARY: Final = "application/octet-stream"
 BROADCAST_FORMATS: Final = ("challenge", "challenge-2025", "tracks", "slahmr-cameras")
 """Formats of a calibrated broadcast camera."""
-CAMERA_FORMATS: Final = ("worldpose", "slahmr-cameras")
-"""Export formats that hold cameras without people."""
 POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
 """Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
@@ -185,8 +183,11 @@ def routes(context: PageContext) -> APIRouter:
             run_id = run.record.run_id
             write_report(context.store, match, file, run_id=run_id, videos=False)
 
+        there = match.at_hand().folder  # nothing while the folder is away
+        seen = [*there.videos, *there.stills, *there.clicked, *there.calibrations]
+        shows = f"{_people_said(match)} {match.journal.tip} {seen}"
         return FileResponse(
-            files.get(run, "report.html", draw, f"{_people_said(match)} {match.journal.tip}"),
+            files.get(run, "report.html", draw, shows),
             media_type="text/html; charset=utf-8",
             headers={"content-security-policy": REPORT_POLICY},
         )
@@ -234,11 +235,10 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     clips = find_clips(record)
     lacking = {clip: why_without_joints(run, clip) for clip in clips}
     is_3d = not clips or None in lacking.values()
-    formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
-    has_moving = any(name.startswith("broadcast_calibration/") for name in record.results)
-    if not clips and (has_moving or static_cameras(run, match.folder.spec)):
-        formats = CAMERA_FORMATS
-    if not has_moving:
+    formats = EXPORT_FORMATS if is_3d else POSITION_FORMATS
+    if not clips:
+        formats = forms_without_people(run, match.folder.spec)
+    if not broadcast_views(run):
         formats = tuple(form for form in formats if form not in BROADCAST_FORMATS)
     return {
         "run": record.run_id,

@@ -17,6 +17,8 @@ from worldpose.store.store import Store, open_run
 
 FRAMES, FPS, BAD = 125, 25, "cam2"
 KNOCK = np.array([25.0, -12.0])
+MIDDLE = np.array([960.0, 540.0])
+"""Of the images [px]."""
 
 
 @pytest.fixture
@@ -26,16 +28,17 @@ def joints(tiny):
 
 @pytest.fixture
 def imported(server, joints, tmp_path):
-    """Returns what imports a match; `spoil` changes the pixels of the bad camera."""
+    """Returns what imports a match; `spoil` changes the pixels of the bad camera, or by name."""
 
-    def build(spoil):
+    def build(spoil, **others):
         rng, cameras, pixels = np.random.default_rng(0), {}, {}
         for turn in range(4):
             name, angle = f"cam{turn}", 0.5 * np.pi * turn + 0.3
             place = [10.0 * np.cos(angle), 10.0 * np.sin(angle), 3.0]
             cameras[name] = look_at_camera(place, [0.0, 0.0, 1.0], 1000.0)
             seen = seen_by(cameras[name], joints, rng)
-            pixels[name] = (spoil(seen) if name == BAD else seen)[:FRAMES]
+            change = spoil if name == BAD else others.get(name, lambda pixels: pixels)
+            pixels[name] = change(seen)[:FRAMES]
         return import_people(tmp_path, cameras, pixels, FPS)
 
     return build
@@ -80,6 +83,16 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
         )
         apart = np.linalg.norm(shown[:, None, :, :2] - seen[None, :, :, :2], axis=-1)
         assert apart.mean(axis=-1).min(axis=1).max() < 3.0
+
+
+def test_a_zoom_is_told_and_hides_no_knock_of_another_camera(imported, joints):
+    match = imported(
+        lambda pixels: np.concatenate([pixels[:60], 1.2 * (pixels[60:] - MIDDLE) + MIDDLE]),
+        cam0=lambda pixels: np.concatenate([pixels[:90], pixels[90:] + KNOCK]),
+    )
+    said, _ = run(match, joints)
+    assert "camera cam2: it moves within the clip, near frame 60" in said
+    assert "camera cam0 moves at frame 90" in said
 
 
 def test_lost_frames_are_named_and_synchronized(imported, joints):

@@ -75,6 +75,11 @@ def test_an_undo_that_is_repeated_is_done_and_goes_on_to_the_one_before(ada, sto
     journal = read_journal(store, TINY)
     assert [*journal.standing] == ids[:1]
     assert sum(isinstance(each, Withdrawal) for each in journal.records) == 2
+    # What a page sends again, whose answer was lost as well, does not undo the withdrawal.
+    edit = journal.corrections[ids[2]].edit.model_dump(mode="json")
+    again = ada.post(f"{MATCH}/corrections", json={"edits": [{"id": ids[2], "edit": edit}]})
+    assert [each["id"] for each in again.json()["kept"]] == [ids[2]]
+    assert [*read_journal(store, TINY).standing] == ids[:1]
 
 
 def test_what_is_refused_on_a_page_names_no_command(ada):

@@ -320,9 +320,16 @@ def test_files_named_by_the_first_word_of_a_camera_are_its_own(place, footage):
     assert view["problems"] == []
     assert view["notes"] == ["near-keypoints.xml: 1 clicks in near_left"]
     ada.post(f"{DRAFTS}/{draft}/files/{named}/removal", json={})
-    add(ada, draft, "far.xml", CLICKS)
+    for name in ("far.xml", "near-right.xml", "near_2.xml"):  # other cameras than near_left
+        other = add(ada, draft, name, CLICKS)
+        (problem,) = ada.get(f"{DRAFTS}/{draft}").json()["problems"]
+        assert "begins with its camera's name" in problem["message"], name
+        ada.post(f"{DRAFTS}/{draft}/files/{other}/removal", json={})
+    # An error of another kind keeps its own remedy.
+    unknown = CLICKS.replace(b"0.jpg", b"near_left.jpg").replace(b"center_mark", b"moon")
+    add(ada, draft, "clicks.xml", unknown)
     (problem,) = ada.get(f"{DRAFTS}/{draft}").json()["problems"]
-    assert "begins with its camera's name" in problem["message"]
+    assert "Rename the label" in problem["message"]
 
 
 def test_frames_of_an_uploaded_video_are_shown(place, footage):

@@ -167,7 +167,7 @@ def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
         assert "found results of ingest" in answer.json()["error"]
 
 
-def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tmp_path):
+def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tiny, tmp_path):
     away = {"folder": str(tmp_path / "away")}
     store.register(store.registration(TINY).model_copy(update=away))
     page = ada.get(MATCH)
@@ -182,6 +182,16 @@ def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tmp
     done = CliRunner().invoke(app, given)
     assert (done.exit_code, "the report has no images" in done.stderr) == (0, True), done.output
     assert out.stat().st_size > 100_000
+    # It has images although a camera's clicks are gone; a damaged file is named.
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
+    done = CliRunner().invoke(app, ["report", str(folder), *given[2:]])
+    assert (done.exit_code, "no images" in done.stderr) == (0, False), done.exception
+    spec = folder / "match.yaml"
+    spec.write_text(spec.read_text().replace(TINY, "other"))
+    (folder / "detections" / "cam00.npz").write_bytes(b"PK")
+    done = CliRunner().invoke(app, ["report", str(folder), *given[2:]])
+    assert "cam00.npz" in str(done.exception)
 
 
 def test_a_camera_that_failed_has_its_reason_in_the_table(store):
@@ -194,7 +204,9 @@ def test_a_camera_that_failed_has_its_reason_in_the_table(store):
     assert row[-1] == "was stopped"
 
 
-def test_the_report_changes_with_the_journal_and_else_is_drawn_once(ada, store, monkeypatch):
+def test_the_report_is_drawn_again_with_the_journal_and_while_its_folder_is_away(
+    ada, store, monkeypatch, tmp_path
+):
     drawn = []
 
     def draw(store, match, file, **given):
@@ -206,3 +218,7 @@ def test_the_report_changes_with_the_journal_and_else_is_drawn_once(ada, store, 
     edits = {"split": SplitTrack(clip="clip", person=0, first_frame_of_new=12)}
     keep_edits(store, lambda: open_match(store, TINY), edits, who="Ada", note="")
     assert ada.get(f"{MATCH}/results/report").text == "report 2"
+    here = store.registration(TINY)
+    for folder, said in ((str(tmp_path / "away"), "report 3"), (here.folder, "report 2")):
+        store.register(here.model_copy(update={"folder": folder}))
+        assert ada.get(f"{MATCH}/results/report").text == said

@@ -352,6 +352,15 @@ def test_a_value_that_no_run_can_use_is_not_kept(store, tmp_path):
     with pytest.raises(InputError, match=r"none\.onnx"):
         settle(store, open_match(store, TINY), RunRequest(typo))
     assert not read_layer(store, f"matches/{TINY}").values
+    # A part of the method, and a match with given 2D poses, do not need what they do not use.
+    gone = {"detection.detector": typo["detection"]["detector"], "refitting.body_model": "gone"}
+    write_layer(store, f"matches/{TINY}", {**gone, "body_fitting.body_model": "gone"})
+    asked = RunRequest({"filtering": {"min_keypoints": 5}}, from_stage="filtering")
+    settle(store, open_match(store, TINY), asked)
+    with pytest.raises(InputError, match="gone"):
+        settle(store, open_match(store, TINY), RunRequest({"tracking": {"gate_m": 0.7}}))
+    write_layer(store, f"matches/{TINY}", gone)
+    settle(store, open_match(store, TINY), RunRequest({"tracking": {"gate_m": 0.7}}))
 
 
 def test_of_two_saves_of_one_revision_one_is_refused(store, ada, bob, monkeypatch):
@@ -373,7 +382,12 @@ def test_of_two_saves_of_one_revision_one_is_refused(store, ada, bob, monkeypatc
         assert sorted(codes) == [200, 409]
 
 
-def test_a_run_without_people_exports_nothing(store):
-    write_layer(store, "project", {"exports": ["joints"]})
-    record = store.run(TINY).model_copy(update={"results": {}})
-    assert export_after_run(store, open_match(store, TINY), record) == []
+def test_a_run_without_people_exports_its_cameras_alone(store):
+    write_layer(store, "project", {"exports": ["joints", "worldpose", "slahmr-cameras"]})
+    record = store.run(TINY)
+    calibrated = {n: key for n, key in record.results.items() if n.startswith("static_cal")}
+    cameras = [f"{name.partition('/')[2]}.npz" for name in sorted(calibrated)]
+    for results, names in (({}, []), (calibrated, cameras)):
+        without = record.model_copy(update={"results": results})
+        files = export_after_run(store, open_match(store, TINY), without)
+        assert [file.name for file in files if file.suffix == ".npz"] == names

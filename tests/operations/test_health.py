@@ -41,6 +41,7 @@ def test_what_was_never_started_or_killed_is_said(state, tmp_path):
     state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
     (finding,) = check(state)
     assert "killed" in finding.state
+    assert not [*state.folder.glob("*.lock")]  # whoever asks may have no right to write
     # Another process can have its number: the lock alone tells that it serves.
     assert match_runs_of(str(tmp_path)) is None
     with state.only_one("serve", wait=False):

@@ -438,10 +438,11 @@ def describe_change(change: CameraChange) -> str:
     todo = "worldpose synchronize proposes offsets that change with it"
     if not change.is_explained:
         what = "its clock changes" if change.kind == "clock" else "it moves"
+        near = "" if change.frame is None else f", near frame {change.frame}"
         left = "; its views are left out" if change.is_left_out else ""
         return (
-            f"camera {camera}: {what} within the clip in a way that no single step or drift "
-            f"explains{left}"
+            f"camera {camera}: {what} within the clip{near}, in a way that no knock and no single "
+            f"drift explains{left}"
         )
     if change.kind == "clock" and change.frame is not None:
         number = max(1, round(abs(late)))

@@ -18,6 +18,9 @@ export async function openSession() {
 export const get = (path) => ask("GET", path);
 export const post = (path, body) => ask("POST", path, body);
 
+// What a page that asks again says of an error.
+export const retrying = (error) => (error instanceof Refusal ? error.message : "The server does not answer; trying again.");
+
 let isAway = false; // the server did not answer the last request
 const returns = new Set();
 
@@ -31,7 +34,7 @@ export function onReturn(call) {
 async function reach(path, what) {
   const answer = await fetch(path, what).catch(() => {
     isAway = true;
-    throw new Error((what?.method ?? "GET") === "GET" ? "The server does not answer; trying again." : "The server does not answer. Try again when it does.");
+    throw new Error("The server does not answer. Try again when it does.");
   });
   if (isAway) {
     isAway = false;
