@@ -445,8 +445,7 @@ def test_chunks_need_a_session_its_secret_bytes_and_a_limit(place, footage):
     path = f"{DRAFTS}/{draft}/files/{file}/bytes?offset=0"
     assert ada.put(path, json={"a": 1}).status_code == 415
     assert put(ada, draft, file, 0, bytes(CHUNK_BYTES + 1)).status_code == 413
-    answer = ada.post(f"{DRAFTS}/{draft}/finish", content=b"abc")
-    assert answer.status_code == 415
+    assert ada.post(f"{DRAFTS}/{draft}/finish", content=b"abc").status_code == 415
     del ada.headers["x-form-secret"]
     assert put(ada, draft, file, 0, b"abc").status_code == 403
 
@@ -478,9 +477,8 @@ def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, 
 )
 def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
     folder, given = tmp_path / "match", tmp_path / "given"
-    for each in (folder, given):
-        each.mkdir()
-    shutil.copy(tiny / "match.yaml", folder)
+    given.mkdir()
+    shutil.copytree(tiny, folder, ignore=lambda *_: {"detections", "calibration.toml"})
     for name in names:
         source = tiny / "detections" / "cam00.npz"
         if name.endswith(".toml"):
