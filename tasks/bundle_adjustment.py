@@ -17,7 +17,7 @@ from tasks.clip_inputs import (
     triangulation_settings,
 )
 from tasks.unit import UnitInputs, unit_task
-from worldpose.bundle_adjustment.clip import Clicks, Clip, image_scale
+from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.report import BundleAdjustment, adjustment_arrays
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
@@ -167,6 +167,6 @@ def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, flo
     if np.isfinite(error).any():
         figures["held_out_error_before_px"] = float(np.nanmedian(error[:, 0]))
         figures["held_out_error_after_px"] = float(np.nanmedian(error[:, 1]))
-        scale = image_scale(adjusted.clip, np.isin(adjusted.clip.detections.frame, adjusted.judged))
-        figures["held_out_error_after_m"] = float(np.nanmedian(error[:, 1] / scale))
+        size = adjusted.clip.distance / adjusted.clip.cameras.focal.mean(axis=-1)  # of a pixel [m]
+        figures["held_out_error_after_m"] = float(np.nanmedian(error[:, 1] * size))
     return figures

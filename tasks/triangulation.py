@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import GroupLayout
+from data_contracts.arrays import Floats, GroupLayout
 from data_contracts.triangulation import (
     CLOCK_CHANGE,
     HEALTH_MEASURES,
@@ -87,6 +87,12 @@ def _write_joints(
     rows = np.arange(0, len(index), stride)
     _, cameras, persons = index.shape
     health = CameraHealth.empty(len(rows), cameras, persons, clip.fps / stride)
+    stated = None
+    if covariance is not None:
+
+        def stated(joints: Floats) -> Floats:
+            return stated_errors(clip.cameras, joints, settings, covariance).variance
+
     with inputs.open_spool() as spool:
         chunks = reconstruct_chunks(
             clip.cameras, detections, model, clip.fps, settings, covariance, stride=stride
@@ -94,9 +100,7 @@ def _write_joints(
         for part in chunks:
             spool.add(_part_arrays(part.triangulation, part.smoothing))
             seen = detections[rows[part.frames]]
-            joints, stated = part.triangulation.joints, None
-            if covariance is not None:
-                stated = stated_errors(clip.cameras, joints, settings, covariance).variance
+            joints = part.triangulation.joints
             health.add(clip.cameras, seen, joints, part.frames.start, stated)
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)

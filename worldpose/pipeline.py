@@ -69,7 +69,7 @@ def reconstruct(match: MatchFolder, clip_id: str | None = None) -> Reconstructio
         clip_id: name of the clip; None = the first one.
     """
     pitch, fps = PitchTemplate.from_spec(match.pitch or PitchSpec()), match.spec.fps
-    clip_id = clip_id or match.spec.clips[0].id
+    clip_id = match.clip(clip_id).id
 
     known = calibrate_static_cameras(match, pitch)
     cameras = Camera.stack([each.estimate.camera for each in known])

@@ -102,7 +102,7 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     replay = _replay(stored, edits, moved if stored.edits else [], with_joints=False)
     names = replay.identities.names
     lost = {
-        name: f"{edit.name!r} names nobody: {why}. Name the person again, or withdraw the name"
+        name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"
         for (name, edit), why in zip(said.items(), replay.objections, strict=True)
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
     }

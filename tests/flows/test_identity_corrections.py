@@ -134,7 +134,7 @@ def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(stor
     withdraw(store, open_match(store, TINY), ["b"], who="Ada", why="")
     append(store, read_journal(store, TINY), [record])
     (said,) = lost_names(run).values()
-    assert "'Bea' names nobody" in said and names_of(run, "clip") == {one: "Ann"}
+    assert "'Bea' names no person" in said and names_of(run, "clip") == {one: "Ann"}
     ada = page_client.log_in(page_client.served(project_copy), "Ada")
     page = ada.get(MATCH).json()
     (group,) = page["groups"]

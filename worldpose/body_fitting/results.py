@@ -73,6 +73,8 @@ class ClipEvidence:
     extra: ExtraJoints | None = None
 
     def __post_init__(self) -> None:
+        for name in ("joints", "covariance"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name)))
         shape = self.joints.shape
         if len(shape) != 4 or shape[2:] != (17, 3) or self.covariance.shape != (*shape, 3):
             raise InputError(

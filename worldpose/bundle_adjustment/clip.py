@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -250,27 +249,6 @@ def project_joints(
         noise = np.sqrt(variance / confidence)
     noise[~np.isfinite(noise)] = np.inf
     return predicted.reshape((*shape, 2)).swapaxes(0, 1), noise
-
-
-def image_scale(clip: Clip, frames: Flags) -> Floats:
-    """Return focal length over depth at the median person that each camera detects.
-
-    Args:
-        clip: cameras and people.
-        frames: (frames,) bool, those that count.
-
-    Returns:
-        (cameras,) [px/m]; NaN for a camera without people.
-    """
-    shown = clip.detections.detection_index[frames] >= 0
-    pose = clip.cameras.cam_from_world
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # nobody is there
-        places = np.nanmean(clip.joints[frames], axis=2)
-        depth = np.einsum("fpx,cx->fcp", places, pose.rotation[:, 2])
-        depth += pose.translation[:, 2, None]
-        median = np.nanmedian(np.where(shown & (depth > 0.0), depth, np.nan), axis=(0, 2))
-    return np.asarray(clip.cameras.focal.mean(axis=-1) / median)
 
 
 def propose_frames(

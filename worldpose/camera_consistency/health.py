@@ -16,7 +16,7 @@ frames has the normal equations of (s, z, r, l); `changes` finds where the solut
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -95,7 +95,7 @@ class CameraHealth:
         people: KeypointDetections,
         joints: Floats,
         start: int,
-        stated: Floats | None = None,
+        stated: Callable[[Floats], Floats] | None = None,
     ) -> None:
         """Add a chunk of a clip; its first and last frame give velocities only.
 
@@ -104,8 +104,8 @@ class CameraHealth:
             people: detections of tracked people, (frames, cameras, detections).
             joints: (frames, persons, 17, 3) triangulated [m], world.
             start: row of the first of these frames in the clip.
-            stated: (frames, cameras, persons) variance per axis by the calibration [px^2]: what it
-                explains is no misfit; None = it explains nothing.
+            stated: returns the variance per axis by the calibration (frames, cameras, persons)
+                [px^2] at joints: what it explains is no misfit; None = it explains nothing.
         """
         rows = np.arange(1, len(joints) - 1)
         rows = rows[(start + rows) % self.every == self.every // 2]
@@ -114,12 +114,13 @@ class CameraHealth:
             return
         points = np.stack([joints[rows + step][:, :, LIMBS] for step in (-1, 0, 1)])
         index = people.detection_index[rows]
+        variance = None if stated is None else stated(joints[rows])
         for c in range(index.shape[1]):
             slot = index[:, c]
             frame, person = np.nonzero(slot >= 0)
             if len(frame):
                 pixels = people.keypoints[rows[frame], c, slot[frame, person]][:, LIMBS]
-                own = 0.0 if stated is None else stated[rows[frame], c, person][:, None]
+                own = 0.0 if variance is None else variance[frame, c, person][:, None]
                 there = points[:, frame, person]
                 self._add_departures(c, cameras[c], bins[frame], pixels, there, own)
 

@@ -104,6 +104,8 @@ class JointTracks:
         )
 
     def __post_init__(self) -> None:
+        for name in ("frames", "person_ids", "joints"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name)))
         parts = [("", ExtraTracks(COCO17, self.joints, self.covariance, self.views))]
         if self.extra is not None:
             names = self.extra.points

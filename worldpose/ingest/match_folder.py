@@ -74,6 +74,19 @@ class MatchFolder:
     boxes: Mapping[str, Path] = field(default_factory=dict)
     camera_data: Mapping[str, Path] = field(default_factory=dict)
 
+    def clip(self, clip_id: str | None = None) -> ClipSpec:
+        """Return the clip with this id, or the first one.
+
+        Raises:
+            InputError: there is none of this id.
+        """
+        for clip in self.spec.clips:
+            if clip_id in (None, clip.id):
+                return clip
+        expected = f"one of the clips {', '.join(clip.id for clip in self.spec.clips)}"
+        todo = "Correct the name."
+        raise InputError(str(self.folder / "match.yaml"), expected, f"{clip_id!r}", todo)
+
     @property
     def to_click(self) -> tuple[str, ...]:
         """Static cameras without calibration and clicks that cannot be proposed either.

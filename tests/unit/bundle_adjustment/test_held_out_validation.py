@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from rigs import errors
 
-from worldpose.bundle_adjustment.clip import image_scale
 from worldpose.bundle_adjustment.estimate import adjust_cameras
 from worldpose.bundle_adjustment.held_out_validation import held_out_errors
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
@@ -75,14 +74,3 @@ def test_true_cameras_are_judged_by_the_noise_alone(clip):
     held = held_out_errors(made, true, frames, np.ones((24, 6), dtype=bool), robust_scale=100.0)
     # Two axes of unit variance, and what the joint of five other views adds: 2 (1 + 3 / (2 x 5)).
     assert np.nanmean(held.loss) == pytest.approx(2.6, rel=0.05)
-
-
-def test_images_are_scaled_by_the_people_whom_a_camera_shows(clip):
-    made, true, _ = clip(cameras=4, frames=6)
-    scale = image_scale(made, np.arange(6) < 3)
-    # People within some metres of the middle, 52 m away.
-    np.testing.assert_allclose(scale, true.focal.mean(axis=-1) / 52.0, rtol=0.15)
-    index = made.detections.detection_index.copy()
-    index[:, 2] = -1
-    unseen = replace(made, detections=made.detections.assign_people(index))
-    assert np.isnan(image_scale(unseen, np.arange(6) < 3)).tolist() == [False, False, True, False]
