@@ -18,6 +18,7 @@ from worldpose.ingest.clock import row_rate
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.noise_model import conditions
 from worldpose.triangulation.settings import TriangulationSettings
 
 
@@ -201,7 +202,7 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
     settings, detections = clip.triangulation, clip.detections
     if settings.learn_noise and len(frames):
         noise = triangulate_joints(clip.cameras, detections[frames], settings).noise
-        precision = noise.precision(detections.confidence, detections.keypoints)
+        precision = noise.precision(detections.confidence, conditions(detections.keypoints))
     else:
         precision = np.where(detections.confidence > 0.0, detections.confidence, 0.0)
     max_precision = max(float(precision.max(initial=0.0)), 1e-12)

@@ -37,6 +37,7 @@ from worldpose.triangulation.limb_lengths import (
 )
 from worldpose.triangulation.noise_model import (
     NoiseModel,
+    conditions,
     learn_common_bias,
     learn_noise,
     shared_variance,
@@ -131,7 +132,7 @@ def learn_clip(
         known = detector.select_person(person)
         raw = triangulate_joints(cameras, alone, settings, camera_covariance, known)
         unswapped = undo_swaps(alone, raw.exchanged)
-        precision = raw.noise.precision(unswapped.confidence, unswapped.keypoints)
+        precision = raw.noise.precision(unswapped.confidence, conditions(unswapped.keypoints))
         return select_person(unswapped, precision, raw.offsets, raw.joints, person=0)
 
     intervals = choose_stretches(_have_views(detections, settings.min_views), fps)
@@ -320,6 +321,7 @@ class _Passes:
         known: DetectorModel | None,
     ) -> None:
         self._cameras, self._detections, self._settings = cameras, detections, settings
+        self._condition = conditions(detections.keypoints)
         self._covariance, self._known = camera_covariance, known
         self._rig, self._limit = Rig.from_cameras(cameras), settings.max_deviation**2
         self._noise: dict[str, NoiseModel] = {}
@@ -373,7 +375,9 @@ class _Passes:
                 self._noise[name] = NoiseModel.nominal(
                     points.confidence.shape[-1], len(self._rig.cameras)
                 )
-        precision = self._noise[name].precision(points.confidence, points.keypoints)
+        own = points is self._detections
+        condition = self._condition if own else conditions(points.keypoints)
+        precision = self._noise[name].precision(points.confidence, condition)
         index = points.detection_index
         return Observations.of(self._rig, points.keypoints, precision, index, self.shift)
 
@@ -382,6 +386,7 @@ class _Passes:
         settings = self._settings
         self.exchanged = find_swaps(self._observations, settings.noise, self._limit, self.solved)
         self._detections = undo_swaps(self._detections, self.exchanged)
+        self._condition = conditions(self._detections.keypoints)
         self._observations = self._observe("detected", self._detections)
         is_last = self._covariance is None or settings.offsets == "midhip"
         if self.exchanged.any() and is_last:

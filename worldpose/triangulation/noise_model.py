@@ -73,19 +73,19 @@ class NoiseModel:
         return float(np.median(np.sqrt(self.joint / self.precision_at[-1])))
 
     def precision(
-        self, confidence: NDArray[np.floating], keypoints: AnyFloats | None = None
+        self, confidence: NDArray[np.floating], condition: NDArray[np.uint8] | None = None
     ) -> Floats:
         """Return the inverse of the factor (frames, cameras, detections, joints); 0 where missing.
 
-        Keypoints are (frames, cameras, detections, joints, 2) [px]; None = in no known condition.
+        The condition of each keypoint is that of `conditions`; None = not known.
         """
         precision = np.empty(confidence.shape)
         rows = np.ascontiguousarray(confidence).reshape(-1, len(self.joint))
         out = precision.reshape(-1, len(self.joint))
         factor, known, people = self.joint[None, None], np.zeros_like(rows, np.uint8), 1
-        if keypoints is not None:
+        if condition is not None:
             factor = self.joint * self.camera[:, None] * self.condition[:, None]
-            known, people = conditions(keypoints).reshape(rows.shape), confidence.shape[-2]
+            known, people = condition.reshape(rows.shape), confidence.shape[-2]
         _precision(rows, known, people, 1.0 / factor, self.confidence, self.precision_at, out)
         return precision
 
@@ -109,30 +109,40 @@ def _find_conditions(keypoints: AnyFloats, edges: Floats, found: NDArray[np.uint
     """Write the conditions (images, people, 17) of keypoints (images, people, 17, 2) [px]."""
     people, joints = found.shape[1:]
     box = np.empty((people, 4))
+    limits = np.empty(len(edges))
     for image in range(len(found)):
         for n in range(people):
-            box[n, :2], box[n, 2:] = np.inf, -np.inf
+            left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
             for j in range(joints):
-                x, y = keypoints[image, n, j]
-                if math.isfinite(x) and math.isfinite(y):
-                    box[n, 0], box[n, 2] = min(box[n, 0], x), max(box[n, 2], x)
-                    box[n, 1], box[n, 3] = min(box[n, 1], y), max(box[n, 3], y)
+                x, y = keypoints[image, n, j, 0], keypoints[image, n, j, 1]
+                # Comparisons with NaN are false.
+                left, right = (x if x < left else left), (x if x > right else right)
+                top, bottom = (y if y < top else top), (y if y > bottom else bottom)
+            box[n, 0], box[n, 1], box[n, 2], box[n, 3] = left, top, right, bottom
         for n in range(people):
+            if not box[n, 0] <= box[n, 2]:
+                continue
             at = keypoints[image, n]
-            up = 0.5 * (at[5] + at[6] - at[11] - at[12])
-            middle = 0.25 * (at[5] + at[6] + at[11] + at[12])
-            length = up[0] ** 2 + up[1] ** 2
+            up_x = 0.5 * (at[5, 0] + at[6, 0] - at[11, 0] - at[12, 0])
+            up_y = 0.5 * (at[5, 1] + at[6, 1] - at[11, 1] - at[12, 1])
+            x0 = 0.25 * (at[5, 0] + at[6, 0] + at[11, 0] + at[12, 0])
+            y0 = 0.25 * (at[5, 1] + at[6, 1] + at[11, 1] + at[12, 1])
+            length = up_x**2 + up_y**2
+            for e in range(len(edges)):
+                limits[e] = edges[e] * edges[e] * length
             for j in range(joints):
-                away = (at[j, 0] - middle[0]) ** 2 + (at[j, 1] - middle[1]) ** 2
-                for edge in edges:
-                    found[image, n, j] += away > edge * edge * length
+                away = (at[j, 0] - x0) ** 2 + (at[j, 1] - y0) ** 2
+                count = 0
+                for e in range(len(edges)):
+                    count += away > limits[e]
+                found[image, n, j] = count
             for other in range(people):
                 if not box[n, 3] < box[other, 3] or box[n, 2] <= box[other, 0]:
                     continue
                 if box[other, 2] <= box[n, 0] or box[n, 3] <= box[other, 1]:
                     continue
                 for j in range(joints):
-                    x, y = at[j]
+                    x, y = at[j, 0], at[j, 1]
                     inside = box[other, 0] < x < box[other, 2] and box[other, 1] < y
                     if inside and y < box[other, 3] and found[image, n, j] <= len(edges):
                         found[image, n, j] += len(edges) + 1
@@ -183,20 +193,21 @@ def learn_noise(
     knots = np.divide(sums[filled], members[filled])
     kinds = KINDS if joints == len(KINDS) else np.arange(joints)
     alike = int(kinds.max(initial=0)) + 1
+    condition = conditions(detections.keypoints)
     classes = [
         np.broadcast_to(each, certain.shape)
         for each in (
             (np.cumsum(filled) - 1)[bin_of],
             np.arange(joints)[:, None],
             kinds[:, None] + alike * np.arange(count),
-            by_view(conditions(detections.keypoints)),
+            by_view(condition),
         )
     ]
     tables = [np.exp(-knots), np.ones(joints), np.ones(alike * count), np.ones(CONDITIONS)]
     squares, known, freedom = (np.empty(certain.shape) for _ in range(3))
     # Weights, inliers and variances settle after three iterations.
     for _ in range(4):
-        precision = model.precision(confidence, detections.keypoints)
+        precision = model.precision(confidence, condition)
         _residuals(
             Observations.of(rig, detections.keypoints, precision, index, shift),
             noise,

@@ -17,6 +17,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.noise_model import conditions
 from worldpose.triangulation.report import Changes, Histogram
 from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.results import MotionModel, Smoothing, Triangulation
@@ -171,7 +172,7 @@ def smooth_joints(
     """
     rig = Rig.from_cameras(cameras)
     detections = undo_swaps(detections, raw.exchanged)
-    precision = raw.noise.precision(detections.confidence, detections.keypoints)
+    precision = raw.noise.precision(detections.confidence, conditions(detections.keypoints))
     joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
     if motion is None:
         chosen = choose_stretches(np.asarray(raw.views.any(axis=-1)), fps)

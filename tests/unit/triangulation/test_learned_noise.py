@@ -30,7 +30,7 @@ def test_a_worse_camera_is_learned_from_residuals(ring):
     rest = np.delete(model.camera, 2, axis=0).mean()
     # Three times the noise; a prior of 20 degrees of freedom per frame holds the ratio back.
     assert 5.0 < model.camera[2].mean() / rest < 9.5
-    precision = model.precision(confidence, keypoints)
+    precision = model.precision(confidence, conditions(keypoints))
     assert precision[:, 0].mean() > 5.0 * precision[:, 2].mean()
 
 
