@@ -36,6 +36,8 @@ from worldpose.store.store import Store
 PROJECT: Final = "project"
 VENUES: Final = "venues"
 MATCHES: Final = "matches"
+SETTINGS_LOCK: Final = "settings"
+"""Lock of a project that is held from reading to writing a layer."""
 ENVIRONMENT: Final = "environment"
 """Name of the layer of environment variables, below all others."""
 

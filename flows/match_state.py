@@ -146,7 +146,8 @@ def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[b
     stopped = ""
     for run in store.unfinished_runs(match_id):
         is_own = run.host == platform.node() and run.pid == os.getpid()
-        if latest is not None and run_order(run.run_id) < run_order(latest.run_id):
+        is_earlier = latest is not None and run_order(run.run_id) < run_order(latest.run_id)
+        if is_earlier and run.run_id not in here:
             continue
         if run.run_id in here or is_own or run.host != platform.node():
             return True, ""
