@@ -109,6 +109,16 @@ def test_a_part_of_the_method_keeps_the_questions_and_the_policy_of_a_run_that_w
     assert run(store, None).gates == "always"
 
 
+def test_what_no_run_waits_for_any_more_is_not_listed(store):
+    run(store, "auto")
+    latest = run(store, "never")
+    assert (latest.run_id, latest.state) == ("0003", "complete")
+    reviews = reviews_of(store, open_match(store, TINY), latest)
+    assert reviews and {each.state for each in reviews} == {"superseded"}
+    with pytest.raises(InputError, match="nothing that waits"):
+        approve(store)
+
+
 def test_always_asks_behind_every_gate_in_turn(store):
     asked = []
     units_of = {stage.name: stage.units(open_match(store, TINY)) for stage in METHOD}

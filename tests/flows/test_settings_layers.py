@@ -21,6 +21,8 @@ from flows.layers import project_layers, read_layer, write_layer
 from flows.progress import reporting_to
 from flows.registering import open_match, register
 from flows.results.automatic_exports import export_after_run
+from flows.results.best_results import Origin
+from flows.results.run_cameras import estimated_pitch
 from flows.run_plan import plan_run
 from flows.running import RunRequest, settle
 from flows.service import deployed
@@ -31,7 +33,7 @@ from flows.web import settings as page_settings
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.errors import InputError, UsageError
 from worldpose.store.run_queue import queue_of
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 BODY = "smpl-test"
 
@@ -322,6 +324,13 @@ def test_exports_have_the_pitch_of_the_layers(store):
     folder = registration.model_copy(update={"folder": store.url})  # without pitch.json
     write_layer(store, "project", {"pitch": {"length": 101.0, "width": 66.0}})
     assert layers.pitch_of(store, folder).length == 101.0
+    # The results of a run keep the pitch that it used, in exports and in reports.
+    used = open_match(store, TINY).folder.pitch
+    origin = Origin(Run(store, store.run(TINY)), folder)
+    assert used.length == 105.0 and origin.pitch == used
+    other = used.model_copy(update={"length": 100.0, "width": 64.0})
+    shown = estimated_pitch(origin.run, other, origin.spec)
+    assert (shown.length, shown.width) == (105.0, 68.0)
 
 
 @pytest.mark.parametrize(
