@@ -7,7 +7,6 @@ from collections.abc import Collection
 from data_contracts.arrays import Integers
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
-from flows.layers import pitch_of_run
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.store import Run
@@ -95,7 +94,6 @@ def estimated_pitch(
     The pitch is that of the clip's (or the view's) broadcast camera that knows it best, if one
     estimated it; otherwise crown and end fall are those that the static cameras show together.
     """
-    stated_now, pitch = pitch, pitch_of_run(run, lambda: stated_now)
     if pitch is None:
         return None
     views = [] if clip is None else broadcast_views(run, clip)

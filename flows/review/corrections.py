@@ -67,10 +67,10 @@ def objections_of(run: Run) -> dict[str, str]:
     standing = read_journal(run.store, run.record.match_id).standing
     said = {name: each.edit.model_dump(mode="json") for name, each in standing.items()}
     for unit, figures in run.record.figures.items():
-        is_there = unit in run and run.store.has(
-            run.record.match_id, *unit.split("/", 1), run.record.results[unit]
-        )
-        if not is_there or not figures.get("corrections_refused"):
+        if unit not in run or not figures.get("corrections_refused"):
+            continue
+        place = (run.record.match_id, *unit.split("/", 1), run.record.results[unit])
+        if not run.store.has(*place):  # withdrawn
             continue
         if unit.startswith("tracking/"):
             taken = run.manifest(unit).recipe.sources["identities"]
@@ -141,8 +141,9 @@ def new_corrections(
             )
         folder = replay.folder
         said.append(correction)
-    require_fitting(store, match, edits)
-    require_seen(store, match, edits)
+    if results:  # before the first run there is nothing to compare with: the run tells
+        require_fitting(store, match, edits)
+        require_seen(store, match, edits)
     return said
 
 

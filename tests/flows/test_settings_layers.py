@@ -20,9 +20,9 @@ from flows.cli.app import app as worldpose
 from flows.layers import project_layers, read_layer, write_layer
 from flows.progress import reporting_to
 from flows.registering import open_match, register
+from flows.reports.match_pictures import shown_pitch
 from flows.results.automatic_exports import export_after_run
 from flows.results.best_results import Origin
-from flows.results.run_cameras import estimated_pitch
 from flows.run_plan import plan_run
 from flows.running import RunRequest, settle
 from flows.service import deployed
@@ -328,8 +328,10 @@ def test_exports_have_the_pitch_of_the_layers(store):
     used = open_match(store, TINY).folder.pitch
     origin = Origin(Run(store, store.run(TINY)), folder)
     assert used.length == 105.0 and origin.pitch == used
+    now = open_match(store, TINY)
     other = used.model_copy(update={"length": 100.0, "width": 64.0})
-    shown = estimated_pitch(origin.run, other, origin.spec)
+    now = replace(now, folder=replace(now.folder, pitch=other))
+    shown = shown_pitch(origin.run, now)
     assert (shown.length, shown.width) == (105.0, 68.0)
 
 
