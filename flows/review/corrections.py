@@ -115,6 +115,9 @@ def new_corrections(
             found="others, which were made since",
             todo="Read them with `worldpose review show`, and repeat the correction.",
         )
+    if results:  # before the first run there is nothing to compare with: the run tells
+        require_fitting(store, match, edits)
+        require_seen(store, match, edits)
     folder, said = match.folder, []
     for number, given in enumerate(edits):
         edit = add_previous_value(folder, given)
@@ -141,9 +144,6 @@ def new_corrections(
             )
         folder = replay.folder
         said.append(correction)
-    if results:  # before the first run there is nothing to compare with: the run tells
-        require_fitting(store, match, edits)
-        require_seen(store, match, edits)
     return said
 
 
