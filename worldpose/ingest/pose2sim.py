@@ -19,6 +19,7 @@ from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
     find_calibration,
+    is_of_sensor,
     read_calibration,
 )
 from worldpose.formats.detection_files import frame_files, read_openpose_folder
@@ -113,7 +114,7 @@ def import_pose2sim(
         names, source = list(cameras), calibration
         places = {name: each for name, each in places.items() if name not in left_out}
         films = {name: each for name, each in films.items() if name not in left_out}
-    is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
+    of_sensor = calibration is not None and is_of_sensor(calibration)
     poses = _assign(folder, places, names, source, notes) if places else {}
     videos = _assign(films_in, films, names, source, notes) if films else {}
     names = [name for name in names if name in (poses or videos)]
@@ -122,7 +123,14 @@ def import_pose2sim(
     indices = {name: known[file] for name, file in videos.items()}
     for name, file in videos.items():
         if name in cameras:
-            cameras[name] = fit_to_video(file, cameras[name], indices[name], notes, is_part=is_part)
+            cameras[name] = fit_to_video(
+                file,
+                cameras[name],
+                indices[name],
+                notes,
+                of_sensor=of_sensor,
+                has_poses=bool(poses),
+            )
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
@@ -133,6 +141,11 @@ def import_pose2sim(
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
     offsets = _find_shifts(project / "pose", poses, notes) if videos else {}
+    ends = [(people[name].frame, len(index)) for name, index in indices.items() if name in people]
+    if ends and all(frame[0] == 1 for frame, _ in ends) and not offsets:
+        if max(frame[-1] - count for frame, count in ends) == 0:
+            people = {name: replace(one, frame=one.frame - 1) for name, one in people.items()}
+            notes.append("2D poses are numbered from 1 to the videos' lengths: 1 is frame 0")
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     for name, files in poses.items():

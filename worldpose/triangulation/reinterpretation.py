@@ -22,6 +22,12 @@ _OTHER_POSES: Final[Mapping[str, Callable[[Rigid], Rigid]]] = {
     "the poses are those of the cameras in the world, not the other way: invert them": (
         lambda pose: pose.inverse()
     ),
+    "R is transposed: its columns are the camera's axes in the world: transpose R": (
+        lambda pose: Rigid(np.swapaxes(pose.rotation, -1, -2), pose.translation)
+    ),
+    "t is the cameras' centres in the world: write -R t": (
+        lambda pose: Rigid(pose.rotation, -(pose.rotation @ pose.translation[..., None])[..., 0])
+    ),
     "the cameras' y axes point up and z backward, as OpenGL's: turn R and t by diag(1, -1, -1)": (
         lambda pose: Rigid(_FLIP @ pose.rotation, pose.translation @ _FLIP)
     ),

@@ -145,7 +145,7 @@ ENTRY = {"K": MATRIX.tolist(), "dist": DISTORTION[0].tolist(), "image_size": [19
         (
             "vector.json",
             json.dumps(
-                {"intrinsics": [1400.0] * 4, "intrinsic_matrix": MATRIX.tolist(), "d": [0.1] * 5}
+                {"intrinsics": [1400.0] * 4, "intrinsic_matrix": MATRIX.tolist(), "d": [0.1, 0.1, 0.0, 0.0, 0.1]}
             ),
         ),
         (

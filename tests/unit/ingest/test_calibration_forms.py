@@ -365,7 +365,7 @@ def test_a_file_in_another_unit_of_length_is_refused(tmp_path, form, factor, mes
     ("file", "old", "new", "message"),
     [
         ("intri.yml", "K_a1: ", "K_zz: ", "intri.yml: K_a1: expected a matrix, found nothing"),
-        ("intri.yml", "W_a1: .*", "", "Add its width and height .* W_a1: 1920"),
+        ("intri.yml", "W_a1: .*", "", "Add the width and height .* W_a1: 1920"),
         ("intri.yml", "names:", "cameras:", "names: expected a list of cameras"),
         ("intri.yml", "data: \\[ 1500.", "data: [ 1e12", "intri.yml: a1.K_a1: expected finite"),
         ("extri.yml", "T_a1: ", "T_zz: ", "extri.yml: T_a1: expected a matrix, found nothing"),
