@@ -39,6 +39,8 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
             steps = np.diff([time.index.to_numpy(np.float64), time.to_numpy(np.float64)])
             steps = steps[:, steps[1] > 0.0]  # times begin again in each period
             rate = float(steps[0].sum() / steps[1].sum()) if steps.size else np.nan
+            while 0.0 < rate < 1.0:  # times are in ms or smaller units
+                rate *= 1000.0
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
             table = table.pivot(columns="name" if named else "person", values=["x", "y"])

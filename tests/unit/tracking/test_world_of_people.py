@@ -124,6 +124,8 @@ def test_what_the_user_states_holds(ring, people, seen):
     [
         (lambda pose: pose.inverse(), "of the cameras in the world, not the other way"),
         (lambda pose: Rigid(FLIP @ pose.rotation, pose.translation @ FLIP), "as OpenGL's: turn"),
+        (lambda pose: Rigid(pose.rotation.swapaxes(-1, -2), pose.translation), "transpose R"),
+        (lambda pose: Rigid(pose.rotation, pose.inverse().translation), "write -R t"),
     ],
 )
 def test_poses_that_mean_something_else_are_refused_with_what_they_mean(
