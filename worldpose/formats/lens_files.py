@@ -50,9 +50,10 @@ DISTORTION_NAMES: Final = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
     *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
-_OWNERS: Final = ("image", "", "img", "frame", "video", "picture", "camera", "calibration")
+_OWNERS: Final = ("image", "img", "frame", "video", "picture", "camera", "calibration")
 SIZE_NAMES: Final = (
-    *((f"{owner}width", f"{owner}height") for owner in _OWNERS),
+    *((f"{owner}width", f"{owner}height") for owner in ("", *_OWNERS)),
+    *(("size",), ("resolution",), ("dim",)),
     *((a + b,) for a, b in product(_OWNERS, ("size", "resolution", "dim", "shape", "dimensions"))),
     ("w", "h"),
 )
@@ -363,7 +364,9 @@ def _read_mapping(file: Path) -> dict[str, Any]:
                 parts = [f"{key} {describe_value(value[key])}" for key in ("rows", "cols", "data")]
                 expected = "data of rows x cols numbers"
                 raise calibration_error(f"{file}: {name}", expected, ", ".join(parts)) from error
-        elif isinstance(value, list | int | float | str) or plain_key(str(name)) in {*chain(*SIZE_NAMES)}:
+        elif isinstance(value, list | int | float | str) or plain_key(str(name)) in {
+            *chain(*SIZE_NAMES)
+        }:
             found[str(name)] = value
     return found
 
@@ -402,12 +405,9 @@ def _image_size(where: str, given: Mapping[str, Any]) -> tuple[int, int] | None:
         value = [given[key] for key in keys]
         if len(value) == 1 and isinstance(value[0], Mapping):
             value = list(_image_size(f"{where}: {keys[0]}", value[0]) or ["nothing"])
-        parts = [
-            re.findall(r"\d+(?:\.\d*)?", str(each)) if np.asarray(each).dtype.kind in "US" else each
-            for each in value
-        ]
-        numbers = [part for each in parts for part in np.ravel(np.asarray(each, object))]
-        if len(numbers) == 2 and keys[0] not in ("shape", "dimensions"):
+        flat = [str(one) for each in value for one in np.ravel(np.asarray(each, object))]
+        numbers = re.findall(r"\d+\.?\d*(?:e[-+]?\d+)?", " ".join(flat).lower())
+        if len(numbers) == 2:
             return int(float(numbers[0])), int(float(numbers[1]))
         if len(numbers) > 2 or (keys and not numbers):
             expected = "width and height of the calibrated images"

@@ -285,7 +285,9 @@ def fit_to_video(
             part = f"warning: {part}, or the whole one resized to it"
             todo = "Give videos of the sensor's size, resized if they show all of it. If they are "
             todo += "its middle, write the calibration of that part: set SENSOR_SIZE, and subtract "
-            todo += "{:g}, {:g} from PRINCIPAL_POINT and the centre of VICON_RADIAL2.".format(*corner)
+            todo += "{:g}, {:g} from PRINCIPAL_POINT and the centre of VICON_RADIAL2.".format(
+                *corner
+            )
             if not has_poses:
                 expected = "{} x {} px, SENSOR_SIZE in the calibration".format(*camera.image_size)
                 raise InputError(str(file), expected, part.partition(": ")[2], todo)

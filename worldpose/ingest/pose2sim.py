@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut
@@ -141,11 +142,7 @@ def import_pose2sim(
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
     offsets = _find_shifts(project / "pose", poses, notes) if videos else {}
-    ends = [(people[name].frame, len(index)) for name, index in indices.items() if name in people]
-    if ends and all(frame[0] == 1 for frame, _ in ends) and not offsets:
-        if max(frame[-1] - count for frame, count in ends) == 0:
-            people = {name: replace(one, frame=one.frame - 1) for name, one in people.items()}
-            notes.append("2D poses are numbered from 1 to the videos' lengths: 1 is frame 0")
+    people = people if offsets else _from_zero(people, indices, notes)
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     for name, files in poses.items():
@@ -164,6 +161,18 @@ def import_pose2sim(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
     return spec, notes + describe_outside(people, sizes) + _describe_poses(folder, read)
+
+
+def _from_zero(
+    people: dict[str, KeypointDetections], indices: Mapping[str, FrameIndex], notes: list[str]
+) -> dict[str, KeypointDetections]:
+    """Return 2D poses by the frames of videos, where they are numbered from 1 to their lengths."""
+    frames = {name: people[name].frame for name in indices if name in people}
+    beyond = [frame[-1] - len(indices[name]) for name, frame in frames.items()]
+    if max(beyond, default=-1) != 0 or any(frame[0] != 1 for frame in frames.values()):
+        return people
+    notes.append("2D poses are numbered from 1 to the videos' lengths: 1 is frame 0")
+    return {name: replace(one, frame=one.frame - 1) for name, one in people.items()}
 
 
 def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict[str, int]:

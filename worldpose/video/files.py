@@ -236,6 +236,7 @@ def _require_one(path: Path, packets: Sequence[tuple[int | None, bool, int | Non
 
 
 def no_video(path: Path, found: str) -> InputError:
+    """Return the error of a file that is no video to be read."""
     return InputError(
         str(path),
         expected="a video file with time stamps",

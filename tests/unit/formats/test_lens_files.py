@@ -153,7 +153,7 @@ def test_a_size_in_the_file_counts_in_any_form(tmp_path, size):
     with pytest.raises(InputError, match="width and height of the calibrated images"):
         read_lenses([file], "left", SIZES)
     file.write_text(json.dumps(lens))
-    with pytest.raises(InputError, match="as no size is stated, found 1940.0, 1060.0, the middle"):
+    with pytest.raises(InputError, match=r"as no size is stated, found 1940.0, 1060.0, the middle"):
         read_lenses([file], "left", SIZES)
 
 
@@ -162,7 +162,7 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
     file = tmp_path / "lens.json"
     for further in (0, 3, 7, 9):
         file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens + [0.0] * further}))
-        with pytest.raises(InputError, match="p1 and p2 up to 0.01"):
+        with pytest.raises(InputError, match=r"p1 and p2 up to 0.01"):
             read_lenses([file], "left", SIZES)
 
 
@@ -180,7 +180,11 @@ ENTRY = {"K": MATRIX.tolist(), "dist": DISTORTION[0].tolist(), "image_size": [19
         (
             "vector.json",
             json.dumps(
-                {"intrinsics": [1400.0] * 4, "intrinsic_matrix": MATRIX.tolist(), "d": [0.1, 0.1, 0.0, 0.0, 0.1]}
+                {
+                    "intrinsics": [1400.0] * 4,
+                    "intrinsic_matrix": MATRIX.tolist(),
+                    "d": [0.1, 0.1, 0.0, 0.0, 0.1],
+                }
             ),
         ),
         (

@@ -140,7 +140,7 @@ def test_videos_of_another_size_do_not_stand_for_a_size_that_is_not_stated(tmp_p
     write_openpose(folders[1], rig())
     shown = dict.fromkeys(["a1", "b2", "c3"], tuple(round(part * side) for side in SIZE))
     for folder in folders:
-        with pytest.raises(InputError, match="principal point: .*, the middle of about 1942 x"):
+        with pytest.raises(InputError, match=r"principal point: .*, the middle of about 1942 x"):
             read_calibration(next(folder.rglob("a1.xml"), folder), shown)
 
 
@@ -155,7 +155,9 @@ def test_multicals_poses_may_be_counted_step_by_step(tmp_path):
     known = rig()
     path = WRITERS["multical"](tmp_path, known)
     content = json.loads(path.read_text())
-    turns, moves = ([np.array(one[key]) for one in content["camera_poses"].values()] for key in "RT")
+    turns, moves = (
+        [np.array(one[key]) for one in content["camera_poses"].values()] for key in "RT"
+    )
     steps = {}
     for n, name in enumerate(("b2_to_a1", "c3_to_b2")):
         turn = turns[n + 1] @ turns[n].T

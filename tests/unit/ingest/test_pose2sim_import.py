@@ -141,7 +141,9 @@ def test_a_vicon_video_of_the_sensor_s_shape_is_refused_without_poses(trial, tmp
     film(trial, (544, 960))
     _, notes = import_pose2sim(trial, tmp_path / "m")
     assert any("warning: cam01.mp4: the middle 544 x 960 px of the sensor, or" in n for n in notes)
-    with pytest.raises(InputError, match="middle 544 x 960 px .* subtract 272, 480 from PRINCIPAL"):
+    with pytest.raises(
+        InputError, match=r"middle 544 x 960 px .* subtract 272, 480 from PRINCIPAL"
+    ):
         import_videos(file, trial / "videos", tmp_path / "n")
     shutil.rmtree(trial / "pose")
     with pytest.raises(InputError, match="or the whole one resized"):

@@ -130,7 +130,9 @@ def test_several_streams_of_video_are_refused(tmp_path):
         for stream in streams:
             target.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(1)[0], format="rgb24")))
             target.mux(stream.encode(None))
-    with pytest.raises(InputError, match="one video stream, found stream 0 of 64 x 48 px, stream 1"):
+    with pytest.raises(
+        InputError, match="one video stream, found stream 0 of 64 x 48 px, stream 1"
+    ):
         index_video(tmp_path / "two.mov")
 
 
