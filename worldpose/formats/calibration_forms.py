@@ -114,11 +114,13 @@ def read_calibration(
     cameras = form.read(files, sizes, left_out)
     if not any_unit:
         require_metres(path, cameras, form_unit_m(path))
-    for name, camera in cameras.items() if left_out is not None else ():
-        if found := other_middle(camera.principal_point_px, camera.image_size):
-            size = "{} x {} px".format(*camera.image_size)
-            said = f"the principal point of {name} is {found}; is the size {size} right?"
-            left_out.notes.append(f"warning: {said}")
+    if left_out is not None:
+        left_out.notes += [
+            f"warning: the principal point of {name} is {found}; is its size of "
+            "{} x {} px right?".format(*camera.image_size)
+            for name, camera in cameras.items()
+            if (found := other_middle(camera.principal_point_px, camera.image_size))
+        ]
     return cameras
 
 

@@ -309,7 +309,8 @@ def _time_frames(path: Path, columns: dict[str, Floats], fps: float) -> tuple[In
         expected, found = "seconds that rise, in many rows a second", f"{time[:3].tolist()}"
         todo = "State the unit in the title: time_s or time_ms."
         raise _wrong(f"{path}: time", expected, found, todo)
-    columns["frame"], rows = _at_frames(time, fps)
+    frame, rows = _at_frames(time, fps)
+    columns["frame"] = frame.astype(np.float64)
     return rows, f"{len(time)} rows by their times; the first is frame 0 of the video"
 
 

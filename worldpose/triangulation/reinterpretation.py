@@ -72,6 +72,18 @@ def reinterpret_calibration(
                 found="poses by which no two cameras agree on their people",
                 todo=f"They agree if {why}.",
             )
+    swap = np.eye(3)[[1, 0, 2]]
+    pose = batch.cam_from_world
+    other = replace(
+        batch,
+        focal=batch.focal[..., ::-1],
+        principal_point=batch.principal_point[..., ::-1],
+        image_size=batch.image_size[..., ::-1],
+        cam_from_world=Rigid(swap @ pose.rotation, pose.translation @ swap),
+    )
+    if agree(other):
+        found = "points on which cameras agree alone if x and y are exchanged"
+        raise InputError("2D poses", "x, y of each point", found, "Write x first, then y.")
     reach = _reach(detections)
     found = {}
     for scale in _SCALES:

@@ -137,6 +137,16 @@ def test_poses_that_mean_something_else_are_refused_with_what_they_mean(
         placed(true, given, poses(*seen(true, walk(people))))
 
 
+def test_points_with_y_before_x_are_refused(ring, people, seen):
+    true = ring(4)
+    given = {
+        name: replace(each, keypoints=each.keypoints[..., ::-1])
+        for name, each in poses(*seen(true, walk(people))).items()
+    }
+    with pytest.raises(InputError, match="agree alone if x and y are exchanged"):
+        placed(true, true, given)
+
+
 def test_a_calibration_of_larger_images_is_scaled_to_those_of_the_people(ring, people, seen):
     true = ring(4)
     middle = 3.0 * (true.principal_point + 0.5) - 0.5
