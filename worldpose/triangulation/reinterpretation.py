@@ -82,8 +82,8 @@ def reinterpret_calibration(
         cam_from_world=Rigid(swap @ pose.rotation, pose.translation @ swap),
     )
     if agree(other):
-        found = "points on which cameras agree alone if x and y are exchanged"
-        raise InputError("2D poses", "x, y of each point", found, "Write x first, then y.")
+        said = "points on which cameras agree alone if x and y are exchanged"
+        raise InputError("2D poses", "x, y of each point", said, "Write x first, then y.")
     reach = _reach(detections)
     found = {}
     for scale in _SCALES:
