@@ -280,19 +280,19 @@ def fit_to_video(
     own, shown = np.array(camera.image_size), np.array(index.size)
     if of_sensor and np.all(shown <= own):
         corner = 0.5 * (own - shown)
-        part = f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor"
+        part = f"the middle {index.size[0]} x {index.size[1]} px of the sensor"
+        warning = ""
         if np.ptp(shown / own) <= same_shape:
-            part = f"warning: {part}, or the whole one resized to it"
+            part += ", or the whole one resized to it"
+            x, y = corner
             todo = "Give videos of the sensor's size, resized if they show all of it. If they are "
             todo += "its middle, write the calibration of that part: set SENSOR_SIZE, and subtract "
-            todo += "{:g}, {:g} from PRINCIPAL_POINT and the centre of VICON_RADIAL2.".format(
-                *corner
-            )
+            todo += f"{x:g}, {y:g} from PRINCIPAL_POINT and the centre of VICON_RADIAL2."
             if not has_poses:
                 expected = "{} x {} px, SENSOR_SIZE in the calibration".format(*camera.image_size)
-                raise InputError(str(file), expected, part.partition(": ")[2], todo)
-            part += f"; if no people agree: {todo}"
-        notes.append(part)
+                raise InputError(str(file), expected, part, todo)
+            warning, part = "warning: ", f"{part}; taken as the middle. If no people agree: {todo}"
+        notes.append(f"{warning}{file.name}: {part}")
         middle = np.array(camera.principal_point_px) - corner
         return camera.model_copy(
             update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}
