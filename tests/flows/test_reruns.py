@@ -139,7 +139,7 @@ def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path
     )
     (tmp_path / "other.npz").replace(folder / "smpl-neutral.npz")
     refused = worldpose(
-        *("export", tiny, "--project", project_copy, "--format", "poses", "--out", tmp_path / "out")
+        *("export", tiny, "--project", project_copy, "--format", "bvh", "--out", tmp_path / "out")
     )
     assert refused.code == 2 and "body model smpl-neutral: expected the file" in refused.err
 

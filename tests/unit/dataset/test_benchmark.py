@@ -184,6 +184,23 @@ def test_a_clip_that_a_method_lacks_is_refused(reference, tmp_path):
         score_folders(reference, {"mine": tmp_path / "mine"})
 
 
+def test_a_clip_in_two_folders_of_a_method_is_refused(reference, tmp_path):
+    shutil.copytree(reference, tmp_path / "mine")
+    shutil.copytree(reference, tmp_path / "mine" / "old")
+    for mine in (tmp_path / "mine", shutil.copytree(tmp_path / "mine" / "old", tmp_path / "2/a")):
+        with pytest.raises(InputError, match=r"clip A_1: expected one, found .* and "):
+            score_folders(reference, {"mine": mine if mine.name == "mine" else mine.parent})
+        shutil.copytree(reference, tmp_path / "2" / "b", dirs_exist_ok=True)
+
+
+def test_sides_of_other_rates_are_refused(reference, tmp_path):
+    for name, rate in (("mine", 50.0), ("true", 25.0)):
+        shutil.copytree(reference, tmp_path / name)
+        (tmp_path / name / "frame_rates.json").write_text(json.dumps(dict.fromkeys(CLIPS, rate)))
+    with pytest.raises(InputError, match=r"found 25 in .*true and 50 in .*mine"):
+        score_folders(tmp_path / "true", {"mine": tmp_path / "mine"})
+
+
 def test_boxes_are_compared_in_the_same_view(reference, tmp_path):
     """Each side has the cameras main and side; then the method has one of them alone."""
     for name in ("mine", "true"):
