@@ -119,7 +119,9 @@ def score(
         )
         truth = Side(tracks, {})
     elif placed and estimate.joints is not None:
-        mine, tracks, notes = align_positions(Path(reference), estimate.joints, reading.first_frame)
+        mine, tracks, notes = align_positions(
+            Path(reference), estimate.joints, reading.first_frame, known
+        )
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
     is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
@@ -172,7 +174,8 @@ def _align_markers(
         )
     markers = read_markers(path)
     people = map_marker_names(markers.names) if marker_map is None else read_marker_map(marker_map)
-    return align_reference(prediction, marker_joints(markers, people), markers.rate, fps)
+    joints = marker_joints(markers, people)
+    return align_reference(prediction, joints, markers.rate, fps, markers.start)
 
 
 def load_reference(name: str) -> JointTracks:

@@ -141,7 +141,7 @@ def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path
     refused = worldpose(
         *("export", tiny, "--project", project_copy, "--format", "bvh", "--out", tmp_path / "out")
     )
-    assert refused.code == 2 and "body model smpl-neutral: expected the file" in refused.err
+    assert refused.code == 1 and "Install that body model again" in refused.err
 
 
 def test_the_first_triangulation_of_a_long_match_skips_frames(tiny, project_copy):
