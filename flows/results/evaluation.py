@@ -209,9 +209,14 @@ def reference_side(name: str) -> Side:
     return Side(load_reference(name), {}, match, fps=rate)
 
 
-def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str | None) -> Side:
+def is_of_files(name: str) -> bool:
+    """Return whether a prediction is a file or a folder of results, and not a match."""
     path = Path(name)
-    if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
+    return path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir()
+
+
+def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str | None) -> Side:
+    if is_of_files(name):
         return reference_side(name)
     store = Store.open(project)
     match = find_match(store, name, unfinished=True)

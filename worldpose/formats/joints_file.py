@@ -104,8 +104,16 @@ class JointTracks:
         )
 
     def __post_init__(self) -> None:
-        for name in ("frames", "person_ids", "joints"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name)))
+        for name in ("frames", "person_ids", "joints", "covariance", "views"):
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, np.asarray(given))
+        for name, kind in (("frames", np.int64), ("person_ids", np.int64), ("views", np.uint8)):
+            given, most = getattr(self, name), np.iinfo(kind).max
+            array: NDArray[Any] = np.zeros(0, kind) if given is None else given
+            whole = array.dtype.kind in "iu" or (array == np.floor(array)).all()
+            if not whole or (array > most).any():
+                todo = "Number frames and people, and give times as fps."
+                raise wrong(name, f"whole numbers up to {most}", f"{array.ravel()[:3]}", todo)
         parts = [("", ExtraTracks(COCO17, self.joints, self.covariance, self.views))]
         if self.extra is not None:
             names = self.extra.points
