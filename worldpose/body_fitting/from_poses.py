@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from worldpose.body_fitting.ray_constraints import find_ray_constraints
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry.cameras import Camera
+from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import reconstruct_joints
@@ -49,7 +49,7 @@ class ReconstructedBodies:
 
 
 def reconstruct_bodies(
-    cameras: Camera | Sequence[Camera] | Mapping[str, Camera],
+    cameras: Cameras,
     detections: KeypointDetections | Sequence[KeypointDetections],
     fps: float,
     *,
@@ -76,9 +76,7 @@ def reconstruct_bodies(
         InputError: numbers of cameras differ, the shapes do not fit together, frames or `fps` are
             invalid, or the cameras are not in metres.
     """
-    if not isinstance(cameras, Camera):
-        each = list(cameras.values() if isinstance(cameras, Mapping) else cameras)
-        cameras = Camera.stack(each)
+    cameras = Camera.batch(cameras)
     if not isinstance(detections, KeypointDetections):
         for camera in detections:
             _require_rising(camera.frame)

@@ -211,8 +211,10 @@ def read_clip(
     for name, camera in rows.items():
         file, pixels = coco / f"{name}.json", None
         if file.is_file():
-            shown = np.isfinite(camera.rotation).all((-1, -2))
-            pixels = read_coco(file, ids, shown if len(shown) == frames else np.ones(frames, bool))
+            shown = np.ones(frames, np.bool_)
+            if len(camera.rotation) == frames:
+                shown = np.isfinite(camera.rotation).reshape(frames, 9).all(axis=1)
+            pixels = read_coco(file, ids, shown)
             if pixels is None:
                 notes.append(f"{file}: not compared: it has other images than the clip has frames")
         views.append(CameraView(name, camera, pixels, COCO17))

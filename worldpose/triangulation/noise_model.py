@@ -99,8 +99,8 @@ def conditions(keypoints: AnyFloats) -> NDArray[np.uint8]:
     found: NDArray[np.uint8] = np.zeros(keypoints.shape[:-1], np.uint8)
     people, joints = found.shape[-2:]
     if joints == len(COCO17):
-        flat = (math.prod(found.shape[:-2]), people, joints)  # -1 is unknown without people
-        _find_conditions(keypoints.reshape(*flat, 2), np.array(REACH), found.reshape(flat))
+        images = keypoints.reshape(-1, people, joints, 2), np.array(REACH)
+        _find_conditions(*images, found.reshape(-1, people, joints))
     return found
 
 

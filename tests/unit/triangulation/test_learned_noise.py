@@ -34,10 +34,6 @@ def test_a_worse_camera_is_learned_from_residuals(ring):
     assert precision[:, 0].mean() > 5.0 * precision[:, 2].mean()
 
 
-def test_images_of_nobody_have_no_conditions():
-    assert conditions(np.zeros((4, 2, 0, 17, 2))).shape == (4, 2, 0, 17)
-
-
 def test_views_that_miss_a_joint_raise_the_error_that_all_views_share():
     variance = shared_variance(np.array([0.02]), np.array([[[4], [3], [0]]]), np.array([[4, 4, 0]]))
     expected = 0.02 * (1.0 + OCCLUDED * np.array([0.0, 0.25, 1.0]))
