@@ -85,6 +85,7 @@ def evaluate(
         **{"--body": body, "--markers": markers, "--first-frame": first_frame is not None},
         **{"--method-fps": method_fps, "--table": table != "text", "--picture": picture},
     }
+    allowed: tuple[str, ...]
     if ablation:
         named = {"--prediction": prediction, "--reference": reference, "--method": method}
         _require_effect("--ablation", {**given, **named}, ())

@@ -311,7 +311,8 @@ def fitted_model(run: Run, unit: str) -> BodyModel:
     name, folder = run[unit].attrs["body_model"], run.record.body_folder
     fitted = {} if is_open_body(name) else run.manifest(unit).recipe.sources
     place = None if folder is None else Path(folder)
-    return find_body(name, place, fitted.get("body_model_sha256"))
+    sha256 = fitted.get("body_model_sha256")
+    return find_body(name, place, None if sha256 is None else str(sha256))
 
 
 def body_tracks(run: Run, clip: str) -> BodyTracks | None:

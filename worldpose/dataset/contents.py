@@ -211,9 +211,9 @@ def read_clip(
     for name, camera in rows.items():
         file, pixels = coco / f"{name}.json", None
         if file.is_file():
-            shown = np.ones(frames, np.bool_)
+            shown: Flags = np.ones(frames, np.bool_)
             if len(camera.rotation) == frames:
-                shown = np.isfinite(camera.rotation).reshape(frames, 9).all(axis=1)
+                shown = np.asarray(np.isfinite(camera.rotation).all((-1, -2)))
             pixels = read_coco(file, ids, shown)
             if pixels is None:
                 notes.append(f"{file}: not compared: it has other images than the clip has frames")

@@ -426,4 +426,4 @@ def _is_measured(picture: LabelledPicture, kind: NetKind) -> Flags:
         return ~picture.ignored
     tall = picture.boxes[:, 3] - picture.boxes[:, 1] >= MIN_HEIGHT
     torso = (picture.visible[:, [5, 6, 11, 12]] > 0).all(-1)
-    return ~picture.ignored & tall & torso & (picture.visible == 2).any(-1)
+    return np.asarray(~picture.ignored & tall & torso & (picture.visible == 2).any(-1))
