@@ -52,6 +52,8 @@ class Markers:
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
     start: float = 0.0
     """Time of the first sample on the file's own clock [s]."""
+    zeros: int = 0
+    """Number of markers at exactly 0, 0, 0, which are missing."""
 
 
 def read_markers(path: Path) -> Markers:
@@ -182,15 +184,34 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
     rows = [
         [
             float(cell) if cell.strip() else np.nan
-            for cell in (line.split("\t") + [""] * width)[1:width]
+            for cell in (line.split("\t") + [""] * width)[:width]
         ]
         for line in lines[5:]
         if line.strip()
     ]
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), width - 1)
-    points = table[:, 1:].reshape(len(rows), len(names), 3)
-    start = float(table[0, 0]) if len(table) and np.isfinite(table[0, 0]) else 0.0
-    return float(about["DataRate"]), names, points, about["Units"].strip().lower(), start
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    rate = float(about["DataRate"])
+    place = _samples(path, table[:, 0], rate * table[:, 1])
+    points = np.full((place[-1] + 1 if len(place) else 0, len(names), 3), np.nan)
+    points[place] = table[:, 2:].reshape(len(rows), len(names), 3)
+    start = float(table[0, 1]) if len(table) and np.isfinite(table[0, 1]) else 0.0
+    return rate, names, points, about["Units"].strip().lower(), start
+
+
+def _samples(path: Path, number: Floats, time: Floats) -> Integers:
+    """Return the sample of each row, from 0, by its Frame# (rows,), or else its time [samples].
+
+    Raises:
+        InputError: neither rises; or rows are missing for longer than any recording.
+    """
+    most = 10_000_000
+    for each in (number, time):
+        steps = np.rint(np.diff(each))
+        if np.isfinite(each).all() and (steps > 0).all() and steps.sum() < most:
+            step = np.gcd.reduce(steps.astype(np.int64)) if each is number and len(steps) else 1
+            return np.rint((each - each[:1]) / step).astype(np.int64)
+    found = f"{number[:3].tolist()} and so on in {len(number)} rows"
+    raise _wrong(f"{path}: Frame#", "numbers, or else times, that rise", found)
 
 
 def _check_markers(
@@ -203,8 +224,10 @@ def _check_markers(
             f"markers with a rate and a unit of {', '.join(METRES)}",
             f"{rate:g} samples/s in {unit!r}, {len(names)} names of {points.shape[1]} markers",
         )
-    whole = np.isfinite(points).all(-1, keepdims=True)
-    return Markers(rate, names, np.where(whole, points, np.nan) * METRES[unit])
+    zero = (points == 0.0).all(-1, keepdims=True)
+    whole = np.isfinite(points).all(-1, keepdims=True) & ~zero
+    places = np.where(whole, points, np.nan) * METRES[unit]
+    return Markers(rate, names, places, int(zero.sum()))
 
 
 def _wrong(where: object, expected: str, found: str) -> InputError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,14 +13,11 @@ from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float]:
-    """Return frames (frames,), names of people, places (frames, persons, 2) [m], and rate [1/s].
+    """Return frames (frames,), names of people, their places (frames, persons, 2) [m], and a rate.
 
-    The rate is that of the column `timestamp` or `time_s`; NaN without one.
+    The rate is that of the frames by their times [1/s]; NaN without times.
 
     The file is a CSV of `worldpose export --format positions`, or of kloppy's `to_df`: columns
     `<player>_x` and `<player>_y`, or `player_id`, x and y, beside `frame_id`. The ball is left out.
@@ -32,10 +28,19 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
     import pandas as pd  # late: it takes half a second
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
+    ours |= {"time_s": "timestamp"}
     try:
         table = pd.read_csv(path).rename(columns=ours).set_index("frame").sort_index()
-        clock = next((table[name] for name in ("timestamp", "time_s") if name in table), None)
-        rate = np.nan if clock is None else _rate(clock[~clock.index.duplicated()])
+        rate = np.nan
+        if "timestamp" in table:
+            time = table["timestamp"].groupby(level=0).first()
+            if not pd.api.types.is_numeric_dtype(time):
+                time = pd.to_timedelta(time, errors="coerce").dt.total_seconds()
+            steps = np.diff([time.index.to_numpy(np.float64), time.to_numpy(np.float64)])
+            steps = steps[:, steps[1] > 0.0]  # times begin again in each period
+            rate = float(steps[0].sum() / steps[1].sum()) if steps.size else np.nan
+            while 0.0 < rate < 1.0:  # times are in ms or smaller units
+                rate *= 1000.0
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
             table = table.pivot(columns="name" if named else "person", values=["x", "y"])
@@ -59,19 +64,21 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
         ) from error
 
 
-def _rate(clock: pd.Series) -> float:
-    """Return frames per second of times by frame; NaN if these are no times of several frames.
-
-    Times of each half may start at 0.
-    """
-    import pandas as pd
-
-    seconds = pd.to_numeric(clock, errors="coerce")
-    if seconds.isna().any():
-        seconds = pd.to_timedelta(clock, errors="coerce").dt.total_seconds()
-    steps, passed = np.diff(clock.index.to_numpy(np.float64)), np.diff(seconds.to_numpy())
-    rises = passed > 0.0
-    return float(steps[rises].sum() / passed[rises].sum()) if rises.any() else np.nan
+def _at_match_frames(
+    frames: Integers, xy: Floats, step: float, first: int | None
+) -> tuple[Integers, Floats]:
+    """Return match frames and places in them, linear between rows, of `step` frames per number."""
+    place = step * frames if first is None else step * (frames - frames[0]) + first
+    if step == 1.0 or len(frames) < 2:
+        return np.rint(place).astype(np.int64), xy
+    whole = np.arange(int(np.ceil(place[0] - 1e-6)), int(place[-1] + 1e-6) + 1)
+    after = np.clip(np.searchsorted(place, whole), 1, len(place) - 1)
+    gap = place[after] - place[after - 1]
+    share = ((whole - place[after - 1]) / gap)[:, None, None]
+    between = (1.0 - share) * xy[after - 1] + share * xy[after]
+    between = np.where((gap > 1.5 * gap.min())[:, None, None], np.nan, between)
+    between = np.where(share < 1e-6, xy[after - 1], between)
+    return whole, np.where(share > 1.0 - 1e-6, xy[after], between)
 
 
 def align_positions(
@@ -82,29 +89,21 @@ def align_positions(
     Axes of providers may point the other way: of the four ways, the one is taken that clearly
     agrees with the prediction.
 
-    `first` is the match frame of the file's first row; None = its frames are match frames. Places
-    at another rate than `fps` [1/s] are interpolated in the match frames.
+    `first` is the match frame of the file's first row; None = its frames are match frames. At
+    another rate than the match's (`fps`), by the file's times or by the best agreement of usual
+    rates, match frame 0 is still frame 0.
 
     Raises:
         InputError: the file is invalid, or no way of its axes clearly agrees.
     """
     most, hips = 1.0, [11, 12]  # largest median distance of one person in both [m]
-    frames, names, xy, rate = read_positions(path)
-    frames, notes = frames if first is None else frames - frames[0] + first, list[str]()
-    if fps is not None and abs(fps / rate - 1.0) * np.ptp(frames) > 1.0:
-        if first is None:
-            raise InputError(
-                f"{path}: timestamp",
-                expected=f"{fps:g} frames per second, as of the match",
-                found=f"{rate:.6g}",
-                todo="State the match frame of the first row: --first-frame NUMBER.",
-            )
-        given = first + (frames - first) * (fps / rate)
-        frames = np.arange(first, int(given[-1]) + 1)
-        paths = xy.reshape(len(xy), -1).T
-        xy = np.stack([np.interp(frames, given, path) for path in paths], axis=-1)
-        xy = xy.reshape(len(frames), -1, 2)
-        notes.append(f"positions at {rate:.6g} per second, interpolated in frames of {fps:g}")
+    numbers, names, given, rate = read_positions(path)
+    usual = (25.0, 10.0, 50.0, 30.0, 20.0, 12.5, 5.0, 60.0)
+    rates = (rate,) if np.isfinite(rate) else usual
+    ratios = {own / each for own in ((fps,) if fps else usual) for each in rates}
+    if fps is None or np.isnan(rate):
+        ratios |= {1.0}
+    steps = sorted(1.0 if abs(step - 1.0) < 5e-4 else step for step in ratios)
 
     def on_ground(frames: Integers, places: Floats) -> JointTracks:
         joints = np.full((*places.shape[:2], 17, 3), np.nan)
@@ -114,15 +113,23 @@ def align_positions(
 
     mine = on_ground(prediction.frames, prediction.joints[:, :, hips, :2].mean(axis=2))
     mine = replace(mine, person_ids=prediction.person_ids)
-    seen = select_frames(mine.joints, mine.frames, frames)
-    found = []
-    for way in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
-        turned = on_ground(frames, xy * way)
-        apart = joint_distances(seen, turned.joints)
-        nearest = apart.min(axis=1, initial=np.inf)
-        known = nearest[np.isfinite(nearest)]
-        found.append((float(np.median(known)) if len(known) else np.inf, way, turned, apart))
-    (best, way, turned, apart), (second, *_) = sorted(found, key=lambda each: each[0])[:2]
+
+    def try_step(step: float) -> list[tuple[float, tuple[float, float], JointTracks, Floats]]:
+        frames, xy = _at_match_frames(numbers, given, step, first)
+        seen = select_frames(mine.joints, mine.frames, frames)
+        found = []
+        for way in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
+            turned = on_ground(frames, xy * way)
+            apart = joint_distances(seen, turned.joints)
+            nearest = apart.min(axis=1, initial=np.inf)
+            known = nearest[np.isfinite(nearest)]
+            found.append((float(np.median(known)) if len(known) else np.inf, way, turned, apart))
+        return sorted(found, key=lambda each: each[0])[:2]
+
+    tried = {step: try_step(step) for step in steps}
+    # The match's own rate holds unless another agrees clearly better.
+    step = min(tried, key=lambda step: tried[step][0][0] * (0.5 if step == 1.0 else 1.0))
+    (best, way, turned, apart), (second, *_) = tried[step]
     if not best < min(most, 0.5 * second):
         raise InputError(
             str(path),
@@ -138,7 +145,10 @@ def align_positions(
         (person, int(row.argmin())) for person, row in zip(mine.person_ids, off.T, strict=True)
     )
     said = (f"{person}: {names[n]}" for p, (person, n) in enumerate(pairs) if off[n, p] < most)
+    notes = [f"people: {{{', '.join(said)}}}"]
+    if step != 1.0:
+        how = "by its times" if fps and np.isfinite(rate) else "by agreement alone"
+        notes.insert(0, f"each frame of the positions is {step:g} frames of the match, {how}")
     if way != (1.0, 1.0):
-        notes.append("axes of the positions: {:+g} x, {:+g} y".format(*way))
-    notes.append(f"people: {{{', '.join(said)}}}")
+        notes.insert(0, "axes of the positions: {:+g} x, {:+g} y".format(*way))
     return mine, turned, notes

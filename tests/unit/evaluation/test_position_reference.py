@@ -58,25 +58,20 @@ def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
     assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
 
 
-@pytest.mark.parametrize("form", [wide, long])
-def test_places_at_another_rate_are_brought_to_the_frames_of_the_match(tmp_path, form):
-    """Ten rows a second in a match of 25: each row is 2.5 frames later."""
+@pytest.mark.parametrize("timed", [True, False])
+def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
     mine, places = tracks()
-    at = 2.5 * np.arange(12)
-    slow = places[0] + at[:, None, None] * (places[1] - places[0])
-    first, *rows = form(slow, first=70).splitlines()
-    column = first.split(",").index("frame_id")
-    times = (int(row.split(",")[column]) - 70 for row in rows)
-    timed = (f"{row},0 days 00:00:0{n // 10}.{n % 10}" for row, n in zip(rows, times, strict=True))
-    file = tmp_path / "positions.csv"
-    file.write_text("\n".join((f"{first},timestamp", *timed)))
-    predicted, given, notes = align_positions(file, mine, 100, 25.0)
-    assert notes[0] == "positions at 10 per second, interpolated in frames of 25"
+    mine = JointTracks(mine.frames - 100, mine.person_ids, mine.joints)
+    lines = wide(places[::2], first=0).splitlines()
+    if timed:
+        times = [f",0 days 00:00:{n / 12.5:09.6f}" for n in range(len(lines) - 1)]
+        lines = [line + more for line, more in zip(lines, [",timestamp", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    predicted, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=25.0)
+    assert "each frame of the positions is 2 frames of the match" in notes[0]
     scores, _ = evaluate_joints(predicted, given, fps=25.0)
     assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
-    assert scores.frames == 28
-    with pytest.raises(InputError, match="timestamp: expected 25 frames per second"):
-        align_positions(file, mine, None, 25.0)
+    assert given.frames.tolist() == list(range(29))
 
 
 @pytest.mark.parametrize(
