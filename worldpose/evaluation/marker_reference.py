@@ -50,10 +50,10 @@ class Markers:
     names: tuple[str, ...]
     points: Floats
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
-    start: float = 0.0
-    """Time of the first sample on the file's own clock [s]."""
     zeros: int = 0
     """Number of markers at exactly 0, 0, 0, which are missing."""
+    start: float = 0.0
+    """Time of the first sample on the file's own clock [s]."""
 
 
 def read_markers(path: Path) -> Markers:
