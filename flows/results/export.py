@@ -136,10 +136,7 @@ def export_challenge(
 def _by_given_rows(
     origin: best_results.Origin, clip: str, truth: challenge.ChallengeTruth
 ) -> tuple[Floats, dict[str, int]]:
-    """Return a clip's submission, the poses that fill gaps of given boxes, and gaps left by row.
-
-    Where boxes with identities were given, the rows are theirs.
-    """
+    """Return a submission with the rows of given boxes, the gaps filled, and those left by row."""
     name, run = f"broadcast_tracking/{clip}", origin.run
     rows = run[name].attrs.get("given_people") if name in run else None
     if rows is None:
