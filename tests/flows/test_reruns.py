@@ -134,6 +134,14 @@ def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path
     bodies = open_run(project_copy, TINY).bodies("clip")
     assert open_run(project_copy, TINY)["body_fitting/clip"].attrs["body_model"] == "smpl-neutral"
     assert bodies is not None
+    save_body(
+        tmp_path / "other.npz", replace(load_open_body("open-neutral/3"), name="smpl-neutral")
+    )
+    (tmp_path / "other.npz").replace(folder / "smpl-neutral.npz")
+    refused = worldpose(
+        *("export", tiny, "--project", project_copy, "--format", "bvh", "--out", tmp_path / "out")
+    )
+    assert refused.code == 1 and "Install that body model again" in refused.err
 
 
 def test_the_first_triangulation_of_a_long_match_skips_frames(tiny, project_copy):

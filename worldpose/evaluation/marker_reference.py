@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -52,6 +52,8 @@ class Markers:
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
     zeros: int = 0
     """Number of markers at exactly 0, 0, 0, which are missing."""
+    start: float = 0.0
+    """Time of the first sample on the file's own clock [s]."""
 
 
 def read_markers(path: Path) -> Markers:
@@ -65,11 +67,11 @@ def read_markers(path: Path) -> Markers:
     if path.suffix.lower() == ".c3d":
         return _read_c3d(path)
     try:
-        rate, names, points, unit = _read_trc(path)
+        rate, names, points, unit, start = _read_trc(path)
     # A truncated file lacks lines, cells or keys; text may be no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
         raise _wrong(path, "a complete C3D or TRC file", say_failure(error)) from error
-    return _check_markers(path, rate, names, points, unit)
+    return replace(_check_markers(path, rate, names, points, unit), start=start)
 
 
 def map_marker_names(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
@@ -172,8 +174,8 @@ def c3d_labels(reader: Any) -> tuple[str, ...]:  # noqa: ANN401
         number += 1
 
 
-def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str]:
-    """Return rate [1/s], names, points (samples, markers, 3) in the file's unit, and that unit."""
+def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
+    """Return rate [1/s], names, points (samples, markers, 3), unit and first time [s]."""
     # The first line has the path, in the bytes of the writer's system; only numbers matter.
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
@@ -192,7 +194,8 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str]:
     place = _samples(path, table[:, 0], rate * table[:, 1])
     points = np.full((place[-1] + 1 if len(place) else 0, len(names), 3), np.nan)
     points[place] = table[:, 2:].reshape(len(rows), len(names), 3)
-    return rate, names, points, about["Units"].strip().lower()
+    start = float(table[0, 1]) if len(table) and np.isfinite(table[0, 1]) else 0.0
+    return rate, names, points, about["Units"].strip().lower(), start
 
 
 def _samples(path: Path, number: Floats, time: Floats) -> Integers:
@@ -246,7 +249,7 @@ class ReferenceAlignment:
 
 
 def align_reference(
-    prediction: JointTracks, joints: Floats, rate: float, fps: float
+    prediction: JointTracks, joints: Floats, rate: float, fps: float, start: float = 0.0
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Return the reference in the prediction's frames and world, and its alignment.
 
@@ -255,7 +258,8 @@ def align_reference(
     prediction remains an error.
 
     `joints` (samples, persons, 17, 3) [m] are in the reference's world, NaN where missing, at
-    `rate` samples per second [1/s].
+    `rate` samples per second [1/s], the first one at `start` [s] of the clock. The clock of a part
+    of a recording may also count from its first sample.
 
     Raises:
         DegenerateError: prediction and reference match at no offset.
@@ -263,9 +267,10 @@ def align_reference(
     # Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate.
     step_s = 0.2
     max_offset_s = 2.0  # maximum clock offset of the search, either way [s]
-    times = prediction.frames / fps
+    times = prediction.frames / fps - start  # since the first sample, if both clocks agree
     count = int(np.ceil(max_offset_s / step_s))
-    grid = np.arange(-count, count + 1) * step_s
+    around_zero = np.arange(-count, count + 1) * step_s
+    grid = np.unique(np.concatenate([around_zero, around_zero + start]))
     tried = [
         (_match_cost(prediction.joints, sample_joints(joints, rate, times + o)), o) for o in grid
     ]

@@ -16,6 +16,7 @@ from worldpose.evaluation.marker_reference import (
 )
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
+from worldpose.formats.motion_capture import write_markers
 
 FPS, RATE, OFFSET = 50.0, 100.0, 0.7313
 TURN = Rotation.from_rotvec([0.0, 0.0, 2.1])
@@ -141,6 +142,17 @@ def test_time_place_and_people_are_found_again(tmp_path, markers, prediction):
     scores, _ = evaluate_joints(prediction, reference)
     assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
     assert scores.coverage == 1.0
+
+
+def test_a_clip_that_starts_late_is_found_by_the_times_of_the_file_or_its_first_sample(
+    tmp_path, markers, prediction
+):
+    late = JointTracks(prediction.frames + 500, prediction.person_ids, prediction.joints)
+    for mine, offset in ((late, OFFSET), (prediction, OFFSET + 10.0)):
+        _, found = align_reference(mine, markers, RATE, FPS, 10.0)
+        assert found.offset == pytest.approx(offset, abs=2e-4) and found.residual < 1e-3
+    write_markers(tmp_path / "late.trc", late, 0, FPS)
+    assert read_markers(tmp_path / "late.trc").start == pytest.approx(late.frames[0] / FPS)
 
 
 def test_known_error_stays(markers, prediction):
