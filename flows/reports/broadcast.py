@@ -269,7 +269,7 @@ def flow_pictures(run: Run, match: Match, view: str, camera: Camera) -> list[Cap
         return []
     pair = int(np.argmin(np.where(known, traces, np.inf)))
     number = int(frames[pair])
-    stills = _pictures(match, view, frames[pair : pair + 2])
+    stills = list(_pictures(match, view, frames[pair : pair + 2]))
     boxes = None
     for unit in seen_in_broadcast(match, view):
         boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)

@@ -91,7 +91,7 @@ def find_lines(
     reach = settings.line_search_px
     first, searched = _measure_lines(camera, samples, picture, people, settings, reach)
     if len(first) < 15:
-        return PointEvidence.none(), camera, searched * [1, 0]
+        return PointEvidence.none(), camera, searched * np.array([1, 0])
     corrected = _correct_camera(camera, first, settings.field_weight)
     found, searched = _measure_lines(corrected, samples, picture, people, settings, 3.0)
     return samples.lower(found), corrected, searched

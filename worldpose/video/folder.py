@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Image
+from data_contracts.arrays import Flags, Image, Integers
 from worldpose.errors import InputError
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.pictures import FrameIndex, Pictures
@@ -229,7 +229,7 @@ def pictures_at(
         yield picture if number >= 0 else None
 
 
-def grey_on_clock(path: Path, numbers: NDArray[np.integer], fps: float) -> Iterator[Image]:
+def grey_on_clock(path: Path, numbers: Integers, fps: float) -> Iterator[Image]:
     """Yield the grey image of each number of a camera's clock; black where the video has none."""
     with open_video(path) as video:
         black = np.zeros(video.index.size[::-1], dtype=np.uint8)
