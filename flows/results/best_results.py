@@ -16,7 +16,7 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Join, Track
-from flows.layers import pitch_of
+from flows.layers import pitch_of, pitch_of_run
 from flows.results.run_cameras import (
     BROADCAST,
     broadcast_unit,
@@ -372,8 +372,8 @@ class Origin:
 
     @property
     def pitch(self) -> PitchSpec | None:
-        """Return the pitch of the match folder; None without one."""
-        return pitch_of(self.run.store, self.registration)
+        """Return the pitch of the run; None without one."""
+        return pitch_of_run(self.run, lambda: pitch_of(self.run.store, self.registration))
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""

@@ -111,11 +111,13 @@ def score(
     if measured:
         rate = fps or (None if match is None else match.spec.fps)
         tracks, alignment = _align_markers(
-            Path(reference), estimate.joints, rate, reading.marker_map
+            Path(reference), estimate.joints, rate, reading.marker_map, notes
         )
         truth = Side(tracks, {})
     elif placed and estimate.joints is not None:
-        mine, tracks, notes = align_positions(Path(reference), estimate.joints, reading.first_frame)
+        rate = fps or (None if match is None else match.spec.fps)
+        first = reading.first_frame
+        mine, tracks, notes = align_positions(Path(reference), estimate.joints, first, rate)
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
     is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
@@ -154,7 +156,11 @@ def score(
 
 
 def _align_markers(
-    path: Path, prediction: JointTracks | None, fps: float | None, marker_map: Path | None
+    path: Path,
+    prediction: JointTracks | None,
+    fps: float | None,
+    marker_map: Path | None,
+    notes: list[str],
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Align a marker file with the prediction's frames and world; return its joints."""
     if prediction is None or fps is None:
@@ -165,6 +171,8 @@ def _align_markers(
             todo="Name a prediction with joints, and give --fps if it belongs to no match.",
         )
     markers = read_markers(path)
+    if markers.zeros:
+        notes.append(f"{markers.zeros} markers at exactly 0, 0, 0 count as missing")
     people = map_marker_names(markers.names) if marker_map is None else read_marker_map(marker_map)
     return align_reference(prediction, marker_joints(markers, people), markers.rate, fps)
 

@@ -215,13 +215,12 @@ def test_from_needs_a_run_to_start_from(tiny, tmp_path):
     assert "without --from first" in answer.err
 
 
-def test_two_runs_of_one_match_at_once_end_with_one_result(tiny, tmp_path):
+def test_of_two_runs_of_one_match_at_once_one_is_refused(tiny, tmp_path):
     project = tmp_path / "worldpose-data"
     joints = ["--until", "triangulation"]
     command = [*WORLDPOSE, "run", str(tiny), "--project", str(project), *joints, "--workers", "1"]
     both = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
-    assert [process.wait(timeout=240) for process in both] == [0, 0]
+    assert sorted(process.wait(timeout=240) for process in both) == [0, 1]
     store = Store.open(project)
-    assert store.runs(TINY) == ("0001", "0002")
-    assert store.run(TINY, "0001").results == store.run(TINY, "0002").results
+    assert store.runs(TINY) == ("0001",)
     assert verify(store) == ()

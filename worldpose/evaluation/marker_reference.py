@@ -50,6 +50,8 @@ class Markers:
     names: tuple[str, ...]
     points: Floats
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
+    zeros: int = 0
+    """Number of markers at exactly 0, 0, 0, which are missing."""
 
 
 def read_markers(path: Path) -> Markers:
@@ -180,13 +182,33 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str]:
     rows = [
         [
             float(cell) if cell.strip() else np.nan
-            for cell in (line.split("\t") + [""] * width)[2:width]
+            for cell in (line.split("\t") + [""] * width)[:width]
         ]
         for line in lines[5:]
         if line.strip()
     ]
-    points = np.array(rows, dtype=np.float64).reshape(len(rows), len(names), 3)
-    return float(about["DataRate"]), names, points, about["Units"].strip().lower()
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    rate = float(about["DataRate"])
+    place = _samples(path, table[:, 0], rate * table[:, 1])
+    points = np.full((place[-1] + 1 if len(place) else 0, len(names), 3), np.nan)
+    points[place] = table[:, 2:].reshape(len(rows), len(names), 3)
+    return rate, names, points, about["Units"].strip().lower()
+
+
+def _samples(path: Path, number: Floats, time: Floats) -> Integers:
+    """Return the sample of each row, from 0, by its Frame# (rows,), or else its time [samples].
+
+    Raises:
+        InputError: neither rises; or rows are missing for longer than any recording.
+    """
+    most = 10_000_000
+    for each in (number, time):
+        steps = np.rint(np.diff(each))
+        if np.isfinite(each).all() and (steps > 0).all() and steps.sum() < most:
+            step = np.gcd.reduce(steps.astype(np.int64)) if each is number and len(steps) else 1
+            return np.rint((each - each[:1]) / step).astype(np.int64)
+    found = f"{number[:3].tolist()} and so on in {len(number)} rows"
+    raise _wrong(f"{path}: Frame#", "numbers, or else times, that rise", found)
 
 
 def _check_markers(
@@ -199,8 +221,10 @@ def _check_markers(
             f"markers with a rate and a unit of {', '.join(METRES)}",
             f"{rate:g} samples/s in {unit!r}, {len(names)} names of {points.shape[1]} markers",
         )
-    whole = np.isfinite(points).all(-1, keepdims=True)
-    return Markers(rate, names, np.where(whole, points, np.nan) * METRES[unit])
+    zero = (points == 0.0).all(-1, keepdims=True)
+    whole = np.isfinite(points).all(-1, keepdims=True) & ~zero
+    places = np.where(whole, points, np.nan) * METRES[unit]
+    return Markers(rate, names, places, int(zero.sum()))
 
 
 def _wrong(where: object, expected: str, found: str) -> InputError:

@@ -96,6 +96,22 @@ def test_a_c3d_file_whose_analog_scale_is_one_number_is_read(tmp_path, markers):
     np.testing.assert_allclose(found.points, markers[:, 0, 11:13], atol=1e-5)
 
 
+@pytest.mark.parametrize("numbers", [(5, 6, 9), (0, 4, 16), ("", "", "")])
+def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers):
+    text = ["PathFileType\t4\t(X/Y/Z)\ta.trc", "DataRate\tUnits", "100\tm"]
+    text += ["Frame#\tTime\tA\t\t\tB\t\t", "\t\tX1\tY1\tZ1", ""]
+    for number, time, x in zip(numbers, (0.0, 0.01, 0.04), (1, 0, 2), strict=True):
+        text += [f"{number}\t{time}\t{x}\t0\t0.0\t1\t2\t3"]
+    (tmp_path / "a.trc").write_text("\n".join(text) + "\n")
+    found = read_markers(tmp_path / "a.trc")
+    np.testing.assert_array_equal(found.points[:, 0, 0], [1.0, *[np.nan] * 3, 2.0])
+    np.testing.assert_array_equal(found.points[:, 1, 0], [1.0, 1.0, np.nan, np.nan, 1.0])
+    assert found.zeros == 1
+    (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
+    with pytest.raises(InputError, match="that rise"):
+        read_markers(tmp_path / "a.trc")
+
+
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):
     file = tmp_path / "map.yaml"
     file.write_text("Ada: {left_hip: [A, B], nose: C}\n")
