@@ -28,19 +28,23 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
     import pandas as pd  # late: it takes half a second
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
-    ours |= {"time_s": "timestamp"}
     try:
-        table = pd.read_csv(path).rename(columns=ours).set_index("frame").sort_index()
+        table = pd.read_csv(path)
+        ours |= {} if "timestamp" in table else {"time_s": "timestamp"}
+        table = table.rename(columns=ours).set_index("frame").sort_index()
         rate = np.nan
         if "timestamp" in table:
             time = table["timestamp"].groupby(level=0).first()
             if not pd.api.types.is_numeric_dtype(time):
                 time = pd.to_timedelta(time, errors="coerce").dt.total_seconds()
-            steps = np.diff([time.index.to_numpy(np.float64), time.to_numpy(np.float64)])
+            rows = np.array([time.index.to_numpy(np.float64), time.to_numpy(np.float64)])
+            # A clock may be coarser than a frame: only rows at which it moves on are exact.
+            steps = np.diff(rows[:, 1:][:, np.diff(rows[1]) != 0.0])
             steps = steps[:, steps[1] > 0.0]  # times begin again in each period
             rate = float(steps[0].sum() / steps[1].sum()) if steps.size else np.nan
             while 0.0 < rate < 1.0:  # times are in ms or smaller units
                 rate *= 1000.0
+            rate = rate if rate <= 240.0 else np.nan  # times are in minutes or the like
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
             table = table.pivot(columns="name" if named else "person", values=["x", "y"])
@@ -101,9 +105,8 @@ def align_positions(
     usual = (25.0, 10.0, 50.0, 30.0, 20.0, 12.5, 5.0, 60.0)
     rates = (rate,) if np.isfinite(rate) else usual
     ratios = {own / each for own in ((fps,) if fps else usual) for each in rates}
-    if fps is None or np.isnan(rate):
-        ratios |= {1.0}
-    steps = sorted(1.0 if abs(step - 1.0) < 5e-4 else step for step in ratios)
+    likely = fps / rate if fps and abs(fps / rate - 1.0) > 0.02 else 1.0
+    steps = sorted({1.0 if abs(step - 1.0) < 5e-4 else step for step in ratios} | {1.0})
 
     def on_ground(frames: Integers, places: Floats) -> JointTracks:
         joints = np.full((*places.shape[:2], 17, 3), np.nan)
@@ -127,8 +130,8 @@ def align_positions(
         return sorted(found, key=lambda each: each[0])[:2]
 
     tried = {step: try_step(step) for step in steps}
-    # The match's own rate holds unless another agrees clearly better.
-    step = min(tried, key=lambda step: tried[step][0][0] * (0.5 if step == 1.0 else 1.0))
+    # The rate of the times, or the match's own, holds unless another agrees clearly better.
+    step = min(tried, key=lambda step: tried[step][0][0] * (0.5 if step == likely else 1.0))
     (best, way, turned, apart), (second, *_) = tried[step]
     if not best < min(most, 0.5 * second):
         raise InputError(
@@ -149,6 +152,8 @@ def align_positions(
     if step != 1.0:
         how = "by its times" if fps and np.isfinite(rate) else "by agreement alone"
         notes.insert(0, f"each frame of the positions is {step:g} frames of the match, {how}")
+    elif step != likely:
+        notes.insert(0, f"places agree frame by frame, not at the times' {rate:g} per second")
     if way != (1.0, 1.0):
         notes.insert(0, "axes of the positions: {:+g} x, {:+g} y".format(*way))
     return mine, turned, notes

@@ -219,13 +219,14 @@ _TITLES: Final[Mapping[str, str]] = {
     **{"frame_number": "frame", "frame_no": "frame", "tc": "timecode", "time_code": "timecode"},
     **{"focal_length_px": "focal_px", "focal_length_mm": "focal_mm", "vfov": "fov_y"},
     **dict.fromkeys(("fov_x", "hfov", "fov_h", "fovx", "fov_horizontal", "horizontal_fov"), "fov"),
-    **{"cx": "cx_px", "cy": "cy_px"},
     **dict.fromkeys(("fov_v", "fovy", "fov_vertical", "vertical_fov"), "fov_y"),
 }
 """Other names of columns; `_deg` or `_rad` may follow those of angles, a unit of length x, y, z."""
 _TIME: Final = re.compile(r"(?:time|timestamp|time_stamp|t|seconds)(?:_(s|sec|ms|us))?")
 _SECONDS: Final = {"ms": 1e-3, "us": 1e-6}
-_KNOWN: Final = {*("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y")}
+_KNOWN: Final = {
+    *("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y", "cx", "cy")
+}
 
 
 def _read_columns(
@@ -248,9 +249,13 @@ def _read_columns(
         where = f"{path}: column {title}"
         if (timed := _TIME.fullmatch(text)) and "time" not in columns:
             seconds = np.array([_seconds(cell) for cell in cells])
-            if cells and np.isfinite(seconds).all():
-                columns["time"] = seconds * _SECONDS.get(timed[1] or "", 1.0)
-                continue
+            seconds *= _SECONDS.get(timed[1] or "", 1.0)
+            if len(cells) > 1 and np.isfinite(seconds).all():
+                # A coarse clock or a counter places no row; in a stated unit it can be a fault.
+                is_stated = timed[1] and not 0.0 <= seconds[-1] - seconds[0] < len(cells) - 1.0
+                if is_stated or _is_fine(seconds):
+                    columns["time"] = seconds
+                    continue
         if name not in _KNOWN:
             left_out.append(title.strip())
         elif name in columns:
@@ -288,20 +293,23 @@ def _seconds(text: str) -> float:
     return float(text.replace(",", ".")) if number else np.nan
 
 
+def _is_fine(time: Floats) -> bool:
+    """Return whether times [s] rise from nearly every row to the next, in many rows a second."""
+    step = np.diff(time)
+    return bool((step >= 0.0).all() and np.quantile(step, 0.1) > 0.0 and np.median(step) < 1.0)
+
+
 def _time_frames(path: Path, columns: dict[str, Floats], fps: float) -> tuple[Integers, str]:
     """Return the rows that count by the time of a table, with `frame` of them; and a sentence.
 
     Raises:
         InputError: times do not rise, are in no seconds, or contradict the frames.
     """
-    time = columns["time"]
-    step = np.diff(time)
-    are_seconds = bool((step >= 0.0).all() and 0.0 < np.median(step) < 1.0)
+    time, are_seconds = columns["time"], _is_fine(columns["time"])
     if "frame" in columns:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            rate = float(np.median(np.diff(columns["frame"]) / step))
-        if are_seconds and abs(rate / fps - 1.0) > 0.05:
-            found = f"frames at {rate:g} per second by their times"
+        count, span = float(np.ptp(columns["frame"])), float(np.ptp(time))
+        if are_seconds and abs(count - fps * span) > 1.0 + 0.05 * count:
+            found = f"frames at {count / span:g} per second by their times"
             todo = "Keep the column frame if it has the video's numbers, else that of the time."
             raise _wrong(f"{path}: time", f"the video's {fps:g} per second", found, todo)
         return np.arange(len(time)), ""
@@ -317,6 +325,7 @@ def _time_frames(path: Path, columns: dict[str, Floats], fps: float) -> tuple[In
 def _read_table(path: Path, fps: float, size: tuple[int, int]) -> CameraData:
     """Return the camera data of a table with a row per image."""
     columns, codes, left_out = _read_columns(path, ("pan", "tilt"))
+    _take_middle(path, columns, left_out, size)
     notes = [f"columns left out: {', '.join(left_out)}"] if left_out else []
     if any(re.search(r"[.,]\d{3,}$", code) for code in codes) and "time" not in columns:
         columns["time"], codes = np.array([_seconds(code) for code in codes]), []
@@ -335,13 +344,30 @@ def _read_table(path: Path, fps: float, size: tuple[int, int]) -> CameraData:
     frame = columns.get("frame", np.arange(len(unknown), dtype=np.float64))
     if not (np.abs(frame) < 1e9).all() or (frame != np.floor(frame)).any():
         raise _wrong(f"{path}: column frame", "whole numbers", "others")
-    if {"cx_px", "cy_px"} <= columns.keys() and np.isfinite(columns["cx_px"]).any():
-        middle = [float(np.nanmedian(columns[name])) for name in ("cx_px", "cy_px")]
-        if found := other_middle(middle, size):
-            raise _wrong(f"{path}: cx_px, cy_px", "pixels of this video", found)
     columns["focal_px"] = _focal_lengths(path, columns, size)
     values = np.stack([columns.get(name, unknown) for name in COLUMNS], axis=1)
     return CameraData(frame.astype(np.int64), values, tuple(notes))
+
+
+def _take_middle(
+    path: Path, columns: dict[str, Floats], left_out: list[str], size: tuple[int, int]
+) -> None:
+    """Check cx_px and cy_px, and take bare cx, cy for them; leave those out in other units."""
+    for names in (("cx_px", "cy_px"), ("cx", "cy")):
+        given = [np.ravel(columns.get(name, np.nan)) for name in names]
+        middle = [
+            float(np.nanmedian(values)) if np.isfinite(values).any() else 0.5 * (side - 1.0)
+            for values, side in zip(given, size, strict=True)
+        ]
+        found = other_middle(middle, size)
+        if found and names[0] == "cx_px":
+            raise _wrong(f"{path}: cx_px, cy_px", "pixels of this video", found)
+        for name in [name for name in ("cx", "cy") if name in names and name in columns]:
+            values = columns.pop(name)
+            if found or f"{name}_px" in columns:
+                left_out.append(name)
+            else:
+                columns[f"{name}_px"] = values
 
 
 def _focal_lengths(path: Path, columns: Mapping[str, Floats], size: tuple[int, int]) -> Floats:

@@ -75,6 +75,30 @@ def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
 
 
 @pytest.mark.parametrize(
+    "form",
+    ["{:.1f}", "00:00:{:02.0f}", "{:.0f}", "{:.5f}"],
+    ids=["tenths", "clock", "s", "minutes"],
+)
+def test_coarse_clocks_leave_each_row_at_its_frame(tmp_path, form):
+    mine, _ = tracks()
+    joints = np.tile(mine.joints[:1], (90, 1, 1, 1))
+    joints[..., 0] += 0.1 * np.arange(90)[:, None, None]
+    mine = JointTracks(np.arange(90), mine.person_ids, joints)
+    lines = wide(joints[:, :, 11:13, :2].mean(axis=2)).splitlines()
+    times = [
+        form.format(n // 5 / 5 if "1f" in form else n / 1500 if "5f" in form else n // 25)
+        for n in range(90)
+    ]
+    lines = [",".join(pair) for pair in zip(lines, ["time_s", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    _, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=25.0)
+    assert (given.frames.tolist(), len(notes)) == (list(range(90)), 1)
+    both = [f"{line},{time}" for line, time in zip(lines, ["timestamp", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(both))
+    assert len(read_positions(tmp_path / "positions.csv")[0]) == 90
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda places: places / [105.0, 68.0] + 0.5, "metres from the centre spot"),

@@ -54,14 +54,43 @@ def test_times_that_contradict_the_frames_are_refused(tmp_path):
     with pytest.raises(InputError, match="frames at 100 per second by their times"):
         read(tmp_path, "\n".join(["frame,time_s,pan,tilt", *rows]))
     with pytest.raises(InputError, match="State the unit in the title"):
-        read(tmp_path, "time,pan,tilt\n0,0,-10\n40,0,-10\n80,0,-10\n")
+        read(tmp_path, "time_s,pan,tilt\n0,0,-10\n40,0,-10\n80,0,-10\n")
+
+
+@pytest.mark.parametrize("fps", [24.0, 25.0, 29.97, 30.0, 50.0, 59.94, 60.0])
+@pytest.mark.parametrize("rows", [3, 300])
+def test_times_in_hundredths_agree_with_frames_of_usual_rates(tmp_path, fps, rows):
+    (tmp_path / "data").write_text(
+        "\n".join(["frame,time_s,pan,tilt", *(f"{n},{n / fps:.2f},0,-10" for n in range(rows))])
+    )
+    assert read_camera_data(tmp_path / "data", fps, SIZE).frame.tolist() == list(range(rows))
+
+
+@pytest.mark.parametrize(
+    ("title", "form", "factor"),
+    [
+        *(("time", "00:00:{:02.0f}", 0.01), ("time", "{:.1f}", 0.04), ("time_s", "{:.1f}", 0.04)),
+        *(("time", "{:.0f}", 40.0), ("t", "{:.0f}", 1.0)),
+    ],
+)
+@pytest.mark.parametrize("has_frame", [False, True])
+def test_coarse_clocks_and_counters_place_no_row(tmp_path, title, form, factor, has_frame):
+    rows = [f"{n}," * has_frame + f"{form.format(factor * n)},0,-10" for n in range(50)]
+    data = read(tmp_path, "\n".join(["frame," * has_frame + f"{title},pan,tilt", *rows]))
+    assert data.frame.tolist() == list(range(50))
+    assert f"columns left out: {title}" in data.notes
 
 
 def test_a_principal_point_has_the_pixels_of_the_video(tmp_path):
     text = "frame,pan,tilt,cx,cy\n0,0,-10,965,540\n"
     assert read(tmp_path, text).values[0, 10:].tolist() == [965.0, 540.0]
     with pytest.raises(InputError, match="the middle of about 3841 x 2161 px"):
-        read(tmp_path, text.replace("965,540", "1920,1080"))
+        read(tmp_path, text.replace("cx,cy", "cx_px,cy_px").replace("965,540", "1920,1080"))
+    with pytest.raises(InputError, match=r"found 0\.3, 539\.5"):
+        read(tmp_path, "pan,tilt,cx_px\n0,-10,0.3\n")
+    shift = read(tmp_path, text.replace("965,540", "0.3,-0.2"))
+    assert np.isnan(shift.values[0, 10:]).all()
+    assert "columns left out: cx, cy" in shift.notes
 
 
 def test_a_packet_is_read_as_computed_by_hand(tmp_path):
