@@ -101,11 +101,15 @@ def _read_multical(
     where = f"{path}: camera_poses"
     given = {str(key): pose for key, pose in poses.items()} if isinstance(poses, dict) else {}
     parts = {key: ("",) if key in cameras else key.partition("_to_")[2:] for key in given}
+    # Poses of cameras that the file does not list count for none.
+    parts = {
+        key: part for key, part in parts.items() if key.removesuffix(f"_to_{part[0]}") in cameras
+    }
     steps = {key.removesuffix(f"_to_{before}"): before for key, (before,) in parts.items()}
     tables = {name: dict(table) for name, table in cameras.items()}
     for key, (before,) in parts.items():
         name, pose = key.removesuffix(f"_to_{before}"), given[key]
-        tables.setdefault(name, {}).update(pose if isinstance(pose, dict) else {})
+        tables[name].update(pose if isinstance(pose, dict) else {})
     origins = dict.fromkeys(each for each in steps.values() if each not in ("", *steps))
     origins |= dict.fromkeys(name for name, before in steps.items() if before == name)
     for name in origins:

@@ -151,10 +151,10 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and the class,
-    of which 1 is a person and -1 is not known; of 10 numbers it may be VisDrone's, which has
-    persons of class 1 and 2, or a place in the world. Frames begin at 1, and
-    (1, 1) is the upper left corner of the image. Trackers follow people out of the image: such
-    boxes are left out.
+    of which 1 is a person and -1 is not known; of 8 or 10 numbers, 0 is one if no box has these.
+    Of 10 numbers it may be VisDrone's, which has persons of class 1 and 2, or a place in the world.
+    Frames begin at 1, and (1, 1) is the upper left corner of the image. Trackers follow people out
+    of the image: such boxes are left out.
 
     Args:
         file: the text.
@@ -168,7 +168,6 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     """
     if file.suffix.lower() == ".npy":
         return _read_identified(file, frames)
-    people = (1, -1, 2)  # class of people in MOTChallenge's truth, none, and in VisDrone's
     lines, rows = _read_rows(file)
     frame, person, box = rows[:, 0], rows[:, 1], rows[:, 2:6]
     corner = box[:, :2] - 1.5
@@ -176,17 +175,25 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     score = rows[:, 6] if rows.shape[1] > 6 else np.full(len(rows), -1.0)
     is_person = np.ones(len(rows), np.bool_)
     # Of ten numbers the last three are a place [m], or VisDrone's class, truncation and occlusion.
-    said = rows[:, 7:]
-    if rows.shape[1] == 9 or (said.any() and np.isin(said, range(-1, 1000)).all()):
-        is_person = np.isin(rows[:, 7], people[: 3 if rows.shape[1] == 10 else 2])
+    said, count, usual = rows[:, 7:], rows.shape[1], 1
+    largest = (999,) if count == 8 else (11, 2, 2)[: said.shape[1]]
+    is_class = (said == np.round(said)) & (said >= -1) & (said <= largest)
+    if count == 9 or (said.any() and is_class.all()):
+        # Class of people in MOTChallenge's truth, none, and in VisDrone's; else COCO's from 0.
+        is_person = np.isin(said[:, 0], (1, -1, 2) if count == 10 else (1, -1))
+        if count != 9 and not is_person.any():
+            is_person, usual = said[:, 0] == 0, 0
     kept = (score != 0.0) & is_person
     pairs = np.stack([frame, person], axis=1)
     order = np.lexsort((np.arange(len(rows)), person, frame))
     again = np.zeros(len(rows), np.bool_)
     again[order[1:]] = (pairs[order[1:]] == pairs[order[:-1]]).all(axis=1)
-    # Right and bottom are larger than left and top in every box, and end beyond as sides of boxes.
+    # Right and bottom are larger than left and top in every box, end in the image, and end beyond
+    # it as sides of boxes.
     cut = ((boxes[:, 2:] - size > 0.1 * box[:, 2:]).any(axis=1)) & is_person
     is_corner = (box[is_person, 2:] > box[is_person, :2]).all() and cut.sum() > 0.2 * len(cut)
+    within = (box[:, 2:] <= np.array(size) + 1.0).all(axis=1) & is_person
+    is_corner &= within.sum() > 0.9 * is_person.sum()
     outside = ((boxes[:, :2] >= np.array(size) - 0.5) | (boxes[:, 2:] <= -0.5)).any(axis=1)
     most = f"a frame from 1 to {frames}, as many as the video has"
     for wrong, key, expected in (
@@ -226,7 +233,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
         todo = "Write the class of people as 1 or -1, and confidences above 0."
         raise InputError(str(file), expected, found, todo)
     changes = {
-        "of another class than 1, a person, which are left out": int((~is_person).sum()),
+        f"of another class than {usual}, a person, which are left out": int((~is_person).sum()),
         "of confidence 0, which are left out": int((is_person & (score == 0.0)).sum()),
         "outside of the image, which are left out": int((kept & outside).sum()),
         "of a confidence above 1, which counts as 1": int((kept & (score > 1.0)).sum()),

@@ -50,11 +50,11 @@ DISTORTION_NAMES: Final = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
     *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
-_OWNERS: Final = ("image", "img", "frame", "video", "picture", "camera", "calibration")
+_OWNERS: Final = ("image", "img", "frame", "video", "picture", "calibration")
 SIZE_NAMES: Final = (
     *((f"{owner}width", f"{owner}height") for owner in ("", *_OWNERS)),
     *(("size",), ("resolution",), ("dim",)),
-    *((a + b,) for a, b in product(_OWNERS, ("size", "resolution", "dim", "shape", "dimensions"))),
+    *((a + b,) for a, b in product(_OWNERS, ("size", "resolution", "dim"))),
     ("w", "h"),
 )
 
@@ -106,7 +106,7 @@ def read_lenses(
         raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
     if "xi" in given:
         raise calibration_error(f"{where}: xi", "a pinhole or fisheye lens", "that of cv2.omnidir")
-    own = _image_size(where, given)
+    own = _image_size(given)
     table = {
         "size": list(own or sizes[camera]),
         "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
@@ -394,24 +394,22 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
     raise InputError(where, expected, ", ".join(sorted(given)) or "nothing", todo)
 
 
-def _image_size(where: str, given: Mapping[str, Any]) -> tuple[int, int] | None:
+def _image_size(given: Mapping[str, Any]) -> tuple[int, int] | None:
     """Return the image size in a file, as two numbers, `width` and `height`, or "1920x1080".
 
-    Raises:
-        InputError: an entry of such a name is none; a number alone is something else.
+    Other entries of such names, as of a board or of numpy's shape, are none.
     """
+    number = r"(\d+\.?\d*(?:e[-+]?\d+)?)"
     for names in SIZE_NAMES:
-        keys = [key for key in (_key(given, [name]) for name in names) if key]
-        value = [given[key] for key in keys]
+        value = [given[key] for key in (_key(given, [name]) for name in names) if key]
         if len(value) == 1 and isinstance(value[0], Mapping):
-            value = list(_image_size(f"{where}: {keys[0]}", value[0]) or ["nothing"])
+            value = list(_image_size(value[0]) or ())
         flat = [str(one) for each in value for one in np.ravel(np.asarray(each, object))]
-        numbers = re.findall(r"\d+\.?\d*(?:e[-+]?\d+)?", " ".join(flat).lower())
-        if len(numbers) == 2:
-            return int(float(numbers[0])), int(float(numbers[1]))
-        if len(numbers) > 2 or (keys and not numbers):
-            expected = "width and height of the calibrated images"
-            raise calibration_error(f"{where}: {', '.join(keys)}", expected, f"{value!r:.60}")
+        text = " ".join(flat).lower()
+        found = re.search(r"(\d+) *x *(\d+)", text)
+        found = found or re.fullmatch(rf"\W*{number}[\s,]+{number}\W*", text)
+        if found and min(sides := [int(float(each)) for each in found.groups()]) >= 32:
+            return sides[0], sides[1]
     return None
 
 

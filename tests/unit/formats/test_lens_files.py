@@ -138,7 +138,7 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
         {"resolution": "3840x2160"},
         {"img_size": "[3840, 2160]"},
         {"DIM": [3840, 2160]},
-        {"img_shape": [3840.0, 2160.0]},
+        {"resolution": "4K UHD 3840x2160@30"},
         {"frame_size": [3840, 2160], "size": 25.0},
     ],
 )
@@ -149,12 +149,26 @@ def test_a_size_in_the_file_counts_in_any_form(tmp_path, size):
     file.write_text(json.dumps({**lens, **size}))
     found = read_lenses([file], "left", SIZES)["left"]
     assert found.focal_px == pytest.approx(1402.0)
-    file.write_text(json.dumps({**lens, **dict.fromkeys(size, "large")}))
-    with pytest.raises(InputError, match="width and height of the calibrated images"):
-        read_lenses([file], "left", SIZES)
-    file.write_text(json.dumps(lens))
-    with pytest.raises(InputError, match=r"as no size is stated, found 1940.0, 1060.0, the middle"):
-        read_lenses([file], "left", SIZES)
+    for none in ({}, dict.fromkeys(size, "large"), dict.fromkeys(size)):
+        file.write_text(json.dumps({**lens, **none}))
+        with pytest.raises(InputError, match=r"no size is stated, found 1940.0, 1060.0, the mid"):
+            read_lenses([file], "left", SIZES)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        *({"image_shape": [1080, 1920]}, {"frame_shape": "(1080, 1920)"}),
+        *({"image_size": [1080, 1920, 3]}, {"image_size": None}, {"calibration_size": [9, 6]}),
+        *({"resolution": "full hd"}, {"resolution": "1080p60"}, {"resolution": "1920x1080@30"}),
+        *({"camera_size": "APS-C"}, {"camera_dimensions": [23.5, 15.6]}),
+    ],
+)
+def test_entries_that_are_no_size_leave_the_videos_size(tmp_path, entry):
+    file = tmp_path / "lens.json"
+    dist = [-0.3, 0.1, 0.012, 0.0, 0.0]  # a webcam's p1
+    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": dist, **entry}))
+    assert read_lenses([file], "left", SIZES)["left"].distortion == tuple(dist)
 
 
 @pytest.mark.parametrize("lens", [[0.05, -0.02, 0.03, -0.015, 0.0], [-0.28, 0.09, -0.04, 0, 0]])
@@ -162,7 +176,7 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
     file = tmp_path / "lens.json"
     for further in (0, 3, 7, 9):
         file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens + [0.0] * further}))
-        with pytest.raises(InputError, match=r"p1 and p2 up to 0.01"):
+        with pytest.raises(InputError, match=r"p1 and p2 up to 0.025"):
             read_lenses([file], "left", SIZES)
 
 

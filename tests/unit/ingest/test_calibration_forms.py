@@ -148,7 +148,9 @@ def test_a_stated_size_that_the_principal_point_contradicts_is_named(tmp_path):
     path, left_out = WRITERS["multical"](tmp_path, rig()), LeftOut()
     path.write_text(path.read_text().replace("[1920, 1080]", "[960, 540]"))
     read_calibration(path, left_out=left_out)
-    assert "a1 is 970.5, 530.2, the middle of about 1942 x 1062 px; is the" in left_out.notes[0]
+    assert (
+        "a1 is 970.5, 530.2, the middle of about 1942 x 1062 px; is its size" in left_out.notes[0]
+    )
 
 
 def test_multicals_poses_may_be_counted_step_by_step(tmp_path):
@@ -162,6 +164,7 @@ def test_multicals_poses_may_be_counted_step_by_step(tmp_path):
     for n, name in enumerate(("b2_to_a1", "c3_to_b2")):
         turn = turns[n + 1] @ turns[n].T
         steps[name] = {"R": turn.tolist(), "T": (moves[n + 1] - turn @ moves[n]).tolist()}
+    steps["r9_to_r8"] = steps["b2_to_a1"]  # of cameras that the file does not list
     for first in ({"a1": content["camera_poses"]["a1"]}, {}):
         path.write_text(json.dumps({**content, "camera_poses": {**first, **steps}}))
         found = read_calibration(path)
