@@ -20,6 +20,7 @@ from data_contracts.arrays import ClipArray, Flags, Floats, Integers
 from data_contracts.conventions import OTHER_UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import offset_change
 from worldpose.tracking.epipolar import size_ratios
 from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
 from worldpose.tracking.settings import TrackingSettings
@@ -195,6 +196,7 @@ def diagnose_no_people(
     *,
     pitch_size: tuple[float, float] | None = None,
     births: int = 0,
+    rates: Floats | float = 1.0,
 ) -> NoPeople:
     """Return the reason why tracking found no person in the clip.
 
@@ -207,6 +209,7 @@ def diagnose_no_people(
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
         births: tracks that began and were dropped again.
+        rates: (cameras,) frames of a camera's video per match frame.
     """
     ground = pitch_size is not None
     joints = _count_joints(detections)
@@ -246,7 +249,7 @@ def diagnose_no_people(
     some = [each for each in matches if (each.agrees if best.agrees else each.count)]
     if best.agrees or (some and max(each.angle for each in some) < settings.min_angle_rad):
         return _explain_limit(cameras, camera_ids, some, settings, pitch_size, births)
-    found = _explain_clock_offset(cameras, camera_ids, rays, matches, fps, settings)
+    found = _explain_clock_offset(cameras, camera_ids, rates, rays, matches, fps, settings)
     if found is not None:
         return found
     if not _views_overlap(cameras, rays, ground, settings):
@@ -444,6 +447,7 @@ def _guess_unit(size: float) -> str:
 def _explain_clock_offset(
     cameras: Camera,
     names: Sequence[str],
+    rates: Floats | float,
     rays: Floats,
     matched_pairs: list[PairMatches],
     fps: float,
@@ -467,11 +471,13 @@ def _explain_clock_offset(
     share, _, then = next(each for each in found if each[1] == shift)
     a, b = (names[n] for n in then.cameras)
     now = next(each for each in matched_pairs if each.cameras == then.cameras)
+    rate = np.broadcast_to(rates, len(names))[list(then.cameras)]
+    to_a, to_b = offset_change(np.array([shift, -shift]), rate)
     return NoPeople(
         "clock",
         f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
         f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
-        f"% as match.yaml has them: correct offset_frames of one of them by {abs(shift)}.",
+        f"% as match.yaml has them: add {to_b:+.0f} to offset_frames of {b}, or {to_a:+.0f} of {a}.",
     )
 
 
