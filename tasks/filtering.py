@@ -451,7 +451,7 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
 def _pictures(
     inputs: UnitInputs, case: _CameraCase, places: NDArray[np.int64]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield the images of some frame indices, in the order of the video, without those that the video lacks.
+    """Yield the images of some frame indices, as the video has them, without those it lacks.
 
     Decoding skips images without a search.
     """

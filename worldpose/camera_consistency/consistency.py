@@ -167,9 +167,7 @@ def describe_faults(
         CameraFault(
             camera=cameras[fault.camera],
             kind=fault.kind,
-            reason=_reason(
-                fault, cameras, offset_frames[fault.camera], rates[fault.camera], fps
-            ),
+            reason=_reason(fault, cameras, offset_frames[fault.camera], rates[fault.camera], fps),
             value=fault.value,
             other=None if fault.other is None else cameras[fault.other],
             share_now=fault.share_now,
@@ -207,17 +205,22 @@ def _cause(
     if detail == OFF_AXIS:
         return f"{OFF_AXIS}: calibrate it again"
     if kind == "clock":
-        late, change = "later" if value < 0 else "earlier", round(float(offset_change(-value, rate)))
+        late, change = (
+            "later" if value < 0 else "earlier",
+            round(float(offset_change(-value, rate))),
+        )
         todo = (
             f"add {change} to its offset_frames"
             if offset is None
             else f"set its offset_frames to {offset + change}"
         )
-        return f"it shows {abs(value):.0f} match frames {late} than the others: {todo} in match.yaml"
+        return (
+            f"it shows {abs(value):.0f} match frames {late} than the others: {todo} in match.yaml"
+        )
     if kind == "frame_rate":
         return (
-            f"its video has about {value * fps * rate:.3g} frames per second, not {fps * rate:g}: convert it, or "
-            "correct its frame numbers"
+            f"its video has about {value * fps * rate:.3g} frames per second, not "
+            f"{fps * rate:g}: convert it, or correct its frame numbers"
         )
     return {
         "flipped": "its calibration is rotated by 180 degrees about the centre spot: check whether "

@@ -60,7 +60,7 @@ def exact_frames(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Flo
 
 
 def offset_change(late: Floats | float, rate: Floats | float) -> Floats:
-    """Return what to add to an `offset_frames` [camera frame] whose images are `late` [match frame].
+    """Return what to add to `offset_frames` if images are `late` [match frame]: [camera frame].
 
     Camera frame n(f) shows f + late, and so match frame f is n(f - late) = f r + o - late r.
     """

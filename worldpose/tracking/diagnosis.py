@@ -477,7 +477,7 @@ def _explain_clock_offset(
         "clock",
         f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
         f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
-        f"% as match.yaml has them: add {to_b:+.0f} to offset_frames of {b}, or {to_a:+.0f} of {a}.",
+        f"% as stated: add {to_b:+.0f} to offset_frames of {b}, or {to_a:+.0f} to those of {a}.",
     )
 
 

@@ -74,7 +74,11 @@ def estimate_plane_clocks(
         values.append(found[0])
         weights.append(1.0 / found[1])
         count += found[2]
-    seconds, std, groups = np.zeros(cameras), np.full(cameras, np.inf), tuple[tuple[int, ...], ...]()
+    seconds, std, groups = (
+        np.zeros(cameras),
+        np.full(cameras, np.inf),
+        tuple[tuple[int, ...], ...](),
+    )
     if rows:
         scale = np.array(weights)
         matrix = np.stack(rows) * scale[:, None]
