@@ -16,15 +16,11 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
+from flows.cli.options import FpsOption
 from worldpose.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from data_contracts.release import CheckReport, Split
-
-FpsOption = Annotated[
-    float | None,
-    typer.Option("--fps", min=0.001, help="Frames per second; by default the data set's, or 50."),
-]
 
 
 def statistics(

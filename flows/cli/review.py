@@ -68,7 +68,7 @@ def list_reviews(
     shown = [each for each in found if everything or each.state == "waits"]
     if as_json:
         console.print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
-    else:
+    elif shown or not problems:
         _print_list(shown)
     if match and problems:
         raise typer.Exit(1)

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Acceptance, Edit
 from flows.review.edit_conflicts import (
@@ -19,6 +21,7 @@ from flows.review.edit_conflicts import (
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_in_broadcast
 from flows.stages.ingest import edits_by_camera
+from worldpose.errors import InputError
 from worldpose.review.detections import DETECTION_EDITS, find_objection, replay_detections
 from worldpose.review.journal import say
 from worldpose.store.store import Store
@@ -136,13 +139,28 @@ def accept(
     those in `people`: match frame, and index among the detections of the frame.
 
     Raises:
-        InputError: the latest run has no detections of this camera.
+        InputError: the latest run has no detections of this camera, or not all of `people`.
     """
     names = results_of(store, match, camera)
+    opened = {name: _open(store, match, name) for name in names}
+    known: set[tuple[int, int]] = set()
+    for each in opened.values():
+        row, detection = np.nonzero(np.isfinite(each.result["score"].values))
+        known.update(
+            zip(each.result["frame"].values[row].tolist(), detection.tolist(), strict=True)
+        )
+    for frame, number in people:
+        if (frame, number) not in known:
+            raise InputError(
+                f"detection {number} of {camera} in frame {frame}",
+                expected="a detection of the latest run",
+                found="none",
+                todo="Load the page again.",
+            )
     acceptance = Acceptance(
         id=f"acceptance.{uuid.uuid4().hex[:12]}",
         match_id=match.match_id,
-        results={name: _open(store, match, name).plain for name in names},
+        results={name: each.plain for name, each in opened.items()},
         at_least=at_least,
         people=tuple(people),
         who=who,

@@ -68,8 +68,8 @@ class GoingOn(Record):
     """Options for continuing a run."""
 
     gates: GatePolicy | None = None
-    """When results need review if no layer of settings says it; None = the default of
-    `worldpose run`."""
+    """When results need review if no layer of settings says it; None = auto, or as the run that
+    waits."""
 
 
 class Withdrawing(Record):
@@ -159,7 +159,10 @@ def routes(context: PageContext) -> APIRouter:
     @router.post("/runs")
     def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:
         stated = merge_general(context.match(match_id).layers).gates
-        return context.continuing.go_on(match_id, given.gates if stated is None else None)
+        latest = latest_run(context.store, match_id)
+        waits = latest is not None and latest.state == "waiting"
+        gates = given.gates or (None if waits else "auto")
+        return context.continuing.go_on(match_id, gates if stated is None else None)
 
     @router.post("/corrections")
     def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:
