@@ -217,13 +217,11 @@ def diagnose_no_people(
     present = np.asarray(usable.any(axis=-1))
     counts = usable.sum(axis=(0, 2))
     detected = dict(zip(camera_ids, counts.tolist(), strict=True))
-    empty = _explain_missing_detections(present, detected, joints, settings)
-    if empty is not None:
+    if (empty := _explain_missing_detections(present, detected, joints, settings)) is not None:
         return empty
     frames = _common_window(present)
     rays = usable_rays(cameras, detections[frames], settings.min_joints)
-    extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
-    if extent < 1e-3:  # [m]
+    if (extent := float(np.ptp(cameras.center[counts > 0], axis=0).max())) < 1e-3:  # [m]
         together = " and ".join(name for name, count in detected.items() if count > 0)
         return NoPeople(
             "same_place",
@@ -249,8 +247,7 @@ def diagnose_no_people(
     some = [each for each in matches if (each.agrees if best.agrees else each.count)]
     if best.agrees or (some and max(each.angle for each in some) < settings.min_angle_rad):
         return _explain_limit(cameras, camera_ids, some, settings, pitch_size, births)
-    found = _explain_clock_offset(cameras, camera_ids, rates, rays, matches, fps, settings)
-    if found is not None:
+    if found := _explain_clock_offset(cameras, camera_ids, rates, rays, matches, fps, settings):
         return found
     if not _views_overlap(cameras, rays, ground, settings):
         return NoPeople(
@@ -456,8 +453,7 @@ def _explain_clock_offset(
     """Return the clock offset at which two cameras agree that otherwise do not, or None."""
     reach = min(len(rays) // 2, round(4.0 * fps))
     found: list[tuple[float, int, PairMatches]] = []
-    busiest = sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]
-    for now in busiest:
+    for now in sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]:
         for shift in range(-reach, reach + 1):
             then = match_pair(cameras, rays, now.cameras, shift, settings.min_joints)
             if then.agrees and then.share >= 2.0 * now.share:
