@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
-from itertools import count, takewhile
+from itertools import count
 from typing import Final
 
 import numpy as np
@@ -53,8 +54,9 @@ def merge_paths(paths: list[PlanePath], fps: float, positions: GroundPositions) 
     left, number = dict(enumerate(paths)), count(len(paths))
     by_start = sorted(left, key=lambda k: paths[k].first)
     together: list[tuple[int, int]] = []  # a heap of the pairs with common frames
+    starts = [paths[k].first for k in by_start]
     for place, k in enumerate(by_start):
-        later = takewhile(lambda n, k=k: paths[n].first <= paths[k].last, by_start[place + 1 :])
+        later = by_start[place + 1 : bisect_right(starts, paths[k].last)]
         together += [(min(k, n), max(k, n)) for n in later]
     heapify(together)
     while together:
