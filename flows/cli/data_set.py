@@ -60,6 +60,8 @@ def statistics(
         from worldpose.reports.data_set import data_set_page
 
         checks = {str(folder): check(folder, fps=fps) for folder in folders}
+        for note in (note for report in checks.values() for note in report.notes):
+            line(note, to=errors)
         title = ", ".join(folder.resolve().name for folder in folders)
         with whole_file(page) as draft:
             draft.write_text(data_set_page(title, found, checks), encoding="utf-8")
@@ -122,6 +124,8 @@ def check(
 
 def _print_check(report: CheckReport, *, as_json: bool) -> None:
     """Print the outcome of a check, and end the command with an exit code if there are findings."""
+    for note in report.notes:
+        line(note, to=errors)
     if as_json:
         print_json({**report.model_dump(mode="json"), "passed": not report.findings})
     else:

@@ -132,8 +132,7 @@ def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> st
     """Return why a run was made, by what differs from the run before it."""
     if parent is None:
         return "first run"
-    made = corrections_since(match.journal, parent.started_at)
-    made -= corrections_since(match.journal, record.started_at)
+    made = corrections_since(match.journal, parent.started_at, record.started_at)
     causes = [f"{made} {'correction' if made == 1 else 'corrections'}"] if made > 0 else []
     causes += ["other settings"] if parent.overrides != record.overrides else []
     causes += ["other libraries"] if parent.versions != record.versions else []

@@ -2,7 +2,8 @@
 
 import sys
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import page_client
@@ -11,7 +12,9 @@ from command_line import TINY
 from page_client import MATCH
 
 from data_contracts.conventions import COCO17
+from data_contracts.review import Correction, MovedKeypoint, Withdrawal
 from flows import registering
+from flows.match_state import corrections_since
 from flows.registering import open_match
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
@@ -48,6 +51,23 @@ def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy, monkeypatc
     monkeypatch.setattr(registering, "_is_there", lambda folder: False)
     assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 200
     assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 422
+
+
+def test_what_is_withdrawn_later_changes_no_cause_of_a_run():
+    start = datetime(2026, 1, 1, tzinfo=UTC)
+
+    def at(hours):
+        return start + timedelta(hours=hours)
+
+    edit = MovedKeypoint(camera="c", frame=1, detection=0, joint="nose", was=None, xy=(1.0, 2.0))
+    made = [
+        Correction(id=name, match_id="m", edit=edit, who="Ada", made_at=at(1), based_on={})
+        for name in "ab"
+    ]
+    undone = Withdrawal(match_id="m", correction="a", who="Ada", withdrawn_at=at(3))
+    journal = SimpleNamespace(records=[*made, undone], corrections={each.id: each for each in made})
+    assert [corrections_since(journal, at(0), at(end)) for end in (0, 2, 4)] == [0, 2, 1]
+    assert corrections_since(journal, at(2)) == 1
 
 
 def test_a_run_is_cancelled(ada, monkeypatch):
