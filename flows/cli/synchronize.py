@@ -24,8 +24,13 @@ from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, unknown_name
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.clock import exact_frames, simplest_offset
-from worldpose.ingest.footage import unit_frames
+from worldpose.ingest.clock import (
+    exact_frames,
+    offset_change,
+    remaining_offset,
+    simplest_offset,
+)
+from worldpose.ingest.footage import UnitFrames, unit_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Run, Store
 
@@ -184,15 +189,23 @@ def _propose(
     first = next(group[0] for group in found.groups if c in group)
     reference = courses[first]
     pairs = unit.offset if isinstance(unit.offset, tuple) else ()
-    inside = [frame - clip.first_frame for frame, _ in pairs]
-    inside = [row for row in inside if 0 <= row < clip.frame_count]
-    row = np.unique([row for row, _ in (*courses[c], *reference)] + inside)
+    changes = [row for course in (courses[c], reference) for row, _ in course if len(course) > 1]
+    # Stated changes outside of the clip stay, with what is found at its nearer end.
+    row = np.unique([frame - clip.first_frame for frame, _ in pairs] + changes or [0])
     late = np.interp(row, *np.array(courses[c]).T) - np.interp(row, *np.array(reference).T)
+    late -= _rounding(unit, clip) - _rounding(unit_frames(spec, names[first]), clip)
     frame = (row + clip.first_frame).astype(np.int64)
-    exact = exact_frames(frame, unit.offset) - frame - late
+    exact = exact_frames(frame, unit.offset) - frame + offset_change(late, unit.rate)
     is_known = isinstance(stated, tuple) and np.abs(late).max() < MIN_OFFSET_FRAMES
     proposed = stated if is_known else simplest_offset(frame, exact)
-    return Proposal(name, stated, float(exact[0]), float(found.std[c]), proposed, "", names[first])
+    start, std = np.interp(clip.first_frame, frame, exact), found.std[c] * unit.rate
+    return Proposal(name, stated, float(start), float(std), proposed, "", names[first])
+
+
+def _rounding(unit: UnitFrames, clip: ClipSpec) -> float:
+    """Return how much later a clip's images are on average, as the nearest ones [match frame]."""
+    frame = np.arange(clip.first_frame, clip.first_frame + clip.frame_count)
+    return float(remaining_offset(frame, unit.offset, unit.rate).mean())
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:

@@ -2,14 +2,18 @@
 
 import shutil
 
+import numpy as np
 import pytest
 import yaml
 from command_line import succeed
 from typer.testing import CliRunner
 
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.cli.app import app
+from flows.cli.synchronize import _propose
 from worldpose.errors import UsageError
 from worldpose.store.store import Store
+from worldpose.triangulation.synchronization import Synchronization
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +58,31 @@ def test_wrong_options_are_told_before_anything_is_computed(shifted, tmp_path, o
     result = CliRunner().invoke(app, command)
     assert isinstance(result.exception, UsageError)
     assert told in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("camera", "first_frame", "late", "proposed"),
+    [
+        # n(f) = f r + o: ten match frames are 20 frames of a camera with twice the frame rate.
+        ({"fps": 100.0, "offset_frames": 20}, 0, -10.0, 40),
+        # Of two match frames with one image, the second is a match frame late: 0.5 on average.
+        ({"fps": 25.0, "offset_frames": 20}, 0, -10.0 + 0.5, 25),
+        ({"offset_frames": ((0, 0.4),)}, 0, -0.4, ((0, 0.4),)),
+        # What is stated outside of the clip stays, but for the offset.
+        ({"offset_frames": ((740, 2), (741, -3))}, 1000, 1.0, ((740, 1), (741, -4))),
+        ({"offset_frames": ((0, 0), (90000, -6))}, 45000, 1.0, ((0, -1.0), (90000, -7.0))),
+    ],
+)
+def test_offsets_are_in_the_cameras_own_frames_for_the_whole_match(
+    camera, first_frame, late, proposed
+):
+    cameras = (
+        CameraSpec(id="a", width=9, height=9),
+        CameraSpec(id="b", width=9, height=9, **camera),
+    )
+    clip = ClipSpec(id="clip", first_frame=first_frame, frame_count=30000)
+    spec = MatchSpec(match_id="m", fps=50.0, cameras=cameras, clips=(clip,))
+    std, empty = np.full(2, 0.05), np.empty(0)
+    found = Synchronization(np.array([0.0, late]), std, ("", ""), empty, empty, ((0, 1),))
+    row = _propose(spec, clip, ["a", "b"], [[(0, 0.0)], [(0, late)]], 1, found)
+    np.testing.assert_allclose(row.proposed, proposed, atol=0.02)

@@ -20,6 +20,7 @@ from data_contracts.arrays import ClipArray, Flags, Floats, Integers
 from data_contracts.conventions import OTHER_UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import offset_change
 from worldpose.tracking.epipolar import size_ratios
 from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
 from worldpose.tracking.settings import TrackingSettings
@@ -195,6 +196,7 @@ def diagnose_no_people(
     *,
     pitch_size: tuple[float, float] | None = None,
     births: int = 0,
+    rates: Floats | float = 1.0,
 ) -> NoPeople:
     """Return the reason why tracking found no person in the clip.
 
@@ -207,6 +209,7 @@ def diagnose_no_people(
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
         births: tracks that began and were dropped again.
+        rates: (cameras,) frames of a camera's video per match frame.
     """
     ground = pitch_size is not None
     joints = _count_joints(detections)
@@ -214,13 +217,11 @@ def diagnose_no_people(
     present = np.asarray(usable.any(axis=-1))
     counts = usable.sum(axis=(0, 2))
     detected = dict(zip(camera_ids, counts.tolist(), strict=True))
-    empty = _explain_missing_detections(present, detected, joints, settings)
-    if empty is not None:
+    if (empty := _explain_missing_detections(present, detected, joints, settings)) is not None:
         return empty
     frames = _common_window(present)
     rays = usable_rays(cameras, detections[frames], settings.min_joints)
-    extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
-    if extent < 1e-3:  # [m]
+    if (extent := float(np.ptp(cameras.center[counts > 0], axis=0).max())) < 1e-3:  # [m]
         together = " and ".join(name for name, count in detected.items() if count > 0)
         return NoPeople(
             "same_place",
@@ -246,8 +247,7 @@ def diagnose_no_people(
     some = [each for each in matches if (each.agrees if best.agrees else each.count)]
     if best.agrees or (some and max(each.angle for each in some) < settings.min_angle_rad):
         return _explain_limit(cameras, camera_ids, some, settings, pitch_size, births)
-    found = _explain_clock_offset(cameras, camera_ids, rays, matches, fps, settings)
-    if found is not None:
+    if found := _explain_clock_offset(cameras, camera_ids, rates, rays, matches, fps, settings):
         return found
     if not _views_overlap(cameras, rays, ground, settings):
         return NoPeople(
@@ -444,6 +444,7 @@ def _guess_unit(size: float) -> str:
 def _explain_clock_offset(
     cameras: Camera,
     names: Sequence[str],
+    rates: Floats | float,
     rays: Floats,
     matched_pairs: list[PairMatches],
     fps: float,
@@ -452,8 +453,7 @@ def _explain_clock_offset(
     """Return the clock offset at which two cameras agree that otherwise do not, or None."""
     reach = min(len(rays) // 2, round(4.0 * fps))
     found: list[tuple[float, int, PairMatches]] = []
-    busiest = sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]
-    for now in busiest:
+    for now in sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]:
         for shift in range(-reach, reach + 1):
             then = match_pair(cameras, rays, now.cameras, shift, settings.min_joints)
             if then.agrees and then.share >= 2.0 * now.share:
@@ -467,11 +467,13 @@ def _explain_clock_offset(
     share, _, then = next(each for each in found if each[1] == shift)
     a, b = (names[n] for n in then.cameras)
     now = next(each for each in matched_pairs if each.cameras == then.cameras)
+    rate = np.broadcast_to(rates, len(names))[list(then.cameras)]
+    to_a, to_b = offset_change(np.array([shift, -shift]), rate)
     return NoPeople(
         "clock",
         f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
         f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
-        f"% as match.yaml has them: correct offset_frames of one of them by {abs(shift)}.",
+        f"% as stated: add {to_b:+.0f} to offset_frames of {b}, or {to_a:+.0f} to those of {a}.",
     )
 
 
