@@ -13,8 +13,8 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from flows.cli import console
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
 from flows.cli.options import WorkersOption
-from flows.cli.synchronize import choose_clip, load_detections
 from flows.registering import find_match
+from flows.results.clock_offsets import choose_clip, load_detections
 from flows.results.outputs import require_new
 from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match

@@ -2,12 +2,15 @@
 
 import shutil
 
+import page_client
 import pytest
 import yaml
 from command_line import succeed
 from typer.testing import CliRunner
 
 from flows.cli.app import app
+from flows.service.inbox import take_in, watch_once
+from flows.service.layout import served_state
 from worldpose.errors import UsageError
 from worldpose.store.store import Store
 
@@ -15,7 +18,10 @@ from worldpose.store.store import Store
 @pytest.fixture(scope="module")
 def shifted(tiny, tmp_path_factory):
     """The match `tiny` with a wrong clock offset of one camera."""
-    folder = tmp_path_factory.mktemp("shifted") / "tiny"
+    return shift(tiny, tmp_path_factory.mktemp("shifted") / "tiny")
+
+
+def shift(tiny, folder):
     shutil.copytree(tiny, folder)
     file = folder / "match.yaml"
     content = yaml.safe_load(file.read_text())
@@ -39,6 +45,36 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
     cameras = yaml.safe_load((shifted / "match.yaml").read_text())["cameras"]
     assert [camera.get("offset_frames", 0) for camera in cameras] == [0] * len(cameras)
     assert "match.yaml needs no change" in succeed("synchronize", shifted, *options[:2]).out
+
+
+def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
+    server, tiny, tmp_path
+):
+    project, inbox = tmp_path / "p", tmp_path / "p" / "inbox"
+    folder = shift(tiny, tmp_path / "m")
+    succeed("run", folder, "--until", "detection", "--project", project)
+    before = (folder / "match.yaml").read_bytes()
+    inbox.mkdir()
+    ada = page_client.log_in(page_client.served(project), "Ada")
+    offsets = f"{page_client.MATCH}/offsets"
+    found = ada.get(offsets).json()
+    assert found["changed"] == {"cam02": 0}
+    row = next(each for each in found["cameras"] if each["camera"] == "cam02")
+    assert (row["stated"], row["proposed"]) == (5, 0) and abs(row["found"]) < 0.2
+    assert ada.get(f"{offsets}/plot").content.startswith(b"\x89PNG")
+    assert ada.post(offsets, json={"offsets": {"cam02": 1}}).status_code == 422  # not the proposal
+    assert ada.post(offsets, json={"offsets": found["changed"]}).status_code == 200
+    (coming,) = ada.get(page_client.MATCH).json()["next_versions"]
+    assert coming["state"] == "arriving"
+    store = Store.open(str(project))
+    state = served_state(store.url)
+    watch_once(state, inbox, 0.0)
+    take_in(store, state, inbox, 0.0, lambda match, arrival: "")
+    spec = store.registration(page_client.TINY).spec
+    assert [each.offset_frames for each in spec.cameras if each.kind == "static"] == [0] * 6
+    assert (folder / "match.yaml").read_bytes() == before
+    answer = ada.get(offsets)  # nobody corrects twice by the run of the old offsets
+    assert answer.status_code == 422 and "Run it again first" in answer.json()["error"]
 
 
 @pytest.mark.parametrize(

@@ -204,4 +204,4 @@ def test_people_whom_the_nets_do_not_know_are_a_reservation_and_a_clip_not_filme
 def test_results_are_not_usable_where_most_detections_belong_to_nobody():
     found = judge("tracking/clip", figures={"unmatched_share": 0.63})
     assert found.verdict == "not usable"
-    assert found.reservations[0].startswith("more than 50 % of the detections in clip belong to no")
+    assert found.reservations[0].startswith("no track follows more than 50 % of the people")

@@ -55,14 +55,14 @@ def beside(ring, apart):
 @pytest.mark.parametrize(
     ("count", "blank", "cause", "said"),
     [
-        (4, [np.s_[:]], "no_detections", ["no camera has a detection"]),
+        (4, [np.s_[:]], "no_detections", ["no camera shows a person"]),
         (
             *(4, [np.s_[..., 4:, :]], "too_few_keypoints"),
-            ["1280 detections has 4 keypoints", "min_joints asks for 5"],
+            ["1280 people in the images shows 4 joints", "5 are needed"],
         ),
         (4, [np.s_[:, 1:]], "one_camera", ["cam0 320, cam1 0"]),
         (2, [np.s_[:40, 0], np.s_[40:, 1]], "never_together", ["cam0 40 to 79, cam1 0 to 39"]),
-        (4, [np.s_[3:]], "too_short", ["4 tracks were started"]),
+        (4, [np.s_[3:]], "too_short", ["4 people were followed for moments"]),
     ],
 )
 def test_what_is_not_seen(ring, people, seen, count, blank, cause, said):
@@ -79,10 +79,10 @@ def test_cameras_side_by_side(ring, people, seen):
     found = reason(cameras, *seen(cameras, walk(people), noise=0.3))
     assert found.cause == "narrow_angle"
     # 0.46 m at 30 m: 0.88 degrees.
-    angle = float(re.search(r"meet at ([0-9.]+) degrees", found.message)[1])
+    angle = float(re.search(r"same side, ([0-9.]+) degrees", found.message)[1])
     assert angle == pytest.approx(0.88, rel=0.2)
     assert "0.46 m apart" in found.message
-    assert "asks for 5.7 (0.1 rad)" in found.message
+    assert "5.7 are needed (setting tracking.min_angle_rad, 0.1 rad)" in found.message
 
 
 @pytest.mark.parametrize(
