@@ -177,25 +177,6 @@ Begin = Callable[[Match, Arrival], str]
 """Starts a match's run, only once however often it is called; returns the run's Prefect id."""
 
 
-def note_whole(
-    state: StateFolder, path: Path, name: str, priority: Priority, replaces: str | None = None
-) -> None:
-    """Note an arrival that comes in one step: no scan has to see that nothing of it changes.
-
-    It may be the next version of a match, that `replaces` its folder.
-    """
-    with suppress(RefusalError, WorldposeError, OSError):  # then scans wait as for any other
-        arrival = Arrival(
-            name=name,
-            state="arriving",
-            priority=priority,
-            replaces=replaces,
-            changed_at=datetime.now(UTC),
-        )
-        seen = {"fingerprint": fingerprint_of(path)}
-        state.write_arrival(arrival.model_copy(update=seen))
-
-
 def put_in(
     state: StateFolder,
     inbox: Path,
@@ -219,22 +200,31 @@ def put_in(
     Raises:
         InputError: another next version of the match is on its way.
     """
+    on_the_way = [it for it in state.arrivals().values() if it.state != "taken"]
+    for each in on_the_way if replaces is not None else ():
+        if each.replaces == replaces and str((inbox / each.name).resolve()) != corrects:
+            raise InputError(
+                name,
+                expected="no other new files of this match on their way",
+                found=f"{each.name}, {each.state}",
+                todo="Wait until they are taken in, or remove them in the list of matches.",
+            )
     target = inbox / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    with state.only_one("arrivals", wait=True):  # no scan sees a part of it
-        for each in state.arrivals().values() if replaces is not None else ():
-            is_same = str((inbox / each.name).resolve()) == corrects
-            if each.replaces == replaces and each.state != "taken" and not is_same:
-                raise InputError(
-                    name,
-                    expected="no other new files of this match on their way",
-                    found=f"{each.name}, {each.state}",
-                    todo="Wait until they are taken in, or remove them in the list of matches.",
-                )
-        if corrects is not None and Path(corrects).exists():
-            set_aside(inbox, Path(corrects))
-        note_whole(state, folder, name, priority, replaces)
-        folder.rename(target)
+    if corrects is not None and Path(corrects).exists():
+        set_aside(inbox, Path(corrects))
+    folder.rename(target)
+    # No scan has to see that nothing of it changes.
+    with suppress(RefusalError, *(() if replaces else (WorldposeError, OSError))):
+        arrival = Arrival(
+            name=name,
+            state="arriving",
+            priority=priority,
+            fingerprint=fingerprint_of(target),
+            replaces=replaces,
+            changed_at=datetime.now(UTC),
+        )
+        state.write_arrival(arrival)
 
 
 def next_version(inbox: Path, name: str) -> str:
@@ -270,18 +260,17 @@ def find_refused(state: StateFolder, inbox: Path, name: str) -> tuple[Entry, Arr
 
 def try_again(state: StateFolder, inbox: Path, name: str) -> None:
     """Let the next scan take in a refused entry as if it had just come."""
-    with state.only_one("arrivals", wait=True):
-        _, arrival = find_refused(state, inbox, name)
-        update = {"fingerprint": "", "deaths": 0}
-        state.write_arrival(change_state(arrival, "arriving", "is tried again", **update))
+    _, arrival = find_refused(state, inbox, name)
+    again = {"fingerprint": "", "deaths": 0}
+    state.write_arrival(change_state(arrival, "arriving", "is tried again", **again))
 
 
 def remove_entry(state: StateFolder, inbox: Path, name: str) -> Path:
     """Take a refused entry out of the inbox; return where its files are now."""
-    with state.only_one("arrivals", wait=True):
-        entry, _ = find_refused(state, inbox, name)
-        state.forget_arrival(name)
-        return set_aside(inbox, entry.path)
+    entry, _ = find_refused(state, inbox, name)
+    moved = set_aside(inbox, entry.path)
+    state.forget_arrival(name)
+    return moved
 
 
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:

@@ -44,23 +44,23 @@ LINKED_BYTES: Final = 1 << 20
 """Size from which a version of a match links a file in place of a copy [byte]."""
 
 
-def take_over(origin: Path, draft: Path) -> tuple[dict[str, JsonValue], dict[str, int]]:
+def take_over(
+    origin: Path, draft: Path, instead: dict[str, JsonValue]
+) -> tuple[dict[str, JsonValue], dict[str, int]]:
     """Link or copy the files of a match folder into a draft; the folder stays as it is.
 
     Folders of images go to the draft's `match`, all other files to its `own`.
 
     Returns:
-        match.yaml, and the sizes of the files that a person can remove, by path [byte].
-
-    Raises:
-        InputError: match.yaml is no mapping.
+        match.yaml, or `instead` if that cannot be read, and the sizes of the files that a person
+        can remove, by path [byte].
     """
-    content = read_yaml(origin / "match.yaml")
-    if not isinstance(content, dict):
-        raise InputError(f"{origin}: match.yaml", "keys with values", "other text", "Correct it.")
-    own = draft / "own"
+    content, own = instead, draft / "own"
+    with suppress(InputError):
+        found = read_yaml(origin / "match.yaml")
+        content = found if isinstance(found, dict) else instead
     copy_version(origin, own)
-    (own / "match.yaml").unlink()
+    (own / "match.yaml").unlink(missing_ok=True)
     for each in (own / "videos").glob("*/"):
         each.rename(draft / "match" / "videos" / each.name)
     paths = sorted(each for each in own.rglob("*") if each.is_file())
@@ -156,6 +156,13 @@ def registered_as(store: Store, match: MatchFolder) -> str | None:
     return None
 
 
+def _is_sound(folder: Path) -> bool:
+    with suppress(InputError, OSError):
+        read_match(folder)
+        return True
+    return False
+
+
 def foresee(store: Store, folder: MatchFolder) -> tuple[list[Problem], list[str]]:
     """Return what forbids the next version of a match, and sentences about what it recomputes."""
     match_id = folder.spec.match_id
@@ -166,7 +173,7 @@ def foresee(store: Store, folder: MatchFolder) -> tuple[list[Problem], list[str]
         {each.path: each.sha256 for each in it.files if each.path != "match.yaml"}
         for it in (before, now)
     ]
-    if files[0] == files[1] and before.spec == now.spec:
+    if files[0] == files[1] and before.spec == now.spec and _is_sound(Path(before.folder)):
         return [{"place": "", "message": "nothing has changed yet: add files, or discard this"}], []
     latest, match = latest_run(store, match_id), corrected_match(store, folder, now)
     if match.folder.to_click:

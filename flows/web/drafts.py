@@ -130,7 +130,9 @@ class Drafts:
                 if origin.stat().st_dev != folder.stat().st_dev:  # its files cannot be linked
                     paths = (each for each in origin.rglob("*") if each.is_file())
                     self._require_space(origin.name, sum(each.stat().st_size for each in paths))
-                content, kept = take_over(origin, folder)
+                if known is not None:
+                    content = known.spec.model_dump(mode="json", exclude_defaults=True)
+                content, kept = take_over(origin, folder, content)
             except BaseException:
                 shutil.rmtree(folder)
                 raise

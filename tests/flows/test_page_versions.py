@@ -171,6 +171,20 @@ def test_a_refused_match_can_be_corrected_tried_again_or_removed(place, footage)
     assert open_for_review(Store.open(str(place / "project")), "cup").folder.spec.fps == FPS
 
 
+def test_an_arrival_without_a_readable_match_yaml_is_a_form_with_its_files(place, footage):  # noqa: F811
+    ada = open_pages(place)
+    folder = refuse(place, a_match("videos/near.mp4", match_id="cup"))
+    shutil.copy(footage, folder / "videos" / "near.mp4")
+    for text in ("{", None):
+        (folder / "match.yaml").unlink()
+        if text is not None:
+            (folder / "match.yaml").write_text(text)
+        assert arrive(place)["cup"].state == ("incomplete" if text is None else "refused")
+        draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
+        assert [file["name"] for file in settle(ada, draft)["files"]] == ["videos/near.mp4"]
+        ada.post(f"{DRAFTS}/{draft}/removal", json={})
+
+
 def test_a_removed_arrival_is_kept_out_of_sight_and_one_with_a_link_is_no_draft(place):  # noqa: F811
     ada = open_pages(place)
     folder = refuse(place, a_match("videos/near.mp4", match_id="cup"))

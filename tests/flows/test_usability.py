@@ -45,8 +45,12 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             {"absent_share": 0.2, **ABSENT},
             "people are missing in clip for 20 % (limit 5 %) of the time, longest person 7 in ",
         ),
-        ("tracking/clip", {"unmatched_share": 0.3}, "30 % (limit 15 %) of the detections in clip"),
-        ("tracking/clip", {"mean_ray_distance_m": 0.2}, "cameras disagree about the people in "),
+        (
+            "tracking/clip",
+            {"unmatched_share": 0.3},
+            "30 % (limit 15 %) of the people found in the images",
+        ),
+        ("tracking/clip", {"mean_ray_distance_m": 0.2}, "about where people are in clip"),
         ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
         (
             "retriangulation/clip",

@@ -66,6 +66,7 @@ def test_a_match_gets_a_camera_and_offsets_and_refused_ones_lead_back(server, ti
     try:
         page_client.wait_until_up(base)
         task = {"base": base, "token": page_client.TOKEN, "match": TINY}
+        task["damaged"] = str(inbox / "cup" / "match.yaml")
         seen = drive(SCRIPT, {**task, "video": str(tmp_path / "roof.mp4")}, tmp_path, 1200)
     finally:
         server.kill()
@@ -81,5 +82,6 @@ def test_a_match_gets_a_camera_and_offsets_and_refused_ones_lead_back(server, ti
     assert "roof" in match.folder.videos and len(store.runs(TINY)) == 1
     assert match.folder.spec.camera("cam02").offset_frames == 0
     assert (folder / "match.yaml").read_bytes() == before
-    assert open_for_review(store, "cup").folder.spec.fps == 25
+    cup = open_for_review(store, "cup").folder
+    assert (cup.folder.name, cup.spec.fps, seen["corrected"]) == ("cup.v2", 25, "25")
     assert not (inbox / "old").exists() and len([*(inbox / ".removed").iterdir()]) == 2

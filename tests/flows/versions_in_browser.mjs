@@ -1,6 +1,7 @@
 // A person corrects one refused arrival and removes another, applies the clock offsets that the page proposes, and adds
 // the video of a further camera to a match. Prints what it saw as one JSON object.
 
+import { writeFileSync } from "node:fs";
 import { logIn, open, shootSizes, task, tell } from "../chromium.mjs";
 
 const seen = { errors: [], outside: [] };
@@ -20,6 +21,17 @@ await page.waitForSelector("text=Nothing is missing");
 await page.click("[data-finish]:enabled");
 await page.waitForSelector("li.panel >> text=cup");
 await page.waitForSelector("[data-arrivals]", { state: "detached" });
+
+// A registered match whose folder was damaged.
+writeFileSync(task.damaged, "{");
+await page.goto(`${task.base}/#/match/cup`);
+await page.click("text=Correct its files");
+await page.waitForSelector("text=Nothing is missing");
+seen.corrected = await page.inputValue('[data-field="fps"]');
+await page.click("[data-finish]:enabled");
+await page.waitForSelector("[data-next]");
+await page.waitForSelector("[data-next]", { state: "detached" });
+await page.waitForSelector("text=cannot be opened", { state: "detached" });
 
 const match = `${task.base}/#/match/${task.match}`;
 await page.goto(match);

@@ -102,7 +102,7 @@ def test_a_world_whose_zero_is_not_the_ground(ring, people, seen):
     raised = moved(ring(4), ring(4).center + [0.0, 0.0, 4.0])
     found = reason(raised, keypoints, confidence)
     assert found.cause == "wrong_height"
-    height = float(re.search(r"at z = ([0-9.]+) m", found.message)[1])
+    height = float(re.search(r"at a height of ([0-9.]+) m", found.message)[1])
     assert height == pytest.approx(5.1, abs=0.2)
 
 
