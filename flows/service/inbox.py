@@ -273,6 +273,15 @@ def remove_entry(state: StateFolder, inbox: Path, name: str) -> Path:
     return moved
 
 
+def run_key(match: Match, arrival: Arrival) -> str:
+    """Return the key of the run that an arrival begins, once however often it is taken in.
+
+    The next version of a match can have the videos, detections and pitch of the one before.
+    """
+    version = f"-{arrival.fingerprint}" if arrival.replaces else ""
+    return f"arrival-{match.registration.identity}{version}"
+
+
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
     """Scan the inbox, save its state, and return the names of complete arrivals.
 

@@ -134,7 +134,10 @@ def build(
         return [describe(error, folder, given)], notes
     problems = list(footage_problems(match, indexes))
     if not problems and match_id is not None:
-        problem, told = foresee(store, match)
+        try:
+            problem, told = foresee(store, match)
+        except InputError as error:  # a setting names a missing file
+            return [describe(error, folder)], notes
         return problem, [*notes, *told]
     if not problems and (same := registered_as(store, match)):
         said = (

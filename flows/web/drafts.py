@@ -196,7 +196,7 @@ class Drafts:
             for each in draft.files:
                 if each == file.model_copy(update={"id": each.id, "name": each.name}):
                     return each
-            if len(draft.files) >= MAX_FILES or file.size == 0:
+            if sum(not it.is_kept for it in draft.files) >= MAX_FILES or file.size == 0:
                 raise InputError(
                     title, f"a file with content, one of at most {MAX_FILES}", "another", "Omit it."
                 )

@@ -75,7 +75,7 @@ def test_a_match_gets_a_camera_and_offsets_and_refused_ones_lead_back(server, ti
     assert "cam02" in seen["apply"]
     assert seen["title"] == f"Add files to {TINY}"
     assert seen["foreseen"].startswith("Before the next run, roof must be calibrated")
-    assert [value for name, value in seen.items() if name.startswith("overflow")] == [0] * 12
+    assert [value for name, value in seen.items() if name.startswith("overflow")] == [0] * 18
     store = Store.open(str(tmp_path / "project"))
     match = open_for_review(store, TINY)
     assert match.folder.folder == inbox / f"{TINY}.v3"

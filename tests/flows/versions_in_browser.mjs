@@ -25,11 +25,14 @@ await page.waitForSelector("[data-arrivals]", { state: "detached" });
 // A registered match whose folder was damaged.
 writeFileSync(task.damaged, "{");
 await page.goto(`${task.base}/#/match/cup`);
+await page.waitForSelector("text=Correct its files");
+await shootSizes(page, seen, "damaged");
 await page.click("text=Correct its files");
 await page.waitForSelector("text=Nothing is missing");
 seen.corrected = await page.inputValue('[data-field="fps"]');
 await page.click("[data-finish]:enabled");
 await page.waitForSelector("[data-next]");
+await shootSizes(page, seen, "next");
 await page.waitForSelector("[data-next]", { state: "detached" });
 await page.waitForSelector("text=cannot be opened", { state: "detached" });
 
