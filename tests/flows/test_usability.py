@@ -48,7 +48,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         (
             "tracking/clip",
             {"unmatched_share": 0.3},
-            "30 % (limit 15 %) of the people found in the images",
+            "no track follows 30 % (limit 15 %) of the people",
         ),
         ("tracking/clip", {"mean_ray_distance_m": 0.2}, "cameras disagree by 20 cm (limit 15 cm) "),
         ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
