@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +16,10 @@ from flows.cli.options import WorkersOption
 from flows.registering import find_match
 from flows.results.clock_offsets import ClockOffsets, choose_clip, find_offsets
 from flows.results.outputs import claim_file
-from flows.run_record import require_no_other_run
+from flows.run_record import alone_with
 from flows.running import RunRequest, run_match
+from flows.stage import Match
+from worldpose.errors import InputError
 from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
@@ -57,10 +60,8 @@ def synchronize(
         spec = opened.folder.spec
         chosen_clip = choose_clip(spec, clip)
         claim_file(plot, opened.match_id)
-        require_no_other_run(store, opened.match_id)
-        request = RunRequest({}, until_stage="detection", workers=workers, gates="never")
-        record = run_match(store, opened, request)
-    offsets = find_offsets(Run(store, record), opened, chosen_clip, max_offset)
+        run = compute_poses(store, opened, workers, RunRequest({}, until_stage="detection"))
+    offsets = find_offsets(run, opened, chosen_clip, max_offset)
     found, rows, changed = offsets.found, offsets.rows, offsets.changed
     if plot is not None:
         draw_synchronization(found, offsets.names, plot)
@@ -82,6 +83,25 @@ def synchronize(
         console.line(f"warning: {offsets.warning}", to=console.errors)
     is_known = np.isfinite(found.late).all() and not offsets.warning
     raise typer.Exit(0 if is_known else 4)
+
+
+def compute_poses(store: Store, match: Match, workers: int | None, *parts: RunRequest) -> Run:
+    """Compute parts of the method, up to the 2D poses, with the gates of the match's other runs.
+
+    Raises:
+        InputError: another process runs the match, or results must be reviewed first.
+    """
+    with alone_with(store, match.match_id):
+        for part in parts:
+            record = run_match(store, match, replace(part, workers=workers))
+    if record.waiting and any(name.startswith("detection/") for name in record.blocked):
+        raise InputError(
+            f"{match.match_id}: 2D poses",
+            expected="all results that they need",
+            found=f"{len(record.waiting)} that wait for review",
+            todo=f"Decide them first: worldpose review list {match.match_id}.",
+        )
+    return Run(store, record)
 
 
 def _offset_text(offset: ClockOffset) -> str:
