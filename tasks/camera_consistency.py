@@ -101,9 +101,9 @@ def _doubt_calibration(inputs: UnitInputs, clip: ClipInputs, found: Consistency)
             "markings.",
         )
     if off and not alone:
-        whole = "has another world or pitch than the stills" if unpainted else "contradicts stills"
-        return f"calibration.toml {whole}: {fits}"
-    clocks = "calibration.toml is that of other cameras, the 2D poses are wrong, or the clocks"
+        whole = "is of another pitch than the stills" if unpainted else "contradicts stills"
+        return f"the calibration (calibration.toml) {whole}: {fits}"
+    clocks = "the calibration is of other cameras, the people found are wrong, or the clocks"
     return (
         f"{alone}: {clocks} differ by more than some frames (worldpose synchronize)"
         if alone

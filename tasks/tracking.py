@@ -183,7 +183,7 @@ def _track_people(inputs: UnitInputs) -> Tracked:
         if not len(tracks.person):
             figures |= further
             said = (
-                f"{inputs.recipe.name} could not triangulate any person: {reason.message} "
+                f"{inputs.recipe.name} could place no person in 3D: {reason.message} "
                 f"{len(found.person)} people are placed on the pitch from their feet, without "
                 f"joints and bodies.{clocks}"
             )
@@ -387,7 +387,7 @@ def _track_on_plane(
     whole = [f"{name} {change:+.0f}" for name, change in changes if round(float(change))]
     said = (
         " Running people show that clocks differ. That is corrected here; for the whole match, "
-        f"add to offset_frames in match.yaml: {', '.join(whole)}."
+        "add to the clock offsets (offset_frames in match.yaml): {}.".format(", ".join(whole))
         if whole
         else ""
     )

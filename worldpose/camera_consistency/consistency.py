@@ -191,8 +191,8 @@ def _reason(
     said = _cause(fault, fault.kind, fault.detail, other, offset, rate, fps)
     if fault.share_corrected:
         said += (
-            f". With that corrected {fault.share_corrected:.0%} of its detections agree with the "
-            f"other cameras, now {fault.share_now:.0%}"
+            f". With that corrected, the other cameras agree about {fault.share_corrected:.0%} of "
+            f"the people in its images, now about {fault.share_now:.0%}"
         )
     return said
 
@@ -205,35 +205,32 @@ def _cause(
     if detail == OFF_AXIS:
         return f"{OFF_AXIS}: calibrate it again"
     if kind == "clock":
-        late, change = (
-            "later" if value < 0 else "earlier",
-            round(float(offset_change(-value, rate))),
-        )
+        late = "later" if value < 0 else "earlier"
+        change = round(float(offset_change(-value, rate)))
         todo = (
-            f"add {change} to its offset_frames"
+            f"add {change} to its clock offset"
             if offset is None
-            else f"set its offset_frames to {offset + change}"
+            else f"set its clock offset to {offset + change}"
         )
-        return (
-            f"it shows {abs(value):.0f} match frames {late} than the others: {todo} in match.yaml"
-        )
+        late = f"it shows {abs(value):.0f} match frames {late} than the others"
+        return f"{late}: {todo} (offset_frames in match.yaml)"
     if kind == "frame_rate":
         return (
             f"its video has about {value * fps * rate:.3g} frames per second, not "
             f"{fps * rate:g}: convert it, or correct its frame numbers"
         )
     return {
-        "flipped": "its calibration is rotated by 180 degrees about the centre spot: check whether "
-        "its clicks have the names of the other end, or match.yaml states the wrong side",
+        "flipped": "its calibration is turned by half a turn about the centre spot: its clicks "
+        "have the names of the other end, or its side is stated wrongly",
         "mirrored": f"it is mirrored: {detail}. Correct its clicks, calibration or images",
-        "focal": f"its focal length is {value:.3g} times that which the other cameras show: "
+        "focal": f"its focal length (zoom) is {value:.3g} times that which the people show: "
         "correct its calibration",
-        "lens": f"its distortion is wrong: {detail}. worldpose reads k1 k2 p1 p2 k3, and k1 "
-        "to k4 of a lens that the file calls a fisheye",
+        "lens": f"the distortion of its lens is wrong: {detail}. worldpose reads k1 k2 p1 p2 k3, "
+        "and k1 to k4 of a lens that the file calls a fisheye",
         "swapped": f"its video is that of camera {other}: exchange the two files",
         "duplicate": f"its video is the same as that of camera {other}: give its own",
         "pose": f"its calibration is wrong: {detail}"
         if detail
-        else "it does not detect the people that the other cameras see in its image: check its "
-        "calibration, clock and video",
+        else "it does not show people where the other cameras see them: check its calibration, "
+        "clock and video",
     }[kind]
