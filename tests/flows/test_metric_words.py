@@ -72,7 +72,7 @@ def test_reasons_of_tracking_are_in_operators_words(stage):
     kinds = ("clock", "frame_rate", "flipped", "mirrored", "focal", "swapped", "duplicate", "pose")
     for kind in kinds if stage == "camera_consistency" else ():
         fault = Fault(0, kind, value=3.0, other=1, share_now=0.1, share_corrected=0.9)
-        said.append(consistency._reason(fault, ("a", "b"), 0, 25.0))
+        said.append(consistency._reason(fault, ("a", "b"), 0, 1.0, 25.0))
     assert said and not [text for text in said if JARGON.search(text)]
 
 

@@ -472,10 +472,9 @@ def _explain_clock_offset(
     to_a, to_b = offset_change(np.array([shift, -shift]), rate)
     return NoPeople(
         "clock",
-        f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
-        f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
-        f"% with their clock offsets of now: add {to_b:+.0f} to that of {b}, or {to_a:+.0f} to "
-        f"that of {a} (offset_frames in match.yaml).",
+        f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken {abs(shift)} "
+        f"frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} % as stated: "
+        f"add {to_b:+.0f} to offset_frames of {b}, or {to_a:+.0f} to those of {a}.",
     )
 
 

@@ -215,5 +215,5 @@ def test_a_camera_with_a_frame_rate_of_its_own_is_told_its_own_frames():
     faults = Fault(1, "clock", value=10.0), Fault(1, "frame_rate", value=0.5)
     found = Consistency(faults, (0,), (), np.zeros((2, 2)))
     clock, rate = describe_faults(found, "ab", [0, 20], np.array([1.0, 2.0]), 50.0)
-    assert "10 match frames earlier than the others: set its offset_frames to 40" in clock.reason
+    assert "10 match frames earlier than the others: set its clock offset to 40" in clock.reason
     assert "about 50 frames per second, not 100" in rate.reason

@@ -143,7 +143,7 @@ def test_a_clock_that_is_off(ring, people, seen):
     found = diagnose_no_people(*given, pitch_size=(105.0, 68.0), rates=np.array([0.5, 2.0]))
     assert found.cause == "clock"
     # In the frames of each camera, of which there are half and twice as many.
-    assert "add +24 to that of cam1, or -6 to that of cam0" in found.message
+    assert "add +24 to offset_frames of cam1, or -6 to those of cam0" in found.message
 
 
 def test_cameras_that_contradict_each_other(ring, people, seen):
