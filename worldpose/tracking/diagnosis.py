@@ -461,14 +461,13 @@ def _explain_clock_offset(
                 found.append((then.share, shift, then))
     if not found:
         return None
-    top = max(share for share, _, _ in found)
     # A person who stands still agrees at many offsets: report the middle of the best ones.
-    near = sorted(shift for share, shift, _ in found if share >= 0.95 * top)
+    near = sorted(n for share, n, _ in found if share >= 0.95 * max(each[0] for each in found))
     shift = near[len(near) // 2]
     share, _, then = next(each for each in found if each[1] == shift)
     a, b = (names[n] for n in then.cameras)
     now = next(each for each in matched_pairs if each.cameras == then.cameras)
-    rate = np.broadcast_to(rates, len(names))[list(then.cameras)]
+    rate = np.broadcast_to(rates, len(names))[[*then.cameras]]
     to_a, to_b = offset_change(np.array([shift, -shift]), rate)
     return NoPeople(
         "clock",
