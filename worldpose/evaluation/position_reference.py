@@ -105,7 +105,8 @@ def align_positions(
     usual = (25.0, 10.0, 50.0, 30.0, 20.0, 12.5, 5.0, 60.0)
     rates = (rate,) if np.isfinite(rate) else usual
     ratios = {own / each for own in ((fps,) if fps else usual) for each in rates}
-    likely = fps / rate if fps and abs(fps / rate - 1.0) > 0.02 else 1.0
+    # A rate by a coarse clock may be wrong by a frame over the file.
+    likely = fps / rate if fps and abs(fps / rate - 1.0) * np.ptp(numbers) > 1.0 else 1.0
     steps = sorted({1.0 if abs(step - 1.0) < 5e-4 else step for step in ratios} | {1.0})
 
     def on_ground(frames: Integers, places: Floats) -> JointTracks:
