@@ -382,8 +382,9 @@ def _read_lens(
     where: str, numbers: NDArray[np.float64], *, fisheye: bool
 ) -> tuple[NDArray[np.float64], LensName]:
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
-    # Maximum p1 and p2 [1]; real lenses have 0.005.
-    max_tangential = 0.01
+    # Maximum p1 and p2 [1]; real lenses have 0.005, and webcams 0.012. Four numbers are often those
+    # of a fisheye.
+    max_tangential = 0.01 if len(numbers) == 4 else 0.02
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
     names = COEFFICIENTS[model]

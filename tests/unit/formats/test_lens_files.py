@@ -162,8 +162,10 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
     file = tmp_path / "lens.json"
     for further in (0, 3, 7, 9):
         file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens + [0.0] * further}))
-        with pytest.raises(InputError, match=r"p1 and p2 up to 0.01"):
+        with pytest.raises(InputError, match=r"p1 and p2 up to 0.02"):
             read_lenses([file], "left", SIZES)
+    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": [-0.3, 0.1, 0.012, 0.0, 0.0]}))
+    assert read_lenses([file], "left", SIZES)["left"].distortion[2] == 0.012
 
 
 LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}
