@@ -147,7 +147,7 @@ def _by_given_rows(
     joints[persons] = truth.submission
     places[tracked["person"].values] = tracked["ground"].values.swapaxes(0, 1)
     filled, added = challenge.fill_submission(joints, places)
-    lacking = np.flatnonzero(np.isnan(filled).any((-1, -2)).all(axis=1)).tolist()
+    lacking = np.flatnonzero(np.isnan(filled.sum(axis=(-1, -2))).all(axis=1)).tolist()
     return filled, {"poses added": added, "rows without poses": lacking}
 
 
