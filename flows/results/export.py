@@ -104,12 +104,12 @@ def export_challenge(
     filmed = _filmed(origin)
     together: dict[str, challenge.ChallengeClip] = {}
     submissions: dict[str, Floats] = {}
-    filled: dict[str, int] = {}
+    filled: dict[str, dict[str, Any]] = {}
     for view, (clip, camera) in filmed.items():
         model, poses, _ = best_results.fitted_bodies(origin.run, clip)
         truth = challenge.challenge_truth(model, poses, camera)
-        submissions[view], added = _by_given_rows(origin, clip, truth)
-        filled |= {f"{view}{row}": count for row, count in added.items() if count}
+        submissions[view], told = _by_given_rows(origin, clip, truth)
+        filled |= {view: told} if any(told.values()) else {}
         path = out / "cameras" / f"{view}.npz"
         challenge.write_challenge_camera(path, camera, edition)
         yield path
@@ -135,8 +135,8 @@ def export_challenge(
 
 def _by_given_rows(
     origin: best_results.Origin, clip: str, truth: challenge.ChallengeTruth
-) -> tuple[Floats, dict[str, int]]:
-    """Return a submission with the rows of given boxes, the gaps filled, and those left by row."""
+) -> tuple[Floats, dict[str, Any]]:
+    """Return a submission with the rows of given boxes, the gaps filled, and what was filled."""
     name, run = f"broadcast_tracking/{clip}", origin.run
     rows = run[name].attrs.get("given_people") if name in run else None
     if rows is None:
@@ -147,10 +147,8 @@ def _by_given_rows(
     joints[persons] = truth.submission
     places[tracked["person"].values] = tracked["ground"].values.swapaxes(0, 1)
     filled, added = challenge.fill_submission(joints, places)
-    gaps = np.isnan(filled).any((-1, -2)).sum(axis=1).tolist()
-    return filled, {"": added} | {
-        f": row {n}, frames without a pose": g for n, g in enumerate(gaps)
-    }
+    lacking = np.flatnonzero(np.isnan(filled.sum(axis=(-1, -2))).all(axis=1)).tolist()
+    return filled, {"poses added": added, "rows without poses": lacking}
 
 
 def _filmed(origin: best_results.Origin) -> dict[str, tuple[str, Camera]]:

@@ -79,11 +79,17 @@ def parts_of_clips(folder: Path) -> dict[str, Path]:
 
 
 def require_one_rate(rates: Mapping[str, float | None]) -> None:
-    """Raise InputError if sides whose frames are paired by number state other rates [1/s]."""
+    """Raise InputError if sides whose frames are paired by number state other rates [1/s].
+
+    The rates that are stated of one video, as 29.97, 29.99 and 30, differ by up to 0.1 %.
+    """
     known = {where: rate for where, rate in rates.items() if rate is not None}
-    if known and max(known.values()) > 1.0001 * min(known.values()):
+    if known and max(known.values()) > 1.005 * min(known.values()):
         sides = " and ".join(f"{rate:g} in {where}" for where, rate in known.items())
-        todo = f"Bring one side to the frames of the other, or correct its {FRAME_RATES}."
+        todo = (
+            "Bring one side to the frames of the other, or correct the rate: fps of match.yaml, or "
+        )
+        todo += f"{FRAME_RATES}."
         raise wrong("frames per second", "the same on both sides", sides, todo)
 
 

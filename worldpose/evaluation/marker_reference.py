@@ -259,7 +259,8 @@ def align_reference(
 
     `joints` (samples, persons, 17, 3) [m] are in the reference's world, NaN where missing, at
     `rate` samples per second [1/s], the first one at `start` [s] of the clock. The clock of a part
-    of a recording may also count from its first sample.
+    of a recording may also count from its first sample, and that of a file from the prediction's
+    first frame, as `write_c3d` does.
 
     Raises:
         DegenerateError: prediction and reference match at no offset.
@@ -269,8 +270,8 @@ def align_reference(
     max_offset_s = 2.0  # maximum clock offset of the search, either way [s]
     times = prediction.frames / fps - start  # since the first sample, if both clocks agree
     count = int(np.ceil(max_offset_s / step_s))
-    around_zero = np.arange(-count, count + 1) * step_s
-    grid = np.unique(np.concatenate([around_zero, around_zero + start]))
+    middles = np.array([0.0, start, -times[0] if len(times) else 0.0])
+    grid = np.unique(middles[:, None] + np.arange(-count, count + 1) * step_s)
     tried = [
         (_match_cost(prediction.joints, sample_joints(joints, rate, times + o)), o) for o in grid
     ]

@@ -355,11 +355,13 @@ def _read_table(path: Path, only: Collection[str] | None) -> dict[str, Floats]:
     for clip in np.unique(sequence).tolist():
         own = sequence == clip
         frame, person, joint = index[own].astype(np.int64).T
-        places = np.full((person.max() + 1, frame.max() + 1, len(CHALLENGE15), 3), np.nan)
-        cells, counts = np.unique(index[own], axis=0, return_counts=True)
+        shape = (int(frame.max()) + 1, int(person.max()) + 1, len(CHALLENGE15))
+        counts = np.bincount(np.ravel_multi_index((frame, person, joint), shape))
         if (counts > 1).any():
-            twice = "frame {:g}, person {:g}, joint {:g}".format(*cells[counts > 1][0])
+            cell = np.unravel_index(int(counts.argmax()), shape)
+            twice = "frame {}, person {}, joint {}".format(*cell)
             raise wrong(f"{path}: {clip}", "one row for each joint", f"several of {twice}")
+        places = np.full((shape[1], shape[0], shape[2], 3), np.nan)
         places[person, frame, joint] = values[own]
         if only is None or clip in only:
             found[clip] = places

@@ -110,7 +110,9 @@ class JointTracks:
         for name, kind in (("frames", np.int64), ("person_ids", np.int64), ("views", np.uint8)):
             given, most = getattr(self, name), np.iinfo(kind).max
             counts: NDArray[Any] = np.zeros(0, kind) if given is None else given
-            whole = counts.dtype.kind in "iu" or (counts == np.floor(counts)).all()
+            whole = counts.dtype.kind in "biu" or (
+                counts.dtype.kind == "f" and (counts == np.floor(counts)).all()
+            )
             if not whole or (counts > most).any():
                 todo = "Number frames and people, and give times as fps."
                 raise wrong(name, f"whole numbers up to {most}", f"{counts.ravel()[:3]}", todo)

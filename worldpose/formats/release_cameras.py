@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
+from worldpose.formats.calibration_unit import other_middle
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid, nearest_rotation
 
@@ -22,6 +24,7 @@ MEMBERS: Final = {
 }
 """Arrays of a camera file; one row for a static camera, else one per frame."""
 
+LOG = logging.getLogger("worldpose.formats")
 RELEASE_SIZE: Final = (1920, 1080)
 """Image size of every released camera [px]; the files do not contain it."""
 
@@ -73,7 +76,7 @@ def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera
     Args:
         path: the file.
         image_size: width and height [px]; None = those of a released camera, or of an image about
-            the principal point where that is elsewhere.
+            the principal point where that is off alike along both axes.
 
     Raises:
         InputError: the file is absent, has missing or unknown members, wrong shapes or no rows, a K
@@ -98,9 +101,11 @@ def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera
     missing = ~known[:, None]
     if image_size is None:
         middle = np.median(k[known, :2, 2], axis=0) if known.any() else np.zeros(2)
-        around = np.round(2.0 * middle + 1.0)  # (0, 0) is the centre of the first pixel
-        far = known.any() and (np.abs(around / RELEASE_SIZE - 1.0) > 0.1).any()
-        image_size = (int(around[0]), int(around[1])) if far else RELEASE_SIZE
+        image_size = RELEASE_SIZE
+        if known.any() and (found := other_middle(middle.tolist(), RELEASE_SIZE)):
+            around = np.round(2.0 * middle + 1.0)  # (0, 0) is the centre of the first pixel
+            image_size = (int(around[0]), int(around[1]))
+            LOG.warning("%s: the principal point is %s, which is taken as the size", path, found)
     camera = Camera(
         focal=np.where(missing, np.nan, k[:, [0, 1], [0, 1]]),
         principal_point=k[:, :2, 2],

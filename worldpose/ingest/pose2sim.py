@@ -142,7 +142,7 @@ def import_pose2sim(
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
     offsets = _find_shifts(project / "pose", poses, notes) if videos else {}
-    people = people if offsets else _from_zero(people, indices, notes)
+    offsets = _from_zero(people, offsets, indices, notes)
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     for name, files in poses.items():
@@ -164,15 +164,24 @@ def import_pose2sim(
 
 
 def _from_zero(
-    people: dict[str, KeypointDetections], indices: Mapping[str, FrameIndex], notes: list[str]
-) -> dict[str, KeypointDetections]:
-    """Return 2D poses by the frames of videos, where they are numbered from 1 to their lengths."""
-    frames = {name: people[name].frame for name in indices if name in people}
-    beyond = [frame[-1] - len(indices[name]) for name, frame in frames.items()]
-    if max(beyond, default=-1) != 0 or any(frame[0] != 1 for frame in frames.values()):
-        return people
-    notes.append("2D poses are numbered from 1 to the videos' lengths: 1 is frame 0")
-    return {name: replace(one, frame=one.frame - 1) for name, one in people.items()}
+    people: Mapping[str, KeypointDetections],
+    offsets: dict[str, int],
+    indices: Mapping[str, FrameIndex],
+    notes: list[str],
+) -> dict[str, int]:
+    """Return the offsets of videos whose frame 0 has 2D poses of number 1, where the numbers tell.
+
+    `pose/` is numbered from 1 if it has no 0 but a number as high as a video has frames.
+    """
+    frames = {n: people[n].frame + offsets.get(n, 0) for n in indices if n in people}
+    beyond = max((frame[-1] - len(indices[n]) for n, frame in frames.items()), default=1)
+    if beyond > 0 or min(frame[0] for frame in frames.values()) != 1:
+        return offsets
+    if beyond < 0:
+        notes.append("warning: the 2D poses begin at 1, which is taken as the videos' second frame")
+        return offsets
+    notes.append("2D poses are numbered from 1 to the videos' lengths: 1 is the videos' frame 0")
+    return {name: offsets.get(name, 0) - 1 for name in frames}
 
 
 def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict[str, int]:

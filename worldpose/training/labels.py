@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import tempfile
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ from worldpose.formats.keypoint_sets import PointOrder, order_by_names
 from worldpose.video.folder import declared_size, decode_image, open_video
 
 LOG = logging.getLogger("worldpose.finetune")
+_PEOPLE = re.compile("person|people|human|pedestrian|player|keeper|goalie|referee|umpire|coach")
+"""Words in the names of categories of people."""
 
 
 class _Given(BaseModel):
@@ -60,7 +63,8 @@ class _Category(_Given):
 
     @property
     def is_of_people(self) -> bool:
-        return bool(self.keypoints) or "person" in (self.name, self.supercategory)
+        is_named = _PEOPLE.search((self.name or "").lower()) is not None
+        return bool(self.keypoints) or is_named or self.supercategory in ("person", "people")
 
 
 class _Dataset(_Given):
@@ -94,7 +98,7 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
 
     `iscrowd` 1 marks ignored people. Boxes are x, y, width, height in the pixels of the keypoints,
     which begin at the centre of the top-left pixel. The categories name the order of keypoints;
-    annotations of categories without keypoints that are no person are left out, and said.
+    annotations of categories without keypoints or a name of people are left out, and said.
 
     Args:
         annotations: the JSON file.
@@ -146,7 +150,7 @@ def _people(
     if len(people) < len(dataset.images):
         raise refusal("images of different ids", f"{len(dataset.images)} of {len(people)} ids")
     orders, known = _orders(path, dataset.categories), {each.id for each in dataset.categories}
-    left_out = 0
+    left_out: Counter[str] = Counter()
     for number, person in enumerate(dataset.annotations):
         key, category = f"annotations.{number}", person.category_id if known else None
         if person.image_id not in people:
@@ -157,7 +161,7 @@ def _people(
             expected = f"one of {', '.join(map(str, sorted(known)))}"
             raise refusal(expected, f"{category}", f"{key}.category_id")
         if category not in orders:
-            left_out += 1
+            left_out.update(str(c.name or c.id) for c in dataset.categories if c.id == category)
             continue
         order, size = orders[category]
         given = np.array(person.keypoints or (0.0,) * 3 * size)
@@ -168,7 +172,8 @@ def _people(
         joints = np.where(places[:, None] >= 0, given.reshape(size, 3)[places], 0.0)
         people[person.image_id].append((person, joints))
     if left_out:
-        LOG.warning("%s: left out %d annotations that are no people", path, left_out)
+        listed = ", ".join(f"{count} of {name}" for name, count in left_out.items())
+        LOG.warning("%s: left out annotations that are no people: %s", path, listed)
     return people
 
 
@@ -185,7 +190,7 @@ def _orders(
     if categories and not people:
         raise InputError(
             f"{path}: categories",
-            expected="a category with keypoints, or of name or supercategory person",
+            expected="a category with keypoints, or of a name such as person or player",
             found=", ".join(str(each.name or each.id) for each in categories),
             todo="Name the category of people so.",
         )

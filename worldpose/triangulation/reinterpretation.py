@@ -77,6 +77,7 @@ def reinterpret_calibration(
     other = replace(
         batch,
         focal=batch.focal[..., ::-1],
+        distortion=batch.distortion[..., [0, 1, 3, 2, 4, 5, 6, 7]],
         principal_point=batch.principal_point[..., ::-1],
         image_size=batch.image_size[..., ::-1],
         cam_from_world=Rigid(swap @ pose.rotation, pose.translation @ swap),

@@ -14,7 +14,7 @@ from data_contracts.conventions import COCO17
 from flows.cli.app import app
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
-from worldpose.dataset.benchmark import score_folders
+from worldpose.dataset.benchmark import require_one_rate, score_folders
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.archives import write_archive
@@ -200,6 +200,7 @@ def test_sides_of_other_rates_are_refused(reference, tmp_path):
         (tmp_path / name / "frame_rates.json").write_text(json.dumps(dict.fromkeys(CLIPS, rate)))
     with pytest.raises(InputError, match=r"found 25 in .*true and 50 in .*mine"):
         score_folders(tmp_path / "true", {"mine": tmp_path / "mine"})
+    require_one_rate({"mine": 29.97, "true": 30.0})
 
 
 def test_boxes_are_compared_in_the_same_view(reference, tmp_path):

@@ -148,8 +148,9 @@ def test_a_clip_that_starts_late_is_found_by_the_times_of_the_file_or_its_first_
     tmp_path, markers, prediction
 ):
     late = JointTracks(prediction.frames + 500, prediction.person_ids, prediction.joints)
-    for mine, offset in ((late, OFFSET), (prediction, OFFSET + 10.0)):
-        _, found = align_reference(mine, markers, RATE, FPS, 10.0)
+    cases = ((late, 10.0, OFFSET), (prediction, 10.0, OFFSET + 10.0), (late, 0.0, OFFSET - 10.0))
+    for mine, start, offset in cases:
+        _, found = align_reference(mine, markers, RATE, FPS, start)
         assert found.offset == pytest.approx(offset, abs=2e-4) and found.residual < 1e-3
     write_markers(tmp_path / "late.trc", late, 0, FPS)
     assert read_markers(tmp_path / "late.trc").start == pytest.approx(late.frames[0] / FPS)

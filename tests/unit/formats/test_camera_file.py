@@ -46,6 +46,17 @@ def test_a_moving_camera_has_one_row_a_frame(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("middle", "size"), [((960.0, 600.0), (1920, 1080)), ((639.5, 359.5), (1280, 720))]
+)
+def test_a_principal_point_off_alike_along_both_axes_tells_the_size(tmp_path, middle, size, caplog):
+    arrays = moving()
+    arrays["K"][:, :2, 2] = middle
+    write_archive(tmp_path / "clip.npz", arrays)
+    assert read_camera(tmp_path / "clip.npz").image_size[0].tolist() == [*size]
+    assert ("the middle of about 1280 x 720 px" in caplog.text) == (size == (1280, 720))
+
+
+@pytest.mark.parametrize(
     ("member", "index", "value", "message"),
     [
         ("K", (1, 0, 1), 3.0, r"K\[1\]: expected \[\[fx, 0, cx\]"),

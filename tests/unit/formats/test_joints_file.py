@@ -75,6 +75,8 @@ HALF_MISSING[0, 1, 0, 2] = np.nan
         {"frames": np.arange(3) * 1.04},
         {"person_ids": np.array([0.5, 1.5])},
         {"views": np.full((3, 2, 17), 300)},
+        {"person_ids": ["a", "b"]},
+        {"frames": [0, None, 2]},
     ],
 )
 def test_numbers_that_a_file_would_cut_are_refused(changes):

@@ -178,6 +178,8 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
         file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens + [0.0] * further}))
         with pytest.raises(InputError, match=r"p1 and p2 up to 0.025"):
             read_lenses([file], "left", SIZES)
+    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": [-0.3, 0.1, 0.012, 0.0, 0.0]}))
+    assert read_lenses([file], "left", SIZES)["left"].distortion[2] == 0.012
 
 
 LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}

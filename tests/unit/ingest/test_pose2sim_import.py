@@ -1,5 +1,6 @@
 """A trial of Pose2Sim becomes a match folder, or is refused with a message that can be followed."""
 
+import itertools
 import json
 import shutil
 
@@ -150,14 +151,32 @@ def test_a_vicon_video_of_the_sensor_s_shape_is_refused_without_poses(trial, tmp
         import_pose2sim(trial, tmp_path / "n")
 
 
-def test_poses_numbered_from_one_to_the_length_of_the_videos_are_shifted(trial, tmp_path):
+@pytest.mark.parametrize("folders", [("pose",), ("pose", "pose-sync")])
+def test_poses_numbered_from_one_to_the_length_of_the_videos_are_shifted(trial, tmp_path, folders):
+    film(trial, (1088, 1920))
+    for name, place in itertools.product(CAMERAS, folders):
+        for number in range(1, 15):
+            write_frame(trial / place / f"{name}_json", number, [person(26, number)[0]])
+    for span, (first, count) in (("[1, 15]", (1, 14)), ("[5, 10]", (5, 5)), ("'all'", (1, 14))):
+        out = tmp_path / f"m{span[:2]}"
+        (trial / "Config.toml").write_text(f"[project]\nframe_rate = 60\nframe_range = {span}\n")
+        spec, notes = import_pose2sim(trial, out)
+        assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (first, count)
+        assert [each.offset_frames for each in spec.cameras] == [-1, -1]
+        assert "2D poses are numbered from 1 to the videos' lengths: 1 is the videos' frame 0" in (
+            notes
+        )
+        people, _ = read_unit(read_match(out), "cam01")
+        found = people.keypoints[list(people.frame).index(first), 0]
+        np.testing.assert_allclose(found, person(26, first)[1][:, :2], rtol=1e-6)
+
+
+def test_poses_from_one_that_end_before_the_videos_are_named(trial, tmp_path):
     film(trial, (1088, 1920))
     for name in CAMERAS:
-        for number in (1, 14):
-            write_frame(trial / "pose" / f"{name}_json", number, [person(26, 3)[0]])
-    spec, notes = import_pose2sim(trial, tmp_path / "m")
-    assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (0, 14)
-    assert "2D poses are numbered from 1 to the videos' lengths: 1 is frame 0" in notes
+        write_frame(trial / "pose" / f"{name}_json", 1, [person(26, 1)[0]])
+    _, notes = import_pose2sim(trial, tmp_path / "m")
+    assert any("the 2D poses begin at 1, which is taken as the videos' second" in n for n in notes)
 
 
 def test_black_bars_shift_the_calibration(trial, tmp_path):

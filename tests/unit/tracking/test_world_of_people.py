@@ -288,3 +288,16 @@ def test_cameras_of_different_sizes_are_scaled_if_people_agree_at_one_size(ring,
         assert [found[name].image_size for name in true] == [c.image_size for c in true.values()]
         both = " and ".join("{} x {}".format(*c.image_size) for c in true.values())
         assert f"scaled by 0.33333, to images of {both} px: of the usual ratios" in notes[0]
+
+
+def test_exchanged_axes_are_found_with_tangential_lenses(ring):
+    true = ring(2)
+    true = replace(true, distortion=true.distortion + [0, 0, 0.01, -0.02, 0, 0, 0, 0])
+    places = np.random.default_rng(0).uniform(-1.0, 1.0, (9, 3))
+    seen = true[0].project(places)[..., ::-1]
+
+    def agree(batch):
+        return np.allclose(batch[0].project(places), seen)
+
+    with pytest.raises(InputError, match="Write x first, then y"):
+        reinterpret_calibration(CALIBRATION, records(true), None, agree)

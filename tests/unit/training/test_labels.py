@@ -77,16 +77,17 @@ def test_categories_say_who_is_a_person_and_in_which_order_joints_are(tmp_path, 
     write_labels(file, [picture], (1920, 1080))
     dataset = json.loads(file.read_text())
     dataset["categories"][0]["keypoints"].reverse()
-    dataset["categories"].append({"id": 2, "name": "ball"})
+    dataset["categories"] += [{"id": 2, "name": "ball"}, {"id": 3, "name": "Referee"}]
     for person in dataset["annotations"]:
         triples = np.reshape(person["keypoints"], (17, 3))[::-1]
         person["keypoints"] = triples.ravel().tolist()
     ball = {"id": 9, "image_id": 0, "category_id": 2, "bbox": [1, 1, 8, 8], "iscrowd": 0}
-    dataset["annotations"].append(ball)
+    dataset["annotations"] += [ball, {**ball, "category_id": 3}]
     file.write_text(json.dumps(dataset))
     (read,) = read_labels(file)
-    np.testing.assert_array_equal(read.keypoints, picture.keypoints)
-    assert "left out 1 annotations" in caplog.text
+    np.testing.assert_array_equal(read.keypoints[:-1], picture.keypoints)
+    assert read.boxes[-1].tolist() == [1.0, 1.0, 9.0, 9.0] and not read.visible[-1].any()
+    assert "left out annotations that are no people: 1 of ball" in caplog.text
 
 
 def test_yolo_labels_of_boxes_and_polygons(tmp_path):
