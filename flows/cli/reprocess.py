@@ -77,7 +77,7 @@ def exit_code(states: Set[State]) -> int:
 
 
 def _print(each: Reprocessed) -> None:
-    if each.state in ("never run", "current"):
+    if each.state in ("never run", "current", "at work"):
         console.line(f"{each.match_id}: {_nothing_to_do(each)}")
         return
     count = 0 if each.status is None else len(each.status.to_compute)
@@ -91,6 +91,8 @@ def _print(each: Reprocessed) -> None:
 
 def _nothing_to_do(each: Reprocessed) -> str:
     record = each.record
+    if each.state == "at work":
+        return f"at work. {each.problem}"
     if record is None:
         return f"no run yet; start one: worldpose run {each.match_id}"
     if record.state in ("failed", "partial"):
