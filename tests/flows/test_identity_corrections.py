@@ -205,11 +205,12 @@ def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
     assert "does not apply: there is no detection 77" in shown
     assert "not in a run yet" in shown and "corrected" not in shown and "  applied" not in shown
     # Made again, it is in the results of before; a name is in none, and counts at once.
+    say(store, name=NamedTrack(clip="clip", person=0, name="Bo"))
     withdraw(store, open_match(store, TINY), ["later", "out", "one"], who="Ada", why="")
     say(store, again=deleted)
     RunLog.begin(store, open_match(store, TINY), until[:1], {}).run_stages(compute_units)
     withdraw(store, open_match(store, TINY), ["again"], who="Ada", why="")
-    say(store, third=deleted, name=NamedTrack(clip="clip", person=0, name="Bo"))
+    say(store, third=deleted)
     shown = succeed("review", "show", TINY, "--project", store.url, "--json").json
     states = {each["id"]: each["state"] for each in shown["corrections"]}
     assert states == {"third": "applied", "name": "applied"}
