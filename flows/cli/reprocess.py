@@ -40,7 +40,8 @@ def reprocess(
     """Recompute results that an edit, a setting, a detector or new code made stale.
 
     Each match is run as worldpose settings MATCH says, up to the last stage of its latest run. Exit
-    code 0: all matches are current or at work; 1: none could be run; 3: some wait for review; 4: some failed.
+    code 0: all matches are current or at work; 1: none could be run; 3: some wait for review; 4:
+    some failed.
 
     Example: worldpose reprocess --dry-run
 
