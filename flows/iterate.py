@@ -79,6 +79,9 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
     """
     require_whole(request)
     match, request = settle(store, match, request)
+    # All iterations ask as the first: that it is complete, ends no policy.
+    policy = request.gate_policy(match, latest_run(store, match.match_id))
+    request = replace(request, gates=policy)
     while True:
         try:
             return _iterate(store, match, request, most)

@@ -178,20 +178,28 @@ def pitch_of(store: Store, registration: Registration) -> PitchSpec | None:
 def pitch_of_run(run: Run, otherwise: Callable[[], PitchSpec | None]) -> PitchSpec | None:
     """Return the pitch that a run was computed with: settings can state another one since.
 
-    `otherwise` gives the pitch of a run whose results do not say theirs.
+    `otherwise` gives the pitch of a run whose results do not say theirs. Tracks say its size alone.
     """
     for stage in (
         "static_calibration",
         "broadcast_calibration",
         "bundle_adjustment",
         "body_fitting",
+        "camera_consistency",
+        "tracking",
     ):
         for name in (name for name in run if name.startswith(f"{stage}/")):
             place = (run.record.match_id, *name.split("/", 1), run.record.results[name])
             sources = run.manifest(name).recipe.sources if run.store.has(*place) else {}
             if "pitch" in sources:
                 stated = sources["pitch"]
-                return None if stated is None else PitchSpec.model_validate(stated)
+                if not isinstance(stated, dict):
+                    return None
+                found = PitchSpec.model_validate({"any_size": True, **stated})  # checked then
+                now = otherwise() if stage == "tracking" else None
+                size = {*stated, "dimensions"}
+                is_same = now and now.model_dump(include=size) == found.model_dump(include=size)
+                return now if is_same else found
     return otherwise()
 
 

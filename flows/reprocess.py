@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,14 +13,16 @@ from flows.overview import read_summary
 from flows.progress import reporter
 from flows.results.automatic_exports import export_after_run
 from flows.run_plan import PlannedUnit
-from flows.run_record import alone_with
+from flows.run_record import AtWorkError, alone_with
 from flows.run_status import RunStatus, run_status
 from flows.running import RunRequest, run_match, settle, shared_machines
 from flows.stage import Match
 from worldpose.errors import InternalError, WorldposeError
 from worldpose.store.store import Store
 
-State = Literal["never run", "current", "stale", "complete", "waiting", "partial", "failed"]
+State = Literal[
+    "never run", "current", "stale", "at work", "complete", "waiting", "partial", "failed"
+]
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class Reprocessed:
     Attributes:
         match_id: the match.
         state: never run and current: nothing to do; stale: not run, since only the check was
-            requested; otherwise the new run's state, or failed if there is none.
+            requested; at work: not run, since another process runs it; otherwise the new run's
+            state, or failed if there is none.
         status: what its latest run would recompute; None if that could not be determined.
         record: record of the current run.
         problem: why the check failed or no run was recorded.
@@ -76,26 +80,28 @@ def _reprocess(
             latest, failed = found.latest, bool(found.latest and found.latest.failed)
             if found.is_settled and not (retry and failed):
                 return Reprocessed(match_id, "current" if latest else "never run", record=latest)
-        status = run_status(store, match_id, request.settings, retry=retry)
-        if status is None:
-            return Reprocessed(match_id, "never run")
-        if not status.is_stale:
-            return Reprocessed(match_id, "current", status, status.latest)
-        if is_rehearsal:
-            return Reprocessed(match_id, "stale", status, status.latest)
-        reporter().say(f"{match_id}: {len(status.to_compute)} units to compute")
-        with alone_with(store, match_id):
+        with nullcontext() if is_rehearsal else alone_with(store, match_id):
+            status = run_status(store, match_id, request.settings, retry=retry)
+            if status is None:
+                return Reprocessed(match_id, "never run")
+            if not status.is_stale:
+                return Reprocessed(match_id, "current", status, status.latest)
+            if is_rehearsal:
+                return Reprocessed(match_id, "stale", status, status.latest)
+            reporter().say(f"{match_id}: {len(status.to_compute)} units to compute")
             match, record = _run(store, status, machines_for(status.to_compute))
+            try:
+                export_after_run(store, match, record)
+            except (WorldposeError, OSError) as failure:
+                return Reprocessed(match_id, record.state, status, record, problem=str(failure))
+    except AtWorkError as refusal:
+        return Reprocessed(match_id, "at work", problem=str(refusal))
     except Exception as failure:  # any error, so that the other matches continue
         text = str(failure)
         if not isinstance(failure, WorldposeError | OSError):
             text = str(InternalError.wrap(match_id, failure))
         reporter().say(f"{match_id} failed: {text}")
         return Reprocessed(match_id, "failed", status, problem=text)
-    try:
-        export_after_run(store, match, record)
-    except (WorldposeError, OSError) as failure:
-        return Reprocessed(match_id, record.state, status, record, problem=str(failure))
     return Reprocessed(match_id, record.state, status, record)
 
 

@@ -238,8 +238,14 @@ class RunPlan:
             return False
         if latest.usability.limits != usable_limits(self.match):  # it judges by them
             return False
-        is_asked = {unit.request for unit in self.waiting} == {u.request for u in latest.waiting}
+        asked = {unit.request for unit in self.of_its_part(latest.waiting)}
+        is_asked = {unit.request for unit in self.waiting} == asked
         return is_asked and self.results.items() <= latest.results.items()
+
+    def of_its_part(self, waiting: Iterable[WaitingUnit]) -> list[WaitingUnit]:
+        """Return the results that need review without those of stages after the plan's last."""
+        part = {stage.name for stage in METHOD[: METHOD.index(self.stages[-1]) + 1]}
+        return [unit for unit in waiting if unit.unit.partition("/")[0] in part]
 
 
 def plan_ahead(

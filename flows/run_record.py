@@ -94,6 +94,10 @@ def runs_at_work(store: Store, match_id: str) -> tuple[Reservation, ...]:
     return tuple(run for run in store.unfinished_runs(match_id) if is_at_work(run))
 
 
+class AtWorkError(InputError):
+    """Another process runs the match."""
+
+
 @contextmanager
 def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[None]:
     """Hold a match, so that no other process of this machine runs it; or wait until none does.
@@ -101,12 +105,12 @@ def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[N
     Every door that runs a match holds it, from before its settings are read to its record.
 
     Raises:
-        InputError: another process runs it, and this one does not wait.
+        AtWorkError: another process runs it, and this one does not wait.
     """
     said = LOG.info
     while True:  # not one long wait: a process that hangs uses no processor time
         with alone(store.blobs, f"match-{match_id}", wait=False) as is_held:
-            runs = runs_at_work(store, match_id)
+            runs = runs_at_work(store, match_id) if is_held or not wait else ()
             if is_held and not runs:
                 yield
                 return
@@ -115,10 +119,10 @@ def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[N
                 f"run {run.run_id}, process {run.pid}, since {run.started_at:%H:%M:%S} UTC"
                 for run in runs
             ]
-            raise InputError(
+            raise AtWorkError(
                 f"match {match_id}",
                 expected="no run of it at work",
-                found=found[0] if found else "another process that runs it",
+                found=found[0] if found else "another process that runs it, perhaps elsewhere",
                 todo="Wait for its end; or end that process: its finished results are kept.",
             )
         said("%s: another run of it is at work; this one continues after it", match_id)

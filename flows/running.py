@@ -114,8 +114,8 @@ class RunRequest:
         """Return when results need review, for a match with this latest run."""
         if self.gates or latest is None:
             return self.gates or "never"
-        # A run of a part is a step of the run to the end, which asks as it did.
-        is_open = latest.state == "waiting" or last_stage(match, latest) is not None
+        # What has not come to the end is a step of the run that does, which asks as it did.
+        is_open = latest.state != "complete" or last_stage(match, latest) is not None
         return latest.gates if is_open else "never"
 
 
@@ -141,7 +141,7 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     with alone(store.blobs, SETTINGS_LOCK, wait=True):
         *others, own = read_layers(store, match.registration.spec)  # it can have changed since
         check_general(own.name, "the request", stated)
-        values = {**_kept_values(own, request, stated), **stated}
+        values = {**_kept_values(own, request), **stated}
         found = resolve([*others, replace(own, values=values)])
         folder = found.origins.get("body_folder")
         if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
@@ -151,6 +151,7 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
         if values != own.values:
             _require_usable(settled, request, found.overrides)  # else the value is not kept
             write_layer(store, own.name, values)
+            _report_lost(own, values)
     _report_settings(found, {*stated}, latest_run(store, match.match_id))
     return settled, replace(
         request,
@@ -161,27 +162,28 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     )
 
 
-def _kept_values(
-    own: Layer, request: RunRequest, stated: Mapping[str, JsonValue]
-) -> dict[str, JsonValue]:
-    """Return what a match's layer keeps beside what a request states; report what it loses."""
-    values = dict(own.values)
-    if request.default_settings:
-        values = {
-            name: value
-            for name, value in values.items()
-            if "." not in name and name not in ("iterations", "body_folder")
-        }
+def _kept_values(own: Layer, request: RunRequest) -> dict[str, JsonValue]:
+    """Return what a match's layer keeps beside what a request states."""
+    if not request.default_settings:
+        return dict(own.values)
+    return {
+        name: value
+        for name, value in own.values.items()
+        if "." not in name and name not in ("iterations", "body_folder")
+    }
+
+
+def _report_lost(own: Layer, values: Mapping[str, JsonValue]) -> None:
+    """Report what a match's layer has lost, of which only `values` are left."""
     for name, was in own.values.items():
-        if name in stated and stated[name] != was:
-            said = f"{name}={as_text(stated[name])} replaces {as_text(was)}"
-        elif name not in {*values, *stated}:
+        if name not in values:
             said = f"--default-settings removes {name}={as_text(was)}"
+        elif values[name] != was:
+            said = f"{name}={as_text(values[name])} replaces {as_text(was)}"
         else:
             continue
         text = f"{own.name.partition('/')[2]}: {said}, which the settings of the match stated"
         reporter().tell_kept_settings(text)
-    return values
 
 
 def require_whole(request: RunRequest) -> None:
@@ -255,12 +257,13 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
         return _with_prefect(store, match, replace(request, gates=policy), plan.missing)
     if latest is not None and plan.is_recorded_by(latest):
         reused = tuple(sorted(plan.results))
+        asked = {unit.request: unit for unit in (*latest.waiting, *plan.waiting)}
         return latest.model_copy(
             update={
                 "executed": (),
                 "reused": reused,
                 "gates": policy,
-                "waiting": tuple(plan.waiting),
+                "waiting": tuple(asked.values()),
             }
         )
     log = RunLog.begin(store, match, stages, request.settings, policy, request.iteration)

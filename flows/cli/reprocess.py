@@ -40,7 +40,8 @@ def reprocess(
     """Recompute results that an edit, a setting, a detector or new code made stale.
 
     Each match is run as worldpose settings MATCH says, up to the last stage of its latest run. Exit
-    code 0: all matches are current; 1: none could be run; 3: some wait for review; 4: some failed.
+    code 0: all matches are current or at work; 1: none could be run; 3: some wait for review; 4:
+    some failed.
 
     Example: worldpose reprocess --dry-run
 
@@ -77,7 +78,7 @@ def exit_code(states: Set[State]) -> int:
 
 
 def _print(each: Reprocessed) -> None:
-    if each.state in ("never run", "current"):
+    if each.state in ("never run", "current", "at work"):
         console.line(f"{each.match_id}: {_nothing_to_do(each)}")
         return
     count = 0 if each.status is None else len(each.status.to_compute)
@@ -91,6 +92,8 @@ def _print(each: Reprocessed) -> None:
 
 def _nothing_to_do(each: Reprocessed) -> str:
     record = each.record
+    if each.state == "at work":
+        return f"at work. {each.problem}"
     if record is None:
         return f"no run yet; start one: worldpose run {each.match_id}"
     if record.state in ("failed", "partial"):

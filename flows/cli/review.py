@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -103,6 +102,9 @@ def show(
         return
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
     refused = objections_of(Run(store, latest)) if latest else {}
+    contained = verdicts.corrections_in(Run(store, latest), opened) if latest else []
+    states = {each.id: "not in a run yet" for each in opened.corrections}
+    states |= {each.id: "applied" for each in contained}
     applied = [each for each in opened.corrections if each.id not in refused]
     gone = ((each, refused[each.id]) for each in opened.corrections if each.id in refused)
     stale = [*opened.stale, *gone]
@@ -111,23 +113,24 @@ def show(
         console.print_json(
             {
                 "match": match,
-                "corrections": [each.model_dump(mode="json") for each in applied],
+                "corrections": [
+                    each.model_dump(mode="json") | {"state": states[each.id]} for each in applied
+                ],
                 "stale": [each.model_dump(mode="json") | {"reason": why} for each, why in stale],
                 "origins": origins,
                 "damage": list(opened.journal.damage),
             }
         )
         return
-    since = latest.started_at if latest else datetime.min.replace(tzinfo=UTC)
-    states = [
-        *((it, "applied" if it.made_at <= since else "not in a run yet") for it in applied),
+    told = [
+        *((it, states[it.id]) for it in applied),
         *((it, f"does not apply: {why}") for it, why in stale),
     ]
-    for correction, state in states:
+    for correction, state in told:
         console.line(f"{correction.id}  {correction.who}, {when(correction.made_at)}")
         console.line(f"  {in_words(correction)}")
         console.line(f"  {state}")
-    if not states:
+    if not told:
         console.line("no corrections")
     for name, origin in marked.items():
         console.line(f"{name}: {origin}")

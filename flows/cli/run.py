@@ -74,7 +74,7 @@ def run(
         default_settings: Forget the settings of stages, iterations and body folder that the match
             states, by earlier runs or otherwise; those of the project and the venue stay.
         gates: When results need review: never (default), auto (metrics beyond limits) or
-            always. While the latest run waits for review, or ended before the last stage, its
+            always. While the latest run is not complete, or ended before the last stage, its
             policy is the default.
         iterations: Number of iterations. Each one leaves out the keypoints that the bodies of
             the previous one contradict. With auto, the run iterates until the error in held-out

@@ -90,7 +90,9 @@ def detection_objections(run: Run, name: str) -> tuple[str | None, ...]:
     stored = open_stored(run.store, run.record, name, "edits")
     if stored.edits:
         return (None,) * len(said)
-    return replay_detections(KeypointDetections.from_arrays(stored.result), said).objections
+    edited = np.isin(stored.result["frame"].values, [edit.frame for edit in said])
+    found = KeypointDetections.from_arrays(stored.result.isel(frame=edited))  # all can be many
+    return replay_detections(found, said).objections
 
 
 def _open(store: Store, match: Match, name: str) -> StoredResult:

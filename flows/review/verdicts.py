@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
+from pydantic import JsonValue
+
 from data_contracts.review import (
     Correction,
     Edit,
@@ -311,7 +313,7 @@ def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str
 def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origin]:
     """Return each result's origin by `stage/unit`: automatic, corrected or rejected.
 
-    Corrections that the run refused, or that were made since, correct none of its results.
+    Corrections that the run refused, or that its results lack, correct none of them.
     """
     made_from: dict[str, tuple[str, ...]] = {}
     rejected = set()
@@ -323,12 +325,54 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
         if decision is not None and decision.verdict == "reject":
             rejected.add(name)
     refused = objections_of(run)
-    applied = [
-        each
-        for each in match.corrections
-        if each.id not in refused and each.made_at <= record.started_at
-    ]
+    applied = (each for each in corrections_in(run, match) if each.id not in refused)
     return unit_origins(made_from, applied, rejected)
+
+
+def corrections_in(run: Run, match: Match) -> list[Correction]:
+    """Return the corrections in force that the results of a run contain, refused or not.
+
+    Names count in every run. Of clicks the recipe has the outcome alone: if it is not that of now,
+    or the result is gone, those count that were made before the run.
+    """
+    stages = {stage.name: stage for stage in METHOD}
+    left: dict[str, list[JsonValue]] = {}  # of two that are equal, a result can have one
+
+    @functools.cache
+    def sources_of(unit: str) -> Mapping[str, JsonValue] | None:
+        place = unit.partition("/")[::2]
+        key = run.record.results.get(unit)
+        if key is None or not run.store.has(match.match_id, *place, key):
+            return None
+        return run.manifest(unit).recipe.sources
+
+    @functools.cache
+    def has_clicks_of_now(unit: str) -> bool:
+        stage, _, camera = unit.partition("/")
+        then, now = sources_of(unit) or {}, stages[stage].sources(match, camera)
+        names = [name for name in ("clicked", "key_frames") if name in then]
+        return bool(names) and all(then[name] == now.get(name) for name in names)
+
+    def is_in(correction: Correction, unit: str) -> bool:
+        edit, sources = correction.edit, sources_of(unit)
+        is_click = isinstance(edit, MovedPoint | RedrawnMarking)
+        if sources is None or is_click:
+            is_earlier = correction.made_at <= run.record.started_at
+            return is_earlier or (is_click and has_clicks_of_now(unit))
+        said = sources.get("edits") or sources.get("identities") or []
+        assert isinstance(said, list)  # corrections as JSON
+        rest, said_now = left.setdefault(unit, [*said]), edit.model_dump(mode="json")
+        if said_now not in rest:
+            return False
+        rest.remove(said_now)
+        return True
+
+    found = []
+    for each in match.corrections:
+        units = _corrected_by(each.edit, run.record.results)
+        if not units or True in {is_in(each, unit) for unit in units}:
+            found.append(each)
+    return found
 
 
 def unit_origins(
@@ -342,17 +386,9 @@ def unit_origins(
     unit with corrected evidence, and units computed from it are automatic. `made_from` has the
     input units of each unit, `applied` the corrections in the results.
     """
-    corrected = set()
-    for edit in (correction.edit for correction in applied):
-        if isinstance(edit, MovedPoint | RedrawnMarking):
-            stage = "static_calibration" if edit.frame is None else "broadcast_calibration"
-            corrected.add(f"{stage}/{edit.camera}")
-        elif isinstance(edit, TRACK_EDITS):
-            corrected.add(f"tracking/{edit.clip}")
-        elif isinstance(edit, DETECTION_EDITS):
-            found = f"detection/{edit.camera}"
-            detected = {u for u in made_from if u == found or u.startswith(f"{found}.")}
-            corrected |= detected or {f"ingest/{edit.camera}"}
+    corrected: set[str] = set()
+    for correction in applied:
+        corrected |= _corrected_by(correction.edit, made_from)
     refused = set(rejected)
     while more := {
         unit for unit, sources in made_from.items() if unit not in refused and refused & {*sources}
@@ -362,6 +398,20 @@ def unit_origins(
         unit: "rejected" if unit in refused else "corrected" if unit in corrected else "automatic"
         for unit in made_from
     }
+
+
+def _corrected_by(edit: Edit, results: Iterable[str]) -> set[str]:
+    """Return the units whose evidence an edit corrects, of a run with these results."""
+    if isinstance(edit, MovedPoint | RedrawnMarking):
+        stage = "static_calibration" if edit.frame is None else "broadcast_calibration"
+        return {f"{stage}/{edit.camera}"}
+    if isinstance(edit, TRACK_EDITS):
+        return {f"tracking/{edit.clip}"}
+    if isinstance(edit, DETECTION_EDITS):
+        found = f"detection/{edit.camera}"
+        detected = {unit for unit in results if unit == found or unit.startswith(f"{found}.")}
+        return detected or {f"ingest/{edit.camera}"}
+    return set()
 
 
 def resume(store: Store, match: Match) -> list[str]:

@@ -115,17 +115,17 @@ def _of_runs(
 
 def _of_match(plan: ServePlan, match: MatchSummary) -> Iterator[Alert]:
     """Yield one alert about pending reviews of a match, and one about its quality."""
-    run = "" if match.latest is None else match.latest.run_id
     link = f"{plan.pages}/#/match/{match.match_id}"
-    waiting = []
+    waiting, newest = [], ""
     for asked in match.waiting:
         hours = age(asked.since) / 3600.0
         if hours >= plan.gate_hours:
             name, why = f"{match.match_id}/{asked.unit}", all_reasons(asked.reasons)
             waiting.append(f"{name} has waited for a person for {hours:.1f} h: {why}")
+            newest = max(newest, str(asked.since)[:16])  # one for all of a run
     if waiting:
         text = waiting[0] + f"; and {len(waiting) - 1} more results" * (len(waiting) > 1)
-        key = f"gate_waiting/{match.match_id}/{run}"
+        key = f"gate_waiting/{match.match_id}/{newest}"
         yield Alert(key, "gate_waiting", text, link, match.match_id)
     if match.latest is not None and match.latest.state in ("complete", "partial"):
         judged = match.latest.usability

@@ -153,13 +153,13 @@ def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunR
             if open_questions:
                 take_verdict(store, match_id, open_questions)
                 continue
-            if latest.state == "complete":
+            if latest.state == "complete" or (latest.state == "waiting" and not plan.waiting):
                 return latest
         with reporting_to(Reporter()):
             reporter().run_planned(expected_work(store, opened, plan.missing, latest))
             log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
             record = run_stages(log, request.time_limits)
-        if record.failed or not waiting_for_verdicts(record.waiting):
+        if record.failed or not waiting_for_verdicts(plan.of_its_part(record.waiting)):
             return record
 
 

@@ -18,6 +18,7 @@ from flows.review.corrections import keep_edits, objections_of, owner_of
 from flows.review.descriptions import in_words, is_first_click
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
+from flows.running import RunRequest
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
 from worldpose.store.store import Run, Store
@@ -67,8 +68,8 @@ class GoingOn(Record):
     """Options for continuing a run."""
 
     gates: GatePolicy | None = None
-    """When results need review if no layer of settings says it; None = auto, or as the run that
-    waits."""
+    """When results need review if no layer of settings says it; None = auto, or as a run that
+    has not come to the end."""
 
 
 class Withdrawing(Record):
@@ -157,10 +158,11 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.post("/runs")
     def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:
-        stated = merge_general(context.match(match_id).layers).gates
-        latest = latest_run(context.store, match_id)
-        waits = latest is not None and latest.state == "waiting"
-        gates = given.gates or (None if waits else "auto")
+        match, latest = context.match(match_id), latest_run(context.store, match_id)
+        stated = merge_general(match.layers).gates
+        waits = latest is not None and bool(latest.waiting)
+        is_kept = waits or RunRequest({}).gate_policy(match, latest) != "never"
+        gates = given.gates or (None if is_kept else "auto")
         return context.continuing.go_on(match_id, gates if stated is None else None)
 
     @router.post("/corrections")

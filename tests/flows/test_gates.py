@@ -26,6 +26,7 @@ from flows.review.verdicts import (
 from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match
+from flows.service import deployed
 from tasks.static_calibration import static_calibration
 from worldpose.errors import InputError
 from worldpose.review.journal import say
@@ -107,6 +108,36 @@ def test_a_part_of_the_method_keeps_the_questions_and_the_policy_of_a_run_that_w
     approve(store)
     run(store, "always", until_stage="ingest")
     assert run(store, None).gates == "always"
+
+
+def test_a_part_before_the_questions_adds_one_record_at_most_and_keeps_them(store, monkeypatch):
+    waits = run(store, "auto")
+    found = run(store, None, until_stage="ingest")
+    assert (found.run_id, found.waiting) == (waits.run_id, waits.waiting)
+    begun = []
+
+    def no_machines(log, limits):
+        begun.append(log.run_id)
+        return log.run_stages(lambda stage, units: ())
+
+    monkeypatch.setattr(deployed, "run_stages", no_machines)
+    part = RunRequest({}, until_stage="ingest", gates="auto")
+    assert deployed._run_until_decided(store, TINY, part) == waits
+    # A run of which only a later stage asks anything ends as well.
+    store.finish_run(
+        waits.model_copy(update={"run_id": store.reserve_run(TINY), "overrides": {"ingest": {}}})
+    )
+    record = deployed._run_until_decided(store, TINY, part)
+    assert begun == [record.run_id] and record.waiting == waits.waiting
+
+
+def test_the_policy_is_kept_where_a_unit_failed(store):
+    waits, match = run(store, "auto"), open_match(store, TINY)
+    for waiting in (waits.waiting, ()):
+        failed = waits.model_copy(update={"state": "failed", "waiting": waiting})
+        assert RunRequest({}).gate_policy(match, failed) == "auto"
+    complete = waits.model_copy(update={"state": "complete", "waiting": ()})
+    assert RunRequest({}).gate_policy(match, complete) == "never"
 
 
 def test_what_no_run_waits_for_any_more_is_not_listed(store):

@@ -12,6 +12,7 @@ from data_contracts.review import (
     Correction,
     DeletedDetection,
     MergedTracks,
+    MovedPoint,
     NamedTrack,
     SplitTrack,
 )
@@ -92,8 +93,10 @@ def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
     assert len(open_match(store, TINY).corrections) == 1
     with pytest.raises(StaleEditError, match="person 0 is not the person that was seen"):
         say(store, b=split)
-    before = latest_run(store, TINY)
-    after = before.model_copy(update={"started_at": datetime.now(UTC)})
+    before, unit = latest_run(store, TINY), planned(store)
+    compute(store, unit)
+    results = {**before.results, f"tracking/{clip}": unit.key}
+    after = before.model_copy(update={"results": results})
     runs = ((before, "automatic"), (after, "corrected"))
     for latest, origin in runs:
         assert origins_of(store, open_match(store, TINY), latest)[f"tracking/{clip}"] == origin
@@ -196,7 +199,23 @@ def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
     found = objections_of(Run(store, record))
     assert "there is no detection 77" in found["out"] and "no person 88" in found["one"]
     assert not {"corrected"} & {*origins_of(store, open_match(store, TINY), record).values()}
-    say(store, later=DeletedDetection(camera="cam01", frame=5, detection=0))
+    deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
+    say(store, later=deleted)
     shown = succeed("review", "show", TINY, "--project", store.url).out
     assert "does not apply: there is no detection 77" in shown
     assert "not in a run yet" in shown and "corrected" not in shown and "  applied" not in shown
+    # Made again, it is in the results of before; a name is in none, and counts at once.
+    say(store, name=NamedTrack(clip="clip", person=0, name="Bo"))
+    withdraw(store, open_match(store, TINY), ["later", "out", "one"], who="Ada", why="")
+    say(store, again=deleted)
+    RunLog.begin(store, open_match(store, TINY), until[:1], {}).run_stages(compute_units)
+    withdraw(store, open_match(store, TINY), ["again"], who="Ada", why="")
+    say(store, third=deleted)
+    shown = succeed("review", "show", TINY, "--project", store.url, "--json").json
+    states = {each["id"]: each["state"] for each in shown["corrections"]}
+    assert states == {"third": "applied", "name": "applied"}
+    assert shown["origins"]["ingest/cam01"] == "corrected"
+    click = open_match(store, TINY).folder.clicked["cam02"].points[0].name
+    say(store, click=MovedPoint(camera="cam02", marking=click, xy=None))
+    shown = succeed("review", "show", TINY, "--project", store.url).out
+    assert shown.count("  applied") == 2 and shown.count("not in a run yet") == 1

@@ -38,6 +38,17 @@ def waiting(store):
     run_match(store, open_match(store, TINY), RunRequest({}, gates="auto"))
 
 
+def test_a_page_keeps_the_policy_of_a_run_that_did_not_come_to_the_end(ada, store, monkeypatch):
+    asked, first = [], store.run(TINY)
+    monkeypatch.setattr(Continuing, "go_on", lambda self, name, gates: asked.append(gates) or {})
+    early = {name: key for name, key in first.results.items() if name.startswith("ingest/")}
+    for gates, results in (("always", early), ("never", early), ("always", first.results)):
+        changes = {"run_id": store.reserve_run(TINY), "gates": gates, "results": results}
+        store.finish_run(first.model_copy(update=changes))
+        ada.post(f"{MATCH}/runs", json={}).raise_for_status()
+    assert asked == [None, "auto", "auto"]
+
+
 def test_the_run_goes_on_when_the_last_question_is_approved(ada, bob, project_copy, going_on):
     waiting(Store.open(str(project_copy)))
     reviews = ada.get(MATCH).json()["reviews"]

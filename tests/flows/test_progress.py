@@ -103,7 +103,8 @@ def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
         deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
         correct(store, open_match(store, TINY), [deleted], who="Ada", why="a shadow")
         answer = worldpose("reprocess", TINY, "--project", project_copy)
-        assert f"found run {run_id}, process {other.pid}, since" in answer.out + answer.err
+        assert (answer.code, answer.out.count(f"{TINY}: at work")) == (0, 1)
+        assert f"found run {run_id}, process {other.pid}, since" in " ".join(answer.out.split())
         # A later run ended meanwhile, as two could once begin together.
         later = store.run(TINY).model_copy(update={"run_id": store.reserve_run(TINY)})
         store.finish_run(later)

@@ -81,6 +81,22 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
     assert begun == [(1, 0), (2, 0), (1, 1), (2, 1)]
 
 
+def test_all_iterations_ask_as_the_run_that_waits(store, monkeypatch):
+    asked, first = [], store.run(TINY)
+
+    def one_pass(store, match, request, machines_for):
+        asked.append(request.gate_policy(match, store.run(TINY)))
+        store.finish_run(first.model_copy(update={"run_id": store.reserve_run(TINY)}))
+        return Iteration(request.iteration, store.run(TINY), None)
+
+    monkeypatch.setattr(iterate, "_pass", one_pass)
+    monkeypatch.setattr(iterate, "run_match", lambda *_: first)
+    waits = {"run_id": store.reserve_run(TINY), "state": "waiting", "gates": "auto"}
+    store.finish_run(first.model_copy(update=waits))
+    iterate_match(store, open_match(store, TINY), RunRequest({}), 2)
+    assert asked == ["auto", "auto"]
+
+
 def test_a_run_is_judged_by_the_limits_of_its_match_and_anew_when_they_change(store):
     click = "clicks of cam03 contradict the others and are not used: 1. Correct or remove them."
     assert store.run(TINY).usability.reservations == (click,)

@@ -333,6 +333,11 @@ def test_exports_have_the_pitch_of_the_layers(store):
     now = replace(now, folder=replace(now.folder, pitch=other))
     shown = shown_pitch(origin.run, now)
     assert (shown.length, shown.width) == (105.0, 68.0)
+    # Of a part without any of these, the tracks say the size.
+    tracks = {n: key for n, key in origin.run.record.results.items() if n.startswith("tracking/")}
+    part = Run(store, origin.run.record.model_copy(update={"results": tracks}))
+    assert layers.pitch_of_run(part, lambda: other).length == 105.0
+    assert layers.pitch_of_run(part, lambda: used) is used
 
 
 @pytest.mark.parametrize(
@@ -361,10 +366,15 @@ def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
 
 
 def test_a_value_that_no_run_can_use_is_not_kept(store, tmp_path):
-    typo = {"detection": {"detector": f"onnx:{tmp_path}/none.onnx"}}
-    with pytest.raises(InputError, match=r"none\.onnx"):
+    typo, told = {"detection": {"detector": f"onnx:{tmp_path}/none.onnx"}}, []
+    kept = {"detection.detector": "embedded"}
+    write_layer(store, f"matches/{TINY}", kept)
+    with (
+        reporting_to(SimpleNamespace(tell_kept_settings=told.append)),
+        pytest.raises(InputError, match=r"none\.onnx"),
+    ):
         settle(store, open_match(store, TINY), RunRequest(typo))
-    assert not read_layer(store, f"matches/{TINY}").values
+    assert (read_layer(store, f"matches/{TINY}").values, told) == (kept, [])
     # A part of the method, and a match with given 2D poses, do not need what they do not use.
     gone = {"detection.detector": typo["detection"]["detector"], "refitting.body_model": "gone"}
     write_layer(store, f"matches/{TINY}", {**gone, "body_fitting.body_model": "gone"})

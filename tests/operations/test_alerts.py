@@ -252,18 +252,26 @@ def plan(tmp_path):
 
 
 def test_a_question_is_no_alert_before_its_time(plan):
-    def waiting(hours):
-        since = datetime.now(UTC) - timedelta(hours=hours)
+    def waiting(*hours, run="0001"):
         unit = "static_calibration/cam04"
-        asked = Question(id="q", unit=unit, since=since, reasons=("clicks_wrong is 1",))
-        return [MatchSummary(match_id="m", waiting=(asked,))]
+        asked = [
+            Question(
+                id="q", unit=unit, since=NOW - timedelta(hours=it), reasons=("clicks_wrong is 1",)
+            )
+            for it in hours
+        ]
+        latest = run_record(state="waiting", run_id=run)
+        return [MatchSummary(match_id="m", waiting=tuple(asked), latest=latest)]
 
     assert alerts_now(plan, waiting(0.9), [], []) == []
     (alert,) = alerts_now(plan, waiting(1.1), [], [])
     assert (alert.alert, alert.match_id) == ("gate_waiting", "m")
     assert alert.link == "http://127.0.0.1:8571/#/match/m"
     assert "m/static_calibration/cam04 has waited for a person for 1.1 h" in alert.text
-    assert alerts_now(plan, waiting(1.2), [], [])[0].key == alert.key
+    # A run of a part keeps the question; another question is another alert.
+    assert alerts_now(plan, waiting(1.1, run="0002"), [], [])[0].key == alert.key
+    assert alerts_now(plan, waiting(2.1, 1.1), [], [])[0].key == alert.key
+    assert alerts_now(plan, waiting(1.2), [], [])[0].key != alert.key
 
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):

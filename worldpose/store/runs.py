@@ -108,8 +108,9 @@ def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
 def alone(blobs: Blobs, what: str, *, wait: bool) -> Iterator[bool]:
     """Hold the lock `what` of a project; yield whether it was acquired, as `hold_lock`.
 
-    The processes of one machine exclude each other. Where the project's folder has no locks, such
-    as in object storage, the lock is in the folder of temporary files.
+    Processes exclude each other that can write the project's folder `locks`: on one machine, or on
+    several where the file system shares its locks. Where there is none, as in object storage, those
+    of one user and machine do, by a lock in the folder of temporary files.
     """
     mine = f"worldpose-{os.getuid()}/{hashlib.sha256(blobs.url.encode()).hexdigest()[:16]}"
     places = [Path(tempfile.gettempdir(), mine)]
