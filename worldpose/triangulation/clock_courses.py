@@ -38,8 +38,8 @@ from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.synchronization import PRIOR, synchronize
 
-MIN_FRAMES: Final = 0.25
-"""Least size of a drift or a step [frame]."""
+MIN_FRAMES: Final = {"drift": 0.25, "step": 0.6}
+"""Least size of a part [frame]: a recorder loses and repeats whole frames."""
 MIN_GAIN: Final = 30.0
 """Least decrease of the sum of squares by a drift or a step, in variances of the noise [1]."""
 Course = list[tuple[int, float]]
@@ -270,7 +270,7 @@ def fit_parts(
             for k, part in enumerate(parts)
             if part.kind != "constant"
             and (
-                abs(fit.sizes[k]) < MIN_FRAMES
+                abs(fit.sizes[k]) < MIN_FRAMES[part.kind]
                 or fit.sizes[k] ** 2 < MIN_GAIN * noise[part.camera] * fit.covariance[k, k]
             )
         ]
@@ -280,9 +280,20 @@ def fit_parts(
             continue
         parts = [replace(part, size=float(x)) for part, x in zip(parts, fit.sizes, strict=False)]
         further = fit.find_part(noise, fps) if len(parts) < most else None
-        if further is None:
+        if further is not None:
+            parts.append(further)
+            continue
+        # Steps in a row look like a drift.
+        drifting = {part.camera for part in parts if part.kind == "drift"}
+        others = [
+            [*parts[:k], replace(part, kind="drift", row=0), *parts[k + 1 :]]
+            for k, part in enumerate(parts)
+            if part.kind == "step" and part.camera not in drifting
+        ]
+        best = max(others, key=lambda each: _Fit.of(sums, each, frames).gain, default=parts)
+        if _Fit.of(sums, best, frames).gain <= fit.gain:
             return parts
-        parts.append(further)
+        parts = best
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,6 +307,7 @@ class _Fit:
         sizes: (parts + views,), x.
         covariance: of the sizes, N^-1.
         left: (bins, unknowns), r.
+        gain: decrease of the sum of squares by the parts [1].
     """
 
     sums: ClockSums
@@ -304,6 +316,7 @@ class _Fit:
     sizes: Floats
     covariance: Floats
     left: Floats
+    gain: float
 
     @classmethod
     def of(cls, sums: ClockSums, parts: Sequence[ClockPart], frames: int) -> Self:
@@ -318,8 +331,10 @@ class _Fit:
         prior = np.array([*(1e-2 for _ in parts), *np.tile(PRIOR, count)])
         held = sums.matrix @ columns
         inverse = np.linalg.inv(np.einsum("buk,bul->kl", columns, held) + np.diag(prior))
-        sizes = inverse @ (np.einsum("buk,bu->k", columns, sums.score) + prior * known)
-        return cls(sums, frames, columns, sizes, inverse, sums.score - held @ sizes)
+        pull = np.einsum("buk,bu->k", columns, sums.score) + prior * known
+        sizes = inverse @ pull
+        left = sums.score - held @ sizes
+        return cls(sums, frames, columns, sizes, inverse, left, float(pull @ sizes))
 
     def find_part(self, noise: Floats, fps: float) -> ClockPart | None:
         """Return the part that lowers the sum of squares most; None if none is clear."""
@@ -341,7 +356,7 @@ class _Fit:
                     continue
                 size = float(share @ pull) / stays
                 gain = size**2 * stays
-                is_clear = gain > MIN_GAIN * noise[c] and abs(size) >= MIN_FRAMES
+                is_clear = gain > MIN_GAIN * noise[c] and abs(size) >= MIN_FRAMES[part.kind]
                 if gain > most and is_clear and self._is_sharp(part, noise, fps):
                     best, most = part, gain
         return best
@@ -373,14 +388,16 @@ def _place_steps(
         if not len(sums.rows):
             continue
         own = 5 * part.camera
-        pull, held = part.size * sums.score[:, own], part.size**2 * sums.matrix[:, own, own]
-        # Of a frame before the step that belongs after it, or of one after it.
-        gain = np.where(sums.rows < part.row, pull - 0.5 * held, pull + 0.5 * held)
-        start = round(float(sums.rows[0]))
-        before = np.concatenate([[0.0], -np.cumsum(gain)])
-        row = int([start, *(sums.rows + 1.0)][int(np.argmax(before))])
+        held = sums.matrix[:, own, own] + 1e-9
+        late = sums.score[:, own] / held + part.size * part.share(sums.rows, frames)
+        # Each row of a step, with a free constant: errors of the calibration last.
+        off = late - part.size * (sums.rows >= sums.rows[:, None])
+        off -= (off @ held)[:, None] / held.sum()
+        cost = off**2 @ held
+        row, gain = int(sums.rows[int(np.argmin(cost))]), cost[sums.rows == part.row] - cost.min()
         # Lost frames have no image: any row among them is as good.
-        if abs(row - part.row) > 1.0 + max(0.0, part.size):
+        is_far = abs(row - part.row) > 1.0 + max(0.0, part.size)
+        if is_far and row > sums.rows[0] and (gain > MIN_GAIN).any():
             placed[k] = replace(part, row=row)
     return placed
 
