@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Final, Literal, Self
 
 import numpy as np
@@ -38,8 +39,9 @@ from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.synchronization import PRIOR, synchronize
 
-MIN_FRAMES: Final = {"drift": 0.25, "step": 0.6}
-"""Least size of a part [frame]: a recorder loses and repeats whole frames."""
+MIN_FRAMES: Final = {"drift": 0.4, "step": 0.6}
+"""Least size of a part [frame]: a recorder loses and repeats whole frames, and the errors that views
+share differ between the ends of a clip."""
 MIN_GAIN: Final = 30.0
 """Least decrease of the sum of squares by a drift or a step, in variances of the noise [1]."""
 Course = list[tuple[int, float]]
@@ -284,16 +286,24 @@ def fit_parts(
             parts.append(further)
             continue
         # Steps in a row look like a drift.
-        drifting = {part.camera for part in parts if part.kind == "drift"}
+        steps = [part for part in parts if part.kind == "step"]
         others = [
-            [*parts[:k], replace(part, kind="drift", row=0), *parts[k + 1 :]]
-            for k, part in enumerate(parts)
-            if part.kind == "step" and part.camera not in drifting
+            [
+                *(part for part in parts if part not in (one, other)),
+                replace(one, kind="drift", row=0),
+            ]
+            for one, other in product(steps, steps)
+            if one.camera == other.camera
+            and not any(part.camera == one.camera and part.kind == "drift" for part in parts)
         ]
-        best = max(others, key=lambda each: _Fit.of(sums, each, frames).gain, default=parts)
-        if _Fit.of(sums, best, frames).gain <= fit.gain:
+        costs = [
+            MIN_GAIN * noise[each[-1].camera] * len(each) - _Fit.of(sums, each, frames).gain
+            for each in others
+        ]
+        k = int(np.argmin(costs)) if costs else 0
+        if not costs or costs[k] >= MIN_GAIN * noise[others[k][-1].camera] * len(parts) - fit.gain:
             return parts
-        parts = best
+        parts = others[k]
 
 
 @dataclass(frozen=True, eq=False)
