@@ -40,7 +40,7 @@ from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.synchronization import PRIOR, synchronize
 
 MIN_FRAMES: Final = {"drift": 0.4, "step": 0.6}
-"""Least size of a part [frame]: a recorder loses and repeats whole frames, and the errors that views
+"""Least size of a part [frame]: a recorder loses whole frames, and the errors that views
 share differ between the ends of a clip."""
 MIN_GAIN: Final = 30.0
 """Least decrease of the sum of squares by a drift or a step, in variances of the noise [1]."""
