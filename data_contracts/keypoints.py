@@ -78,7 +78,7 @@ class KeypointDetections(Generic[Array]):
     def from_keypoints(
         keypoints: ArrayLike,
         confidence: ArrayLike,
-        detection_index: NDArray[np.integer] | None = None,
+        detection_index: ArrayLike | None = None,
         frame: ArrayLike | None = None,
     ) -> KeypointDetections:
         """Return detections without boxes and scores, which are NaN and read-only."""
@@ -91,7 +91,7 @@ class KeypointDetections(Generic[Array]):
             np.broadcast_to(nan, (*shape, 4)),
             np.broadcast_to(nan, shape),
             _no_frames() if frame is None else np.asarray(frame, dtype=np.int64),
-            _no_people() if detection_index is None else detection_index,
+            _no_people() if detection_index is None else np.asarray(detection_index),
         )
 
     @staticmethod

@@ -140,6 +140,8 @@ class CheckReport(Record):
     clips: dict[str, ClipFigures]
     findings: tuple[Finding, ...]
     """Empty if there is no fault."""
+    notes: tuple[str, ...] = ()
+    """What was assumed, or could not be compared."""
 
 
 class BaselineSettings(Record):

@@ -14,6 +14,7 @@ from prefect import flow
 
 from data_contracts.finetune import NetKind, NetVersion
 from tasks.finetune import finetune
+from worldpose.training.labels import read_labels
 from worldpose.training.settings import FineTuningSettings
 
 FOLDER = "detectors"
@@ -34,6 +35,11 @@ def fine_tune_nets(
     The images are in `pictures`, or beside the annotations; `starts` are initial weights, if not
     the shipped ones.
     """
+    from worldpose.training.fine_tuning import split  # late: it imports torch
+
+    labelled = read_labels(annotations, pictures)
+    for kind in nets:  # refuses labels before the first training
+        split(labelled, settings, kind)
     return [
         finetune(kind, annotations, pictures, folder, settings, starts.get(kind)) for kind in nets
     ]

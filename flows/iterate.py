@@ -119,7 +119,7 @@ def _pass(
 ) -> Iteration:
     """Return the complete or latest run that has all results of an iteration, or a new run."""
     latest = latest_run(store, match.match_id)
-    gatekeeper = Gatekeeper(store, match, request.gate_policy(latest))
+    gatekeeper = Gatekeeper(store, match, request.gate_policy(match, latest))
     plan = plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
     record = _recorded_run(store, match, plan)
     is_latest = record is not None and latest is not None and record.run_id == latest.run_id

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -31,11 +31,13 @@ from worldpose.ingest.pitch_file import pitch_file, read_pitch
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.paths import checked_name
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 PROJECT: Final = "project"
 VENUES: Final = "venues"
 MATCHES: Final = "matches"
+SETTINGS_LOCK: Final = "settings"
+"""Lock of a project that is held from reading to writing a layer."""
 ENVIRONMENT: Final = "environment"
 """Name of the layer of environment variables, below all others."""
 
@@ -171,6 +173,26 @@ def pitch_of(store: Store, registration: Registration) -> PitchSpec | None:
         if found is not None:
             return found
     return read_pitch(folder, spec)
+
+
+def pitch_of_run(run: Run, otherwise: Callable[[], PitchSpec | None]) -> PitchSpec | None:
+    """Return the pitch that a run was computed with: settings can state another one since.
+
+    `otherwise` gives the pitch of a run whose results do not say theirs.
+    """
+    for stage in (
+        "static_calibration",
+        "broadcast_calibration",
+        "bundle_adjustment",
+        "body_fitting",
+    ):
+        for name in (name for name in run if name.startswith(f"{stage}/")):
+            place = (run.record.match_id, *name.split("/", 1), run.record.results[name])
+            sources = run.manifest(name).recipe.sources if run.store.has(*place) else {}
+            if "pitch" in sources:
+                stated = sources["pitch"]
+                return None if stated is None else PitchSpec.model_validate(stated)
+    return otherwise()
 
 
 def layer_path(name: str) -> str:

@@ -146,7 +146,8 @@ def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[b
     stopped = ""
     for run in store.unfinished_runs(match_id):
         is_own = run.host == platform.node() and run.pid == os.getpid()
-        if latest is not None and run_order(run.run_id) < run_order(latest.run_id):
+        is_earlier = latest is not None and run_order(run.run_id) < run_order(latest.run_id)
+        if is_earlier and run.run_id not in here:
             continue
         if run.run_id in here or is_own or run.host != platform.node():
             return True, ""
@@ -154,14 +155,18 @@ def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[b
     return False, stopped
 
 
-def corrections_since(journal: Journal, moment: datetime) -> int:
+def corrections_since(journal: Journal, moment: datetime, until: datetime | None = None) -> int:
     """Return the number of corrections made or withdrawn since a time, without names."""
     changed: set[str] = set()
     for record in journal.records:
-        if isinstance(record, Correction) and record.made_at > moment:
-            changed ^= {record.id}
-        elif isinstance(record, Withdrawal) and record.withdrawn_at > moment:
-            changed ^= {record.correction}
+        if isinstance(record, Correction):
+            at, name = record.made_at, record.id
+        elif isinstance(record, Withdrawal):
+            at, name = record.withdrawn_at, record.correction
+        else:
+            continue
+        if at > moment and (until is None or at <= until):
+            changed ^= {name}
     made = (journal.corrections[name] for name in changed)
     return sum(not isinstance(each.edit, NamedTrack) and not is_first_click(each) for each in made)
 
@@ -210,6 +215,8 @@ def _first_cause(store: Store, latest: RunRecord, plan: list[PlannedUnit]) -> st
         for reason in unit_status(store, unit, latest).own_reasons:
             if isinstance(reason, RecipeDifference) and reason.kind in _CAUSES:
                 is_edit = reason.name.startswith(("edits", "identities"))
+                if reason.kind == "source" and reason.name.partition(".")[0] == "pitch":
+                    return "its pitch has changed"
                 return "corrections have changed" if is_edit else _CAUSES[reason.kind]
             if isinstance(reason, Cause) and reason != Cause.NOT_COMPUTED:
                 return "results were removed"

@@ -32,8 +32,8 @@ from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
 from flows.registering import open_for_review
 from flows.results.timings import Cost
+from flows.review.corrections import objections_of
 from flows.review.descriptions import is_first_click
-from flows.review.identities import lost_names
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import reviews_of, still_waiting
 from flows.run_record import latest_run, runs_at_work
@@ -313,7 +313,7 @@ def _summarize(store: Store, draft: MatchSummary) -> MatchSummary:
     except (OSError, WorldposeError) as error:  # a setting can name a missing file
         now = describe_problem(error)
     first = sum(map(is_first_click, match.corrections))
-    lost = 0 if latest is None else len(lost_names(Run(store, latest)))
+    lost = 0 if latest is None else len(objections_of(Run(store, latest)))
     found |= {
         "waiting": tuple(_questions(store, match, latest)),
         "to_click": match.folder.to_click,

@@ -8,8 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
-from data_contracts.pitch import PitchSpec
-from flows.layers import read_layers
+from flows.layers import pitch_of_run, read_layers
 from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
@@ -20,7 +19,7 @@ from worldpose.ingest.registration import READERS, register_match
 from worldpose.ingest.validation import reachable
 from worldpose.review.journal import read_journal
 from worldpose.store.paths import is_name
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 
 def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[Match, bool]:
@@ -87,24 +86,14 @@ def open_stored(store: Store, name: str) -> Match:
     try:
         return open_for_review(store, match_id)
     except (InputError, OSError):
-        spec, pitch = registration.spec, _pitch_of_run(store, match_id)
+        spec, pitch = registration.spec, None
+        if store.runs(match_id):
+            pitch = pitch_of_run(Run(store, store.run(match_id)), lambda: None)
         paths = [Path(registration.folder, file.path) for file in registration.files]
         given = {path.stem: path for path in paths if path.parent.name == "detections"}
         folder = MatchFolder(Path(registration.folder), spec, {}, given, pitch, {}, {}, {}, {})
         journal, layers = read_journal(store, match_id), read_layers(store, spec)
         return Match(folder, registration, journal, layers=layers)
-
-
-def _pitch_of_run(store: Store, match_id: str) -> PitchSpec | None:
-    """Return the pitch that the latest run used; None if none of its results has one."""
-    results = store.run(match_id).results if store.runs(match_id) else {}
-    for name, key in results.items():
-        place = (match_id, *name.split("/", 1), key)
-        if name.startswith(("static_calibration/", "broadcast_calibration/")) and store.has(*place):
-            pitch = store.manifest(*place).recipe.sources.get("pitch")
-            if pitch is not None:
-                return PitchSpec.model_validate(pitch)
-    return None
 
 
 def _registered_folder(store: Store, match_id: str) -> Path:

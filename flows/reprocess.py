@@ -12,6 +12,7 @@ from flows.overview import read_summary
 from flows.progress import reporter
 from flows.results.automatic_exports import export_after_run
 from flows.run_plan import PlannedUnit
+from flows.run_record import alone_with
 from flows.run_status import RunStatus, run_status
 from flows.running import RunRequest, run_match, settle, shared_machines
 from flows.stage import Match
@@ -83,7 +84,8 @@ def _reprocess(
         if is_rehearsal:
             return Reprocessed(match_id, "stale", status, status.latest)
         reporter().say(f"{match_id}: {len(status.to_compute)} units to compute")
-        match, record = _run(store, status, machines_for(status.to_compute))
+        with alone_with(store, match_id):
+            match, record = _run(store, status, machines_for(status.to_compute))
     except Exception as failure:  # any error, so that the other matches continue
         text = str(failure)
         if not isinstance(failure, WorldposeError | OSError):

@@ -229,9 +229,9 @@ class RunPlan:
         """Return whether the latest run's record equals that of a run made now."""
         if latest is None or latest.failed or latest.state == "failed" or self.missing:
             return False
-        earlier = {stage.name for stage in METHOD[: METHOD.index(self.stages[0])]}
+        staged = {unit.name.partition("/")[0] for unit in self.units}
         ours, theirs = (
-            {name: values for name, values in each.items() if name not in earlier}
+            {name: values for name, values in each.items() if name in staged}
             for each in (self.overrides, latest.overrides)
         )
         if ours != theirs:  # the next run is to know them

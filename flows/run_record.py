@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from types import MappingProxyType
@@ -36,7 +38,7 @@ from tasks.tracing import add_unit_span, stage_span
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.recipes import libraries
-from worldpose.store.runs import identify_process
+from worldpose.store.runs import alone, identify_process
 from worldpose.store.store import Store
 
 ComputeUnits = Callable[
@@ -67,6 +69,9 @@ def describe_end(record: RunRecord) -> str:
     return f"run {record.run_id} of {record.match_id}: {', '.join(said)}{first}"
 
 
+LOG: Final = logging.getLogger("worldpose.operations")
+LOOK_SECONDS: Final = 1.0
+"""Between two looks for the end of another run [s]."""
 CLOCK_SECONDS: Final = 5.0
 """Tolerance between the clocks of a process table and of records without `process` [s]."""
 
@@ -89,19 +94,36 @@ def runs_at_work(store: Store, match_id: str) -> tuple[Reservation, ...]:
     return tuple(run for run in store.unfinished_runs(match_id) if is_at_work(run))
 
 
-def require_no_other_run(store: Store, match_id: str) -> None:
-    """Refuse a second run of a match that is being computed on this machine.
+@contextmanager
+def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[None]:
+    """Hold a match, so that no other process of this machine runs it; or wait until none does.
+
+    Every door that runs a match holds it, from before its settings are read to its record.
 
     Raises:
-        InputError: another process computes it.
+        InputError: another process runs it, and this one does not wait.
     """
-    for run in runs_at_work(store, match_id):
-        raise InputError(
-            f"match {match_id}",
-            expected="no run of it at work",
-            found=f"run {run.run_id}, process {run.pid}, since {run.started_at:%H:%M:%S} UTC",
-            todo="Wait for its end; or end that process: its finished results are kept.",
-        )
+    said = LOG.info
+    while True:  # not one long wait: a process that hangs uses no processor time
+        with alone(store.blobs, f"match-{match_id}", wait=False) as is_held:
+            runs = runs_at_work(store, match_id)
+            if is_held and not runs:
+                yield
+                return
+        if not wait:
+            found = [
+                f"run {run.run_id}, process {run.pid}, since {run.started_at:%H:%M:%S} UTC"
+                for run in runs
+            ]
+            raise InputError(
+                f"match {match_id}",
+                expected="no run of it at work",
+                found=found[0] if found else "another process that runs it",
+                todo="Wait for its end; or end that process: its finished results are kept.",
+            )
+        said("%s: another run of it is at work; this one continues after it", match_id)
+        said = LOG.debug
+        time.sleep(LOOK_SECONDS)
 
 
 UNIT_SECONDS: Final[Mapping[str, float]] = MappingProxyType(
@@ -350,13 +372,16 @@ class RunLog:
         return sorted(self.plan.results, key=unit_order)
 
     def _carry_over(self) -> None:
-        """Keep results of later stages that are still current and need no review."""
+        """Keep results of later stages that are still current, and their open questions."""
+        asked = set() if self.latest is None else {each.request for each in self.latest.waiting}
         for stage in METHOD[METHOD.index(self.plan.stages[-1]) + 1 :]:
             units = self.plan.plan_stage(stage)
             current = {unit.name: unit for unit in units if unit.published}
             keys = {name: unit.key for name, unit in current.items()}
-            passing = without_waiting(keys, self.gatekeeper.list_held_units(stage.name, keys))
-            self.reuse(current[name] for name in passing)
+            held = self.gatekeeper.list_held_units(stage.name, keys)
+            self.plan.waiting += (each for each in held if each.request in asked)
+            new = [each for each in held if each.request not in asked]
+            self.reuse(current[name] for name in without_waiting(keys, new))
 
     def _settings(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
         """Return all settings and the overrides, by stage; stages that did not run keep theirs."""

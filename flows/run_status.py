@@ -205,7 +205,7 @@ def run_status(
     if latest is None:
         return None
     match = open_match(store, match_id)
-    until = _last_stage(match, latest)
+    until = last_stage(match, latest)
     found = resolve(match.layers, settings)
     most = found.general.iterations if until is None else 1  # a part of the method has one
     passes = latest.iteration if most == "auto" else most
@@ -249,7 +249,7 @@ def _stale_units(
             yield unit_status(store, unit, record)
 
 
-def _last_stage(match: Match, latest: RunRecord) -> str | None:
+def last_stage(match: Match, latest: RunRecord) -> str | None:
     """Return the last stage of the run; None = the method's last."""
     units = [*latest.results, *latest.blocked, *(failure.unit for failure in latest.failed)]
     planned = {name.partition("/")[0] for name in units}

@@ -6,17 +6,26 @@ import importlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.resource_tracker import ensure_running
 from types import FrameType
 from typing import TYPE_CHECKING, Any, cast
 
+from pydantic import JsonValue
+
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.settings import IterationCount
 from flows.gates import Gatekeeper
-from flows.layers import ENVIRONMENT, check_general, write_layer
+from flows.layers import (
+    ENVIRONMENT,
+    SETTINGS_LOCK,
+    Layer,
+    check_general,
+    read_layers,
+    write_layer,
+)
 from flows.method import METHOD, task_modules
 from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
@@ -31,6 +40,7 @@ from flows.overview import make_summary
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
+from flows.run_status import last_stage
 from flows.settings import (
     Overrides,
     ResolvedSettings,
@@ -44,6 +54,7 @@ from flows.stage import Match
 from tasks.tracing import flush_spans, start_tracing
 from worldpose.body.body_file import is_open_body
 from worldpose.errors import InputError, UsageError, WorldposeError
+from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
 if TYPE_CHECKING:
@@ -69,7 +80,7 @@ class RunRequest:
         workers: number of worker processes on this machine; None = one per core, as far as there is
             work for them.
         gates: when results need review; None = as the layers say, or as in the latest run while
-            that waits, or never.
+            that waits or did not reach the last stage, or never.
         iteration: iteration number of the whole method, whose previous iterations have results; a
             part continues the latest run's.
         time_limits: stage to the time limit of a unit [min], if not the default.
@@ -99,10 +110,13 @@ class RunRequest:
         """Maximum number of iterations of a settled request; None = until one is no better."""
         return self.iterations if isinstance(self.iterations, int) else None
 
-    def gate_policy(self, latest: RunRecord | None) -> GatePolicy:
+    def gate_policy(self, match: Match, latest: RunRecord | None) -> GatePolicy:
         """Return when results need review, for a match with this latest run."""
-        waits = latest is not None and latest.state == "waiting"
-        return self.gates or (latest.gates if latest is not None and waits else "never")
+        if self.gates or latest is None:
+            return self.gates or "never"
+        # A run of a part is a step of the run to the end, which asks as it did.
+        is_open = latest.state == "waiting" or last_stage(match, latest) is not None
+        return latest.gates if is_open else "never"
 
 
 def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunRequest]:
@@ -121,37 +135,22 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     is_part = selected_stages(request.from_stage, request.until_stage) != METHOD
     if request.iterations not in (None, 1):
         require_whole(request)
-    before = match.layers
-    if request.default_settings:
-        stated_by_runs = ("iterations", "body_folder")
-        own = {
-            name: value
-            for name, value in before[-1].values.items()
-            if "." not in name and name not in stated_by_runs
-        }
-        before = (*before[:-1], replace(before[-1], values=own))
     stated = flatten(request.settings)
     stated |= {} if request.iterations is None else {"iterations": request.iterations}
     stated |= {} if request.body_folder is None else {"body_folder": request.body_folder}
-    check_general(before[-1].name, "the request", stated)
-    for name, value in stated.items():
-        was = match.layers[-1].values.get(name, value)
-        if was != value:
-            reporter().tell_kept_settings(
-                f"{match.match_id}: {name}={as_text(value)} replaces {as_text(was)}, which the "
-                "settings of the match stated"
-            )
-    layers = (*before[:-1], replace(before[-1], values={**before[-1].values, **stated}))
-    found = resolve(layers)
-    folder = found.origins.get("body_folder")
-    if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
-        # Another shell, or the service, may not have the variable.
-        values = {**layers[-1].values, "body_folder": folder.values["body_folder"]}
-        layers = (*layers[:-1], replace(layers[-1], values=values))
-    settled = replace(match, layers=layers)
-    if layers[-1].values != match.layers[-1].values:
-        _require_usable(settled, request, found.overrides)  # else the value is not kept
-        write_layer(store, layers[-1].name, layers[-1].values)
+    with alone(store.blobs, SETTINGS_LOCK, wait=True):
+        *others, own = read_layers(store, match.registration.spec)  # it can have changed since
+        check_general(own.name, "the request", stated)
+        values = {**_kept_values(own, request, stated), **stated}
+        found = resolve([*others, replace(own, values=values)])
+        folder = found.origins.get("body_folder")
+        if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
+            # Another shell, or the service, may not have the variable.
+            values["body_folder"] = folder.values["body_folder"]
+        settled = replace(match, layers=(*others, replace(own, values=values)))
+        if values != own.values:
+            _require_usable(settled, request, found.overrides)  # else the value is not kept
+            write_layer(store, own.name, values)
     _report_settings(found, {*stated}, latest_run(store, match.match_id))
     return settled, replace(
         request,
@@ -160,6 +159,29 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
         iterations=request.iterations or (1 if is_part else found.general.iterations),
         is_settled=True,
     )
+
+
+def _kept_values(
+    own: Layer, request: RunRequest, stated: Mapping[str, JsonValue]
+) -> dict[str, JsonValue]:
+    """Return what a match's layer keeps beside what a request states; report what it loses."""
+    values = dict(own.values)
+    if request.default_settings:
+        values = {
+            name: value
+            for name, value in values.items()
+            if "." not in name and name not in ("iterations", "body_folder")
+        }
+    for name, was in own.values.items():
+        if name in stated and stated[name] != was:
+            said = f"{name}={as_text(stated[name])} replaces {as_text(was)}"
+        elif name not in {*values, *stated}:
+            said = f"--default-settings removes {name}={as_text(was)}"
+        else:
+            continue
+        text = f"{own.name.partition('/')[2]}: {said}, which the settings of the match stated"
+        reporter().tell_kept_settings(text)
+    return values
 
 
 def require_whole(request: RunRequest) -> None:
@@ -225,7 +247,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     stages = selected_stages(request.from_stage, request.until_stage)
     match, request = settle(store, match, request)
     latest = latest_run(store, match.match_id)
-    policy = request.gate_policy(latest)
+    policy = request.gate_policy(match, latest)
     gatekeeper = Gatekeeper(store, match, policy)
     plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)
     reporter().run_planned(expected_work(store, match, plan.missing, latest))

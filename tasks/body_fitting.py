@@ -22,7 +22,7 @@ from tasks.clip_inputs import (
 )
 from tasks.triangulation import camera_errors
 from tasks.unit import UnitInputs, figures_of, unit_task
-from worldpose.body.body_file import digest_of_body, find_body
+from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.estimate import fit_in_windows
@@ -33,7 +33,6 @@ from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_cons
 from worldpose.body_fitting.report import FitMetrics, far_offsets
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.errors import InputError
 from worldpose.reference_method import require_torch
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.limb_lengths import undo_swaps
@@ -315,13 +314,6 @@ def find_same_body(inputs: UnitInputs) -> BodyModel:
         InputError: this worker has another file of that name.
         UsageError: this worker has none.
     """
-    name, sha256 = str(inputs.recipe.settings["body_model"]), inputs.sources["body_model_sha256"]
     folder = None if inputs.work.body_folder is None else Path(inputs.work.body_folder)
-    if sha256 is not None and digest_of_body(name, folder) != sha256:
-        raise InputError(
-            f"body model {name}",
-            expected="the file that the run was planned with",
-            found="another",
-            todo="Install the same body model on all workers, and run again.",
-        )
-    return find_body(name, folder)
+    name = str(inputs.recipe.settings["body_model"])
+    return find_body(name, folder, inputs.sources["body_model_sha256"])

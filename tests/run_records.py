@@ -27,7 +27,8 @@ class StubRun(Mapping):
 
     def __init__(self, results, store, **stated):
         self.results, self.store = results, store
-        about = {"run_id": "0001", "match_id": "m", "state": "complete", "results": results}
+        about = {"run_id": "0001", "match_id": "m", "state": "complete"}
+        about["results"] = dict.fromkeys(results, "0" * 32)
         about |= {"left_out": {}, "body_folder": None, "usability": Usability(verdict="usable")}
         self.record = SimpleNamespace(**(about | stated))
 

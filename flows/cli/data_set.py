@@ -16,15 +16,11 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
+from flows.cli.options import FpsOption
 from worldpose.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from data_contracts.release import CheckReport, Split
-
-FpsOption = Annotated[
-    float | None,
-    typer.Option("--fps", min=0.001, help="Frames per second; by default the data set's, or 50."),
-]
 
 
 def statistics(
@@ -64,6 +60,8 @@ def statistics(
         from worldpose.reports.data_set import data_set_page
 
         checks = {str(folder): check(folder, fps=fps) for folder in folders}
+        for note in (note for report in checks.values() for note in report.notes):
+            line(note, to=errors)
         title = ", ".join(folder.resolve().name for folder in folders)
         with whole_file(page) as draft:
             draft.write_text(data_set_page(title, found, checks), encoding="utf-8")
@@ -126,6 +124,8 @@ def check(
 
 def _print_check(report: CheckReport, *, as_json: bool) -> None:
     """Print the outcome of a check, and end the command with an exit code if there are findings."""
+    for note in report.notes:
+        line(note, to=errors)
     if as_json:
         print_json({**report.model_dump(mode="json"), "passed": not report.findings})
     else:

@@ -80,20 +80,23 @@ def evaluate(
         table: Table of methods: text, csv or latex.
         picture: With a data set, a PNG of each method's people in the camera and from the side.
     """
+    given = {
+        **{"--run": run != "latest", "--stage": stage, "--match-in": match_in, "--fps": fps},
+        **{"--body": body, "--markers": markers, "--first-frame": first_frame is not None},
+        **{"--method-fps": method_fps, "--table": table != "text", "--picture": picture},
+    }
+    allowed: tuple[str, ...]
     if ablation:
+        named = {"--prediction": prediction, "--reference": reference, "--method": method}
+        _require_effect("--ablation", {**given, **named}, ())
         print_ablation(ablation, as_json=as_json)
         return
     if reference is not None and prediction and not method:
         from worldpose.dataset.benchmark import is_data_set, score_folders
 
         if len(prediction) > 1 or is_data_set(Path(reference)):
-            if any((stage, markers, method_fps, first_frame is not None, run != "latest")):
-                raise UsageError(
-                    "worldpose evaluate",
-                    expected="no --run, --stage, --markers, --first-frame or --method-fps",
-                    found="one of them, with clips of a data set, where it has no effect",
-                    todo="Leave it out.",
-                )
+            allowed = ("--body", "--match-in", "--fps", "--table", "--picture")
+            _require_effect("clips of a data set", given, allowed)
             folders = named_folders(prediction)
             results, sample = score_folders(
                 Path(reference), folders, body=body, match_in=match_in, fps=fps
@@ -111,6 +114,8 @@ def evaluate(
     if method and reference is not None and not prediction and picture is None:
         from flows.results.baselines import score_methods
 
+        allowed = ("--match-in", "--body", "--first-frame", "--fps", "--method-fps", "--table")
+        _require_effect("--method", given, allowed)
         found = score_methods(
             method,
             reference,
@@ -132,10 +137,15 @@ def evaluate(
     from worldpose.formats.challenge import is_submission
 
     if is_submission(Path(prediction[0])) and is_submission(Path(reference)):
+        _require_effect("submissions", given, ())
         _print_challenge(Path(prediction[0]), Path(reference), as_json=as_json)
         return
-    from flows.results.evaluation import Reading, score
+    from flows.results.evaluation import Reading, is_of_files, score
 
+    of_reference = {".csv": "--first-frame", ".c3d": "--markers", ".trc": "--markers"}
+    allowed = ("--match-in", "--fps", of_reference.get(Path(reference).suffix.lower(), ""))
+    of_run = () if is_of_files(prediction[0]) else ("--run", "--stage")
+    _require_effect("this prediction and reference", given, (*allowed, *of_run))
     scores = score(
         prediction[0],
         reference,
@@ -149,6 +159,18 @@ def evaluate(
     if scores.later_run:
         line(scores.later_run, to=errors)
     _print_scores(scores, as_json=as_json)
+
+
+def _require_effect(kind: str, given: Mapping[str, object], allowed: Sequence[str]) -> None:
+    """Raise UsageError if an option is given that has no effect."""
+    idle = [name for name, value in given.items() if value and name not in allowed]
+    if idle:
+        raise UsageError(
+            f"worldpose evaluate {' '.join(idle)}",
+            expected=f"with {kind}, {', '.join(filter(None, allowed)) or 'none of these options'}",
+            found=f"{', '.join(idle)}, which has no effect",
+            todo="Leave it out.",
+        )
 
 
 def named_folders(given: Sequence[str]) -> dict[str, Path]:
@@ -169,8 +191,11 @@ def named_folders(given: Sequence[str]) -> dict[str, Path]:
 
 def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:
     from worldpose.evaluation.challenge import ALL, score_submission
+    from worldpose.formats.challenge import submission_clips
 
     found = {name: each.row() for name, each in score_submission(prediction, reference).items()}
+    if unknown := [clip for clip in submission_clips(prediction) if clip not in found]:
+        line(f"not scored, as the reference lacks them: {', '.join(unknown)}", to=errors)
     if as_json:
         print_json({**found.pop(ALL), "clips": found})
         return

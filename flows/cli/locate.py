@@ -13,14 +13,13 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from flows.cli import console
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
 from flows.cli.options import WorkersOption
-from flows.cli.synchronize import choose_clip, load_detections
+from flows.cli.synchronize import choose_clip, compute_poses, load_detections
 from flows.registering import find_match
 from flows.results.outputs import require_new
-from flows.run_record import require_no_other_run
-from flows.running import RunRequest, run_match
+from flows.running import RunRequest
 from flows.stage import Match
 from worldpose.errors import InputError, UsageError
-from worldpose.store.store import Run, Store
+from worldpose.store.store import Store
 
 if TYPE_CHECKING:
     from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength
@@ -100,14 +99,10 @@ def locate_cameras(
         if distance is not None:
             known = _distance(distance, names)
         chosen = choose_clip(folder.spec, clip)
-        require_no_other_run(store, opened.match_id)
         # Cameras without a calibration are left out once it is computed: it is passed over.
-        for first, last in (("ingest", "ingest"), ("detection", "detection")):
-            request = RunRequest(
-                {}, from_stage=first, until_stage=last, workers=workers, gates="never"
-            )
-            record = run_match(store, opened, request)
-    detections = load_detections(Run(store, record), opened, chosen, names)
+        ingest, poses = RunRequest({}, "ingest", "ingest"), RunRequest({}, "detection", "detection")
+        run = compute_poses(store, opened, workers, ingest, poses)
+    detections = load_detections(run, opened, chosen, names)
     found = estimate(lenses, detections, folder.spec.fps, known)
     calibrations = {name: found.cameras[c].to_calibration(name) for c, name in enumerate(names)}
     written = _write(calibrations, folder.folder if apply else None, out)

@@ -22,6 +22,7 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
+from flows.cli.options import FpsOption
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
@@ -43,7 +44,7 @@ def import_command(
     join: Annotated[bool, typer.Option("--join")] = False,
     pose2sim: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     challenge: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
-    fps: float | None = None,
+    fps: FpsOption = None,
     match_id: str | None = None,
     pitch: Path | None = None,
     clicks: Path | None = None,
@@ -79,7 +80,6 @@ def import_command(
             videos/.
         challenge: Folder of a pose challenge: cameras/, boxes/, videos/ or images/, skel_2d/,
             skel_3d/ and pitch_points.txt; writes OUT/<sequence> for each sequence.
-        fps: Frames per second.
         match_id: Id of the match; the folder's name by default.
         pitch: Survey of the markings (CSV); writes only pitch.json.
         clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
@@ -229,7 +229,8 @@ def _import_challenge(kit: Path, out: Path, fps: float | None, *, as_json: bool)
     made = import_challenge(kit, out, pose_skeletons, fps)
     lines = [note for _, notes in made.values() for note in notes]
     folders = {name: str(out / name) for name in made}
-    answer(as_json, {"folders": folders, "notes": lines}, *lines, f"next: worldpose run {out}/*")
+    following = [f"next: worldpose run {folder}" for folder in folders.values()]
+    answer(as_json, {"folders": folders, "notes": lines}, *lines, *following)
 
 
 def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:

@@ -9,6 +9,21 @@ import typer
 
 from worldpose.errors import UsageError
 
+
+def _require_rate(fps: float | None) -> float | None:
+    if fps is not None and not 0.001 <= fps <= 100_000.0:
+        raise typer.BadParameter(f"{fps:g} is not a number of frames per second")
+    return fps
+
+
+FpsOption = Annotated[
+    float | None,
+    typer.Option(
+        "--fps",
+        callback=_require_rate,
+        help="Frames per second; by default as the files say, or 50 of a data set.",
+    ),
+]
 DaskOption = Annotated[
     str | None, typer.Option(metavar="ADDR", help="A running Dask scheduler, tcp://host:port.")
 ]

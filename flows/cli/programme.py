@@ -130,7 +130,7 @@ def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, Image | N
 def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     """Cut a range of images out, and print the entry for match.yaml."""
     from worldpose.formats.files import whole_file
-    from worldpose.video.files import cut_video
+    from worldpose.video.recordings import cut_video
 
     first, _, stop = take.partition(":")
     if not (first.isdecimal() and stop.isdecimal()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,8 +16,8 @@ from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
+from flows.review.corrections import objections_of
 from flows.review.descriptions import describe_corrections, in_words, review_json, when
-from flows.review.identities import lost_names
 from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
@@ -68,7 +69,7 @@ def list_reviews(
     shown = [each for each in found if everything or each.state == "waits"]
     if as_json:
         console.print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
-    else:
+    elif shown or not problems:
         _print_list(shown)
     if match and problems:
         raise typer.Exit(1)
@@ -101,9 +102,9 @@ def show(
         _print_review(known[request], as_json)
         return
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
-    lost = lost_names(Run(store, latest)) if latest else {}
-    applied = [each for each in opened.corrections if each.id not in lost]
-    gone = ((each, lost[each.id]) for each in opened.corrections if each.id in lost)
+    refused = objections_of(Run(store, latest)) if latest else {}
+    applied = [each for each in opened.corrections if each.id not in refused]
+    gone = ((each, refused[each.id]) for each in opened.corrections if each.id in refused)
     stale = [*opened.stale, *gone]
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
     if as_json:
@@ -117,11 +118,15 @@ def show(
             }
         )
         return
-    states = [*((each, "applied") for each in applied), *stale]
+    since = latest.started_at if latest else datetime.min.replace(tzinfo=UTC)
+    states = [
+        *((it, "applied" if it.made_at <= since else "not in a run yet") for it in applied),
+        *((it, f"does not apply: {why}") for it, why in stale),
+    ]
     for correction, state in states:
         console.line(f"{correction.id}  {correction.who}, {when(correction.made_at)}")
         console.line(f"  {in_words(correction)}")
-        console.line(f"  {state if state == 'applied' else f'no longer applies: {state}'}")
+        console.line(f"  {state}")
     if not states:
         console.line("no corrections")
     for name, origin in marked.items():

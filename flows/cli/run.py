@@ -27,10 +27,10 @@ from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
 from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
-from flows.review.identities import lost_names
+from flows.review.corrections import objections_of
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
-from flows.run_record import require_no_other_run
+from flows.run_record import alone_with
 from flows.running import RunRequest, run_match, settle
 from flows.settings import parse_overrides, selected_stages
 from flows.stage import Match
@@ -71,10 +71,11 @@ def run(
         until_stage: Last stage.
         assignments: A setting for this run and later ones of the match; repeatable; `list` shows
             all settings. All others are as worldpose settings MATCH says.
-        default_settings: Forget what earlier runs of the match stated with --set, --iterations
-            and --body-folder; settings of the project and the venue stay.
+        default_settings: Forget the settings of stages, iterations and body folder that the match
+            states, by earlier runs or otherwise; those of the project and the venue stay.
         gates: When results need review: never (default), auto (metrics beyond limits) or
-            always. While the latest run waits for review, its policy is the default.
+            always. While the latest run waits for review, or ended before the last stage, its
+            policy is the default.
         iterations: Number of iterations. Each one leaves out the keypoints that the bodies of
             the previous one contradict. With auto, the run iterates until the error in held-out
             cameras stops decreasing. Later runs of the match keep the number.
@@ -99,18 +100,18 @@ def run(
     )
     with console.progress(verbose=verbose):
         opened = find_match(store, match)
-        require_no_other_run(store, opened.match_id)
-        for text in warnings_of(opened):
-            console.line(f"warning: {text}", to=console.errors)
-        opened, request = settle(store, opened, request)
-        most = request.most_iterations
-        passes = None if most == 1 else iterate_match(store, opened, request, most)
-        record = run_match(store, opened, request) if passes is None else passes.record
-        exported, problem = _export(store, opened, record)
+        with alone_with(store, opened.match_id):
+            for text in warnings_of(opened):
+                console.line(f"warning: {text}", to=console.errors)
+            opened, request = settle(store, opened, request)
+            most = request.most_iterations
+            passes = None if most == 1 else iterate_match(store, opened, request, most)
+            record = run_match(store, opened, request) if passes is None else passes.record
+            exported, problem = _export(store, opened, record)
     seconds = time.monotonic() - started
     warned = [
         *record.warnings,
-        *lost_names(Run(store, record)).values(),
+        *objections_of(Run(store, record)).values(),
         *clock_advice(record.figures, opened.folder.spec),
         *click_advice(record.figures, record.settings),
     ]

@@ -10,6 +10,7 @@ import typer
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, answer, line, print_json
 from flows.layers import (
     PROJECT,
+    SETTINGS_LOCK,
     VENUES,
     Layer,
     list_venues,
@@ -20,6 +21,7 @@ from flows.layers import (
 from flows.registering import find_match
 from flows.settings import as_text, known_settings, parse_value, require_known, resolve, save_layer
 from worldpose.errors import UsageError, unknown_name
+from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
 NAME_WIDTH, ABOUT_WIDTH = 42, 56
@@ -66,7 +68,7 @@ def settings(
     store = Store.open(project)
     name, layers = _read(store, match, venue, is_new=add)
     if assignments or removed or add:
-        _change(store, name, layers, assignments or (), removed or ())
+        change_layer(store, name, layers, assignments or (), removed or ())
         name, layers = _read(store, match, venue)  # a match can have another venue now
     told: dict[str, Any] = {"layer": name, "settings": resolve(layers).differences()}
     if match is None and venue is None:
@@ -117,7 +119,7 @@ def _cut(text: str, width: int) -> str:
     return text if len(text) <= width else f"{text[: width - 1]}…"
 
 
-def _change(
+def change_layer(
     store: Store,
     name: str,
     layers: Sequence[Layer],
@@ -125,22 +127,23 @@ def _change(
     removed: Sequence[str],
 ) -> None:
     """Write a layer with changes."""
-    values = dict(read_layer(store, name).values)
-    for text in assignments:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise UsageError(
-                f"--set {text}",
-                expected="NAME=VALUE",
-                found=repr(text),
-                todo="Write it as in: --set detection.stride=2.",
-            )
-        values[key] = parse_value(value, key)
-    for key in removed:
-        if key not in values:
-            raise unknown_name(f"--unset {key}", key, values)
-        del values[key]
-    save_layer(store, layers, name, values)
+    with alone(store.blobs, SETTINGS_LOCK, wait=True):
+        values = dict(read_layer(store, name).values)
+        for text in assignments:
+            key, equals, value = text.partition("=")
+            if not equals:
+                raise UsageError(
+                    f"--set {text}",
+                    expected="NAME=VALUE",
+                    found=repr(text),
+                    todo="Write it as in: --set detection.stride=2.",
+                )
+            values[key] = parse_value(value, key)
+        for key in removed:
+            if key not in values:
+                raise unknown_name(f"--unset {key}", key, values)
+            del values[key]
+        save_layer(store, layers, name, values)
 
 
 def _lines(told: dict[str, Any]) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -17,7 +18,7 @@ from flows.cli.options import WorkersOption
 from flows.registering import find_match
 from flows.results.outputs import claim_file
 from flows.results.run_cameras import static_cameras
-from flows.run_record import require_no_other_run
+from flows.run_record import alone_with
 from flows.running import RunRequest, run_match
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
@@ -89,10 +90,8 @@ def synchronize(
         spec = opened.folder.spec
         chosen_clip = choose_clip(spec, clip)
         claim_file(plot, opened.match_id)
-        require_no_other_run(store, opened.match_id)
-        request = RunRequest({}, until_stage="detection", workers=workers, gates="never")
-        record = run_match(store, opened, request)
-    cameras, names, detections = load_clip(Run(store, record), opened, chosen_clip)
+        run = compute_poses(store, opened, workers, RunRequest({}, until_stage="detection"))
+    cameras, names, detections = load_clip(run, opened, chosen_clip)
     pitch = opened.folder.pitch
     template = None if pitch is None else PitchTemplate.from_spec(pitch)
     found, courses = _find_clocks(cameras, detections, spec.fps, max_offset, template)
@@ -206,6 +205,25 @@ def choose_clip(spec: MatchSpec, clip: str | None) -> str:
     if clip is not None and clip not in names:
         raise unknown_name(f"--clip {clip}", clip, names)
     return clip or max(spec.clips, key=lambda each: each.frame_count).id
+
+
+def compute_poses(store: Store, match: Match, workers: int | None, *parts: RunRequest) -> Run:
+    """Compute parts of the method, up to the 2D poses, with the gates of the match's other runs.
+
+    Raises:
+        InputError: another process runs the match, or results must be reviewed first.
+    """
+    with alone_with(store, match.match_id):
+        for part in parts:
+            record = run_match(store, match, replace(part, workers=workers))
+    if record.waiting and any(name.startswith("detection/") for name in record.blocked):
+        raise InputError(
+            f"{match.match_id}: 2D poses",
+            expected="all results that they need",
+            found=f"{len(record.waiting)} that wait for review",
+            todo=f"Decide them first: worldpose review list {match.match_id}.",
+        )
+    return Run(store, record)
 
 
 def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], KeypointDetections]:

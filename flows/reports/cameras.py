@@ -11,6 +11,7 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.match import MatchSpec
 from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
+from flows.layers import pitch_of_run
 from flows.reports.match_pictures import background_image, shown_pitch
 from flows.results.best_results import clip_title
 from flows.stage import Match
@@ -145,7 +146,7 @@ def camera_pictures(
         for name in cameras
     }
     weakest = sorted((name for name in cameras if errors[name]), key=lambda name: -errors[name])
-    shown = weakest[:MAX_CAMERAS] if match.folder.pitch is not None else ()
+    shown = weakest[:MAX_CAMERAS] if shown_pitch(run, match) is not None else ()
     return [
         CaptionedImage(
             f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
@@ -161,7 +162,8 @@ def paint_pictures(
     store: Store, run: Run, match: Match, cameras: Mapping[str, Camera]
 ) -> list[CaptionedImage]:
     """Draw painted lines in the image of the camera with most clicks, and the distance map."""
-    if match.folder.pitch is None:
+    pitch = shown_pitch(run, match)
+    if pitch is None:
         return []
     counts = {
         name: run.record.figures.get(f"static_calibration/{name}", {}).get("clicks_used", 0.0)
@@ -174,8 +176,6 @@ def paint_pictures(
     still = background_image(store, match, name)
     if still is None:  # no image of the video's clips can be read
         return []
-    pitch = shown_pitch(run, match)
-    assert pitch is not None  # of the match folder
     png, share = plot_paint(cameras[name], still, pitch)
     return [
         CaptionedImage(
@@ -223,7 +223,7 @@ def proposal_evidence(
 
     None if no camera was proposed.
     """
-    pitch = match.folder.pitch
+    pitch = pitch_of_run(run, lambda: match.folder.pitch)
     if pitch is None or f"proposal/{name}" not in run.record.results:
         return None
     found = run[f"proposal/{name}"]

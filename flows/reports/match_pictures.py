@@ -8,6 +8,7 @@ import numpy as np
 
 from data_contracts.arrays import Image, Integers
 from data_contracts.pitch import PitchSpec
+from flows.layers import pitch_of_run
 from flows.results.run_cameras import estimated_pitch
 from flows.stage import Match
 from worldpose.ingest.footage import read_still, unit_frames
@@ -17,7 +18,8 @@ from worldpose.video.folder import open_video, pictures_at
 
 def shown_pitch(run: Run, match: Match, clip: str | None = None) -> PitchSpec | None:
     """Return the pitch as a run, or a clip's broadcast cameras, estimated it; None without one."""
-    return estimated_pitch(run, match.folder.pitch, match.folder.spec, clip)
+    pitch = pitch_of_run(run, lambda: match.folder.pitch)
+    return estimated_pitch(run, pitch, match.folder.spec, clip)
 
 
 def background_image(store: Store, match: Match, camera_id: str) -> Image | None:

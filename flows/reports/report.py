@@ -75,6 +75,9 @@ def write_report(
     Raises:
         UsageError: there is no such static camera with a video.
     """
+    if out.is_dir():
+        todo = f"Name a file in it, as in --out {out / 'report.html'}."
+        raise UsageError(f"--out {out}", expected="a file", found="a folder", todo=todo)
     if camera is not None:
         _check_film(match, camera)
     match = match.at_hand()

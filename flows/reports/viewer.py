@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from data_contracts.arrays import Floats
-from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES
 from flows.reports.clip_video import clip_view, video_frames, write_clip_video
 from flows.results.best_results import (
@@ -47,7 +46,7 @@ def report_viewer(run: Run, match: Match) -> tuple[tuple[EmbeddedPage, ...], str
     """
     origin, spare, clips, all_frames = Origin(run, match.registration), REPORT_POSES, [], 0
     for name in find_clips(run.record):
-        clip = viewer_clip(origin, name, match.folder.pitch, None)
+        clip = viewer_clip(origin, name, None)
         all_frames += len(clip.frames)
         shown = clip.first_frames(spare // max(1, len(clip.people)))
         if shown.has_people:
@@ -77,7 +76,6 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         UsageError: a video is asked for, and no camera of a clip has one.
         InputError: there is nobody to show.
     """
-    pitch = origin.pitch
     page, footage = _viewer_page(), origin.footage
     written: dict[Path, tuple[str, ...]] = {
         out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips
@@ -91,7 +89,6 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
                 viewer_clip(
                     origin,
                     name,
-                    pitch,
                     describe_video(origin.run, footage.match, name) if footage else None,
                 )
                 for name in names
@@ -126,18 +123,16 @@ def describe_video(run: Run, match: Match, clip: str) -> dict[str, Any] | None:
     return {"camera": owner, "first": int(frames[0]), "frames": len(frames), "step": step}
 
 
-def viewer_clip(
-    origin: Origin, clip: str, pitch: PitchSpec | None, video: Mapping[str, Any] | None
-) -> ViewerClip:
+def viewer_clip(origin: Origin, clip: str, video: Mapping[str, Any] | None) -> ViewerClip:
     """Return a clip of a run as the viewer shows it, with its video as `describe_video` returns it.
 
-    A `stage` before body fitting shows joints in place of bodies. The pitch is that of the match
-    folder; the viewer draws the surface that the run estimated.
+    A `stage` before body fitting shows joints in place of bodies. The pitch has the surface that
+    the run estimated.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings, note_undrawn_distortion, person_color
 
-    shown = estimated_pitch(origin.run, pitch, origin.spec, clip)
+    shown = estimated_pitch(origin.run, origin.pitch, origin.spec, clip)
     tracks, positions = origin.tracks(clip), clip_positions(origin.run, clip)
     kinds = person_kinds(origin.run, clip)
     roster = {player.id: player for player in origin.spec.roster}

@@ -16,7 +16,7 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Join, Track
-from flows.layers import pitch_of
+from flows.layers import pitch_of, pitch_of_run
 from flows.results.run_cameras import (
     BROADCAST,
     broadcast_unit,
@@ -27,7 +27,7 @@ from flows.results.run_cameras import (
 )
 from flows.review.identities import names_of
 from flows.stage import Match
-from worldpose.body.body_file import find_body
+from worldpose.body.body_file import find_body, is_open_body
 from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.body_fitting.evidence import perceived_joints
 from worldpose.body_fitting.extra_points import perceived_points
@@ -203,7 +203,7 @@ def joint_tracks(
         identity_certainty=_identity_certainty(
             run, clip, result["frame"].values, result["person"].values
         ),
-        extra=_extra_tracks(run, result, seen, definition),
+        extra=_extra_tracks(run, f"{stages[0]}/{clip}", result, seen, definition),
     )
 
 
@@ -226,11 +226,11 @@ def _identity_certainty(
 
 
 def _extra_tracks(
-    run: Run, result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
+    run: Run, unit: str, result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
 ) -> ExtraTracks | None:
     """Return the points besides COCO-17 of bodies or triangulated joints; None without any.
 
-    `seen` is the triangulation of the same people.
+    `result` is that of the unit, `seen` is the triangulation of the same people.
     """
     if "extra_joints" not in result:
         return None
@@ -241,7 +241,7 @@ def _extra_tracks(
             np.broadcast_to(result["betas"].values, (*joints.shape[:2], result["betas"].shape[-1])),
             *(result[name].values for name in ("global_orient", "body_pose", "transl")),
         )
-        model = fitted_model(run, result)
+        model = fitted_model(run, unit)
         offsets = result["extra_offsets"].values
         joints = joints + perceived_points(model, points, bodies, offsets)
     views = seen["extra_views"].sel(point=list(points)).values.astype(np.int64)
@@ -301,30 +301,35 @@ def bodies_unit(run: Run, clip: str) -> str:
     return again if again in run else first
 
 
-def fitted_model(run: Run, fits: xr.Dataset) -> BodyModel:
-    """Return the body model of a run's bodies, from the folder that the run was given.
+def fitted_model(run: Run, unit: str) -> BodyModel:
+    """Return the body model of a result `stage/unit`, from the folder that the run was given.
 
     Raises:
         UsageError: no body of that name is installed there.
+        InputError: the installed body is not the one that was fitted.
     """
-    folder = run.record.body_folder
-    return find_body(fits.attrs["body_model"], None if folder is None else Path(folder))
+    name, folder = run[unit].attrs["body_model"], run.record.body_folder
+    fitted = {} if is_open_body(name) else run.manifest(unit).recipe.sources
+    place = None if folder is None else Path(folder)
+    sha256 = fitted.get("body_model_sha256")
+    return find_body(name, place, None if sha256 is None else str(sha256))
 
 
 def body_tracks(run: Run, clip: str) -> BodyTracks | None:
     """Return the best fitted bodies of a clip; None if the run has none."""
     from worldpose.reports.bodies import BodyTracks  # late: it imports matplotlib
 
-    if bodies_unit(run, clip) not in run:
+    unit = bodies_unit(run, clip)
+    if unit not in run:
         return None
-    fits = run[bodies_unit(run, clip)]
+    fits = run[unit]
     return BodyTracks(
         frames=fits["frame"].values,
         person_ids=fits["person"].values.astype(np.int64),
         poses=BodyParameters(
             *(fits[name].values for name in ("betas", "global_orient", "body_pose", "transl"))
         ),
-        model=fitted_model(run, fits),
+        model=fitted_model(run, unit),
     )
 
 
@@ -372,8 +377,8 @@ class Origin:
 
     @property
     def pitch(self) -> PitchSpec | None:
-        """Return the pitch of the match folder; None without one."""
-        return pitch_of(self.run.store, self.registration)
+        """Return the pitch of the run; None without one."""
+        return pitch_of_run(self.run, lambda: pitch_of(self.run.store, self.registration))
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""
@@ -387,12 +392,13 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     Raises:
         InputError: the run has no fitted bodies.
     """
-    fits = run[require_result(run, bodies_unit(run, clip), "Run the match to the end first.")]
+    unit = require_result(run, bodies_unit(run, clip), "Run the match to the end first.")
+    fits = run[unit]
     poses = BodyParameters(
         fits["betas"].values[:, None],
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
     )
-    return fitted_model(run, fits), poses, fits["person"].values
+    return fitted_model(run, unit), poses, fits["person"].values
 
 
 def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:

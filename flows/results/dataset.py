@@ -65,7 +65,7 @@ def check(
         InputError: a file cannot be read.
     """
     manifest = read_manifest(folder)
-    findings = []
+    findings, notes = list[Finding](), list[str]()
     if manifest is not None and (changed := changed_files(folder, manifest.files)):
         findings.append(
             Finding(
@@ -81,18 +81,28 @@ def check(
     for name, rate in rates.items():
         if only not in (None, name):
             continue
+
+        def find(model: str | None, clip: str = name) -> BodyModel:
+            if model is None and body is None:
+                notes.append(
+                    f"poses of {clip} name no body model: {OPEN_BODY} is assumed (--body); shapes "
+                    "of another one have no meaning"
+                )
+            return models.get(model or "") or find_body(model or body or OPEN_BODY)
+
         shipped = read_clip(
             folder,
             name,
             clips,
-            lambda model: models.get(model or "") or find_body(model or body or OPEN_BODY),
+            find,
             manifest,
             rate or USUAL_FPS,
             pitch and (manifest is None or manifest.pitch),
         )
         figures[name], found = check_clip(shipped)
         findings += found
-    return CheckReport(clips=figures, findings=tuple(findings))
+        notes.extend(shipped.notes)
+    return CheckReport(clips=figures, findings=tuple(findings), notes=tuple(notes))
 
 
 def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatistics:
@@ -136,7 +146,8 @@ def _views_of_clips(folder: Path, names: tuple[str, ...]) -> dict[str, list[tupl
     for name in names:
         places, clip = read_places(folder, name), name.rpartition(".")[0]
         known = {one.tobytes() for _, seen in views.get(clip, ()) for one in seen.swapaxes(0, 1)}
-        new = np.array([one.tobytes() not in known for one in places.swapaxes(0, 1)], np.bool_)
+        columns = places.swapaxes(0, 1)  # empty columns are alike, but nobody
+        new = np.array([c.tobytes() not in known or np.isnan(c).all() for c in columns], np.bool_)
         own = clip if clip and (clip not in views or not new.all()) else name
         views.setdefault(own, []).append((name, places[:, new]))
     return {own if len(seen) > 1 else seen[0][0]: seen for own, seen in views.items()}

@@ -12,6 +12,8 @@ from data_contracts.run import JOINT_STAGES
 from flows.registering import find_match
 from flows.results.best_results import clips_of, describe_later_run, joint_tracks, open_results
 from flows.results.run_cameras import broadcast_cameras, static_cameras
+from worldpose.dataset.benchmark import require_one_rate
+from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (
@@ -70,6 +72,8 @@ class Side:
     """The match it belongs to, if known."""
     later_run: str = ""
     """A sentence about a later run of the match, if there is one."""
+    fps: float | None = None
+    """Frames per second; None if nothing states them."""
 
 
 def score(
@@ -94,7 +98,7 @@ def score(
         run_id: the match's run as for `open_results`; only if `prediction` is a match.
         stage: stage whose joints are scored if `prediction` is a match; None = the last one with
             joints.
-        fps: frames per second; None = the match's, if there is one.
+        fps: frames per second; None = those that a side states.
         match_in: reference camera in whose image tracks are matched (E3).
         reading: how the reference's file is read.
 
@@ -106,16 +110,17 @@ def score(
     measured, placed = suffix in SUFFIXES, suffix == ".csv"
     truth = Side(None, {}) if measured or placed else reference_side(reference)
     estimate = _prediction(prediction, project, truth, run_id=run_id, stage=stage)
-    match = estimate.match or truth.match
+    match, known = estimate.match or truth.match, fps or estimate.fps or truth.fps
+    require_one_rate({f"--prediction {prediction}": estimate.fps, reference: truth.fps})
     alignment = None
     if measured:
-        rate = fps or (None if match is None else match.spec.fps)
         tracks, alignment = _align_markers(
-            Path(reference), estimate.joints, rate, reading.marker_map
+            Path(reference), estimate.joints, known, reading.marker_map, notes
         )
         truth = Side(tracks, {})
     elif placed and estimate.joints is not None:
-        mine, tracks, notes = align_positions(Path(reference), estimate.joints, reading.first_frame)
+        first = reading.first_frame
+        mine, tracks, notes = align_positions(Path(reference), estimate.joints, first, known)
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
     is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
@@ -135,7 +140,7 @@ def score(
         evaluation, people = evaluate_joints(
             estimate.joints,
             truth.joints,
-            fps=fps or (None if spec is None else spec.fps),
+            fps=known,
             camera=None if match_in is None else true_cameras[match_in],
         )
     if placed:  # hips alone tell nothing of the challenge's joints
@@ -149,12 +154,18 @@ def score(
             found=f"{_contents(estimate)} against {_contents(truth)}",
             todo="Name files or folders with the same kind of data.",
         )
+    if cameras and match is None:
+        notes.append("no match states the pitch: ground errors are those of one of 105 x 68 m")
     evaluation = evaluation.model_copy(update={"cameras": errors})
     return Scores(evaluation, people, cameras, alignment, estimate.later_run, tuple(notes))
 
 
 def _align_markers(
-    path: Path, prediction: JointTracks | None, fps: float | None, marker_map: Path | None
+    path: Path,
+    prediction: JointTracks | None,
+    fps: float | None,
+    marker_map: Path | None,
+    notes: list[str],
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Align a marker file with the prediction's frames and world; return its joints."""
     if prediction is None or fps is None:
@@ -165,8 +176,11 @@ def _align_markers(
             todo="Name a prediction with joints, and give --fps if it belongs to no match.",
         )
     markers = read_markers(path)
+    if markers.zeros:
+        notes.append(f"{markers.zeros} markers at exactly 0, 0, 0 count as missing")
     people = map_marker_names(markers.names) if marker_map is None else read_marker_map(marker_map)
-    return align_reference(prediction, marker_joints(markers, people), markers.rate, fps)
+    joints = marker_joints(markers, people)
+    return align_reference(prediction, joints, markers.rate, fps, markers.start)
 
 
 def load_reference(name: str) -> JointTracks:
@@ -188,16 +202,26 @@ def reference_side(name: str) -> Side:
     path = Path(name)
     above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
     match = read_match(above[0]) if above else None
+    folder = path if path.is_dir() else path.parent
+    clip = path.name.removesuffix(".npz").removesuffix(".joints")
+    rate = clip_frame_rate(read_frame_rates(folder), clip)
+    rate = match.spec.fps if rate is None and match is not None else rate
     files = sorted((path / "cameras").glob("*.npz"))
     if path.is_dir() and files:
         joints = read_joints(path / "joints.npz") if (path / "joints.npz").is_file() else None
-        return Side(joints, {file.stem: read_camera(file) for file in files}, match)
-    return Side(load_reference(name), {}, match)
+        cameras = {file.stem: read_camera(file) for file in files}
+        return Side(joints, cameras, match, fps=rate)
+    return Side(load_reference(name), {}, match, fps=rate)
+
+
+def is_of_files(name: str) -> bool:
+    """Return whether a prediction is a file or a folder of results, and not a match."""
+    path = Path(name)
+    return path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir()
 
 
 def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str | None) -> Side:
-    path = Path(name)
-    if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
+    if is_of_files(name):
         return reference_side(name)
     store = Store.open(project)
     match = find_match(store, name, unfinished=True)
@@ -206,7 +230,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
     spec = match.folder.spec
     placed = any(unit.partition("/")[0] in JOINT_STAGES for unit in run)
     if not placed and truth.cameras and (cameras := static_cameras(run, spec)):
-        return Side(None, cameras, match.folder, later)
+        return Side(None, cameras, match.folder, later, spec.fps)
     clips = clips_of(run.record)
     if len(clips) > 1:
         raise UsageError(
@@ -216,7 +240,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             todo="Export the match and score clip by clip.",
         )
     cameras = static_cameras(run, spec, stage) | broadcast_cameras(run) if truth.cameras else {}
-    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder, later)
+    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder, later, spec.fps)
 
 
 def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:

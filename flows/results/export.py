@@ -109,8 +109,7 @@ def export_challenge(
         model, poses, _ = best_results.fitted_bodies(origin.run, clip)
         truth = challenge.challenge_truth(model, poses, camera)
         submissions[view], added = _by_given_rows(origin, clip, truth)
-        if added:
-            filled[view] = added
+        filled |= {f"{view}{row}": count for row, count in added.items() if count}
         path = out / "cameras" / f"{view}.npz"
         challenge.write_challenge_camera(path, camera, edition)
         yield path
@@ -136,21 +135,22 @@ def export_challenge(
 
 def _by_given_rows(
     origin: best_results.Origin, clip: str, truth: challenge.ChallengeTruth
-) -> tuple[Floats, int]:
-    """Return a clip's submission, and the poses that fill gaps of given boxes.
-
-    Where boxes with identities were given, the rows are theirs.
-    """
+) -> tuple[Floats, dict[str, int]]:
+    """Return a submission with the rows of given boxes, the gaps filled, and those left by row."""
     name, run = f"broadcast_tracking/{clip}", origin.run
     rows = run[name].attrs.get("given_people") if name in run else None
     if rows is None:
-        return truth.submission, 0
+        return truth.submission, {}
     tracked, persons = run[name], best_results.fitted_bodies(run, clip)[2][truth.persons]
     joints = np.full((rows, *truth.submission.shape[1:]), np.nan)
     places = np.full((rows, joints.shape[1], 2), np.nan)
     joints[persons] = truth.submission
     places[tracked["person"].values] = tracked["ground"].values.swapaxes(0, 1)
-    return challenge.fill_submission(joints, places)
+    filled, added = challenge.fill_submission(joints, places)
+    gaps = np.isnan(filled).any((-1, -2)).sum(axis=1).tolist()
+    return filled, {"": added} | {
+        f": row {n}, frames without a pose": g for n, g in enumerate(gaps)
+    }
 
 
 def _filmed(origin: best_results.Origin) -> dict[str, tuple[str, Camera]]:

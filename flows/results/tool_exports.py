@@ -22,6 +22,7 @@ from flows.results.run_cameras import (
     estimated_pitch,
     moving_cameras,
 )
+from worldpose.body.body_file import is_open_body
 from worldpose.body.keypoints import HALPE26, fold_keypoints
 from worldpose.body.occlusions import hidden_joints
 from worldpose.errors import UsageError
@@ -45,9 +46,6 @@ from worldpose.triangulation.camera_changes import move_on
 
 if TYPE_CHECKING:
     import pandas as pd
-
-OPEN_BODY = "open-neutral"
-"""Names of the body model that ships begin so."""
 
 
 def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
@@ -73,7 +71,7 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
     unit = best_results.bodies_unit(origin.run, clip)
     if unit in origin.run:
         model = str(origin.run[unit].attrs["body_model"])
-        terms = "CC0 1.0" if model.startswith(OPEN_BODY) else "the terms of its publisher apply"
+        terms = "CC0 1.0" if is_open_body(model) else "the terms of its publisher apply"
         notes["body_model"] = f"{model} ({terms})"
         if "joint_offsets" in origin.run[unit]:  # a monocular method's bodies have none
             notes["joint_offsets_mm"] = _describe_offsets(origin.run[unit]["joint_offsets"].values)
@@ -281,7 +279,7 @@ def export_scenes(
     for clip in origin.clips:
         model, poses, persons = best_results.fitted_bodies(origin.run, clip)
         frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
-        free = model.name.startswith(OPEN_BODY)
+        free = is_open_body(model.name)
         if origin.surface and not free and origin.licence is None:
             raise UsageError(
                 "--surface",

@@ -10,9 +10,9 @@ from weakref import WeakKeyDictionary
 from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
 from flows.layers import add_venue, read_layers
-from flows.review.detections import require_seen
+from flows.review.detections import detection_objections, require_seen
 from flows.review.edit_conflicts import StaleEditError
-from flows.review.identities import require_fitting
+from flows.review.identities import lost_names, require_fitting
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
@@ -20,7 +20,7 @@ from worldpose.review.clicks import Replay, add_previous_value, current_value, r
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.review.journal import MOST_KEPT, Journal, append, read_journal
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 
 def owner_of(edit: Edit) -> str:
@@ -61,7 +61,33 @@ def _replay_corrections(
     return replay
 
 
+def objections_of(run: Run) -> dict[str, str]:
+    """Return why corrections in force do not apply to the results of a run, by their ids."""
+    found = lost_names(run)
+    standing = read_journal(run.store, run.record.match_id).standing
+    said = {name: each.edit.model_dump(mode="json") for name, each in standing.items()}
+    for unit, figures in run.record.figures.items():
+        if unit not in run or not figures.get("corrections_refused"):
+            continue
+        place = (run.record.match_id, *unit.split("/", 1), run.record.results[unit])
+        if not run.store.has(*place):  # withdrawn
+            continue
+        if unit.startswith("tracking/"):
+            taken = run.manifest(unit).recipe.sources["identities"]
+            objections = run[unit].attrs["objections"]
+        else:
+            taken = run.manifest(unit).recipe.sources["edits"]
+            objections = detection_objections(run, unit)
+        assert isinstance(taken, list)  # corrections as JSON
+        for edit, why in zip(taken, objections, strict=True):
+            name = next((it for it in said if said[it] == edit), "")
+            said.pop(name, None)  # of two that are equal, the second can be refused
+            found |= {name: why} if name and why else {}
+    return found
+
+
 def new_corrections(
+    store: Store,
     match: Match,
     journal: Journal,
     edits: Sequence[Edit],
@@ -77,7 +103,7 @@ def new_corrections(
     saw. `ids` has one id per edit; empty = new ids.
 
     Raises:
-        StaleEditError: the edited value differs from the edit's `was`.
+        StaleEditError: the edited value differs from the edit's `was`, or from the results.
         InputError: an edit does not apply, because of its target or because of another person's
             edit in between; no edit is kept.
     """
@@ -89,6 +115,9 @@ def new_corrections(
             found="others, which were made since",
             todo="Read them with `worldpose review show`, and repeat the correction.",
         )
+    if results:  # before the first run there is nothing to compare with: the run tells
+        require_fitting(store, match, edits)
+        require_seen(store, match, edits)
     folder, said = match.folder, []
     for number, given in enumerate(edits):
         edit = add_previous_value(folder, given)
@@ -134,10 +163,9 @@ def keep_edits(
         match = open_match()
         said = match.journal.corrections
         fresh = {name: edit for name, edit in given.items() if name not in said}
-        require_fitting(store, match, [*fresh.values()])
-        require_seen(store, match, [*fresh.values()])
         runs = store.runs(match.match_id)
         corrections = new_corrections(
+            store,
             match,
             match.journal,
             tuple(fresh.values()),

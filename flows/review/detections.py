@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+import numpy as np
+from pydantic import TypeAdapter
+
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Acceptance, Edit
 from flows.review.edit_conflicts import (
@@ -19,9 +22,15 @@ from flows.review.edit_conflicts import (
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_in_broadcast
 from flows.stages.ingest import edits_by_camera
-from worldpose.review.detections import DETECTION_EDITS, find_objection, replay_detections
+from worldpose.errors import InputError
+from worldpose.review.detections import (
+    DETECTION_EDITS,
+    DetectionEdit,
+    find_objection,
+    replay_detections,
+)
 from worldpose.review.journal import say
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
     from worldpose.review.evidence import OpenDetections
@@ -68,6 +77,20 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
                 frame=edit.frame,
             )
         found[place] = replay_detections(found[place], [edit]).observations
+
+
+def detection_objections(run: Run, name: str) -> tuple[str | None, ...]:
+    """Return why each correction in a result with detections does not apply; None if it does.
+
+    Without the result before the corrections, nothing is said of the single ones.
+    """
+    said = TypeAdapter(list[DetectionEdit]).validate_python(
+        run.manifest(name).recipe.sources["edits"]
+    )
+    stored = open_stored(run.store, run.record, name, "edits")
+    if stored.edits:
+        return (None,) * len(said)
+    return replay_detections(KeypointDetections.from_arrays(stored.result), said).objections
 
 
 def _open(store: Store, match: Match, name: str) -> StoredResult:
@@ -136,13 +159,28 @@ def accept(
     those in `people`: match frame, and index among the detections of the frame.
 
     Raises:
-        InputError: the latest run has no detections of this camera.
+        InputError: the latest run has no detections of this camera, or not all of `people`.
     """
     names = results_of(store, match, camera)
+    opened = {name: _open(store, match, name) for name in names}
+    known: set[tuple[int, int]] = set()
+    for each in opened.values():
+        row, detection = np.nonzero(np.isfinite(each.result["score"].values))
+        known.update(
+            zip(each.result["frame"].values[row].tolist(), detection.tolist(), strict=True)
+        )
+    for frame, number in people:
+        if (frame, number) not in known:
+            raise InputError(
+                f"detection {number} of {camera} in frame {frame}",
+                expected="a detection of the latest run",
+                found="none",
+                todo="Load the page again.",
+            )
     acceptance = Acceptance(
         id=f"acceptance.{uuid.uuid4().hex[:12]}",
         match_id=match.match_id,
-        results={name: _open(store, match, name).plain for name in names},
+        results={name: each.plain for name, each in opened.items()},
         at_least=at_least,
         people=tuple(people),
         who=who,

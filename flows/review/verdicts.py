@@ -23,7 +23,7 @@ from flows.gates import GATES
 from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.orchestration.prefect_environment import has_server
-from flows.review.corrections import new_corrections
+from flows.review.corrections import new_corrections, objections_of
 from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
@@ -42,13 +42,14 @@ class Review:
     """A review request and its verdict.
 
     `decision` is the last verdict on exactly these bytes. `is_current` says whether the latest run
-    has the result, `is_corrected` whether corrections since then make the next run compute it
-    again.
+    has the result, `is_asked` whether it waits for this review, and `is_corrected` whether
+    corrections since then make the next run compute the result again.
     """
 
     request: ReviewRequest
     decision: ReviewDecision | None
     is_current: bool
+    is_asked: bool
     is_corrected: bool = False
 
     @property
@@ -62,7 +63,7 @@ class Review:
             return "corrected"
         if self.decision is not None:
             return self.decision.verdict
-        return "waits" if self.is_current else "superseded"
+        return "waits" if self.is_asked else "superseded"
 
     @property
     def question(self) -> str:
@@ -138,6 +139,7 @@ def _find_corrected(store: Store, match: Match, latest: RunRecord) -> frozenset[
 
 def _reviews(journal: Journal, latest: RunRecord | None, corrected: frozenset[str]) -> list[Review]:
     results = {} if latest is None else latest.results
+    asked = set() if latest is None else {unit.request for unit in latest.waiting}
     found = []
     for request in requests_by_id(journal.questions).values():
         decisions = [
@@ -146,7 +148,8 @@ def _reviews(journal: Journal, latest: RunRecord | None, corrected: frozenset[st
         ]
         is_current = any(results.get(unit) == key for unit, key in request.keys.items())
         is_corrected = not corrected.isdisjoint(request.keys)
-        found.append(Review(request, decisions[0] if decisions else None, is_current, is_corrected))
+        decision, is_asked = decisions[0] if decisions else None, request.id in asked
+        found.append(Review(request, decision, is_current, is_asked, is_corrected))
     return found
 
 
@@ -215,7 +218,9 @@ def decide(
             if seen is not None and current[name].state != seen.get(name):
                 raise _decided_meanwhile(name, current[name], seen.get(name))
         results = {} if latest is None else latest.results
-        corrections[:] = new_corrections(match, journal, edits, who=who, note=why, results=results)
+        corrections[:] = new_corrections(
+            store, match, journal, edits, who=who, note=why, results=results
+        )
         now = datetime.now(UTC)
         said = [
             ReviewDecision(
@@ -265,7 +270,9 @@ def correct(
     corrections: list[Correction] = []
 
     def list_corrections(journal: Journal) -> list[Correction]:
-        corrections[:] = new_corrections(match, journal, edits, who=who, note=why, results=results)
+        corrections[:] = new_corrections(
+            store, match, journal, edits, who=who, note=why, results=results
+        )
         return corrections
 
     say(store, match.match_id, list_corrections)
@@ -302,7 +309,10 @@ def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str
 
 
 def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origin]:
-    """Return each result's origin by `stage/unit`: automatic, corrected or rejected."""
+    """Return each result's origin by `stage/unit`: automatic, corrected or rejected.
+
+    Corrections that the run refused, or that were made since, correct none of its results.
+    """
     made_from: dict[str, tuple[str, ...]] = {}
     rejected = set()
     run = Run(store, record)
@@ -312,7 +322,13 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
         decision = last_decision(match.journal.questions, name, manifest.content)
         if decision is not None and decision.verdict == "reject":
             rejected.add(name)
-    return unit_origins(made_from, match.corrections, rejected)
+    refused = objections_of(run)
+    applied = [
+        each
+        for each in match.corrections
+        if each.id not in refused and each.made_at <= record.started_at
+    ]
+    return unit_origins(made_from, applied, rejected)
 
 
 def unit_origins(

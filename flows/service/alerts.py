@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from threading import Lock
 from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival, MatchSummary, QueuedRun
+from data_contracts.run import RunRecord
 from flows.overview import age
 from flows.review.metric_words import all_reasons
 from flows.service.channels import Channel
@@ -63,24 +64,18 @@ class Alert:
 
 def alerts_now(
     plan: ServePlan,
-    matches: Iterable[MatchSummary],
+    matches: Sequence[MatchSummary],
     arrivals: Iterable[Arrival],
     runs: Sequence[QueuedRun],
 ) -> list[Alert]:
-    """Return all current alerts, sent before or not; at most one of each match.
+    """Return all current alerts, sent before or not.
 
     `runs` are those of the queue, in the order of the requests.
     """
-    found = [*_of_runs(plan, runs)]
+    latest = {each.match_id: each.latest for each in matches if each.latest is not None}
+    found = [*_of_runs(plan, runs, latest)]
     for match in matches:
         found += _of_match(plan, match)
-    by_match: dict[str, list[Alert]] = {}
-    for alert in found:
-        by_match.setdefault(alert.match_id or alert.key, []).append(alert)
-    found = [
-        replace(first, text="; ".join([first.text, *(each.text for each in others)]))
-        for first, *others in by_match.values()
-    ]
     found += [
         Alert(
             f"arrival_refused/{arrival.name}/{arrival.fingerprint}",
@@ -98,9 +93,14 @@ def alerts_now(
     return found
 
 
-def _of_runs(plan: ServePlan, runs: Sequence[QueuedRun]) -> Iterator[Alert]:
+def _of_runs(
+    plan: ServePlan, runs: Sequence[QueuedRun], latest: Mapping[str, RunRecord]
+) -> Iterator[Alert]:
     """Yield alerts of the last ended run of each match and flow, and of runs that were stalled."""
     for run in last_ended(runs):
+        since = latest.get(run.match_id) if run.flow == "match" else None
+        if since and since.state in ("complete", "waiting") and since.finished_at > run.changed_at:
+            continue  # of `worldpose run`, which is not in the queue
         link = f"{plan.dashboard}/runs/flow-run/{run.flow_run}"
         if run.state == "failed" and age(run.changed_at) < 86400.0 * FAILED_DAYS:
             state = "partial" if ": partial" in run.message else "failed"
@@ -190,9 +190,10 @@ class AlertDispatcher:
         """
         while pending := self._pending(channel):
             is_flood = len(pending) > MAX_SINGLE
-            keys, content = [pending[0][0]], pending[0][1]
+            keys, content = pending[0]
             if is_flood:
-                keys, texts = [key for key, _ in pending], [it["text"] for _, it in pending]
+                keys = [key for some, _ in pending for key in some]
+                texts = [it["text"] for _, it in pending]
                 content = {**_content(Alert("", "digest", _digest(texts, "are new")))}
             try:
                 channel.send(content)
@@ -213,13 +214,20 @@ class AlertDispatcher:
             self._keep()
         return 0.0
 
-    def _pending(self, channel: Channel) -> list[tuple[str, dict[str, str]]]:
+    def _pending(self, channel: Channel) -> list[tuple[list[str], dict[str, str]]]:
+        """Return the keys and content of each outstanding message, one of each match."""
+        found: dict[str, dict[str, dict[str, str]]] = {}
         with self._lock:
-            return [
-                (key, {name: kept[name] for name in CONTENT})
-                for key, kept in self._told.items()
-                if channel.name not in kept["told_by"]
-            ]
+            for key, kept in self._told.items():
+                if channel.name not in kept["told_by"]:
+                    content = {name: kept[name] for name in CONTENT}
+                    found.setdefault(kept["match"] or key, {})[key] = content
+        merged = []
+        for some in found.values():
+            first, *others = some.values()
+            text = "; ".join([first["text"], *(each["text"] for each in others)])
+            merged.append(([*some], {**first, "text": text}))
+        return merged
 
     def _keep(self) -> None:
         try:

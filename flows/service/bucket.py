@@ -44,8 +44,10 @@ class BucketInbox:
         self._objects = ObjectBlobs.at(url)
         self._file = state.folder / "bucket.json"
         kept = json.loads(self._file.read_text()) if self._file.exists() else {}
-        self._copied: dict[str, str] = kept
+        # Fingerprints of a match's objects and of the files that became of them.
+        self._copied: dict[str, list[str]] = kept
         self._since: dict[str, tuple[str, float]] = {}
+        self._told: dict[str, str] = {}
 
     def fetch(self, now: float, quiet: float) -> list[str]:
         """Copy each match without recent changes; return their names.
@@ -59,13 +61,19 @@ class BucketInbox:
             if seen != fingerprint:
                 since = now
             self._since[name] = (fingerprint, since)
-            if self._copied.get(name) == fingerprint or now - since < quiet:
+            if self._copied.get(name, [""])[0] == fingerprint or now - since < quiet:
                 continue
-            if self._copy(name, objects):
+            refused = self._find_objection(name, objects)
+            if refused is not None:
+                if self._told.get(name) != refused:
+                    LOG.warning("%s/%s is not taken: %s", self.url, name, refused)
+                self._told[name] = refused
+            else:
+                self._copy(name, objects)
                 fetched.append(name)
-            self._copied[name] = fingerprint
-            with whole_file(self._file) as draft:
-                draft.write_text(json.dumps(self._copied, indent=2) + "\n")
+                self._copied[name] = [fingerprint, _fingerprint_files(self.inbox / name)]
+                with whole_file(self._file) as draft:
+                    draft.write_text(json.dumps(self._copied, indent=2) + "\n")
         return fetched
 
     def _list_objects(self) -> dict[str, list[Entry]]:
@@ -82,28 +90,38 @@ class BucketInbox:
             if any(each.path == f"{name}/match.yaml" for each in objects)
         }
 
-    def _copy(self, name: str, objects: list[Entry]) -> bool:
-        """Copy the whole match to the folder, replacing an earlier copy."""
-        target = self.inbox / name
-        draft = target.with_name(f".{target.name}.arriving")
+    def _find_objection(self, name: str, objects: list[Entry]) -> str | None:
+        """Return why the match cannot be copied to the folder; None if it can."""
         try:
             for each in objects:
                 checked_path(each.path)
         except InputError as error:
-            LOG.warning("%s/%s is not taken: %s", self.url, name, error)
-            return False
+            return str(error)
+        target, made = self.inbox / name, self._copied.get(name, [])[1:]
+        if not target.exists() or made == [_fingerprint_files(target)]:
+            return None
+        why = "was changed here since it was copied: move it away" if made else "is there already"
+        return f"{target} {why}"
+
+    def _copy(self, name: str, objects: list[Entry]) -> None:
+        """Copy the whole match to the folder, replacing an earlier copy."""
+        target = self.inbox / name
+        draft = target.with_name(f".{target.name}.arriving")
         shutil.rmtree(draft, ignore_errors=True)
         for each in objects:
             self._objects.download(each.path, draft / each.path.removeprefix(f"{name}/"))
-        if target.exists() and name not in self._copied:
-            LOG.warning("%s/%s is not taken: %s is there already", self.url, name, target)
-            shutil.rmtree(draft)
-            return False
         shutil.rmtree(target, ignore_errors=True)
         draft.rename(target)
-        return True
 
 
 def _fingerprint(objects: list[Entry]) -> str:
-    lines = [f"{each.path}\n{each.size} {each.modified.isoformat()}" for each in objects]
+    return _digest([f"{each.path}\n{each.size} {each.modified.isoformat()}" for each in objects])
+
+
+def _fingerprint_files(folder: Path) -> str:
+    files = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
+    return _digest([f"{path}\n{about.st_size} {about.st_mtime_ns}" for path, about in files])
+
+
+def _digest(lines: list[str]) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()

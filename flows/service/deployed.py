@@ -33,10 +33,10 @@ from flows.registering import open_match
 from flows.reprocess import reprocess_matches
 from flows.results.automatic_exports import export_after_run
 from flows.run_plan import plan_ahead
-from flows.run_record import RunLog, expected_work, latest_run
+from flows.run_record import RunLog, alone_with, expected_work, latest_run
 from flows.running import RunRequest, settle
 from flows.service.inbox import take_in
-from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name, title_of
+from flows.service.match_runs import MatchRuns, match_runs_of, run_name, title_of
 from flows.service.plan import ServePlan
 from flows.settings import selected_stages
 from flows.stage import Match
@@ -115,7 +115,7 @@ def match(
     runs = match_runs_of(store.url)
     if runs is not None:
         link_pages(runs.pages, match_id)
-    with alone_with(store, match_id):
+    with alone_with(store, match_id, wait=True):
         opened, request = settle(store, open_match(store, match_id), request)
         request = replace(request, gates=request.gates or "auto")
         compute = _run_until_decided if request.most_iterations == 1 else _iterate_until_decided

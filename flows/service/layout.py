@@ -19,6 +19,7 @@ from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.store.blobs import storage_errors
+from worldpose.store.runs import hold_lock
 
 PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")
 """First to last; `INBOX/urgent` and `INBOX/background` set the priority of their matches."""
@@ -113,18 +114,9 @@ class StateFolder:
 
     @contextmanager
     def only_one(self, what: str, *, wait: bool) -> Iterator[bool]:
-        """Hold the lock `what`; yield whether it was acquired, which can fail without `wait`.
-
-        The operating system releases the lock when the process ends.
-        """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / f"{what}.lock").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            except BlockingIOError:
-                yield False
-                return
-            yield True
+        """Hold the lock `what`; yield whether it was acquired, as `hold_lock`."""
+        with hold_lock(self.folder / f"{what}.lock", wait=wait) as is_held:
+            yield is_held
 
     def is_held(self, what: str) -> bool:
         """Return whether a process holds the lock `what`; a reader needs no right to write."""

@@ -6,15 +6,12 @@ have the worker, queues, limits and links of the deployment.
 
 from __future__ import annotations
 
-import logging
 import os
-import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Final
+from typing import Any
 from urllib.parse import quote
 
 from pydantic import JsonValue
@@ -22,16 +19,10 @@ from pydantic import JsonValue
 from data_contracts.operations import Priority, QueuedRun
 from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
-from flows.run_record import runs_at_work
 from flows.service.layout import is_alive, served_state
 from flows.service.plan import TITLES, ServePlan, deployment_name
 from flows.service.run_queue import queued_run
 from worldpose.store.run_queue import RunQueue, queue_of
-from worldpose.store.store import Store
-
-LOG: Final = logging.getLogger("worldpose.operations")
-LOOK_SECONDS: Final = 1.0
-"""Between two looks for the end of another run [s]."""
 
 
 @dataclass(frozen=True)
@@ -158,26 +149,3 @@ def match_runs_of(url: str) -> MatchRuns | None:
     return MatchRuns(
         serving.prefect, login, name=serving.name, pages=address, project=serving.project
     )
-
-
-@contextmanager
-def alone_with(store: Store, match_id: str) -> Iterator[None]:
-    """Wait until no other run of a deployment processes the match on this machine.
-
-    The operating system ends the hold when the process ends.
-    """
-    state = served_state(store.url)
-    with ExitStack() as stack:
-        if state.folder.parent.is_dir():  # else this is a worker without a service's state
-            said = LOG.info
-            while True:  # not one long wait: a process that hangs uses no processor time
-                with ExitStack() as held:
-                    if held.enter_context(state.only_one(f"match-{match_id}", wait=False)):
-                        stack.push(held.pop_all())
-                        break
-                said("%s: another run of it is at work; this one continues after it", match_id)
-                said = LOG.debug
-                time.sleep(LOOK_SECONDS)
-        while runs_at_work(store, match_id):  # by `worldpose run`, which takes no lock
-            time.sleep(LOOK_SECONDS)
-        yield

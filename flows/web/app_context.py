@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock, Thread, Timer
 from typing import Annotated, Any
@@ -216,6 +217,8 @@ class Continuing:
         if last is None or last.state != "failed":
             return None
         code, message = 1, last.message
+        if _ran_since(self.store, match_id, last.changed_at):
+            return None
         record = latest_run(self.store, match_id)
         if record is not None and f"run {record.run_id} of {match_id}:" in message:
             # The flow failed because its run is not complete: the record says how it ended.
@@ -290,6 +293,12 @@ class _Seen:
     ended: dict[str, QueuedRun]
 
 
+def _ran_since(store: Store, match_id: str, ended_at: datetime) -> bool:
+    """Return whether a run of the match, of these pages or not, has a record since then."""
+    record = latest_run(store, match_id)
+    return record is not None and record.finished_at > ended_at
+
+
 def _terminate(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGTERM)
@@ -304,7 +313,7 @@ class LocalRuns:
     _at_work: str | None = None
     _output: Path | None = None
     _process: subprocess.Popen[bytes] | None = None
-    _ended: dict[str, tuple[int, Path | str]] = field(default_factory=dict)
+    _ended: dict[str, tuple[int, Path | str, datetime]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     def go_on(self, match_id: str, gates: str | None) -> dict[str, Any]:
@@ -334,7 +343,9 @@ class LocalRuns:
             ended = self._ended.get(match_id)
         if ended is None:
             return None
-        code, said = ended
+        code, said, ended_at = ended
+        if _ran_since(self.store, match_id, ended_at):
+            return None
         printed = said if isinstance(said, str) else said.read_text(errors="replace")
         lines = printed.splitlines()[-LAST_LINES:]
         return {"state": "ended", "code": code, "lines": lines}
@@ -367,7 +378,7 @@ class LocalRuns:
                 ended = 1, f"The run could not be started: {error}"
             with self._lock:
                 self._process = None
-                self._ended[match_id], self._output = ended, None
+                self._ended[match_id], self._output = (*ended, datetime.now(UTC)), None
                 if not self._waiting:
                     self._at_work = None
                     return

@@ -16,7 +16,7 @@ _SENTENCE: Final = re.compile(r"(?<=[.!?]) +")
 _ON_PAGES: Final = {
     "run": "Run the match on its page.",
     "review": "The page of the match shows what waits.",
-    "ingest": "Put the match folder into the inbox.",
+    "ingest": "Put the match folder into the inbox, or ask the operator to register it.",
     "status": "The status page lists all runs.",
 }
 """Actions of pages in place of commands."""

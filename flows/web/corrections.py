@@ -14,9 +14,8 @@ from data_contracts.records import Count, Name, Record
 from data_contracts.review import Correction, Edit
 from data_contracts.run import GatePolicy
 from flows.layers import merge_general
-from flows.review.corrections import keep_edits, owner_of
+from flows.review.corrections import keep_edits, objections_of, owner_of
 from flows.review.descriptions import in_words, is_first_click
-from flows.review.identities import lost_names
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
 from flows.stage import Match
@@ -68,8 +67,8 @@ class GoingOn(Record):
     """Options for continuing a run."""
 
     gates: GatePolicy | None = None
-    """When results need review if no layer of settings says it; None = the default of
-    `worldpose run`."""
+    """When results need review if no layer of settings says it; None = auto, or as the run that
+    waits."""
 
 
 class Withdrawing(Record):
@@ -110,7 +109,7 @@ class Group:
 def group_corrections(store: Store, match: Match) -> list[Group]:
     """Return all corrections in force in groups, the latest group first."""
     latest = latest_run(store, match.match_id)
-    objections = {} if latest is None else lost_names(Run(store, latest))
+    objections = {} if latest is None else objections_of(Run(store, latest))
     objections |= {each.id: why for each, why in match.stale}
     groups: list[Group] = []
     open_groups: dict[tuple[str, str, bool], Group] = {}
@@ -159,7 +158,10 @@ def routes(context: PageContext) -> APIRouter:
     @router.post("/runs")
     def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:
         stated = merge_general(context.match(match_id).layers).gates
-        return context.continuing.go_on(match_id, given.gates if stated is None else None)
+        latest = latest_run(context.store, match_id)
+        waits = latest is not None and latest.state == "waiting"
+        gates = given.gates or (None if waits else "auto")
+        return context.continuing.go_on(match_id, gates if stated is None else None)
 
     @router.post("/corrections")
     def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:

@@ -154,8 +154,10 @@ def _interpolate(
     }
     hidden = {frame for frame, edit in corrected.items() if edit.xy is None}
     last = corrected.get(max(corrected.keys() - hidden, default=-1))
-    joint = COCO17.index(given.joint)
-    now = detections_now(store, match, camera, given.frame).keypoints[0, given.detection, joint]
+    shown = detections_now(store, match, camera, given.frame).keypoints[0]
+    is_there = given.joint in COCO17 and given.detection < len(shown)
+    joint = COCO17.index(given.joint) if is_there else 0
+    now = shown[given.detection, joint] if is_there else np.full(2, np.nan)
     if last is None or last.xy is None or not np.isfinite(now).all():
         raise InputError(
             f"{given.joint} of detection {given.detection} in {camera}, frame {given.frame}",

@@ -18,7 +18,12 @@ from flows.web.browser_words import in_browser
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
 from worldpose.formats.calibration_files import LeftOut
-from worldpose.formats.calibration_forms import FORMS, calibrations_in, read_calibration
+from worldpose.formats.calibration_forms import (
+    FORMS,
+    calibrations_in,
+    is_of_sensor,
+    read_calibration,
+)
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.keypoint_files import read_people
 from worldpose.ingest.camera_videos import fit_to_video
@@ -289,7 +294,10 @@ def _take_calibration(
     for name, camera in known.items():
         index = indexes.get(camera.video or "")
         if isinstance(index, FrameIndex) and camera.video is not None:
-            cameras[name] = fit_to_video(folder / camera.video, cameras[name], index, notes)
+            file, poses = folder / camera.video, bool(people)
+            cameras[name] = fit_to_video(
+                file, cameras[name], index, notes, of_sensor=is_of_sensor(source), has_poses=poses
+            )
     placed, changes = place_as_stated(None, None)(
         source, {name: cameras[name] for name in known}, people, spec.fps
     )

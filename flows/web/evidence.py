@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint, ReviewRequest
+from flows.layers import pitch_of_run
 from flows.reports.broadcast import broadcast_pictures, broadcast_tables
 from flows.reports.cameras import camera_evidence, health_picture, proposal_evidence
 from flows.reports.clip_video import clip_view
@@ -208,7 +209,7 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
         joints=joints,
     )
     cameras = static_cameras(run, match.folder.spec, "triangulation")
-    png = plot_paths(tracks, cameras=cameras, pitch=match.folder.pitch)
+    png = plot_paths(tracks, cameras=cameras, pitch=pitch_of_run(run, lambda: match.folder.pitch))
     rows = tuple(
         (
             str(join["before"]),

@@ -90,14 +90,14 @@ def _add_changes(router: APIRouter, context: PageContext) -> None:
 
     @router.post("/cancellation")
     def cancel(match_id: str) -> dict[str, bool]:
-        context.match(match_id)
+        context.stored_match(match_id)
         if not context.continuing.cancel(match_id):
             raise HTTPException(409, "no run of these pages is at work: end it where it was begun")
         return {"cancelled": True}
 
     @router.post("/pins")
     def pin(match_id: str, given: GivenPin, who: Person) -> dict[str, str]:
-        context.match(match_id)
+        context.stored_match(match_id)
         _find_run(context.store, match_id, given.run)
         now = datetime.now(UTC)
         kept = Pin(
@@ -112,7 +112,7 @@ def _add_changes(router: APIRouter, context: PageContext) -> None:
 
     @router.post("/pins/{name}/removal")
     def unpin(match_id: str, name: str) -> dict[str, str]:
-        context.match(match_id)
+        context.stored_match(match_id)
         return {"name": unpin_run(context.store.blobs, match_id, name).name}
 
 
@@ -132,8 +132,7 @@ def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> st
     """Return why a run was made, by what differs from the run before it."""
     if parent is None:
         return "first run"
-    made = corrections_since(match.journal, parent.started_at)
-    made -= corrections_since(match.journal, record.started_at)
+    made = corrections_since(match.journal, parent.started_at, record.started_at)
     causes = [f"{made} {'correction' if made == 1 else 'corrections'}"] if made > 0 else []
     causes += ["other settings"] if parent.overrides != record.overrides else []
     causes += ["other libraries"] if parent.versions != record.versions else []

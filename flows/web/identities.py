@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Image, find_runs
 from data_contracts.conventions import COCO17_HIPS
 from data_contracts.review import Correction, SplitTrack
+from flows.layers import pitch_of_run
 from flows.reports.match_pictures import frame_picture
 from flows.review.descriptions import in_words
 from flows.review.detections import detections_now
@@ -50,8 +51,9 @@ def routes(context: PageContext) -> APIRouter:
         spec = match.folder.spec
         first = int(found.frame[0])
         step = max(1, len(found.frame) // TRAJECTORY_POINTS)
-        pitch = match.folder.pitch
-        ways = _ways(found, open_run(context.store.url, match_id)[f"tracking/{clip}"])
+        run = open_run(context.store.url, match_id)
+        pitch = pitch_of_run(run, lambda: match.folder.pitch)
+        ways = _ways(found, run[f"tracking/{clip}"])
         return {
             "clip": clip,
             "fps": spec.fps,

@@ -106,7 +106,7 @@ class _Clips:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)
                 video = describe_video(run, match, clip)
-                self._clip = viewer_clip(origin, clip, match.folder.pitch, video)
+                self._clip = viewer_clip(origin, clip, video)
                 self._key = key
             return self._clip
 

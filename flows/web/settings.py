@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from threading import Lock
 from typing import Any
 
 from fastapi import APIRouter, HTTPException
@@ -13,6 +12,7 @@ from data_contracts.records import Name, Record
 from flows.layers import (
     MATCHES,
     PROJECT,
+    SETTINGS_LOCK,
     VENUES,
     Layer,
     list_venues,
@@ -25,6 +25,7 @@ from flows.settings import known_settings, resolve, save_layer
 from flows.web.app_context import PageContext
 from worldpose.errors import InputError
 from worldpose.store.paths import is_name
+from worldpose.store.runs import alone
 
 
 class SavedLayer(Record):
@@ -38,7 +39,7 @@ class SavedLayer(Record):
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the settings page."""
     router = APIRouter(prefix="/api/settings")
-    store, lock = context.store, Lock()
+    store = context.store
 
     def layers_of(match: str | None) -> tuple[Layer, ...]:
         if match is None:
@@ -76,7 +77,8 @@ def routes(context: PageContext) -> APIRouter:
         is_venue = kind == VENUES and is_name(name)
         if not (given.layer == PROJECT or is_match or is_venue):
             raise HTTPException(404, "no such layer of settings")
-        with lock:  # of two saves of one revision, the second is refused
+        # Of two saves of one revision, the second is refused.
+        with alone(store.blobs, SETTINGS_LOCK, wait=True):
             save_revision(given, name if is_match else None)
         return settings(match)
 

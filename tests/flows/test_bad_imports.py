@@ -173,6 +173,11 @@ def test_places_for_a_match(lab):
     given = ("--calibration", lab / "calibration.toml", "--detections", lab / "poses", "--fps", 25)
     for out, told in cases.items():
         assert told in refuse(*given, "--out", out)
+    for fps in ("nan", "-5", "0"):
+        given = (*given[:-1], fps)
+        told = run(*given, "--out", lab / "out").output
+        assert f"{fps} is not a number of frames per second" in told
+    given = (*given[:-1], 25)
     assert run(*given, "--out", lab / "out").exit_code == 0
 
 

@@ -53,6 +53,11 @@ def test_the_kit_becomes_a_scored_submission_with_the_given_rows(server, kit, tm
     ("change", "words"),
     [
         (lambda kit: (kit / "boxes" / f"{NAME}.npy").unlink(), ("boxes", NAME)),
+        (lambda kit: shutil.copy(kit / f"boxes/{NAME}.npy", kit / "boxes/B.npy"), ("B.npz",)),
+        (
+            lambda kit: shutil.copy(kit / f"videos/{NAME}.mp4", kit / f"videos/{NAME}.mov"),
+            (f"one video of {NAME}", f"{NAME}.mov"),
+        ),
         (lambda kit: (kit / "pitch_points.txt").unlink(), ("pitch_points.txt",)),
         (lambda kit: shutil.rmtree(kit / "videos"), (f"videos/{NAME}.mp4", "neither")),
         (lambda kit: cut(kit, "boxes"), ("skel_2d", "(24, 5)", "(25, 5")),

@@ -1,11 +1,16 @@
 """`worldpose evaluate` on files alone: what is scored, and what is said when nothing can be."""
 
+import shutil
+
 import numpy as np
 import pytest
 from command_line import succeed
 
+from flows.results.evaluation import score
+from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import write_markers
+from worldpose.formats.release_cameras import read_camera
 
 
 def changed(source, target, **changes):
@@ -58,6 +63,29 @@ def test_cameras_are_scored_against_those_of_the_reference(tiny, tmp_path):
     assert errors["ground_error_median_m"] == pytest.approx(0.3, abs=0.01)
     assert errors["rotation_error_deg"] == pytest.approx(0.0, abs=1e-9)
     assert errors["focal_error_percent"] == 0
+
+
+def test_cameras_without_a_match_have_the_image_that_their_centre_states(tiny, tmp_path):
+    def halved(k):
+        return k * [[[0.5], [0.5], [1.0]]]
+
+    for name in ("mine", "true"):
+        (tmp_path / name / "cameras").mkdir(parents=True)
+        for file in (tiny / "reference" / "cameras").iterdir():
+            changed(file, tmp_path / name / "cameras" / file.name, K=halved)
+    file = next((tmp_path / "true" / "cameras").iterdir())
+    assert read_camera(file).image_size == pytest.approx([960, 540], abs=10)
+    figures = evaluate(tmp_path / "mine", tmp_path / "true")
+    assert figures["notes"] == [
+        "no match states the pitch: ground errors are those of one of 105 x 68 m"
+    ]
+
+
+def test_joints_of_other_rates_are_refused(tiny, tmp_path):
+    (tmp_path / "frame_rates.json").write_text('{"clip": 99.0}')
+    shutil.copy(tiny / "reference" / "joints.npz", tmp_path)
+    with pytest.raises(InputError, match=r"found 99 in .*joints\.npz and 25 in"):
+        score(f"{tmp_path / 'joints.npz'}", f"{tiny / 'reference' / 'joints.npz'}", "none")
 
 
 def test_markers_are_laid_over_and_scored(tiny, tmp_path):

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from data_contracts.review import MovedPoint, ReviewDecision
 from flows.cli.app import app
+from flows.cli.synchronize import compute_poses
 from flows.gates import GATES, Gatekeeper
 from flows.method import METHOD
 from flows.registering import open_match
@@ -88,6 +89,34 @@ def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_app
     record = run(store, "auto")
     assert (record.run_id, record.state, record.executed) == ("0004", "complete", ())
     assert record.results == store.run(TINY, "0001").results
+
+
+def test_a_part_of_the_method_keeps_the_questions_and_the_policy_of_a_run_that_waits(store):
+    waits = run(store, "auto")
+    part = RunRequest({}, until_stage="detection")
+    found = compute_poses(store, open_match(store, TINY), 1, part).record
+    assert units(found.waiting) == units(waits.waiting)
+    assert latest_run(store, TINY) == waits
+    while (later := units(run(store, "always").waiting)) != ["tracking/clip"]:
+        approve(store)
+    run_match(store, open_match(store, TINY), part)
+    latest = latest_run(store, TINY)
+    assert (latest.gates, units(latest.waiting)) == ("always", later)
+    # Where a part ended without a question, the run to the end asks as it was begun.
+    run(store, "always", until_stage="ingest", from_stage="ingest")
+    approve(store)
+    run(store, "always", until_stage="ingest")
+    assert run(store, None).gates == "always"
+
+
+def test_what_no_run_waits_for_any_more_is_not_listed(store):
+    run(store, "auto")
+    latest = run(store, "never")
+    assert (latest.run_id, latest.state) == ("0003", "complete")
+    reviews = reviews_of(store, open_match(store, TINY), latest)
+    assert reviews and {each.state for each in reviews} == {"superseded"}
+    with pytest.raises(InputError, match="nothing that waits"):
+        approve(store)
 
 
 def test_always_asks_behind_every_gate_in_turn(store):

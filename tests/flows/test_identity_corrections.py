@@ -1,19 +1,29 @@
 """Identity corrections override the tracker's output, however the run produced it."""
 
+from datetime import UTC, datetime
+from importlib import import_module
+
 import page_client
 import pytest
 from command_line import TINY, succeed
 from page_client import MATCH
 
-from data_contracts.review import Correction, MergedTracks, NamedTrack, SplitTrack
+from data_contracts.review import (
+    Correction,
+    DeletedDetection,
+    MergedTracks,
+    NamedTrack,
+    SplitTrack,
+)
 from flows.registering import open_match
 from flows.results.best_results import clip_positions
-from flows.review.corrections import keep_edits
+from flows.review.corrections import keep_edits, objections_of
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import identities_now, lost_names, names_of
-from flows.review.verdicts import origins_of, withdraw
+from flows.review.verdicts import correct, origins_of, withdraw
 from flows.run_plan import plan_run
-from flows.run_record import latest_run
+from flows.run_record import RunLog, latest_run
+from flows.settings import selected_stages
 from tasks.tracking import tracking
 from worldpose.review.identities import find_sighting
 from worldpose.review.journal import append, read_journal
@@ -82,9 +92,11 @@ def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
     assert len(open_match(store, TINY).corrections) == 1
     with pytest.raises(StaleEditError, match="person 0 is not the person that was seen"):
         say(store, b=split)
-    latest = latest_run(store, TINY)
-    origins = origins_of(store, open_match(store, TINY), latest)
-    assert origins[f"tracking/{clip}"] == "corrected"
+    before = latest_run(store, TINY)
+    after = before.model_copy(update={"started_at": datetime.now(UTC)})
+    runs = ((before, "automatic"), (after, "corrected"))
+    for latest, origin in runs:
+        assert origins_of(store, open_match(store, TINY), latest)[f"tracking/{clip}"] == origin
 
 
 def test_a_name_recomputes_nothing_and_is_in_the_tables_at_once(store):
@@ -143,3 +155,48 @@ def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(stor
     assert (listed["id"], listed["reason"]) == ("c", said)
     say(store, d=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
     assert lost_names(run) == {}
+
+
+def test_every_door_refuses_what_does_not_fit_the_results(store):
+    refused = [
+        NamedTrack(clip="clip", person=77, name="p"),
+        DeletedDetection(camera="cam01", frame=5, detection=77),
+        DeletedDetection(camera="cam01", frame=5, detection=0, was=(1.0, 1.0, 20.0, 20.0)),
+    ]
+    match = open_match(store, TINY)
+    for edit in refused:
+        with pytest.raises(StaleEditError):
+            correct(store, match, [edit], who="Ada", why="")
+        with pytest.raises(StaleEditError):
+            say(store, a=edit)
+    assert read_journal(store, TINY).entries == ()
+
+
+def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
+    edits = {
+        "out": DeletedDetection(camera="cam01", frame=5, detection=77),
+        "one": MergedTracks(clip="clip", kept=0, merged=88),
+    }
+    based = {"match_id": TINY, "who": "Ada", "based_on": {}}
+    made = [
+        Correction(id=name, edit=edit, made_at=datetime.now(UTC), **based)
+        for name, edit in edits.items()
+    ]
+    append(store, read_journal(store, TINY), made)  # as an older version kept them
+
+    def compute_units(stage, units):
+        for unit in units:
+            if not unit.published:
+                task = getattr(import_module(stage.task_module), stage.name)
+                task.fn(unit.work(store.url, open_match(store, TINY), "0002"))
+                yield unit, None
+
+    match, until = open_match(store, TINY), selected_stages(None, "tracking")
+    record = RunLog.begin(store, match, until, {}).run_stages(compute_units)
+    found = objections_of(Run(store, record))
+    assert "there is no detection 77" in found["out"] and "no person 88" in found["one"]
+    assert not {"corrected"} & {*origins_of(store, open_match(store, TINY), record).values()}
+    say(store, later=DeletedDetection(camera="cam01", frame=5, detection=0))
+    shown = succeed("review", "show", TINY, "--project", store.url).out
+    assert "does not apply: there is no detection 77" in shown
+    assert "not in a run yet" in shown and "corrected" not in shown and "  applied" not in shown

@@ -137,7 +137,7 @@ def looped(monkeypatch):
         class Anything:
             match_id = "m"
 
-        return iterate_match(None, Anything(), RunRequest({}), most), ran
+        return iterate_match(None, Anything(), RunRequest({}, gates="never"), most), ran
 
     return loop
 
@@ -207,7 +207,7 @@ def test_questions_of_an_earlier_run_are_asked_by_a_new_one(monkeypatch):
     monkeypatch.setattr(iterate, "plan_ahead", lambda *_: SimpleNamespace(missing=[]))
     monkeypatch.setattr(iterate, "latest_run", lambda *_: latest)
     monkeypatch.setattr(iterate, "run_match", lambda *_: run(3, "waiting"))
-    match, request = SimpleNamespace(match_id="m"), RunRequest({})
+    match, request = SimpleNamespace(match_id="m"), RunRequest({}, gates="never")
     for recorded, expected in (
         (run(1, "waiting"), "0003"),  # nobody can answer them: they are not the latest run's
         (run(1, "complete"), "0001"),

@@ -2,6 +2,8 @@
 
 import sys
 import time
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import page_client
@@ -10,6 +12,9 @@ from command_line import TINY
 from page_client import MATCH
 
 from data_contracts.conventions import COCO17
+from data_contracts.review import Correction, MovedKeypoint, Withdrawal
+from flows import registering
+from flows.match_state import corrections_since
 from flows.registering import open_match
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
@@ -22,7 +27,7 @@ def ada(project_copy):
     return page_client.log_in(page_client.served(project_copy), "Ada")
 
 
-def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy):
+def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy, monkeypatch):
     store = Store.open(str(project_copy))
     first = store.run(TINY)
     figures = {name: dict(each) for name, each in first.figures.items()}
@@ -42,8 +47,27 @@ def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy):
     pin = {"run": "0001", "name": "v1"}
     assert ada.post(f"{MATCH}/pins", json=pin).status_code == 200
     assert ada.get(f"{MATCH}/runs").json()[1]["pins"] == ["v1"]
+    # Neither needs the match folder.
+    monkeypatch.setattr(registering, "_is_there", lambda folder: False)
     assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 200
     assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 422
+
+
+def test_what_is_withdrawn_later_changes_no_cause_of_a_run():
+    start = datetime(2026, 1, 1, tzinfo=UTC)
+
+    def at(hours):
+        return start + timedelta(hours=hours)
+
+    edit = MovedKeypoint(camera="c", frame=1, detection=0, joint="nose", was=None, xy=(1.0, 2.0))
+    made = [
+        Correction(id=name, match_id="m", edit=edit, who="Ada", made_at=at(1), based_on={})
+        for name in "ab"
+    ]
+    undone = Withdrawal(match_id="m", correction="a", who="Ada", withdrawn_at=at(3))
+    journal = SimpleNamespace(records=[*made, undone], corrections={each.id: each for each in made})
+    assert [corrections_since(journal, at(0), at(end)) for end in (0, 2, 4)] == [0, 2, 1]
+    assert corrections_since(journal, at(2)) == 1
 
 
 def test_a_run_is_cancelled(ada, monkeypatch):
@@ -69,7 +93,7 @@ def test_a_run_that_cannot_start_has_its_reason_and_delays_no_other(store, monke
 
     monkeypatch.setattr(app_context.tempfile, "mkdtemp", make)
     monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", "print('ran')"])
-    runs = app_context.LocalRuns(store)
+    runs, first = app_context.LocalRuns(store), store.run(TINY)
     begun = time.monotonic()
     for name in ("first", "second"):
         runs.go_on(name, None)
@@ -78,6 +102,14 @@ def test_a_run_that_cannot_start_has_its_reason_and_delays_no_other(store, monke
             time.sleep(0.05)
     assert "No space left" in runs.state("first")["lines"][0]
     assert runs.state("second")["lines"] == ["ran"]
+    # What ended here is old news once the match has run elsewhere.
+    runs.go_on(TINY, None)
+    while runs.state(TINY)["state"] == "running":
+        assert time.monotonic() - begun < 40
+        time.sleep(0.05)
+    done = {"run_id": store.reserve_run(TINY), "finished_at": datetime.now(UTC)}
+    store.finish_run(first.model_copy(update=done))
+    assert runs.state(TINY) is None
 
 
 def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
@@ -95,6 +127,11 @@ def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
 
     joint = int(np.isfinite(np.stack([place(n)[1] for n in range(5)])).all(axis=(0, 2)).argmax())
     assert ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).status_code == 422
+    for odd in ({"joint": "zz"}, {"joint": COCO17[joint], "detection": 5000}):
+        assert ada.post(path, json={**place(4)[0], **odd}).status_code == 422
+    unknown = {"kind": "moved_keypoint", "camera": camera, **place(4)[0], "joint": "zz", "xy": None}
+    edits = {"edits": [{"id": "moved_keypoint.zz", "edit": unknown}]}
+    assert ada.post(f"{MATCH}/corrections", json=edits).status_code == 409
     for number, (offset, xy) in enumerate(
         # The last correction of a frame counts.
         ((0, (700.0, 20.0)), (0, (100.0, 200.0)), (3, None), (4, (140.0, 208.0)))

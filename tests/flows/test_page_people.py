@@ -152,7 +152,8 @@ def test_who_is_certain_is_accepted_at_once_and_the_rest_one_by_one(ada, bob, pr
     assert all(results[each.name] == each.key for each in plan if each.name in results)
     for wrong in ({"at_least": 1.5}, {"people": [["a", 1]]}, {"at_least": "nan"}):
         assert ada.post(f"{path}/acceptances", json=wrong).status_code == 422
-    for beyond in ([10**30, 0], [0, 10**30], [0, -1]):  # the journal's limits
+    # The journal's limits, and detections that are not there.
+    for beyond in ([10**30, 0], [0, 10**30], [0, -1], [99999, 5], [first["frame"], 5000]):
         assert ada.post(f"{path}/acceptances", json={"people": [beyond]}).status_code == 422
     assert ada.get(f"{MATCH}/detections/nowhere/queue").status_code == 422
 

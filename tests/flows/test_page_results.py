@@ -182,6 +182,8 @@ def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tin
     done = CliRunner().invoke(app, given)
     assert (done.exit_code, "the report has no images" in done.stderr) == (0, True), done.output
     assert out.stat().st_size > 100_000
+    done = CliRunner().invoke(app, [*given, "--out", str(tmp_path)])
+    assert "expected a file, found a folder" in str(done.exception)
     # It has images although a camera's clicks are gone; a damaged file is named.
     folder = shutil.copytree(tiny, tmp_path / "copy")
     (folder / "annotations" / "static_calibration" / "cam00.json").unlink()

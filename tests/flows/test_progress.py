@@ -13,12 +13,15 @@ import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 from rich.console import Console
 
+from data_contracts.review import DeletedDetection
 from flows import progress
 from flows.cli import console
+from flows.match_state import match_state
 from flows.progress import Reporter
 from flows.registering import open_match
+from flows.review.verdicts import correct
 from flows.run_plan import plan_run
-from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
+from flows.run_record import UNIT_SECONDS, alone_with, expected_work, latest_run
 from flows.web.app_context import read_progress
 from worldpose.store.documents import seal
 from worldpose.store.runs import identify_process
@@ -85,7 +88,8 @@ def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
     other = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     run_id = store.reserve_run(TINY)
     (mine,) = store.unfinished_runs(TINY)
-    require_no_other_run(store, TINY)  # it is this process's own
+    with alone_with(store, TINY):
+        pass  # it is this process's own
     path = next(project_copy.rglob(f"{run_id}.open.json"))
     try:
         path.unlink()
@@ -96,9 +100,18 @@ def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
         assert answer.code == 1
         assert answer.err.count("\n") == 1, answer.err
         assert f"found run {run_id}, process {other.pid}, since" in answer.err
+        deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
+        correct(store, open_match(store, TINY), [deleted], who="Ada", why="a shadow")
+        answer = worldpose("reprocess", TINY, "--project", project_copy)
+        assert f"found run {run_id}, process {other.pid}, since" in answer.out + answer.err
+        # A later run ended meanwhile, as two could once begin together.
+        later = store.run(TINY).model_copy(update={"run_id": store.reserve_run(TINY)})
+        store.finish_run(later)
+        assert match_state(store, open_match(store, TINY)).name == "running"
     finally:
         other.communicate(b"\n")
-    require_no_other_run(store, TINY)  # its process has ended
+    with alone_with(store, TINY):
+        pass  # its process has ended
 
 
 def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(server, tiny, tmp_path):

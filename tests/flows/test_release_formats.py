@@ -348,7 +348,7 @@ def test_a_surface_with_terms_of_its_own_is_written_on_request_with_them(
     match_folder, tmp_path, monkeypatch
 ):
     other = dataclasses.replace(load_open_body(), name="smpl-neutral")
-    monkeypatch.setattr(best_results, "find_body", lambda name, folder: other)
+    monkeypatch.setattr(best_results, "find_body", lambda *_: other)
     run = origin(match_folder, **tracked())
     (path,) = write("gltf", run, tmp_path / "joints")
     assert b'"skins"' not in path.read_bytes() and b"person_003_left_hip" in path.read_bytes()

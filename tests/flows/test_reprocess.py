@@ -250,6 +250,13 @@ def test_the_command_lists_what_it_would_compute_and_why(store):
     assert store.runs(TINY) == ("0001",)
 
 
+def test_a_setting_of_a_stage_that_this_match_lacks_makes_nothing_stale(store):
+    here = ("--project", store.url)
+    succeed("settings", TINY, "--set", "broadcast_calibration.line_search_px=3.0", *here)
+    answer = succeed("reprocess", "--dry-run", "--json", *here).json["matches"]
+    assert [each["state"] for each in answer] == ["untouched"]
+
+
 @pytest.mark.slow
 def test_reprocessing_computes_what_was_listed(server, store):
     edit_point(store)

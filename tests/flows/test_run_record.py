@@ -5,7 +5,7 @@ import shutil
 import pytest
 from command_line import TINY, succeed, worldpose
 
-from data_contracts.review import MergedTracks
+from data_contracts.review import SplitTrack
 from flows import iterate
 from flows.gates import Gatekeeper
 from flows.iterate import Iteration, iterate_match
@@ -19,10 +19,10 @@ from flows.run_status import run_status
 from flows.running import RunRequest, settle
 
 
-def merge(store):
-    """Record the correction that two tracks are one person."""
-    edit = MergedTracks(clip="clip", kept=0, merged=1)
-    correct(store, open_match(store, TINY), [edit], who="Ada", why="one person")
+def split(store):
+    """Record the correction that a track is two people."""
+    edit = SplitTrack(clip="clip", person=0, first_frame_of_new=12)
+    correct(store, open_match(store, TINY), [edit], who="Ada", why="two people")
 
 
 def recorded(store, stages, failing=None, before_stage=None):
@@ -30,7 +30,7 @@ def recorded(store, stages, failing=None, before_stage=None):
     log = RunLog.begin(store, open_match(store, TINY), stages, {})
     for stage in stages:
         if before_stage == stage.name:
-            merge(store)
+            split(store)
         for unit in log.plan.plan_stage(stage):
             log.finish_unit(unit, RuntimeError("x") if stage.name == failing else None)
     return log.close()
@@ -72,7 +72,7 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
     def one_pass(store, match, request, machines_for):
         begun.append((request.iteration, len(match.corrections)))
         if request.iteration == 2 and not match.corrections:
-            merge(store)
+            split(store)
             raise EditedMeanwhileError("x", expected="a", found="b", todo="c")
         return Iteration(request.iteration, store.run(TINY), None)
 

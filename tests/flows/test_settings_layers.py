@@ -15,10 +15,14 @@ from typer.testing import CliRunner
 
 from flows import layers, reprocess
 from flows.cli import run as run_command
+from flows.cli import settings as cli_settings
 from flows.cli.app import app as worldpose
-from flows.layers import read_layer, write_layer
+from flows.layers import project_layers, read_layer, write_layer
+from flows.progress import reporting_to
 from flows.registering import open_match, register
+from flows.reports.match_pictures import shown_pitch
 from flows.results.automatic_exports import export_after_run
+from flows.results.best_results import Origin
 from flows.run_plan import plan_run
 from flows.running import RunRequest, settle
 from flows.service import deployed
@@ -29,7 +33,7 @@ from flows.web import settings as page_settings
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.errors import InputError, UsageError
 from worldpose.store.run_queue import queue_of
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 BODY = "smpl-test"
 
@@ -320,6 +324,15 @@ def test_exports_have_the_pitch_of_the_layers(store):
     folder = registration.model_copy(update={"folder": store.url})  # without pitch.json
     write_layer(store, "project", {"pitch": {"length": 101.0, "width": 66.0}})
     assert layers.pitch_of(store, folder).length == 101.0
+    # The results of a run keep the pitch that it used, in exports and in reports.
+    used = open_match(store, TINY).folder.pitch
+    origin = Origin(Run(store, store.run(TINY)), folder)
+    assert used.length == 105.0 and origin.pitch == used
+    now = open_match(store, TINY)
+    other = used.model_copy(update={"length": 100.0, "width": 64.0})
+    now = replace(now, folder=replace(now.folder, pitch=other))
+    shown = shown_pitch(origin.run, now)
+    assert (shown.length, shown.width) == (105.0, 68.0)
 
 
 @pytest.mark.parametrize(
@@ -380,6 +393,43 @@ def test_of_two_saves_of_one_revision_one_is_refused(store, ada, bob, monkeypatc
     with ThreadPoolExecutor(2) as pool:
         codes = pool.map(post, (ada, bob), ({"iterations": 2}, {"gates": "auto"}))
         assert sorted(codes) == [200, 409]
+
+
+def test_two_commands_that_change_one_layer_both_count(store, monkeypatch):
+    both, save, opened = Barrier(2), cli_settings.save_layer, open_match(store, TINY)
+
+    def save_late(*given):
+        with suppress(BrokenBarrierError):
+            both.wait(timeout=0.5)
+        save(*given)
+
+    monkeypatch.setattr(cli_settings, "save_layer", save_late)
+    layers = project_layers(store)
+
+    def change(text):
+        cli_settings.change_layer(store, "project", layers, [text], [])
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(change, ("detection.stride=2", "triangulation.min_views=3")))
+    stated = {"detection.stride": 2, "triangulation.min_views": 3}
+    assert read_layer(store, "project").values == stated
+    # A run that was opened before keeps what another command has stated since.
+    write_layer(store, f"matches/{TINY}", {"tracking.gate_m": 0.6})
+    settle(store, opened, RunRequest({"triangulation": {"min_views": 4}}))
+    own = {"tracking.gate_m": 0.6, "triangulation.min_views": 4}
+    assert read_layer(store, f"matches/{TINY}").values == own
+
+
+def test_default_settings_says_what_it_removes(store):
+    own = {"triangulation.min_views": 4, "venue": None, "tracking.gate_m": 0.6}
+    write_layer(store, f"matches/{TINY}", own)
+    told = []
+    with reporting_to(SimpleNamespace(tell_kept_settings=told.append)):
+        request = RunRequest({"tracking": {"gate_m": 0.6}}, default_settings=True)
+        settle(store, open_match(store, TINY), request)
+    (text,) = (each for each in told if "--default-settings" in each)
+    assert "removes triangulation.min_views=4" in text
+    assert read_layer(store, f"matches/{TINY}").values == {"venue": None, "tracking.gate_m": 0.6}
 
 
 def test_a_run_without_people_exports_its_cameras_alone(store):

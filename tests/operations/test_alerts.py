@@ -322,7 +322,7 @@ def test_a_run_that_was_ended_for_lack_of_progress_is_an_alert_until_it_ends(pla
     assert alerts_now(plan, [], [], [done]) == []
 
 
-def test_a_match_is_one_alert_however_many_of_its_results_are_poor_or_wait(plan):
+def test_a_match_is_one_message_and_each_new_cause_another(plan, webhook, tmp_path):
     since = datetime.now(UTC) - timedelta(hours=2)
     usability = Usability(verdict="usable with reservations", reservations=("cam1 is bad.",))
     latest = run_record(state="partial", usability=usability)
@@ -331,9 +331,24 @@ def test_a_match_is_one_alert_however_many_of_its_results_are_poor_or_wait(plan)
     ]
     match = MatchSummary(match_id="m", latest=latest, waiting=tuple(waits))
     runs = [ended("m", "failed", "dark")]
-    (alert,) = alerts_now(plan, [match], [], runs)
-    assert (alert.alert, alert.match_id) == ("run_failed", "m")
-    assert "and 5 more results" in alert.text and alert.text.endswith("cam1 is bad.")
+    assert tell(tmp_path / "a", hook(webhook), *alerts_now(plan, [match], [], runs)) == 0.0
+    ((_, sent),) = webhook.posted
+    assert (sent["alert"], sent["match"]) == ("run_failed", "m")
+    assert "and 5 more results" in sent["text"] and sent["text"].endswith("cam1 is bad.")
+    # A match whose failure is known begins to wait.
+    tell(tmp_path / "b", hook(webhook), *alerts_now(plan, [MatchSummary(match_id="m")], [], runs))
+    tell(tmp_path / "b", hook(webhook), *alerts_now(plan, [match], [], runs))
+    first, second = (sent for _, sent in webhook.posted[1:])
+    assert (first["alert"], second["alert"]) == ("run_failed", "gate_waiting")
+    assert "dark" not in second["text"] and "has waited" in second["text"]
+
+
+def test_a_run_from_a_shell_ends_the_alert_about_a_failed_one(plan):
+    done = run_record(finished_at=NOW + timedelta(minutes=1))
+    matches = [MatchSummary(match_id="m", latest=done)]
+    assert alerts_now(plan, matches, [], [ended("m", "failed", "dark")]) == []
+    before = [MatchSummary(match_id="m", latest=run_record(finished_at=NOW - timedelta(hours=1)))]
+    assert len(alerts_now(plan, before, [], [ended("m", "failed", "dark")])) == 1
 
 
 def test_a_flood_of_alerts_is_one_message(webhook, tmp_path):

@@ -71,6 +71,23 @@ def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp
     assert files_of(tmp_path / "inbox") == {"m/match.yaml", "m/old.npz"}
 
 
+def test_a_copy_that_was_changed_here_stays_until_it_is_moved_away(arriving, tmp_path, caplog):
+    _, put = arriving
+    inbox, copy = watched(arriving, tmp_path), tmp_path / "inbox" / "m"
+    put("m/match.yaml", b"contract: 1")
+    inbox.fetch(0.0, QUIET)
+    assert inbox.fetch(10.0, QUIET) == ["m"]
+    (copy / "clicks.json").write_text("mine")
+    put("m/notes.txt")
+    inbox.fetch(20.0, QUIET)
+    assert inbox.fetch(30.0, QUIET) == inbox.fetch(31.0, QUIET) == []
+    assert files_of(copy) == {"match.yaml", "clicks.json"}
+    assert caplog.text.count("was changed here") == 1
+    copy.rename(tmp_path / "away")
+    assert inbox.fetch(40.0, QUIET) == ["m"]
+    assert files_of(copy) == {"match.yaml", "notes.txt"}
+
+
 def test_what_somebody_put_into_the_folder_is_left_alone(arriving, tmp_path, caplog):
     _, put = arriving
     (tmp_path / "inbox" / "m").mkdir()

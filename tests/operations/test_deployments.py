@@ -38,6 +38,7 @@ from flows.web import app_context
 from flows.web.app_context import Continuing
 from worldpose.errors import InputError, UsageError
 from worldpose.review.journal import read_journal
+from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
 
@@ -434,7 +435,7 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
     worker = ServedWorker("worked", installed)
     at_work = Thread(target=copy_context().run, args=(anyio.run, worker.start, True, False, str))
     # A run waits while another one of its match is at work.
-    with plan.state_folder.only_one("match-held", wait=True):
+    with alone(Store.open(plan.project).blobs, "match-held", wait=True):
         at_work.start()
         wait_until(lambda: state(held) == "Running" and state(absent) == "Failed")
         pid = int(prefect.ask(f"/flow_runs/{held.flow_run}")["infrastructure_pid"])

@@ -70,7 +70,7 @@ def processor_seconds():
 
 
 def many_cameras(folder, count):
-    """Write a match of `count` cameras, all copies of one camera and its detections."""
+    """Write a match of `count` copies of one camera and its detections, at two places."""
     small = folder.with_name("small")
     options = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
     simulate_match(SCENARIOS["tiny"], 0, small, MatchOptions(calibrated=True, **options))
@@ -86,10 +86,12 @@ def many_cameras(folder, count):
     (folder / "match.yaml").write_text(yaml.safe_dump(spec))
     shutil.copy(small / "pitch.json", folder)
     text = (small / "calibration.toml").read_text()
-    block = text[text.index("[cam_0]") : text.index("[cam_1]")]
+    # Two places: no calibration has all cameras in one.
+    cut = [text.index(f"[cam_{number}]") for number in range(3)]
+    blocks = [text[cut[0] : cut[1]], text[cut[1] : cut[2]]]
     cameras = [
-        block.replace("cam00", name).replace("cam_0", f"cam_{number}")
-        for number, name in enumerate(names)
+        blocks[n % 2].replace(f"cam0{n % 2}", name).replace(f"cam_{n % 2}", f"cam_{n}")
+        for n, name in enumerate(names)
     ]
     (folder / "calibration.toml").write_text("".join(cameras))
     for name in names:

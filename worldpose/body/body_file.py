@@ -86,7 +86,11 @@ def load_body(path: Path) -> BodyModel:
 
 
 def save_body(path: Path, model: BodyModel) -> None:
-    """Write a model in single precision, to 0.1 um; the file appears complete or not at all."""
+    """Write a model in single precision, to 0.1 um; the file appears complete or not at all.
+
+    Raises:
+        InputError: the file exists and differs.
+    """
     root = np.where(model.parents < 0, np.iinfo(np.uint32).max, model.parents)
     arrays = {
         "v_template": model.template.astype(np.float32),
@@ -101,6 +105,13 @@ def save_body(path: Path, model: BodyModel) -> None:
     try:
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, name=np.array(model.name), **arrays)
+        if path.is_file() and path.read_bytes() != partial.read_bytes():
+            raise InputError(
+                str(path),
+                expected="no other body model of this name: results of runs belong to it",
+                found="one",
+                todo="Give another name with --name, or remove this file first.",
+            )
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -207,19 +218,19 @@ def install_body(file: Path, folder: Path | None = None, name: str | None = None
 
     Args:
         file: SMPL's .pkl or .npz, as downloaded.
-        folder: where `<name>.npz` is written, `body_folder()` by default; one of the same name is
-            replaced.
+        folder: where `<name>.npz` is written, `body_folder()` by default.
         name: name of the model in results.
 
     Raises:
-        InputError: the file is not a body model in SMPL's layout, or names code to run.
+        InputError: the file is not a body model in SMPL's layout, or names code to run, or another
+            one of the same name is installed.
         UsageError: the name is invalid.
     """
     model_name = name or file.stem.lower().replace("_", "-")
-    if not _NAME.fullmatch(model_name):
+    if not _NAME.fullmatch(model_name) or model_name.startswith("open-neutral"):
         raise UsageError(
             f"name of the body model {model_name!r}",
-            expected="small letters, digits, dots and hyphens",
+            expected="small letters, digits, dots and hyphens, and not that of the open body",
             found=repr(model_name),
             todo="Give another name with --name.",
         )
@@ -292,19 +303,29 @@ def digest_of_body(name: str, folder: Path | None = None) -> str:
     return hashlib.sha256(_find_installed(name, folder).read_bytes()).hexdigest()
 
 
-def find_body(name: str = OPEN_BODY, folder: Path | None = None) -> BodyModel:
+def find_body(
+    name: str = OPEN_BODY, folder: Path | None = None, sha256: str | None = None
+) -> BodyModel:
     """Return the open body or an installed one.
 
     Args:
         name: name of the model.
         folder: folder of installed bodies; `body_folder()` by default.
+        sha256: digest of the installed file; None = any.
 
     Raises:
         UsageError: no body of that name is installed.
-        InputError: its file is damaged.
+        InputError: its file is damaged, or has another digest.
     """
     if is_open_body(name):
         return load_open_body(name)
+    if sha256 is not None and digest_of_body(name, folder) != sha256:
+        raise InputError(
+            f"body model {name}",
+            expected=f"the file that the run was planned with, of SHA-256 {sha256[:12]}",
+            found=f"another in {body_path('', folder).parent}",
+            todo="Install that body model again on all machines, or run again with this one.",
+        )
     return load_body(_find_installed(name, folder))
 
 

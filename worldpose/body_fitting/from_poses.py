@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from worldpose.body_fitting.ray_constraints import find_ray_constraints
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry.cameras import Camera
+from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import reconstruct_joints
@@ -49,7 +49,7 @@ class ReconstructedBodies:
 
 
 def reconstruct_bodies(
-    cameras: Camera | Sequence[Camera] | Mapping[str, Camera],
+    cameras: Cameras,
     detections: KeypointDetections | Sequence[KeypointDetections],
     fps: float,
     *,
@@ -73,12 +73,10 @@ def reconstruct_bodies(
         camera_covariance: (cameras, 12, 12) of the calibration on a pitch; None = unknown.
 
     Raises:
-        InputError: numbers of cameras differ, the shapes do not fit together, or frames or `fps`
-            are invalid.
+        InputError: numbers of cameras differ, the shapes do not fit together, frames or `fps` are
+            invalid, or the cameras are not in metres.
     """
-    if not isinstance(cameras, Camera):
-        each = list(cameras.values() if isinstance(cameras, Mapping) else cameras)
-        cameras = Camera.stack(each)
+    cameras = Camera.batch(cameras)
     if not isinstance(detections, KeypointDetections):
         for camera in detections:
             _require_rising(camera.frame)
@@ -92,6 +90,7 @@ def reconstruct_bodies(
             found=f"cameras {cameras.batch_shape}, detections {detections.score.shape}",
             todo="Give the detections of all cameras in the order of the cameras.",
         )
+    _require_metres(float(np.ptp(cameras.center, axis=0).max()), 0.0, 500.0, "cameras within")
     detections = _fill_frames(detections)
     rate = row_rate("reconstruct_bodies", fps, detections.frame)
     person = np.arange(detections.detection_index.shape[2], dtype=np.int64)
@@ -101,9 +100,24 @@ def reconstruct_bodies(
         detections = detections.assign_people(tracks.detection_index)
     joints = reconstruct_joints(cameras, detections, fps, camera_covariance=camera_covariance)
     placed = joints.triangulation
+    sides = placed.joints[..., [5, 6], :] - placed.joints[..., [11, 12], :]
+    torsos = np.linalg.norm(sides[np.isfinite(sides).all(-1)], axis=-1)
+    if len(torsos):
+        _require_metres(float(np.median(torsos)), 0.1, 1.5, "torsos of")
     rays = find_ray_constraints(cameras, undo_swaps(detections, placed.exchanged), placed.joints)
     bodies = fit_bodies(body or find_body(), ClipEvidence.of(placed, rate, rays), ground=ground)
     return ReconstructedBodies(detections.frame, person, joints, bodies)
+
+
+def _require_metres(size: float, least: float, most: float, what: str) -> None:
+    """Raise InputError if a size can be no metres."""
+    if not least <= size <= most:
+        raise InputError(
+            "reconstruct_bodies: cameras",
+            expected=f"metres: {what} {least:g} to {most:g} m",
+            found=f"{size:.4g}",
+            todo="Give t of x_cam = R x_world + t in metres: divide millimetres by 1000.",
+        )
 
 
 def _require_rising(frame: Integers) -> None:

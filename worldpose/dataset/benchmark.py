@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,9 @@ from data_contracts.evaluation import Evaluation, MethodScore
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
-from worldpose.dataset.contents import ShippedClip, camera_files, list_clips, read_clip
+from worldpose.dataset.contents import SUBMISSIONS, ShippedClip, camera_files, list_clips, read_clip
 from worldpose.dataset.faults import LIMITS, camera_faults
-from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
+from worldpose.dataset.manifest import FRAME_RATES, clip_frame_rate, read_frame_rates
 from worldpose.errors import InputError
 from worldpose.evaluation import matching, metrics
 from worldpose.formats.archives import ARRAY_BYTES, read_npz, wrong
@@ -50,10 +50,13 @@ class _People(NamedTuple):
     notes: Mapping[str, str]
 
 
+FORMS: Final = ("poses/*.npz", "*.joints.npz")
+"""Files of clips in a data set."""
+
+
 def is_data_set(folder: Path) -> bool:
     """Return whether a folder has files by clip, or splits that have, and no `joints.npz`."""
-    forms = ("poses/*.npz", "*.joints.npz", "*/poses/*.npz")
-    found = any(path for form in forms for path in folder.glob(form))
+    found = any(path for form in (*FORMS, "*/poses/*.npz") for path in folder.glob(form))
     return found and not (folder / "joints.npz").is_file()
 
 
@@ -61,10 +64,27 @@ def parts_of_clips(folder: Path) -> dict[str, Path]:
     """Return the folder of each clip: the folder itself, or the splits of a release below it.
 
     Raises:
-        InputError: there are no clips.
+        InputError: there are no clips, or one is in two folders.
     """
     splits = sorted({path.parents[1] for path in folder.glob("*/poses/*.npz")})
-    return {clip: part for part in splits or [folder] for clip in list_clips(part)}
+    own = any(path for form in (*FORMS, *SUBMISSIONS) for path in folder.glob(form))
+    parts: dict[str, Path] = {}
+    for part in splits if splits and not own else [folder, *splits]:
+        for clip in list_clips(part):
+            if clip in parts:
+                todo = "Name one of these folders, or move the other one away."
+                raise wrong(f"{folder}: clip {clip}", "one", f"{parts[clip]} and {part}", todo)
+            parts[clip] = part
+    return parts
+
+
+def require_one_rate(rates: Mapping[str, float | None]) -> None:
+    """Raise InputError if sides whose frames are paired by number state other rates [1/s]."""
+    known = {where: rate for where, rate in rates.items() if rate is not None}
+    if known and max(known.values()) > 1.0001 * min(known.values()):
+        sides = " and ".join(f"{rate:g} in {where}" for where, rate in known.items())
+        todo = f"Bring one side to the frames of the other, or correct its {FRAME_RATES}."
+        raise wrong("frames per second", "the same on both sides", sides, todo)
 
 
 def score_folders(
@@ -98,17 +118,19 @@ def score_folders(
     for clip, part in parts_of_clips(reference).items():
         truth = _read_people(part, clip, body, match_in)
         true, camera = truth.tracks.joints, _true_camera(truth)
-        rate = fps or clip_frame_rate(read_frame_rates(part), clip)
+        stated = clip_frame_rate(read_frame_rates(part), clip)
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
                 todo = "Write its poses, with NaN where the method found no person."
                 found = ", ".join(parts[name])
                 raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
+            own = clip_frame_rate(read_frame_rates(parts[name][clip]), clip)
+            require_one_rate({f"{part}": stated, f"{parts[name][clip]}": own})
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
             boxes = None if camera is None else _boxes(mine, truth, camera)
             clips[name][clip], persons = metrics.evaluate_joints(
-                mine.tracks, truth.tracks, settings, fps=rate, camera=camera, boxes=boxes
+                mine.tracks, truth.tracks, settings, fps=fps or stated, camera=camera, boxes=boxes
             )
             distances = matching.joint_distances(mine.tracks.joints, true)
             match = matching.match_people(distances, settings.match_gate_m)

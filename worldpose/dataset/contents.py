@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
@@ -104,6 +104,8 @@ class ShippedClip:
     """Findings of the reader."""
     given: ChallengeClip | None = None
     """Boxes and skeletons of the challenge's layout."""
+    notes: tuple[str, ...] = ()
+    """What could not be compared."""
 
 
 def convention(fault: str, says: str, *where: str, **figures: float) -> Finding:
@@ -205,10 +207,16 @@ def read_clip(
     rows = {path.stem: read_camera_rows(path) for path in sorted((*own, *static))}
     frames = max((len(source.points) for source in sources), default=0)
     coco = folder if len(clips) == 1 else folder / clip
-    views = []
+    views, notes = list[CameraView](), list[str]()
     for name, camera in rows.items():
-        file = coco / f"{name}.json"
-        pixels = read_coco(file, ids, frames) if file.is_file() else None
+        file, pixels = coco / f"{name}.json", None
+        if file.is_file():
+            shown: Flags = np.ones(frames, np.bool_)
+            if len(camera.rotation) == frames:
+                shown = np.asarray(np.isfinite(camera.rotation).all((-1, -2)))
+            pixels = read_coco(file, ids, shown)
+            if pixels is None:
+                notes.append(f"{file}: not compared: it has other images than the clip has frames")
         views.append(CameraView(name, camera, pixels, COCO17))
     given = None
     if (folder / "boxes.npz").is_file() or any((folder / "boxes").glob("*.npy")):
@@ -225,7 +233,9 @@ def read_clip(
             ]
             sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])
             findings += swapped
-    return ShippedClip(clip, fps, tuple(sources), tuple(views), pitch, tuple(findings), given)
+    return ShippedClip(
+        clip, fps, tuple(sources), tuple(views), pitch, tuple(findings), given, tuple(notes)
+    )
 
 
 def camera_files(folder: Path, clip: str, clips: Collection[str]) -> tuple[list[Path], list[Path]]:
@@ -237,23 +247,27 @@ def camera_files(folder: Path, clip: str, clips: Collection[str]) -> tuple[list[
     return found.get(clip, []), found.get("", [])
 
 
-def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
+def read_coco(path: Path, ids: tuple[int, ...], shown: Flags) -> Floats | None:
     """Read 2D points (frames, persons, 17, 2) [px] of a COCO file; NaN if v is 0.
 
-    The first image is frame 0; people who are not in `ids` are left out.
+    The images are those of the frames with a camera, `shown` (frames,), in order; None if there are
+    fewer or more, as of a camera of another rate. People who are not in `ids` are left out.
 
     Raises:
         InputError: the file is not a COCO keypoints file.
     """
-    pixels = np.full((frames, len(ids), len(COCO17), 2), np.nan)
+    pixels = np.full((len(shown), len(ids), len(COCO17), 2), np.nan)
     person_of = {person: place for place, person in enumerate(ids)}
     try:
         dataset: Mapping[str, Any] = json.loads(path.read_bytes())
         numbers = sorted(int(image["id"]) for image in dataset["images"])
-        frame_of = {number: place for place, number in enumerate(numbers)}
+        places = np.flatnonzero(shown).tolist()
+        if len(numbers) != len(places):
+            return None
+        frame_of = dict(zip(numbers, places, strict=True))
         for row in dataset["annotations"]:
             frame, person = frame_of[row["image_id"]], person_of.get(row["track_id"])
-            if person is None or frame >= frames:
+            if person is None:
                 continue
             points = np.array(row["keypoints"], dtype=np.float64).reshape(len(COCO17), 3)
             pixels[frame, person] = np.where(points[:, 2:] > 0, points[:, :2], np.nan)

@@ -46,6 +46,8 @@ def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeSc
     """
     true = read_submission(reference)
     found = read_submission(prediction)
+    if not true:
+        raise _refuse(f"{reference}", "clips", "none")
     errors: dict[str, tuple[Floats, Floats]] = {}
     for clip, places in true.items():
         where = f"{prediction}: {clip}"

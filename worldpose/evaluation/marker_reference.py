@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,6 +50,10 @@ class Markers:
     names: tuple[str, ...]
     points: Floats
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
+    zeros: int = 0
+    """Number of markers at exactly 0, 0, 0, which are missing."""
+    start: float = 0.0
+    """Time of the first sample on the file's own clock [s]."""
 
 
 def read_markers(path: Path) -> Markers:
@@ -63,11 +67,11 @@ def read_markers(path: Path) -> Markers:
     if path.suffix.lower() == ".c3d":
         return _read_c3d(path)
     try:
-        rate, names, points, unit = _read_trc(path)
+        rate, names, points, unit, start = _read_trc(path)
     # A truncated file lacks lines, cells or keys; text may be no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
         raise _wrong(path, "a complete C3D or TRC file", say_failure(error)) from error
-    return _check_markers(path, rate, names, points, unit)
+    return replace(_check_markers(path, rate, names, points, unit), start=start)
 
 
 def map_marker_names(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
@@ -170,8 +174,8 @@ def c3d_labels(reader: Any) -> tuple[str, ...]:  # noqa: ANN401
         number += 1
 
 
-def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str]:
-    """Return rate [1/s], names, points (samples, markers, 3) in the file's unit, and that unit."""
+def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
+    """Return rate [1/s], names, points (samples, markers, 3), unit and first time [s]."""
     # The first line has the path, in the bytes of the writer's system; only numbers matter.
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
@@ -180,13 +184,34 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str]:
     rows = [
         [
             float(cell) if cell.strip() else np.nan
-            for cell in (line.split("\t") + [""] * width)[2:width]
+            for cell in (line.split("\t") + [""] * width)[:width]
         ]
         for line in lines[5:]
         if line.strip()
     ]
-    points = np.array(rows, dtype=np.float64).reshape(len(rows), len(names), 3)
-    return float(about["DataRate"]), names, points, about["Units"].strip().lower()
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    rate = float(about["DataRate"])
+    place = _samples(path, table[:, 0], rate * table[:, 1])
+    points = np.full((place[-1] + 1 if len(place) else 0, len(names), 3), np.nan)
+    points[place] = table[:, 2:].reshape(len(rows), len(names), 3)
+    start = float(table[0, 1]) if len(table) and np.isfinite(table[0, 1]) else 0.0
+    return rate, names, points, about["Units"].strip().lower(), start
+
+
+def _samples(path: Path, number: Floats, time: Floats) -> Integers:
+    """Return the sample of each row, from 0, by its Frame# (rows,), or else its time [samples].
+
+    Raises:
+        InputError: neither rises; or rows are missing for longer than any recording.
+    """
+    most = 10_000_000
+    for each in (number, time):
+        steps = np.rint(np.diff(each))
+        if np.isfinite(each).all() and (steps > 0).all() and steps.sum() < most:
+            step = np.gcd.reduce(steps.astype(np.int64)) if each is number and len(steps) else 1
+            return np.rint((each - each[:1]) / step).astype(np.int64)
+    found = f"{number[:3].tolist()} and so on in {len(number)} rows"
+    raise _wrong(f"{path}: Frame#", "numbers, or else times, that rise", found)
 
 
 def _check_markers(
@@ -199,8 +224,10 @@ def _check_markers(
             f"markers with a rate and a unit of {', '.join(METRES)}",
             f"{rate:g} samples/s in {unit!r}, {len(names)} names of {points.shape[1]} markers",
         )
-    whole = np.isfinite(points).all(-1, keepdims=True)
-    return Markers(rate, names, np.where(whole, points, np.nan) * METRES[unit])
+    zero = (points == 0.0).all(-1, keepdims=True)
+    whole = np.isfinite(points).all(-1, keepdims=True) & ~zero
+    places = np.where(whole, points, np.nan) * METRES[unit]
+    return Markers(rate, names, places, int(zero.sum()))
 
 
 def _wrong(where: object, expected: str, found: str) -> InputError:
@@ -222,7 +249,7 @@ class ReferenceAlignment:
 
 
 def align_reference(
-    prediction: JointTracks, joints: Floats, rate: float, fps: float
+    prediction: JointTracks, joints: Floats, rate: float, fps: float, start: float = 0.0
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Return the reference in the prediction's frames and world, and its alignment.
 
@@ -231,7 +258,8 @@ def align_reference(
     prediction remains an error.
 
     `joints` (samples, persons, 17, 3) [m] are in the reference's world, NaN where missing, at
-    `rate` samples per second [1/s].
+    `rate` samples per second [1/s], the first one at `start` [s] of the clock. The clock of a part
+    of a recording may also count from its first sample.
 
     Raises:
         DegenerateError: prediction and reference match at no offset.
@@ -239,9 +267,10 @@ def align_reference(
     # Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate.
     step_s = 0.2
     max_offset_s = 2.0  # maximum clock offset of the search, either way [s]
-    times = prediction.frames / fps
+    times = prediction.frames / fps - start  # since the first sample, if both clocks agree
     count = int(np.ceil(max_offset_s / step_s))
-    grid = np.arange(-count, count + 1) * step_s
+    around_zero = np.arange(-count, count + 1) * step_s
+    grid = np.unique(np.concatenate([around_zero, around_zero + start]))
     tried = [
         (_match_cost(prediction.joints, sample_joints(joints, rate, times + o)), o) for o in grid
     ]

@@ -14,8 +14,10 @@ from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
 
 
-def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats]:
-    """Return frames (frames,), names of people, and their places (frames, persons, 2) [m].
+def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float]:
+    """Return frames (frames,), names of people, their places (frames, persons, 2) [m], and a rate.
+
+    The rate is that of the frames by their times [1/s]; NaN without times.
 
     The file is a CSV of `worldpose export --format positions`, or of kloppy's `to_df`: columns
     `<player>_x` and `<player>_y`, or `player_id`, x and y, beside `frame_id`. The ball is left out.
@@ -26,8 +28,19 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats]:
     import pandas as pd  # late: it takes half a second
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
+    ours |= {"time_s": "timestamp"}
     try:
         table = pd.read_csv(path).rename(columns=ours).set_index("frame").sort_index()
+        rate = np.nan
+        if "timestamp" in table:
+            time = table["timestamp"].groupby(level=0).first()
+            if not pd.api.types.is_numeric_dtype(time):
+                time = pd.to_timedelta(time, errors="coerce").dt.total_seconds()
+            steps = np.diff([time.index.to_numpy(np.float64), time.to_numpy(np.float64)])
+            steps = steps[:, steps[1] > 0.0]  # times begin again in each period
+            rate = float(steps[0].sum() / steps[1].sum()) if steps.size else np.nan
+            while 0.0 < rate < 1.0:  # times are in ms or smaller units
+                rate *= 1000.0
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
             table = table.pivot(columns="name" if named else "person", values=["x", "y"])
@@ -41,7 +54,7 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats]:
         reach = float(np.nanmax(np.abs([x, y]), initial=0.0))
         if not 1.5 < reach < 200.0 or not table.index.is_unique:
             raise ValueError(f"{len(names)} people at places up to {reach:g} in {len(x)} rows")
-        return table.index.to_numpy(np.int64), names, np.stack([x, y], axis=-1)
+        return table.index.to_numpy(np.int64), names, np.stack([x, y], axis=-1), rate
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
             str(path),
@@ -51,22 +64,46 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats]:
         ) from error
 
 
+def _at_match_frames(
+    frames: Integers, xy: Floats, step: float, first: int | None
+) -> tuple[Integers, Floats]:
+    """Return match frames and places in them, linear between rows, of `step` frames per number."""
+    place = step * frames if first is None else step * (frames - frames[0]) + first
+    if step == 1.0 or len(frames) < 2:
+        return np.rint(place).astype(np.int64), xy
+    whole = np.arange(int(np.ceil(place[0] - 1e-6)), int(place[-1] + 1e-6) + 1)
+    after = np.clip(np.searchsorted(place, whole), 1, len(place) - 1)
+    gap = place[after] - place[after - 1]
+    share = ((whole - place[after - 1]) / gap)[:, None, None]
+    between = (1.0 - share) * xy[after - 1] + share * xy[after]
+    between = np.where((gap > 1.5 * gap.min())[:, None, None], np.nan, between)
+    between = np.where(share < 1e-6, xy[after - 1], between)
+    return whole, np.where(share > 1.0 - 1e-6, xy[after], between)
+
+
 def align_positions(
-    path: Path, prediction: JointTracks, first: int | None = None
+    path: Path, prediction: JointTracks, first: int | None = None, fps: float | None = None
 ) -> tuple[JointTracks, JointTracks, list[str]]:
     """Return a prediction and given places as tracks on the ground, and what was found.
 
     Axes of providers may point the other way: of the four ways, the one is taken that clearly
     agrees with the prediction.
 
-    `first` is the match frame of the file's first row; None = its frames are match frames.
+    `first` is the match frame of the file's first row; None = its frames are match frames. At
+    another rate than the match's (`fps`), by the file's times or by the best agreement of usual
+    rates, match frame 0 is still frame 0.
 
     Raises:
         InputError: the file is invalid, or no way of its axes clearly agrees.
     """
     most, hips = 1.0, [11, 12]  # largest median distance of one person in both [m]
-    frames, names, xy = read_positions(path)
-    frames = frames if first is None else frames - frames[0] + first
+    numbers, names, given, rate = read_positions(path)
+    usual = (25.0, 10.0, 50.0, 30.0, 20.0, 12.5, 5.0, 60.0)
+    rates = (rate,) if np.isfinite(rate) else usual
+    ratios = {own / each for own in ((fps,) if fps else usual) for each in rates}
+    if fps is None or np.isnan(rate):
+        ratios |= {1.0}
+    steps = sorted(1.0 if abs(step - 1.0) < 5e-4 else step for step in ratios)
 
     def on_ground(frames: Integers, places: Floats) -> JointTracks:
         joints = np.full((*places.shape[:2], 17, 3), np.nan)
@@ -76,15 +113,23 @@ def align_positions(
 
     mine = on_ground(prediction.frames, prediction.joints[:, :, hips, :2].mean(axis=2))
     mine = replace(mine, person_ids=prediction.person_ids)
-    seen = select_frames(mine.joints, mine.frames, frames)
-    found = []
-    for way in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
-        turned = on_ground(frames, xy * way)
-        apart = joint_distances(seen, turned.joints)
-        nearest = apart.min(axis=1, initial=np.inf)
-        known = nearest[np.isfinite(nearest)]
-        found.append((float(np.median(known)) if len(known) else np.inf, way, turned, apart))
-    (best, way, turned, apart), (second, *_) = sorted(found, key=lambda each: each[0])[:2]
+
+    def try_step(step: float) -> list[tuple[float, tuple[float, float], JointTracks, Floats]]:
+        frames, xy = _at_match_frames(numbers, given, step, first)
+        seen = select_frames(mine.joints, mine.frames, frames)
+        found = []
+        for way in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
+            turned = on_ground(frames, xy * way)
+            apart = joint_distances(seen, turned.joints)
+            nearest = apart.min(axis=1, initial=np.inf)
+            known = nearest[np.isfinite(nearest)]
+            found.append((float(np.median(known)) if len(known) else np.inf, way, turned, apart))
+        return sorted(found, key=lambda each: each[0])[:2]
+
+    tried = {step: try_step(step) for step in steps}
+    # The match's own rate holds unless another agrees clearly better.
+    step = min(tried, key=lambda step: tried[step][0][0] * (0.5 if step == 1.0 else 1.0))
+    (best, way, turned, apart), (second, *_) = tried[step]
     if not best < min(most, 0.5 * second):
         raise InputError(
             str(path),
@@ -101,6 +146,9 @@ def align_positions(
     )
     said = (f"{person}: {names[n]}" for p, (person, n) in enumerate(pairs) if off[n, p] < most)
     notes = [f"people: {{{', '.join(said)}}}"]
+    if step != 1.0:
+        how = "by its times" if fps and np.isfinite(rate) else "by agreement alone"
+        notes.insert(0, f"each frame of the positions is {step:g} frames of the match, {how}")
     if way != (1.0, 1.0):
         notes.insert(0, "axes of the positions: {:+g} x, {:+g} y".format(*way))
     return mine, turned, notes

@@ -382,8 +382,7 @@ def _read_lens(
     where: str, numbers: NDArray[np.float64], *, fisheye: bool
 ) -> tuple[NDArray[np.float64], LensName]:
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
-    # Maximum p1 and p2 of four numbers that do not say their model [1]; real lenses have
-    # 0.005.
+    # Maximum p1 and p2 [1]; real lenses have 0.005.
     max_tangential = 0.01
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
@@ -394,11 +393,11 @@ def _read_lens(
             "k1 k2 k3 k4 of a fisheye" if fisheye else "k1 k2 p1 p2, with k3, or with k3 k4 k5 k6",
             f"{len(numbers)} numbers{', a lens model with more terms' * (len(numbers) > 5)}",
         )
-    if len(numbers) == 4 and not fisheye and np.abs(numbers[2:]).max() > max_tangential:
-        expected = f"k1 k2 p1 p2 with p1 and p2 up to {max_tangential:g}"
+    if not fisheye and np.abs(numbers[2:4]).max() > max_tangential:
+        expected = f"k1 k2 p1 p2 k3 with p1 and p2 up to {max_tangential:g}"
         todo = (
             "If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
-            "fisheye_model: 1 in others."
+            "fisheye_model: 1 in others. If it is k1 k2 k3 p1 p2, move k3 to the end."
         )
         raise InputError(where, expected, str(numbers.tolist()), todo)
     return np.append(numbers, 0.0)[: len(names)], model

@@ -35,7 +35,13 @@ from worldpose.formats.calibration_programs import (
     read_openpose_cameras,
 )
 from worldpose.formats.calibration_systems import read_calibration_xml
-from worldpose.formats.calibration_unit import MILLIMETRE, require_metres, toml_unit_m
+from worldpose.formats.calibration_unit import (
+    MILLIMETRE,
+    other_middle,
+    require_metres,
+    require_middle,
+    toml_unit_m,
+)
 from worldpose.formats.files import SETTINGS_BYTES, require_file
 from worldpose.formats.lens_files import read_opencap
 from worldpose.formats.opencv_storage import read_file_storage
@@ -108,7 +114,20 @@ def read_calibration(
     cameras = form.read(files, sizes, left_out)
     if not any_unit:
         require_metres(path, cameras, form_unit_m(path))
+    if left_out is not None:
+        left_out.notes += [
+            f"warning: the principal point of {name} is {found}; is its size of "
+            "{} x {} px right?".format(*camera.image_size)
+            for name, camera in cameras.items()
+            if (found := other_middle(camera.principal_point_px, camera.image_size))
+        ]
     return cameras
+
+
+def is_of_sensor(path: Path) -> bool:
+    """Return whether a calibration is of sensors, of which videos may show the middle alone."""
+    form, _ = find_calibration(path) if path.is_dir() else _form_of(path)
+    return form is VICON
 
 
 def form_unit_m(path: Path) -> float:
@@ -310,15 +329,15 @@ def _read_easymocap(
     cameras = []
     for name in names:
         where = f"{lens_file}: {name}"
-        known = sizes.get(camera_id(name))
-        if known is not None and f"W_{name}" not in lenses:
+        todo = (
+            f"Add the width and height of the calibrated images: a line W_{name}: 1920 and a line "
+            f"H_{name}: 1080."
+        )
+        known = None if f"W_{name}" in lenses else sizes.get(camera_id(name))
+        if known is not None:
             lenses |= {f"W_{name}": float(known[0]), f"H_{name}": float(known[1])}
         if f"W_{name}" not in lenses or f"H_{name}" not in lenses:
             expected = f"the image size of camera {name}"
-            todo = (
-                f"Add its width and height in pixels: a line W_{name}: 1920 and a line "
-                f"H_{name}: 1080."
-            )
             raise InputError(f"{lens_file}: W_{name}", expected, "none", todo)
         entries = {
             "W, H": [lenses[f"W_{name}"], lenses[f"H_{name}"]],
@@ -337,6 +356,8 @@ def _read_easymocap(
         }
         keys = Keys("W, H", f"K_{name}", f"dist_{name}", f"R_{name}", f"T_{name}")
         camera = read_camera_table(where, name, table, keys=keys, where_pose=f"{pose_file}: {name}")
+        if known is not None:
+            require_middle(where, camera.principal_point_px, known, todo)
         cameras.append((where, camera))
     return index_by_name(lens_file, cameras)
 

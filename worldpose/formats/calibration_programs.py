@@ -22,6 +22,7 @@ from worldpose.formats.calibration_files import (
     index_by_name,
     read_camera_table,
 )
+from worldpose.formats.calibration_unit import require_middle
 from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml
 from worldpose.formats.lens_files import kalibr_tables
 from worldpose.formats.opencv_storage import read_file_storage
@@ -92,15 +93,44 @@ def _has_skew(matrix: object) -> bool:
 def _read_multical(
     path: Path, cameras: dict[str, dict[str, Any]], poses: object, left_out: LeftOut | None
 ) -> dict[str, CameraCalibration]:
-    """Return cameras with `image_size`, `K`, `dist`; the pose of `b` may be called `b_to_a`."""
-    given = poses if isinstance(poses, dict) else {}
-    by_camera = {str(key).partition("_to_")[0]: pose for key, pose in given.items()}
-    by_camera |= {key: pose for key, pose in given.items() if key in cameras}
-    tables = {}
-    for name, table in cameras.items():
-        pose = by_camera.get(name)
-        tables[name] = {**table, **(pose if isinstance(pose, dict) else {})}
-    return _read_tables(path, tables, Keys("image_size", "K", "dist", "R", "T"), left_out)
+    """Return cameras with `image_size`, `K`, `dist`; the pose of `b` from `a` is called `b_to_a`.
+
+    The world is that of the one camera from which the others are counted, perhaps step by step:
+    x_b = R x_a + t, and so on to the first.
+    """
+    where = f"{path}: camera_poses"
+    given = {str(key): pose for key, pose in poses.items()} if isinstance(poses, dict) else {}
+    parts = {key: ("",) if key in cameras else key.partition("_to_")[2:] for key in given}
+    steps = {key.removesuffix(f"_to_{before}"): before for key, (before,) in parts.items()}
+    tables = {name: dict(table) for name, table in cameras.items()}
+    for key, (before,) in parts.items():
+        name, pose = key.removesuffix(f"_to_{before}"), given[key]
+        tables.setdefault(name, {}).update(pose if isinstance(pose, dict) else {})
+    origins = dict.fromkeys(each for each in steps.values() if each not in ("", *steps))
+    origins |= dict.fromkeys(name for name, before in steps.items() if before == name)
+    for name in origins:
+        tables.get(name, {}).update(R=np.eye(3).tolist(), T=[0.0] * 3)
+    own = [name for name, before in steps.items() if not before]
+    if len(origins) > 1 or (own and origins):
+        found = f"poses counted from {', '.join([*own, *origins])}"
+        raise calibration_error(where, "poses counted from one of the cameras", found)
+    keys = Keys("image_size", "K", "dist", "R", "T")
+    read = _read_tables(path, {name: tables[name] for name in cameras}, keys, left_out)
+
+    def place(name: str, passed: tuple[str, ...] = ()) -> CameraCalibration:
+        camera, before = read[camera_id(name)], steps.get(name, "")
+        if not before or before in origins:
+            return camera
+        if before in passed or camera_id(before) not in read:
+            found = " from ".join((*passed, name, before))
+            raise calibration_error(where, "poses counted from one of the cameras", found)
+        first, step = place(before, (*passed, name)), np.array(camera.rotation)
+        turn, move = step @ first.rotation, step @ first.translation + camera.translation
+        pose = {"rotation": tuple(map(tuple, turn.tolist())), "translation": tuple(move.tolist())}
+        return camera.model_copy(update=pose)
+
+    placed = {camera_id(name): place(name) for name in cameras if camera_id(name) in read}
+    return index_by_name(path, [(f"{path}: {name}", each) for name, each in placed.items()])
 
 
 def read_kalibr(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
@@ -163,7 +193,8 @@ def read_openpose_cameras(
     cameras = []
     for file in files:
         given, where = read_file_storage(file), str(file)
-        if camera_id(file.stem) not in sizes:
+        size = sizes.get(camera_id(file.stem))
+        if size is None:
             expected = f"the image size of camera {file.stem}, which OpenPose's files lack"
             todo = "Import the calibration with --videos, or write it as TOML with a size."
             raise InputError(where, expected, "no video of that name", todo)
@@ -175,8 +206,10 @@ def read_openpose_cameras(
             for key in ("Intrinsics", "Distortion")
             if key in given
         }
-        table |= {"size": list(sizes[camera_id(file.stem)])}
-        table |= {"R": pose[:, :3].tolist(), "t": pose[:, 3].tolist()}
+        table |= {"size": list(size), "R": pose[:, :3].tolist(), "t": pose[:, 3].tolist()}
         keys = Keys("size", "Intrinsics", "Distortion", "R", "t")
-        cameras.append((where, read_camera_table(where, file.stem, table, keys=keys)))
+        camera = read_camera_table(where, file.stem, table, keys=keys)
+        todo = "Give videos of the calibrated size, or write TOML with a size."
+        require_middle(where, camera.principal_point_px, size, todo)
+        cameras.append((where, camera))
     return index_by_name(files[0].parent, cameras)

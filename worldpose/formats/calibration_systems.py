@@ -109,11 +109,16 @@ def _read_qualisys(
     path: Path, root: ET.Element, left_out: LeftOut | None
 ) -> dict[str, CameraCalibration]:
     """Return the active cameras by serial; the video cameras alone if some are called so."""
-    active = [
+    every = [
         (f"{path}: camera[{index}]", element)
         for index, element in enumerate(root.iterfind("cameras/camera"))
-        if element.get("active", "1") != "0"
     ]
+    # Those that the file calls inactive are left out in any case.
+    off = ("0", "false")
+    active = [each for each in every if each[1].get("active", "1").lower() not in off]
+    if left_out is not None and active:
+        gone = [each for each in every if each not in active]
+        left_out.update({element.get("serial", where): "it is inactive" for where, element in gone})
     has_video = any("video" in element.get("model", "").lower() for _, element in active)
     has_fov = any(element.find("fov_video") is not None for _, element in active)
     lacks = [_qualisys_lack(element, has_video, has_fov) for _, element in active]
@@ -133,6 +138,8 @@ def _qualisys_lack(element: ET.Element, has_video: bool, has_fov: bool) -> str:
         return f"it records markers ({model})"
     if has_fov and element.find("fov_video") is None:
         return "it makes no video (no fov_video)"
+    if element.get("calibrated", "1").lower() in ("0", "false"):
+        return "it is not calibrated (calibrated is false)"
     place = element.find("transform")
     axes = [] if place is None else [place.get(f"r{i}{j}", "") for i in "123" for j in "123"]
     if all(re.fullmatch(r"-?0*[.,]?0*", text) for text in axes):

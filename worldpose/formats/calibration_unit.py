@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,6 +47,29 @@ def require_metres(
         else "Divide the positions by 1000 if they are in millimetres (worldpose import --unit "
         "mm).",
     )
+
+
+def other_middle(principal_point: Sequence[float], size: Sequence[int]) -> str:
+    """Return whose middle a principal point is if it is far from that of images of a size; else "".
+
+    Lenses are off along one axis, or differently along both; another size is off alike along both.
+    """
+    most, alike = 0.4, 0.15  # largest distance, and that along both axes [half sides]
+    size_of = 2.0 * np.array(principal_point) + 1.0
+    off = size_of / size - 1.0
+    if np.abs(off).max() <= most and (np.abs(off).min() <= alike or np.ptp(off) > 0.1):
+        return ""
+    x, y = (round(each, 1) for each in principal_point)
+    return f"{x}, {y}, the middle of about {size_of[0]:.0f} x {size_of[1]:.0f} px"
+
+
+def require_middle(
+    where: str, principal_point: Sequence[float], size: tuple[int, int], todo: str
+) -> None:
+    """Raise InputError if a lens whose file states no size is not of images of the video's size."""
+    if found := other_middle(principal_point, size):
+        expected = f"near the middle of the video's {size[0]} x {size[1]} px, as no size is stated"
+        raise InputError(f"{where}: principal point", expected, found, todo)
 
 
 def scaled(

@@ -21,6 +21,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import UNITS
 from worldpose.errors import InputError
+from worldpose.formats.calibration_unit import other_middle
 from worldpose.formats.tables import write_rows
 from worldpose.parsing import read_cells
 
@@ -166,12 +167,18 @@ def _read_capture(path: Path, content: bytes, number: int, fps: float) -> Camera
         raise _wrong(str(path), "FreeD packets (D1)", f"none in {len(found)} frames", todo)
     data = _read_freed(path, b"".join(packet for _, packet in packets), number)
     times = np.array([time for time, packet in packets if number in (-1, packet[1])])
+    frame, rows = _at_frames(times, fps)
+    note = f"{len(times)} packets by the capture's times; the first is frame 0 of the video"
+    return CameraData(frame, data.values[rows], (COUNTS, note, *data.notes[2:]))
+
+
+def _at_frames(times: Floats, fps: float) -> tuple[Integers, Integers]:
+    """Return frames from that of the first time [s] on, and for each the row that is nearest."""
     exact = (times - times[0]) * fps
     slot = np.rint(exact).astype(np.int64)
     order = np.lexsort((np.abs(exact - slot), slot))
     frame, first = np.unique(slot[order], return_index=True)
-    note = f"{len(times)} packets by the capture's times; the first is frame 0 of the video"
-    return CameraData(frame, data.values[order[first]], (COUNTS, note, *data.notes[2:]))
+    return frame, order[first]
 
 
 def _is_freed(packet: bytes) -> bool:
@@ -212,9 +219,12 @@ _TITLES: Final[Mapping[str, str]] = {
     **{"frame_number": "frame", "frame_no": "frame", "tc": "timecode", "time_code": "timecode"},
     **{"focal_length_px": "focal_px", "focal_length_mm": "focal_mm", "vfov": "fov_y"},
     **dict.fromkeys(("fov_x", "hfov", "fov_h", "fovx", "fov_horizontal", "horizontal_fov"), "fov"),
+    **{"cx": "cx_px", "cy": "cy_px"},
     **dict.fromkeys(("fov_v", "fovy", "fov_vertical", "vertical_fov"), "fov_y"),
 }
 """Other names of columns; `_deg` or `_rad` may follow those of angles, a unit of length x, y, z."""
+_TIME: Final = re.compile(r"(?:time|timestamp|time_stamp|t|seconds)(?:_(s|sec|ms|us))?")
+_SECONDS: Final = {"ms": 1e-3, "us": 1e-6}
 _KNOWN: Final = {*("frame", "timecode", *COLUMNS, "focal_mm", "sensor_width_mm", "fov", "fov_y")}
 
 
@@ -236,6 +246,11 @@ def _read_columns(
         name = f"{axis[1]}_m" if axis and factor else _TITLES.get(text, text)
         cells = [row[place].strip() if place < len(row) else "" for _, row in rows[1:]]
         where = f"{path}: column {title}"
+        if (timed := _TIME.fullmatch(text)) and "time" not in columns:
+            seconds = np.array([_seconds(cell) for cell in cells])
+            if cells and np.isfinite(seconds).all():
+                columns["time"] = seconds * _SECONDS.get(timed[1] or "", 1.0)
+                continue
         if name not in _KNOWN:
             left_out.append(title.strip())
         elif name in columns:
@@ -263,20 +278,67 @@ def _numbers(where: str, cells: Sequence[str], decimal: str) -> Floats:
     return values
 
 
+def _seconds(text: str) -> float:
+    """Return the seconds of a number or of HH:MM:SS.fff, perhaps after a date; NaN for others."""
+    clock = re.fullmatch(r"(?:.*[ T])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)Z?", text)
+    if clock:
+        hours, minutes, seconds = (float(each.replace(",", ".")) for each in clock.groups())
+        return 3600.0 * hours + 60.0 * minutes + seconds
+    number = re.fullmatch(r"-?\d+(?:[.,]\d+)?(?:e[-+]?\d+)?", text.lower())
+    return float(text.replace(",", ".")) if number else np.nan
+
+
+def _time_frames(path: Path, columns: dict[str, Floats], fps: float) -> tuple[Integers, str]:
+    """Return the rows that count by the time of a table, with `frame` of them; and a sentence.
+
+    Raises:
+        InputError: times do not rise, are in no seconds, or contradict the frames.
+    """
+    time = columns["time"]
+    step = np.diff(time)
+    are_seconds = bool((step >= 0.0).all() and 0.0 < np.median(step) < 1.0)
+    if "frame" in columns:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rate = float(np.median(np.diff(columns["frame"]) / step))
+        if are_seconds and abs(rate / fps - 1.0) > 0.05:
+            found = f"frames at {rate:g} per second by their times"
+            todo = "Keep the column frame if it has the video's numbers, else that of the time."
+            raise _wrong(f"{path}: time", f"the video's {fps:g} per second", found, todo)
+        return np.arange(len(time)), ""
+    if not are_seconds:
+        expected, found = "seconds that rise, in many rows a second", f"{time[:3].tolist()}"
+        todo = "State the unit in the title: time_s or time_ms."
+        raise _wrong(f"{path}: time", expected, found, todo)
+    frame, rows = _at_frames(time, fps)
+    columns["frame"] = frame.astype(np.float64)
+    return rows, f"{len(time)} rows by their times; the first is frame 0 of the video"
+
+
 def _read_table(path: Path, fps: float, size: tuple[int, int]) -> CameraData:
     """Return the camera data of a table with a row per image."""
     columns, codes, left_out = _read_columns(path, ("pan", "tilt"))
-    unknown = np.full(len(columns["pan"]), np.nan)
     notes = [f"columns left out: {', '.join(left_out)}"] if left_out else []
-    frame = columns.get("frame", np.arange(len(unknown), dtype=np.float64))
+    if any(re.search(r"[.,]\d{3,}$", code) for code in codes) and "time" not in columns:
+        columns["time"], codes = np.array([_seconds(code) for code in codes]), []
     if "frame" not in columns and codes:
         frame = np.array([_frames(path, n, text, fps) for n, text in enumerate(codes, 1)])
-        frame = frame - frame[0]
+        columns["frame"] = frame - frame[0]
         notes.append(f"time code {codes[0]} is the first frame")
-    elif "frame" not in columns:
+    elif len(columns.get("time", ())) > 1:
+        rows, note = _time_frames(path, columns, fps)
+        frame = columns.pop("frame")
+        columns = {name: values[rows] for name, values in columns.items()} | {"frame": frame}
+        notes += [note] if note else []
+    unknown = np.full(len(columns["pan"]), np.nan)
+    if "frame" not in columns:
         notes.append("the table has no frames: each row is one frame of the video")
+    frame = columns.get("frame", np.arange(len(unknown), dtype=np.float64))
     if not (np.abs(frame) < 1e9).all() or (frame != np.floor(frame)).any():
         raise _wrong(f"{path}: column frame", "whole numbers", "others")
+    if {"cx_px", "cy_px"} <= columns.keys() and np.isfinite(columns["cx_px"]).any():
+        middle = [float(np.nanmedian(columns[name])) for name in ("cx_px", "cy_px")]
+        if found := other_middle(middle, size):
+            raise _wrong(f"{path}: cx_px, cy_px", "pixels of this video", found)
     columns["focal_px"] = _focal_lengths(path, columns, size)
     values = np.stack([columns.get(name, unknown) for name in COLUMNS], axis=1)
     return CameraData(frame.astype(np.int64), values, tuple(notes))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from data_contracts.arrays import Floats
 from data_contracts.records import FRAME_LIMIT
 from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
 from worldpose.body.model import BodyModel, BodyParameters
-from worldpose.errors import InputError
+from worldpose.errors import InputError, say_failure
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import whole_file
 from worldpose.formats.tables import read_parquet
@@ -332,7 +332,14 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
 def _read_table(path: Path, only: Collection[str] | None) -> dict[str, Floats]:
     """Read a submission's table (parquet) by clip."""
     table = read_parquet(path, _COLUMNS)
-    index = np.stack([table[name] for name in _COLUMNS[1:4]], axis=1).astype(np.float64)
+
+    def numbers(names: Sequence[str]) -> Floats:
+        try:
+            return np.stack([table[name].astype(np.float64) for name in names], axis=1)
+        except (ValueError, TypeError) as error:
+            raise wrong(f"{path}: {', '.join(names)}", "numbers", say_failure(error)) from error
+
+    index = numbers(_COLUMNS[1:4])
     # Largest number of persons in a submission's table [1].
     max_persons = 1000
     limits = np.array([FRAME_LIMIT, max_persons, len(CHALLENGE15)])
@@ -343,12 +350,16 @@ def _read_table(path: Path, only: Collection[str] | None) -> dict[str, Floats]:
         raise wrong(
             where, f"a whole number from 0 to {limits[column] - 1}", f"{index[row, column]}"
         )
-    values = np.stack([table[name] for name in _COLUMNS[4:]], axis=1).astype(np.float64)
+    values = numbers(_COLUMNS[4:])
     sequence, found = table["sequence"].astype(np.str_), dict[str, Floats]()
     for clip in np.unique(sequence).tolist():
         own = sequence == clip
         frame, person, joint = index[own].astype(np.int64).T
         places = np.full((person.max() + 1, frame.max() + 1, len(CHALLENGE15), 3), np.nan)
+        cells, counts = np.unique(index[own], axis=0, return_counts=True)
+        if (counts > 1).any():
+            twice = "frame {:g}, person {:g}, joint {:g}".format(*cells[counts > 1][0])
+            raise wrong(f"{path}: {clip}", "one row for each joint", f"several of {twice}")
         places[person, frame, joint] = values[own]
         if only is None or clip in only:
             found[clip] = places

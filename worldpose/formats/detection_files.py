@@ -150,8 +150,9 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     """Return the boxes of a MOTChallenge text, or of an npy file (frames, persons, 4).
 
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
-    taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and, in truth
-    of nine numbers, the class, of which 1 is a person and -1 is not known. Frames begin at 1, and
+    taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and the class,
+    of which 1 is a person and -1 is not known; of 10 numbers it may be VisDrone's, which has
+    persons of class 1 and 2, or a place in the world. Frames begin at 1, and
     (1, 1) is the upper left corner of the image. Trackers follow people out of the image: such
     boxes are left out.
 
@@ -167,18 +168,25 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     """
     if file.suffix.lower() == ".npy":
         return _read_identified(file, frames)
-    people = (1, -1)  # class of people in MOTChallenge's truth, and none
+    people = (1, -1, 2)  # class of people in MOTChallenge's truth, none, and in VisDrone's
     lines, rows = _read_rows(file)
     frame, person, box = rows[:, 0], rows[:, 1], rows[:, 2:6]
     corner = box[:, :2] - 1.5
     boxes = np.concatenate([corner, corner + box[:, 2:]], axis=1)
     score = rows[:, 6] if rows.shape[1] > 6 else np.full(len(rows), -1.0)
-    is_person = np.isin(rows[:, 7], people) if rows.shape[1] == 9 else np.ones(len(rows), np.bool_)
+    is_person = np.ones(len(rows), np.bool_)
+    # Of ten numbers the last three are a place [m], or VisDrone's class, truncation and occlusion.
+    said = rows[:, 7:]
+    if rows.shape[1] == 9 or (said.any() and np.isin(said, range(-1, 1000)).all()):
+        is_person = np.isin(rows[:, 7], people[: 3 if rows.shape[1] == 10 else 2])
     kept = (score != 0.0) & is_person
     pairs = np.stack([frame, person], axis=1)
     order = np.lexsort((np.arange(len(rows)), person, frame))
     again = np.zeros(len(rows), np.bool_)
     again[order[1:]] = (pairs[order[1:]] == pairs[order[:-1]]).all(axis=1)
+    # Right and bottom are larger than left and top in every box, and end beyond as sides of boxes.
+    cut = ((boxes[:, 2:] - size > 0.1 * box[:, 2:]).any(axis=1)) & is_person
+    is_corner = (box[is_person, 2:] > box[is_person, :2]).all() and cut.sum() > 0.2 * len(cut)
     outside = ((boxes[:, :2] >= np.array(size) - 0.5) | (boxes[:, 2:] <= -0.5)).any(axis=1)
     most = f"a frame from 1 to {frames}, as many as the video has"
     for wrong, key, expected in (
@@ -192,6 +200,12 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
             outside & (outside.mean() > 0.5),
             "left, top, width, height",
             f"a box in the image of {size[0]} x {size[1]} px, as most should be",
+        ),
+        (
+            cut & is_corner,
+            "left, top, width, height",
+            f"width and height of a box in the image of {size[0]} x {size[1]} px, as most should "
+            "be; are these right and bottom?",
         ),
         (
             (score > MAX_CONFIDENCE) | ((score < 0.0) & (score != -1.0)),

@@ -104,8 +104,16 @@ class JointTracks:
         )
 
     def __post_init__(self) -> None:
-        for name in ("frames", "person_ids", "joints"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name)))
+        for name in ("frames", "person_ids", "joints", "covariance", "views"):
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, np.asarray(given))
+        for name, kind in (("frames", np.int64), ("person_ids", np.int64), ("views", np.uint8)):
+            given, most = getattr(self, name), np.iinfo(kind).max
+            counts: NDArray[Any] = np.zeros(0, kind) if given is None else given
+            whole = counts.dtype.kind in "iu" or (counts == np.floor(counts)).all()
+            if not whole or (counts > most).any():
+                todo = "Number frames and people, and give times as fps."
+                raise wrong(name, f"whole numbers up to {most}", f"{counts.ravel()[:3]}", todo)
         parts = [("", ExtraTracks(COCO17, self.joints, self.covariance, self.views))]
         if self.extra is not None:
             names = self.extra.points

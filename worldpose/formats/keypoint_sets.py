@@ -243,6 +243,8 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
             found = "thighs, shanks and arms as in the order of Human3.6M"
             todo = "Estimate poses with a model of COCO, or write COCO's joints."
             raise InputError(where, "the 17 joints in COCO's order", found, todo)
+        if _is_posetrack(points):
+            return PointOrder("PoseTrack18", (*[-1] * 5, *range(5, 17)))
     misfit = misfits[orders.index(chosen)]
     is_doubtful = chosen.name == "MPI-15" or (named is None and (stated or "").strip() != "")
     # Landmarks of a face, such as 300-W's, are 68 points too, of which none is hidden.
@@ -261,6 +263,23 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
             + ", ".join(MODELS),
         )
     return chosen
+
+
+def _is_posetrack(points: AnyFloats) -> bool:
+    """Return whether neck and top of the head (people, 17, 3) are in the place of COCO's eyes.
+
+    PoseTrack18 has no ears, and its two are far from the nose, on opposite sides.
+    """
+    place = points[(points[:, [0, 1, 2, 5, 6, 11, 12], 2] > 0.0).all(axis=1), :, :2]
+    if not len(place) or (points[:, 3:5, 2] > 0.0).any():
+        return False
+    one, two = (place[:, [1, 2]] - place[:, :1]).swapaxes(0, 1)
+    length = np.linalg.norm([one, two], axis=-1)
+    trunk = np.linalg.norm(place[:, 5:7].mean(axis=1) - place[:, 11:13].mean(axis=1), axis=-1)
+    cosine = (one * two).sum(axis=-1) / np.maximum(length.prod(axis=0), 1e-9)
+    # An eye is a tenth of the trunk from the nose; seen from above, the trunk is short.
+    is_far = np.median(length.mean(axis=0) / np.maximum(trunk, 1e-9)) > 0.2
+    return bool(is_far and np.median(cosine) < -0.5)
 
 
 def unknown_size(where: str, size: int) -> InputError:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,6 +30,7 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
+from worldpose.formats.calibration_unit import require_middle
 from worldpose.formats.files import (
     SETTINGS_BYTES,
     by_last_number,
@@ -49,9 +50,12 @@ DISTORTION_NAMES: Final = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
     *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
+_OWNERS: Final = ("image", "img", "frame", "video", "picture", "camera", "calibration")
 SIZE_NAMES: Final = (
-    *(("imagewidth", "imageheight"), ("width", "height"), ("imagesize",), ("size",)),
-    *(("resolution",), ("imgsize",), ("w", "h")),
+    *((f"{owner}width", f"{owner}height") for owner in ("", *_OWNERS)),
+    *(("size",), ("resolution",), ("dim",)),
+    *((a + b,) for a, b in product(_OWNERS, ("size", "resolution", "dim", "shape", "dimensions"))),
+    ("w", "h"),
 )
 
 
@@ -102,13 +106,18 @@ def read_lenses(
         raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
     if "xi" in given:
         raise calibration_error(f"{where}: xi", "a pinhole or fisheye lens", "that of cv2.omnidir")
+    own = _image_size(where, given)
     table = {
-        "size": list(_image_size(given, sizes[camera])),
+        "size": list(own or sizes[camera]),
         "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
         "distortions": distortion.tolist(),
         "fisheye": is_fisheye(where, given),
     }
-    return {camera: _lens(where, camera, table, sizes[camera])}
+    lens = _lens(where, camera, table, sizes[camera])
+    if own is None:
+        todo = "Add the calibrated images' size to the file: image_size = [WIDTH, HEIGHT]."
+        require_middle(where, lens.principal_point_px, sizes[camera], todo)
+    return {camera: lens}
 
 
 def read_lens_toml(
@@ -355,7 +364,9 @@ def _read_mapping(file: Path) -> dict[str, Any]:
                 parts = [f"{key} {describe_value(value[key])}" for key in ("rows", "cols", "data")]
                 expected = "data of rows x cols numbers"
                 raise calibration_error(f"{file}: {name}", expected, ", ".join(parts)) from error
-        elif isinstance(value, list | int | float | str):
+        elif isinstance(value, list | int | float | str) or plain_key(str(name)) in {
+            *chain(*SIZE_NAMES)
+        }:
             found[str(name)] = value
     return found
 
@@ -383,13 +394,25 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
     raise InputError(where, expected, ", ".join(sorted(given)) or "nothing", todo)
 
 
-def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
-    """Return the image size in a file, or the camera's own if the file has none."""
+def _image_size(where: str, given: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the image size in a file, as two numbers, `width` and `height`, or "1920x1080".
+
+    Raises:
+        InputError: an entry of such a name is none; a number alone is something else.
+    """
     for names in SIZE_NAMES:
-        values = np.concatenate([np.ravel(given.get(_key(given, [n]) or "", ())) for n in names])
-        if len(values) == 2:
-            return int(values[0]), int(values[1])
-    return otherwise
+        keys = [key for key in (_key(given, [name]) for name in names) if key]
+        value = [given[key] for key in keys]
+        if len(value) == 1 and isinstance(value[0], Mapping):
+            value = list(_image_size(f"{where}: {keys[0]}", value[0]) or ["nothing"])
+        flat = [str(one) for each in value for one in np.ravel(np.asarray(each, object))]
+        numbers = re.findall(r"\d+\.?\d*(?:e[-+]?\d+)?", " ".join(flat).lower())
+        if len(numbers) == 2:
+            return int(float(numbers[0])), int(float(numbers[1]))
+        if len(numbers) > 2 or (keys and not numbers):
+            expected = "width and height of the calibrated images"
+            raise calibration_error(f"{where}: {', '.join(keys)}", expected, f"{value!r:.60}")
+    return None
 
 
 def _lens(

@@ -65,14 +65,15 @@ def write_moving_camera(path: Path, camera: Camera) -> None:
     )
 
 
-def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camera:
+def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera:
     """Read the camera of a file: a single one if it has one row, else a batch (frames,).
 
     The batch is NaN where a frame has no camera.
 
     Args:
         path: the file.
-        image_size: width and height [px].
+        image_size: width and height [px]; None = those of a released camera, or of an image about
+            the principal point where that is elsewhere.
 
     Raises:
         InputError: the file is absent, has missing or unknown members, wrong shapes or no rows, a K
@@ -95,6 +96,11 @@ def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camer
             )
         rotation[row] = nearest_rotation(f"{path}: R[{row}]", rotation[row])
     missing = ~known[:, None]
+    if image_size is None:
+        middle = np.median(k[known, :2, 2], axis=0) if known.any() else np.zeros(2)
+        around = np.round(2.0 * middle + 1.0)  # (0, 0) is the centre of the first pixel
+        far = known.any() and (np.abs(around / RELEASE_SIZE - 1.0) > 0.1).any()
+        image_size = (int(around[0]), int(around[1])) if far else RELEASE_SIZE
     camera = Camera(
         focal=np.where(missing, np.nan, k[:, [0, 1], [0, 1]]),
         principal_point=k[:, :2, 2],

@@ -101,6 +101,17 @@ class Camera:
             object.__setattr__(self, "cam_from_world", Rigid(rotation, pose.translation))
 
     @classmethod
+    def batch(cls, cameras: Cameras) -> Camera:
+        """Return the batch (cameras,) of cameras in any form.
+
+        Raises:
+            InputError: there are no cameras, or their batch shapes differ.
+        """
+        if isinstance(cameras, Camera):
+            return cameras
+        return cls.stack(list(cameras.values() if isinstance(cameras, Mapping) else cameras))
+
+    @classmethod
     def stack(cls, cameras: Sequence[Camera]) -> Camera:
         """Return one batch of cameras, stacked along a new first dimension.
 
@@ -467,3 +478,7 @@ def camera_from_arrays(arrays: Mapping[Any, ArrayLike]) -> Camera:
     parts["lens_model"] = np.asarray(arrays.get("lens_model", LensModel.BROWN))
     rotation, translation = (np.asarray(arrays[name]) for name in ("rotation", "translation"))
     return Camera(**parts, cam_from_world=Rigid(rotation, translation))
+
+
+Cameras = Camera | Sequence[Camera] | Mapping[str, Camera]
+"""Cameras of a rig: a batch (cameras,), each camera, or those of `read_cameras`."""

@@ -255,7 +255,8 @@ def fit_to_video(
     index: FrameIndex,
     notes: list[str],
     *,
-    is_part: bool = False,
+    of_sensor: bool,
+    has_poses: bool = False,
 ) -> CameraCalibration:
     """Return a camera in the pixels of its video, which may be resized, or have black bars.
 
@@ -264,20 +265,34 @@ def fit_to_video(
         camera: the camera in the calibrated pixels.
         index: the video's frames.
         notes: sentences for the user, to which a change is added.
-        is_part: whether a smaller video is the middle part of the image, as Vicon's video modes
-            are of the sensor to which the calibration belongs.
+        of_sensor: whether the calibration is of the sensor (`is_of_sensor`), of which a smaller
+            video is the middle part, as in Vicon's video modes.
+        has_poses: whether 2D poses can contradict that where a resized video has the same shape.
 
     Raises:
-        InputError: the video is neither what was calibrated nor the same picture resized.
+        InputError: the video is neither what was calibrated nor the same picture resized, or
+            perhaps both the middle part of it and the same picture resized.
     """
     # Largest relative difference of two shapes of one picture [1]: sides are whole pixels.
     same_shape = 0.002
     if index.size == camera.image_size:
         return camera
     own, shown = np.array(camera.image_size), np.array(index.size)
-    if is_part and np.all(shown <= own):
+    if of_sensor and np.all(shown <= own):
         corner = 0.5 * (own - shown)
-        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
+        part = f"the middle {index.size[0]} x {index.size[1]} px of the sensor"
+        warning = ""
+        if np.ptp(shown / own) <= same_shape:
+            part += ", or the whole one resized to it"
+            x, y = corner
+            todo = "Give videos of the sensor's size, resized if they show all of it. If they are "
+            todo += "its middle, write the calibration of that part: set SENSOR_SIZE, and subtract "
+            todo += f"{x:g}, {y:g} from PRINCIPAL_POINT and the centre of VICON_RADIAL2."
+            if not has_poses:
+                expected = "{} x {} px, SENSOR_SIZE in the calibration".format(*camera.image_size)
+                raise InputError(str(file), expected, part, todo)
+            warning, part = "warning: ", f"{part}; taken as the middle. If no people agree: {todo}"
+        notes.append(f"{warning}{file.name}: {part}")
         middle = np.array(camera.principal_point_px) - corner
         return camera.model_copy(
             update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}

@@ -85,6 +85,9 @@ def import_challenge(
     cameras = sorted((kit / "cameras").glob("[!.]*.npz"))
     if not cameras:
         raise _refuse(str(kit), "cameras/<sequence>.npz", "no such file")
+    for boxes in sorted((kit / "boxes").glob("[!.]*.npy")):
+        if (expected := kit / "cameras" / f"{boxes.stem}.npz") not in cameras:
+            raise _refuse(str(kit), f"{expected}, as there is {boxes.name}", "no such file")
     read = [_read_sequence(kit, file) for file in cameras]
     rates = {each.name: each.index.fps if fps is None else fps for each in read}
     for each in read:
@@ -118,7 +121,10 @@ def _read_sequence(kit: Path, file: Path) -> KitSequence:
         skeletons[kind] = (
             _read_skeleton(path, kind, np.asarray(known.all(-1))) if path.exists() else None
         )
-    videos = [path for path in (kit / "videos").glob(f"{name}.*") if is_video(path)]
+    videos = sorted(path for path in (kit / "videos").glob(f"{name}.*") if is_video(path))
+    if len(videos) > 1:
+        found = ", ".join(path.name for path in videos)
+        raise _refuse(str(kit / "videos"), f"one video of {name}", found)
     images = kit / "images" / name
     if not videos and not images.is_dir():
         raise _refuse(str(kit), f"videos/{name}.mp4 or images/{name}/", "neither")

@@ -16,7 +16,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut, camera_id
-from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_forms import is_of_sensor, read_calibration
 from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
 from worldpose.formats.keypoint_sets import PeopleFile
@@ -421,7 +421,9 @@ def _import_found(
         indices = {name: indices[name] for name in files}
         cameras = {name: cameras[name] for name in files}
         for name, file in files.items():
-            cameras[name] = fit_to_video(file, cameras[name], indices[name], notes)
+            cameras[name] = fit_to_video(
+                file, cameras[name], indices[name], notes, of_sensor=is_of_sensor(calibration)
+            )
     rate = _first_rate(files, indices) if fps is None else fps
     clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
     notes += describe_videos(files, indices, clocks)

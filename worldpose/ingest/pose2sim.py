@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut
@@ -19,6 +20,7 @@ from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
     find_calibration,
+    is_of_sensor,
     read_calibration,
 )
 from worldpose.formats.detection_files import frame_files, read_openpose_folder
@@ -113,7 +115,7 @@ def import_pose2sim(
         names, source = list(cameras), calibration
         places = {name: each for name, each in places.items() if name not in left_out}
         films = {name: each for name, each in films.items() if name not in left_out}
-    is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
+    of_sensor = calibration is not None and is_of_sensor(calibration)
     poses = _assign(folder, places, names, source, notes) if places else {}
     videos = _assign(films_in, films, names, source, notes) if films else {}
     names = [name for name in names if name in (poses or videos)]
@@ -122,7 +124,14 @@ def import_pose2sim(
     indices = {name: known[file] for name, file in videos.items()}
     for name, file in videos.items():
         if name in cameras:
-            cameras[name] = fit_to_video(file, cameras[name], indices[name], notes, is_part=is_part)
+            cameras[name] = fit_to_video(
+                file,
+                cameras[name],
+                indices[name],
+                notes,
+                of_sensor=of_sensor,
+                has_poses=bool(poses),
+            )
     rate = fps if fps is not None else settings.get("frame_rate")
     rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     clocks = {name: index.on_clock(rate, str(videos[name])) for name, index in indices.items()}
@@ -133,6 +142,7 @@ def import_pose2sim(
     read = {name: read_openpose_folder(place, model) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
     offsets = _find_shifts(project / "pose", poses, notes) if videos else {}
+    people = people if offsets else _from_zero(people, indices, notes)
     first, stop = find_people(folder, people) if people else (0, length)
     first, stop = settings.get("frame_range", (first, stop))
     for name, files in poses.items():
@@ -151,6 +161,18 @@ def import_pose2sim(
         out, spec, calibrations=cameras, observations=people, further=partial(copy_videos, videos)
     )
     return spec, notes + describe_outside(people, sizes) + _describe_poses(folder, read)
+
+
+def _from_zero(
+    people: dict[str, KeypointDetections], indices: Mapping[str, FrameIndex], notes: list[str]
+) -> dict[str, KeypointDetections]:
+    """Return 2D poses by the frames of videos, where they are numbered from 1 to their lengths."""
+    frames = {name: people[name].frame for name in indices if name in people}
+    beyond = [frame[-1] - len(indices[name]) for name, frame in frames.items()]
+    if max(beyond, default=-1) != 0 or any(frame[0] != 1 for frame in frames.values()):
+        return people
+    notes.append("2D poses are numbered from 1 to the videos' lengths: 1 is frame 0")
+    return {name: replace(one, frame=one.frame - 1) for name, one in people.items()}
 
 
 def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict[str, int]:

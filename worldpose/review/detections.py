@@ -91,6 +91,8 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
             return None
         seen = [round(float(value), 2) for value in box]
         return f"the box of {place} was {list(edit.was)} when it was deleted, and is {seen} now"
+    if edit.joint not in COCO17:
+        return f"COCO-17 has no joint {edit.joint}"
     now = found.keypoints[row, edit.detection, COCO17.index(edit.joint)].astype(np.float64)
     if np.isnan(now).any():
         return f"{edit.joint} of {place} is not seen" if edit.was or edit.xy is None else None

@@ -1,13 +1,18 @@
-"""Runs of a project: their numbers, reservations, records and pins.
+"""Runs of a project: their numbers, reservations, records, pins and locks.
 
 A pin is a name of a run, and garbage collection keeps every pinned run.
 """
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import os
 import platform
 import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -97,6 +102,46 @@ def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
     names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
     pins = (read_pin(blobs, match_id, name) for name in names if is_name(name))
     return tuple(pin for pin in pins if pin is not None)
+
+
+@contextmanager
+def alone(blobs: Blobs, what: str, *, wait: bool) -> Iterator[bool]:
+    """Hold the lock `what` of a project; yield whether it was acquired, as `hold_lock`.
+
+    The processes of one machine exclude each other. Where the project's folder has no locks, such
+    as in object storage, the lock is in the folder of temporary files.
+    """
+    mine = f"worldpose-{os.getuid()}/{hashlib.sha256(blobs.url.encode()).hexdigest()[:16]}"
+    places = [Path(tempfile.gettempdir(), mine)]
+    if "://" not in blobs.url:
+        places.insert(0, Path(blobs.url, "locks"))
+    with ExitStack() as stack:
+        for place in places:
+            try:
+                is_held = stack.enter_context(hold_lock(place / f"{what}.lock", wait=wait))
+                break
+            except OSError:
+                if place is places[-1]:
+                    raise
+        yield is_held
+
+
+@contextmanager
+def hold_lock(file: Path, *, wait: bool) -> Iterator[bool]:
+    """Hold the lock of a file; yield whether it was acquired, which can fail without `wait`.
+
+    The operating system releases the lock when the process ends, however it ends.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    is_of_other = file.exists() and not os.access(file, os.W_OK)  # another user's
+    with file.open("r" if is_of_other else "a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            is_held = False
+        else:
+            is_held = True
+        yield is_held
 
 
 LATEST = "latest"

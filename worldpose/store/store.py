@@ -56,7 +56,7 @@ class Store:
     """Results, runs and registered matches of one project.
 
     Results live at `results/<match>/<stage>/<unit>/<key>/`, each with a manifest written last.
-    Safe for any number of concurrent processes: nothing is locked and nothing is overwritten.
+    Safe for any number of concurrent processes: results need no lock, and none is overwritten.
     """
 
     def __init__(self, blobs: Blobs) -> None:

@@ -15,7 +15,7 @@ from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
+from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.tracking.frame_tracker import FrameTracker
@@ -83,7 +83,7 @@ class Tracking:
 
 
 def track_people(
-    cameras: Camera,
+    cameras: Cameras,
     detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TrackingSettings = TrackingSettings(),  # noqa: B008
@@ -98,7 +98,7 @@ def track_people(
     (T1); remaining detections are associated across views and start people (T2).
 
     Args:
-        cameras: batch (cameras,).
+        cameras: batch (cameras,), each camera, or the cameras of `read_cameras`.
         detections: (frames, cameras, detections), read in blocks of frames, whose numbers rise in
             equal steps; a confidence of NaN, 0 or less excludes a keypoint.
         fps: frame numbers per second [1/s].
@@ -115,6 +115,7 @@ def track_people(
     Note:
         T1, T2, D2. Constant velocity between frames departs from the paper (`predict_motion`).
     """
+    cameras = Camera.batch(cameras)
     fps = row_rate("tracking", fps, detections.frame)
     keypoints, confidence = detections.keypoints, detections.confidence
     if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:

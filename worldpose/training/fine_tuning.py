@@ -23,6 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from data_contracts.arrays import Flags
 from data_contracts.finetune import NetKind
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
@@ -365,7 +366,7 @@ def fine_tune(
         InputError: too few frames, a subset without people, or weights of another net.
     """
     settings = settings or FineTuningSettings()
-    learned, checked, held_out = split(pictures, settings)
+    learned, checked, held_out = split(pictures, settings, kind)
     cache, training = PictureCache(), settings.training
     checkpoint = weights.with_suffix(".checkpoint")
     torch.manual_seed(training.seed)
@@ -385,13 +386,16 @@ def fine_tune(
 
 
 def split(
-    pictures: Pictures, settings: FineTuningSettings
+    pictures: Pictures, settings: FineTuningSettings, kind: NetKind = "people"
 ) -> tuple[list[LabelledPicture], list[LabelledPicture], list[LabelledPicture]]:
     """Return the frames for training, for validation, and for the test.
 
     Raises:
-        InputError: a subset without people.
+        InputError: a subset without people by whom the metric of this net is measured.
     """
+    people = "people"
+    if kind == "keypoints":
+        people += f" of {MIN_HEIGHT:g} px or more with a labelled torso and visible keypoints"
     # Blocks of consecutive frames that stay together: neighbours in a video are almost the same.
     count = min(20, len(pictures))
     blocks = np.array_split(np.arange(len(pictures)), max(count, 1))
@@ -405,12 +409,21 @@ def split(
         ("the test", order[:held]),
     ):
         part = [pictures[index] for place in sorted(places) for index in blocks[place]]
-        if not any((~picture.ignored).any() for picture in part):
+        if not any(_is_measured(picture, kind).any() for picture in part):
             raise InputError(
                 "labels",
-                expected="people in the images for training, for validation and for the test",
-                found=f"no people in the images for {name}, of {len(pictures)} images in all",
+                expected=f"{people}, in the images for training, for validation and for the test",
+                found=f"none in the images for {name}, of {len(pictures)} images in all",
                 todo="Label more images; 200 are a good start.",
             )
         parts.append(part)
     return parts[0], parts[1], parts[2]
+
+
+def _is_measured(picture: LabelledPicture, kind: NetKind) -> Flags:
+    """Return (people,) whether the metric of a net counts them."""
+    if kind == "people":
+        return ~picture.ignored
+    tall = picture.boxes[:, 3] - picture.boxes[:, 1] >= MIN_HEIGHT
+    torso = (picture.visible[:, [5, 6, 11, 12]] > 0).all(-1)
+    return np.asarray(~picture.ignored & tall & torso & (picture.visible == 2).any(-1))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +22,10 @@ from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.errors import InputError, UsageError
-from worldpose.video.folder import decode_image, open_video
+from worldpose.formats.keypoint_sets import PointOrder, order_by_names
+from worldpose.video.folder import declared_size, decode_image, open_video
+
+LOG = logging.getLogger("worldpose.finetune")
 
 
 class _Given(BaseModel):
@@ -33,18 +37,36 @@ class _Given(BaseModel):
 class _Image(_Given):
     id: int
     file_name: str = Field(min_length=1)
+    width: int | None = None
+    height: int | None = None
+
+
+_Side = Annotated[float, Field(ge=0.0)]
 
 
 class _Person(_Given):
     image_id: int
-    bbox: tuple[float, float, float, float]
-    keypoints: Annotated[tuple[float, ...], Field(min_length=51, max_length=51)] | None = None
+    category_id: int | None = None
+    bbox: tuple[float, float, _Side, _Side]
+    keypoints: tuple[float, ...] | None = None
     iscrowd: int = 0
+
+
+class _Category(_Given):
+    id: int
+    name: str | None = None
+    supercategory: str | None = None
+    keypoints: tuple[str, ...] | None = None
+
+    @property
+    def is_of_people(self) -> bool:
+        return bool(self.keypoints) or "person" in (self.name, self.supercategory)
 
 
 class _Dataset(_Given):
     images: tuple[_Image, ...]
     annotations: tuple[_Person, ...]
+    categories: tuple[_Category, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,20 +93,22 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
     """Return the images of a COCO keypoints data set, in the order of their ids.
 
     `iscrowd` 1 marks ignored people. Boxes are x, y, width, height in the pixels of the keypoints,
-    which begin at the centre of the top-left pixel.
+    which begin at the centre of the top-left pixel. The categories name the order of keypoints;
+    annotations of categories without keypoints that are no person are left out, and said.
 
     Args:
         annotations: the JSON file.
         pictures: the folder of the images; the folder of the JSON file if None.
 
     Raises:
-        InputError: the file is no COCO keypoints data set, or an image lies outside of the folder.
+        InputError: the file is no COCO keypoints data set, or an image lies outside of the folder
+            or has another size.
     """
     folder = annotations.parent if pictures is None else pictures
 
-    def refusal(expected: str, found: str) -> InputError:
+    def refusal(expected: str, found: str, key: str = "") -> InputError:
         return InputError(
-            str(annotations),
+            f"{annotations}{key and ': '}{key}",
             expected=expected,
             found=found,
             todo="Export the labels again as COCO keypoints of 17 joints.",
@@ -98,17 +122,79 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
         raise refusal("a COCO keypoints data set", found) from error
     except OSError as error:
         raise refusal("a COCO keypoints data set", f"{type(error).__name__}: {error}") from error
-    people: dict[int, list[_Person]] = {image.id: [] for image in dataset.images}
-    for person in dataset.annotations:
-        if person.image_id not in people:
-            raise refusal("an image for each annotation", f"none of id {person.image_id}")
-        people[person.image_id].append(person)
+    people = _people(annotations, dataset, refusal)
     images = sorted(dataset.images, key=lambda image: image.id)
     read = [_picture(folder, image, people[image.id]) for image in images]
-    for picture in read:
+    for image, picture in zip(images, read, strict=True):
         if not picture.path.resolve().is_relative_to(folder.resolve()):
             raise refusal("images within the folder of the data set", str(picture.path))
+        if not (image.width and image.height and picture.path.is_file()):
+            continue
+        size_on_disk = declared_size(np.fromfile(picture.path, np.uint8))
+        if size_on_disk not in (None, (image.width, image.height)):
+            found = "{} x {} in {}".format(*size_on_disk, picture.path)
+            where = f"images of id {image.id}"
+            raise refusal(f"an image of {image.width} x {image.height}", found, where)
     return read
+
+
+def _people(
+    path: Path, dataset: _Dataset, refusal: Callable[..., InputError]
+) -> dict[int, list[tuple[_Person, Floats]]]:
+    """Return people by image, each with COCO-17's joints (17, 3) x, y, v."""
+    people: dict[int, list[tuple[_Person, Floats]]] = {image.id: [] for image in dataset.images}
+    if len(people) < len(dataset.images):
+        raise refusal("images of different ids", f"{len(dataset.images)} of {len(people)} ids")
+    orders, known = _orders(path, dataset.categories), {each.id for each in dataset.categories}
+    left_out = 0
+    for number, person in enumerate(dataset.annotations):
+        key, category = f"annotations.{number}", person.category_id if known else None
+        if person.image_id not in people:
+            raise refusal("an image for each annotation", f"none of id {person.image_id}", key)
+        if category is None and len(known) == 1:
+            (category,) = known
+        if known and category not in known:
+            expected = f"one of {', '.join(map(str, sorted(known)))}"
+            raise refusal(expected, f"{category}", f"{key}.category_id")
+        if category not in orders:
+            left_out += 1
+            continue
+        order, size = orders[category]
+        given = np.array(person.keypoints or (0.0,) * 3 * size)
+        if len(given) != 3 * size or not np.isin(given[2::3], (0.0, 1.0, 2.0)).all():
+            expected = f"x, y and v = 0, 1 or 2 of {size} points"
+            raise refusal(expected, f"{given.tolist()}", f"{key}.keypoints")
+        places = np.array(order.joints)
+        joints = np.where(places[:, None] >= 0, given.reshape(size, 3)[places], 0.0)
+        people[person.image_id].append((person, joints))
+    if left_out:
+        LOG.warning("%s: left out %d annotations that are no people", path, left_out)
+    return people
+
+
+def _orders(
+    path: Path, categories: Sequence[_Category]
+) -> Mapping[int | None, tuple[PointOrder, int]]:
+    """Return order and number of keypoints by category of people; by None without categories.
+
+    Raises:
+        InputError: none of several categories is of people, or its keypoints are others.
+    """
+    usual = order_by_names(str(path), COCO17), len(COCO17)
+    people = [each for each in categories if each.is_of_people or len(categories) == 1]
+    if categories and not people:
+        raise InputError(
+            f"{path}: categories",
+            expected="a category with keypoints, or of name or supercategory person",
+            found=", ".join(str(each.name or each.id) for each in categories),
+            todo="Name the category of people so.",
+        )
+    orders: dict[int | None, tuple[PointOrder, int]] = {} if people else {None: usual}
+    for each in people:
+        names = each.keypoints or ()
+        where = f"{path}: category {each.name or each.id}"
+        orders[each.id] = (order_by_names(where, names), len(names)) if names else usual
+    return orders
 
 
 def write_labels(
@@ -153,17 +239,18 @@ def _annotation(box: Floats, keypoints: Floats, visible: NDArray[np.int8]) -> di
     }
 
 
-def _picture(folder: Path, image: _Image, people: Sequence[_Person]) -> LabelledPicture:
-    boxes = np.array([person.bbox for person in people], dtype=np.float64).reshape(-1, 4)
-    given = [person.keypoints or (0.0,) * 51 for person in people]
-    triples = np.array(given, dtype=np.float64).reshape(len(people), 17, 3)
+def _picture(
+    folder: Path, image: _Image, people: Sequence[tuple[_Person, Floats]]
+) -> LabelledPicture:
+    boxes = np.array([person.bbox for person, _ in people], dtype=np.float64).reshape(-1, 4)
+    triples = np.array([points for _, points in people], dtype=np.float64).reshape(-1, 17, 3)
     visible = triples[..., 2].astype(np.int8)
     return LabelledPicture(
         path=folder / image.file_name,
         boxes=np.column_stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]),
         keypoints=np.where(visible[..., None] > 0, triples[..., :2], np.nan),
         visible=visible,
-        ignored=np.array([bool(person.iscrowd) for person in people], dtype=np.bool_),
+        ignored=np.array([bool(person.iscrowd) for person, _ in people], dtype=np.bool_),
     )
 
 

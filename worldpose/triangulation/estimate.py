@@ -25,7 +25,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
+from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.reference_method import require_torch
 from worldpose.triangulation.clocks import estimate_clocks, read_frames
@@ -73,7 +73,7 @@ that ends the iteration, across gaps too."""
 
 
 def reconstruct_joints(
-    cameras: Camera,
+    cameras: Cameras,
     detections: KeypointDetections,
     fps: float,
     settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
@@ -85,7 +85,7 @@ def reconstruct_joints(
     own.
 
     Args:
-        cameras: batch (cameras,).
+        cameras: batch (cameras,), each camera, or the cameras of `read_cameras`.
         detections: detections of all tracked people; their frame numbers rise in equal steps.
         fps: frame numbers per second [1/s].
         settings: settings of the stage.
@@ -94,6 +94,7 @@ def reconstruct_joints(
     Raises:
         InputError: the shapes do not match, or frames or `fps` are invalid.
     """
+    cameras = Camera.batch(cameras)
     check_shapes(cameras, detections, camera_covariance)
     fps = row_rate("reconstruct_joints", fps, detections.frame)
     model = learn_clip(cameras, detections, fps, settings, camera_covariance)
@@ -217,7 +218,7 @@ def reconstruct_chunks(
 
 
 def triangulate_joints(
-    cameras: Camera,
+    cameras: Cameras,
     detections: KeypointDetections,
     settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: Floats | None = None,
@@ -230,7 +231,7 @@ def triangulate_joints(
     is learned from frames all over the clip.
 
     Args:
-        cameras: batch (cameras,).
+        cameras: batch (cameras,), each camera, or the cameras of `read_cameras`.
         detections: detections of all tracked people.
         settings: noise, inlier limit and minimum views.
         camera_covariance: (cameras, 12, 12) covariance of steps in the order of
@@ -245,6 +246,7 @@ def triangulate_joints(
         T3, T4. Residuals are pixels to first order in their length: the lens is linearised at the
         observation, accurate enough for any inlier residual.
     """
+    cameras = Camera.batch(cameras)
     check_shapes(cameras, detections, camera_covariance)
     if model is None and (
         settings.learn_noise or settings.offsets == "body" or settings.repair_limb_lengths

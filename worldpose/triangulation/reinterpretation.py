@@ -22,6 +22,12 @@ _OTHER_POSES: Final[Mapping[str, Callable[[Rigid], Rigid]]] = {
     "the poses are those of the cameras in the world, not the other way: invert them": (
         lambda pose: pose.inverse()
     ),
+    "R is transposed: its columns are the camera's axes in the world: transpose R": (
+        lambda pose: Rigid(np.swapaxes(pose.rotation, -1, -2), pose.translation)
+    ),
+    "t is the cameras' centres in the world: write -R t": (
+        lambda pose: Rigid(pose.rotation, -(pose.rotation @ pose.translation[..., None])[..., 0])
+    ),
     "the cameras' y axes point up and z backward, as OpenGL's: turn R and t by diag(1, -1, -1)": (
         lambda pose: Rigid(_FLIP @ pose.rotation, pose.translation @ _FLIP)
     ),
@@ -66,6 +72,18 @@ def reinterpret_calibration(
                 found="poses by which no two cameras agree on their people",
                 todo=f"They agree if {why}.",
             )
+    swap = np.eye(3)[[1, 0, 2]]
+    pose = batch.cam_from_world
+    other = replace(
+        batch,
+        focal=batch.focal[..., ::-1],
+        principal_point=batch.principal_point[..., ::-1],
+        image_size=batch.image_size[..., ::-1],
+        cam_from_world=Rigid(swap @ pose.rotation, pose.translation @ swap),
+    )
+    if agree(other):
+        said = "points on which cameras agree alone if x and y are exchanged"
+        raise InputError("2D poses", "x, y of each point", said, "Write x first, then y.")
     reach = _reach(detections)
     found = {}
     for scale in _SCALES:

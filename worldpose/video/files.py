@@ -14,6 +14,7 @@ from typing import Any
 import av
 import numpy as np
 from av.container import InputContainer
+from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
@@ -35,7 +36,7 @@ def open_file(path: Path, form: str | None = None) -> InputContainer:
     container = av.open(str(path), format=form, options=limit, container_options=local)
     if {"concat", "hls", "dash", "sdp", "imf"} & {*container.format.name.split(",")}:
         container.close()
-        raise _no_video(path, "a list of other files")
+        raise no_video(path, "a list of other files")
     for stream in container.streams.video:
         if stream.codec_context is not None:
             stream.codec_context.options = limit
@@ -57,13 +58,14 @@ def index_frames(path: Path) -> FrameIndex:
     try:
         with open_file(path) as container:
             if not container.streams.video:
-                raise _no_video(path, "no video stream")
+                raise no_video(path, "no video stream")
+            _require_alone(path, container)
             stream = container.streams.video[0]
             if stream.codec_context is None:
-                raise _no_video(path, "a video stream that this program has no decoder for")
+                raise no_video(path, "a video stream that this program has no decoder for")
             if not stream.width * stream.height:
                 said = f"frames without a size, or of more than {MAX_FRAME_PIXELS:,} pixels"
-                raise _no_video(path, said)
+                raise no_video(path, said)
             size: tuple[int, int] | None = None
             packets: list[tuple[int | None, bool, int | None]] = []
             for packet in read_packets(container, stream):
@@ -77,7 +79,7 @@ def index_frames(path: Path) -> FrameIndex:
             reorders = stream.codec_context.has_b_frames
         given = [stamp for stamp, _, _ in packets if stamp is not None]
         if not given or base is None:
-            raise _no_video(path, f"{len(packets)} pictures without time stamps")
+            raise no_video(path, f"{len(packets)} pictures without time stamps")
         is_told = len(set(given)) == len(packets)
         # The order of decoding, although the codec may decode a frame before one shown earlier?
         if is_told and reorders and given == sorted(given):
@@ -88,7 +90,7 @@ def index_frames(path: Path) -> FrameIndex:
     except (av.error.FFmpegError, OSError) as error:
         is_empty = path.is_file() and not path.stat().st_size
         found = "an empty file" if is_empty else error.strerror or say_failure(error)
-        raise _no_video(path, found) from error
+        raise no_video(path, found) from error
     stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     key = np.array([key for _, key, _ in packets], dtype=np.bool_)[order]
@@ -101,7 +103,7 @@ def _count_frames(
     """Return the index of a video whose packets do not say when each frame is shown."""
     shown = _shown_stamps(path)
     if len(shown) != count:
-        raise _no_video(path, f"{count} pictures without their order, {len(shown)} can be decoded")
+        raise no_video(path, f"{count} pictures without their order, {len(shown)} can be decoded")
     stamps = np.sort(np.array(given, dtype=np.int64))
     if len(np.unique(stamps)) < count:
         known = np.array([number for number, stamp in enumerate(shown) if stamp is not None])
@@ -109,7 +111,7 @@ def _count_frames(
         spans = len(known) > 1 and times[-1] > times[0]
         step = (times[-1] - times[0]) / (known[-1] - known[0]) if spans else 0.0
         if not spans or np.abs(times[0] + step * (known - known[0]) - times).max() > 0.5 * step:
-            raise _no_video(path, f"{count} pictures, not all with time stamps")
+            raise no_video(path, f"{count} pictures, not all with time stamps")
         stamps = np.rint(times[0] + step * (np.arange(count) - known[0])).astype(np.int64)
     return FrameIndex(stamps, np.arange(count) == 0, base, size, is_counted=True)
 
@@ -202,9 +204,27 @@ def _require_square(path: Path, stream: VideoStream) -> None:
         )
 
 
+def _require_alone(path: Path, container: InputContainer) -> None:
+    """Raise InputError for a file with videos of several cameras or programmes."""
+    films = [
+        (stream.index, stream.width, stream.height)
+        for stream in container.streams.video
+        if stream.codec_context is not None
+        and stream.width * stream.height
+        and not stream.disposition & (Disposition.attached_pic | Disposition.timed_thumbnails)
+    ]
+    if len(films) > 1:
+        found = ", ".join("stream {} of {} x {} px".format(*film) for film in films)
+        todo = "Give each as a file of its own: ffmpeg -i IN -map 0:NUMBER -c copy OUT."
+        raise InputError(str(path), "one video stream", found, todo)
+
+
 def _require_one(path: Path, packets: Sequence[tuple[int | None, bool, int | None]]) -> None:
     """Raise InputError where the times of decoding, or of key frames, go back."""
-    dts = [(number, time) for number, (_, _, time) in enumerate(packets) if time is not None]
+    # Up to the first key frame, if it is not the first frame, FFmpeg makes the times up.
+    first = next((number for number, (_, key, _) in enumerate(packets) if key), 0)
+    known = [(n, time) for n, (_, _, time) in enumerate(packets) if time is not None]
+    dts = [(n, time) for n, time in known if n > first or not first]
     keys = [
         (number, pts) for number, (pts, key, _) in enumerate(packets) if key and pts is not None
     ]
@@ -215,7 +235,8 @@ def _require_one(path: Path, packets: Sequence[tuple[int | None, bool, int | Non
             raise InputError(str(path), "time stamps that rise", found, todo)
 
 
-def _no_video(path: Path, found: str) -> InputError:
+def no_video(path: Path, found: str) -> InputError:
+    """Return the error of a file that is no video to be read."""
     return InputError(
         str(path),
         expected="a video file with time stamps",
@@ -359,25 +380,25 @@ class VideoReader(Pictures):
         """Yield the packets from a key frame, or the first frame, on.
 
         Many containers seek by the time of decoding, or roughly: where the frame is not ahead, the
-        next try seeks earlier, in the end from the beginning of the file.
+        next try seeks earlier, in the end from the beginning of the file. Without a key frame up to
+        it, decoding begins there: packets before it may be of a key frame shown later.
         """
         stamp, is_key = int(self.index.stamps[begin]), bool(self.index.key[begin])
         lead = self._lead
-        while stamp - lead >= self.index.stamps[0] and not self.index.is_counted:
-            self._container.seek(stamp - lead, stream=self._stream, backward=True, any_frame=False)
-            before: list[av.Packet[VideoStream]] = []
+        while stamp - lead >= self.index.stamps[0] and not self.index.is_counted and is_key:
+            try:
+                self._container.seek(stamp - lead, stream=self._stream)
+            except av.error.FFmpegError:
+                break
             packets = read_packets(self._container, self._stream)
             for packet in packets:
                 if packet.pts == stamp:
                     self._lead = lead
-                    yield from before
                     yield packet
                     yield from packets
                     return
                 if packet.pts is not None and packet.pts > stamp:
                     break  # too late
-                if not is_key:
-                    before.append(packet)
             assert self.index.time_base is not None  # of a video file
             lead = 2 * lead or max(1, round(0.5 / self.index.time_base))
         self.close()
@@ -395,52 +416,6 @@ class VideoReader(Pictures):
             found="one that cannot be decoded",
             todo="Convert the video with any video tool.",
         )
-
-
-def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
-    """Write a range of frames of a video without re-encoding.
-
-    Decoding begins at key frames: the file also holds some frames before the first one wanted, and
-    perhaps some after the last one, from which others are predicted.
-
-    Args:
-        path: the video.
-        start: number of the first frame.
-        stop: one past the last.
-        out: the file to write, of the same kind.
-
-    Returns:
-        The number of frame `start` in the new file.
-
-    Raises:
-        InputError: no video, or it has no such frames.
-    """
-    index = index_frames(path)
-    if not 0 <= start < stop <= len(index):
-        raise InputError(
-            str(path),
-            expected=f"a stretch within its {len(index)} pictures",
-            found=f"{start} to {stop}",
-            todo="Request images that the video has.",
-        )
-    if index.is_counted:
-        raise _no_video(path, "one that does not say when each picture is shown")
-    with VideoReader(path, index) as source, av.open(str(out), "w") as target:
-        begin = source.key_before(start)
-        first, end = int(index.stamps[begin]), int(index.stamps[stop - 1])
-        written: VideoStream | None = None
-        for packet in source.packets_from(begin):
-            if packet.dts is None or packet.pts is None or packet.pts < first:
-                continue
-            if packet.dts > end:
-                break
-            if written is None:
-                written = target.add_stream_from_template(packet.stream)
-            packet.pts -= first
-            packet.dts -= first
-            packet.stream = written
-            target.mux(packet)
-    return start - begin
 
 
 def write_video(path: Path, pictures: Iterable[Image], fps: float, *, quality: int = 20) -> int:

@@ -11,7 +11,14 @@ from av.video.stream import VideoStream
 
 from data_contracts.arrays import Image
 from worldpose.errors import InputError
-from worldpose.video.files import decode_packets, index_frames, open_file, read_packets
+from worldpose.video.files import (
+    VideoReader,
+    decode_packets,
+    index_frames,
+    no_video,
+    open_file,
+    read_packets,
+)
 from worldpose.video.pictures import FrameIndex, convert_pixels
 
 
@@ -48,6 +55,52 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
             found=f"{len(joined)} frames of {joined.size[0]} x {joined.size[1]} px",
             todo="Join them with a video tool, and import the result.",
         )
+
+
+def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
+    """Write a range of frames of a video without re-encoding.
+
+    Decoding begins at key frames: the file also holds some frames before the first one wanted, and
+    perhaps some after the last one, from which others are predicted.
+
+    Args:
+        path: the video.
+        start: number of the first frame.
+        stop: one past the last.
+        out: the file to write, of the same kind.
+
+    Returns:
+        The number of frame `start` in the new file.
+
+    Raises:
+        InputError: no video, or it has no such frames.
+    """
+    index = index_frames(path)
+    if not 0 <= start < stop <= len(index):
+        raise InputError(
+            str(path),
+            expected=f"a stretch within its {len(index)} pictures",
+            found=f"{start} to {stop}",
+            todo="Request images that the video has.",
+        )
+    if index.is_counted:
+        raise no_video(path, "one that does not say when each picture is shown")
+    with VideoReader(path, index) as source, av.open(str(out), "w") as target:
+        begin = source.key_before(start)
+        first, end = int(index.stamps[begin]), int(index.stamps[stop - 1])
+        written: VideoStream | None = None
+        for packet in source.packets_from(begin):
+            if packet.dts is None or packet.pts is None or packet.pts < first:
+                continue
+            if packet.dts > end:
+                break
+            if written is None:
+                written = target.add_stream_from_template(packet.stream)
+            packet.pts -= first
+            packet.dts -= first
+            packet.stream = written
+            target.mux(packet)
+    return start - begin
 
 
 def read_dpx(file: Path, *, grey: bool) -> Image | None:

@@ -7,7 +7,14 @@ from smpl_pickles import pickled, smpl_like
 from typer.testing import CliRunner
 
 from flows.cli.app import app
-from worldpose.body.body_file import KEYS, find_body, install_body, read_npz_arrays, save_body
+from worldpose.body.body_file import (
+    KEYS,
+    digest_of_body,
+    find_body,
+    install_body,
+    read_npz_arrays,
+    save_body,
+)
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError, UsageError
 
@@ -79,7 +86,9 @@ def test_a_body_in_other_axes_or_units_is_refused(arrays, tmp_path, change, foun
         install_body(tmp_path / "other.pkl", tmp_path / "bodies")
 
 
-@pytest.mark.parametrize("name", ["open-neutral/2", "../up", "Capital", ".hidden"])
+@pytest.mark.parametrize(
+    "name", ["open-neutral/2", "open-neutral-smpl", "../up", "Capital", ".hidden"]
+)
 def test_a_name_that_cannot_be_a_file_is_refused(official, tmp_path, name):
     with pytest.raises(UsageError, match="--name"):
         install_body(official, tmp_path, name)
@@ -110,3 +119,14 @@ def test_body_install_says_where_the_body_is(file, tmp_path):
     assert find_body("smpl-female", folder).name == "smpl-female"
     named = CliRunner().invoke(app, [*command, "--name", "mine", "--json"])
     assert json.loads(named.stdout) == {"body_model": "mine", "file": str(folder / "mine.npz")}
+
+
+def test_another_body_of_the_same_name_is_not_overwritten(official, file, tmp_path):
+    install_body(official, tmp_path, "mine")
+    before = digest_of_body("mine", tmp_path)
+    install_body(official, tmp_path, "mine")
+    with pytest.raises(InputError, match=r"mine\.npz: .*--name"):
+        install_body(file, tmp_path, "mine")
+    assert digest_of_body("mine", tmp_path) == before
+    with pytest.raises(InputError, match=r"body model mine.*of SHA-256 0123"):
+        find_body("mine", tmp_path, "0123")

@@ -9,7 +9,8 @@ from turning_clip import film_empty_pitch
 from worldpose.broadcast_calibration.shots import find_shots
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.video.files import VideoReader, cut_video, index_frames, write_video
+from worldpose.video.files import VideoReader, index_frames, write_video
+from worldpose.video.recordings import cut_video
 
 SIZE = np.array([320, 180])
 FPS = 10.0

@@ -18,6 +18,7 @@ from worldpose.dataset.benchmark import score_folders
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.archives import write_archive
+from worldpose.formats.challenge import write_submission
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
 from worldpose.formats.release_cameras import write_moving_camera
 
@@ -184,6 +185,23 @@ def test_a_clip_that_a_method_lacks_is_refused(reference, tmp_path):
         score_folders(reference, {"mine": tmp_path / "mine"})
 
 
+def test_a_clip_in_two_folders_of_a_method_is_refused(reference, tmp_path):
+    shutil.copytree(reference, tmp_path / "mine")
+    shutil.copytree(reference, tmp_path / "mine" / "old")
+    for mine in (tmp_path / "mine", shutil.copytree(tmp_path / "mine" / "old", tmp_path / "2/a")):
+        with pytest.raises(InputError, match=r"clip A_1: expected one, found .* and "):
+            score_folders(reference, {"mine": mine if mine.name == "mine" else mine.parent})
+        shutil.copytree(reference, tmp_path / "2" / "b", dirs_exist_ok=True)
+
+
+def test_sides_of_other_rates_are_refused(reference, tmp_path):
+    for name, rate in (("mine", 50.0), ("true", 25.0)):
+        shutil.copytree(reference, tmp_path / name)
+        (tmp_path / name / "frame_rates.json").write_text(json.dumps(dict.fromkeys(CLIPS, rate)))
+    with pytest.raises(InputError, match=r"found 25 in .*true and 50 in .*mine"):
+        score_folders(tmp_path / "true", {"mine": tmp_path / "mine"})
+
+
 def test_boxes_are_compared_in_the_same_view(reference, tmp_path):
     """Each side has the cameras main and side; then the method has one of them alone."""
     for name in ("mine", "true"):
@@ -202,6 +220,28 @@ def test_boxes_are_compared_in_the_same_view(reference, tmp_path):
     shutil.copy(tmp_path / "true/cameras/A_1.main.npz", tmp_path / "mine/cameras/A_1.npz")
     (score,), _ = score_folders(*asked)
     assert score.clips["A_1"].g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("reference", "option"),
+    [
+        ("joints.npz", "--run=3"),
+        ("joints.npz", "--first-frame=3"),
+        ("joints.npz", "--body=x"),
+        ("joints.npz", "--table=csv"),
+        ("a.zip", "--match-in=main"),
+    ],
+)
+def test_an_option_without_effect_on_files_is_refused(tmp_path, reference, option):
+    if reference == "a.zip":
+        write_submission(tmp_path / reference, {"A_1": np.zeros((1, 2, 15, 3))})
+    else:
+        tracks = JointTracks(np.arange(2), np.arange(1), np.zeros((2, 1, 17, 3)))
+        write_joints(tmp_path / reference, tracks)
+    file = tmp_path / reference
+    answer = run("--reference", file, "--prediction", file, option)
+    assert isinstance(answer.exception, UsageError)
+    assert option.split("=")[0] in str(answer.exception)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Every broken convention of cameras and poses is named, and a sound data set is left alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from faulty_data_sets import (
@@ -23,9 +25,14 @@ from faulty_data_sets import (
     zeros_for_missing,
 )
 
+from flows.results.dataset import check
 from worldpose.dataset.contents import list_clips
 from worldpose.errors import InputError
 from worldpose.formats.challenge import read_submission, write_submission
+from worldpose.formats.joints_file import read_joints
+from worldpose.formats.motion_capture import coco_dataset, write_json
+from worldpose.formats.release_cameras import write_moving_camera
+from worldpose.geometry.rigid import Rigid
 
 
 def test_a_sound_data_set_passes(written, model):
@@ -139,6 +146,30 @@ def test_what_is_implausible_is_named(data_set, model, fault):
     folder = data_set("plain")
     DAMAGE[fault](folder)
     assert fault in {each.fault for each in findings(folder, model)[1]}
+
+
+def test_a_gap_of_the_moving_camera_is_no_slip_and_another_rate_is_said(
+    data_set, model, main_camera
+):
+    """The images of frames without a camera are missing; half as many images tell nothing."""
+    folder = data_set("plain")
+    tracks = read_joints(data_set("static") / "joints.npz")
+    pose, gap = main_camera.cam_from_world, np.zeros((FRAMES, 1))
+    gap[10:20] = np.nan
+    unknown = Rigid(pose.rotation + gap[..., None], pose.translation + gap)
+    camera = replace(main_camera, cam_from_world=unknown)
+    write_moving_camera(folder / "cameras" / "A_1.npz", camera)
+    seen = np.ones(tracks.joints.shape[:3], bool)
+    write_json(folder / "A_1.json", coco_dataset("A_1", camera, tracks, seen))
+    assert findings(folder, model)[1] == []
+    half = coco_dataset("A_1", main_camera, tracks, seen, number=np.arange(FRAMES) // 2)
+    write_json(folder / "A_1.json", half)
+    write_moving_camera(folder / "cameras" / "A_1.npz", main_camera)
+    edit_poses(folder, lambda arrays: arrays.pop("body_model"))
+    told = check(folder)
+    assert told.findings == ()
+    assert "poses of A_1 name no body model: open-neutral" in told.notes[0]
+    assert "A_1.json: not compared" in told.notes[1]
 
 
 def test_a_folder_without_data_is_refused(tmp_path):

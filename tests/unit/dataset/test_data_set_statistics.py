@@ -61,6 +61,14 @@ def test_a_clip_that_two_cameras_film_is_one_clip_with_the_people_of_both(tmp_pa
     assert (found.frames, found.poses, found.clips["goal"].camera) == (40, 100, "M")
 
 
+def test_clips_whose_names_differ_behind_a_dot_are_two(tmp_path):
+    people = np.random.default_rng(0).normal(size=(4, 20, 15, 3)).astype(np.float32)
+    people[3] = np.nan
+    write_submission(tmp_path / "submission.zip", {"game.1": people, "game.2": people + 1.0})
+    found = count([tmp_path], fps=25.0)
+    assert {name: clip.poses for name, clip in found.clips.items()} == {"game.1": 60, "game.2": 60}
+
+
 def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
     rng = np.random.default_rng(4)
     frames = poses = 0

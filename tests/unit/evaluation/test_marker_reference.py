@@ -16,6 +16,7 @@ from worldpose.evaluation.marker_reference import (
 )
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
+from worldpose.formats.motion_capture import write_markers
 
 FPS, RATE, OFFSET = 50.0, 100.0, 0.7313
 TURN = Rotation.from_rotvec([0.0, 0.0, 2.1])
@@ -96,6 +97,22 @@ def test_a_c3d_file_whose_analog_scale_is_one_number_is_read(tmp_path, markers):
     np.testing.assert_allclose(found.points, markers[:, 0, 11:13], atol=1e-5)
 
 
+@pytest.mark.parametrize("numbers", [(5, 6, 9), (0, 4, 16), ("", "", "")])
+def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers):
+    text = ["PathFileType\t4\t(X/Y/Z)\ta.trc", "DataRate\tUnits", "100\tm"]
+    text += ["Frame#\tTime\tA\t\t\tB\t\t", "\t\tX1\tY1\tZ1", ""]
+    for number, time, x in zip(numbers, (0.0, 0.01, 0.04), (1, 0, 2), strict=True):
+        text += [f"{number}\t{time}\t{x}\t0\t0.0\t1\t2\t3"]
+    (tmp_path / "a.trc").write_text("\n".join(text) + "\n")
+    found = read_markers(tmp_path / "a.trc")
+    np.testing.assert_array_equal(found.points[:, 0, 0], [1.0, *[np.nan] * 3, 2.0])
+    np.testing.assert_array_equal(found.points[:, 1, 0], [1.0, 1.0, np.nan, np.nan, 1.0])
+    assert found.zeros == 1
+    (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
+    with pytest.raises(InputError, match="that rise"):
+        read_markers(tmp_path / "a.trc")
+
+
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):
     file = tmp_path / "map.yaml"
     file.write_text("Ada: {left_hip: [A, B], nose: C}\n")
@@ -125,6 +142,17 @@ def test_time_place_and_people_are_found_again(tmp_path, markers, prediction):
     scores, _ = evaluate_joints(prediction, reference)
     assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
     assert scores.coverage == 1.0
+
+
+def test_a_clip_that_starts_late_is_found_by_the_times_of_the_file_or_its_first_sample(
+    tmp_path, markers, prediction
+):
+    late = JointTracks(prediction.frames + 500, prediction.person_ids, prediction.joints)
+    for mine, offset in ((late, OFFSET), (prediction, OFFSET + 10.0)):
+        _, found = align_reference(mine, markers, RATE, FPS, 10.0)
+        assert found.offset == pytest.approx(offset, abs=2e-4) and found.residual < 1e-3
+    write_markers(tmp_path / "late.trc", late, 0, FPS)
+    assert read_markers(tmp_path / "late.trc").start == pytest.approx(late.frames[0] / FPS)
 
 
 def test_known_error_stays(markers, prediction):

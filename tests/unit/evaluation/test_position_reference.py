@@ -58,6 +58,22 @@ def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
     assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
 
 
+@pytest.mark.parametrize("timed", [True, False])
+def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
+    mine, places = tracks()
+    mine = JointTracks(mine.frames - 100, mine.person_ids, mine.joints)
+    lines = wide(places[::2], first=0).splitlines()
+    if timed:
+        times = [f",0 days 00:00:{n / 12.5:09.6f}" for n in range(len(lines) - 1)]
+        lines = [line + more for line, more in zip(lines, [",timestamp", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    predicted, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=25.0)
+    assert "each frame of the positions is 2 frames of the match" in notes[0]
+    scores, _ = evaluate_joints(predicted, given, fps=25.0)
+    assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
+    assert given.frames.tolist() == list(range(29))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -33,6 +33,37 @@ def read(tmp_path, content, name="data", **options):
     return read_camera_data(file, 25.0, SIZE, **options)
 
 
+@pytest.mark.parametrize(
+    ("title", "form"),
+    [
+        ("time_s", "{:.2f}"),
+        ("Time (ms)", "{0:.0f}0"),
+        ("timestamp", "2024-05-01 10:59:{:05.2f}"),
+        ("timecode", "10:59:{:06.3f}"),
+    ],
+)
+def test_rows_of_a_table_are_at_their_times(tmp_path, title, form):
+    rows = [form.format(n if "ms" in title else 0.01 * n) + f",{n},-10" for n in range(41)]
+    data = read(tmp_path, "\n".join([f"{title},pan,tilt", *rows]))
+    assert data.frame.tolist() == list(range(11))
+    assert data.values[:, 0].tolist() == list(range(0, 41, 4))
+
+
+def test_times_that_contradict_the_frames_are_refused(tmp_path):
+    rows = [f"{n},{0.01 * n:.2f},0,-10" for n in range(9)]
+    with pytest.raises(InputError, match="frames at 100 per second by their times"):
+        read(tmp_path, "\n".join(["frame,time_s,pan,tilt", *rows]))
+    with pytest.raises(InputError, match="State the unit in the title"):
+        read(tmp_path, "time,pan,tilt\n0,0,-10\n40,0,-10\n80,0,-10\n")
+
+
+def test_a_principal_point_has_the_pixels_of_the_video(tmp_path):
+    text = "frame,pan,tilt,cx,cy\n0,0,-10,965,540\n"
+    assert read(tmp_path, text).values[0, 10:].tolist() == [965.0, 540.0]
+    with pytest.raises(InputError, match="the middle of about 3841 x 2161 px"):
+        read(tmp_path, text.replace("965,540", "1920,1080"))
+
+
 def test_a_packet_is_read_as_computed_by_hand(tmp_path):
     data = read(tmp_path, PACKET + packet(b2=0xA6, b3=0, b4=0), first=10)
     assert data.frame.tolist() == [10, 11]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from camera_builders import plain_camera
 
@@ -167,6 +168,21 @@ def test_a_submission_of_each_form_is_read_as_written(tmp_path, ending):
     read = read_submission(file)
     np.testing.assert_allclose(read["A"], joints, atol=1e-5)
     np.testing.assert_allclose(read["B"], joints[:2], atol=1e-5)
+
+
+def test_a_table_with_a_row_twice_or_text_is_refused(tmp_path):
+    pytest.importorskip("pyarrow")
+    file, twice, text = (tmp_path / f"{name}.parquet" for name in "abc")
+    write_submission(file, {"A": drawn_joints()})
+    table = pd.read_parquet(file)
+    pd.concat([table, table.tail(1)]).to_parquet(twice)
+    with pytest.raises(
+        InputError, match=r"b\.parquet: A: .*several of frame 3, person 2, joint 14"
+    ):
+        read_submission(twice)
+    table.assign(x="far").to_parquet(text)
+    with pytest.raises(InputError, match=r"c\.parquet: x, y, z: expected numbers"):
+        read_submission(text)
 
 
 def test_a_frame_without_a_body_takes_the_nearest_one_at_the_place_of_the_feet():

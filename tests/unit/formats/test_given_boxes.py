@@ -51,6 +51,20 @@ def test_boxes_outside_and_confidences_above_one_are_counted(read):
     )
 
 
+@pytest.mark.parametrize(
+    ("line", "people"), [("{},{}", 1), ("{},{},0,0", 2), ("{},0.5,7.25,0", 3), ("{},0,0,0", 3)]
+)
+def test_classes_are_told_in_lines_of_any_length(read, line, people):
+    lines = [f"1,{n},{50 * n},10,5,5,{line.format(1, n)}" for n in (1, 2, 4)]
+    assert len(read("\n".join(lines)).person) == people
+
+
+def test_right_and_bottom_are_not_width_and_height(read):
+    with pytest.raises(InputError, match="are these right and bottom"):
+        read("1,1,300,200,340,300,1\n2,1,400,200,440,300,1\n")
+    assert len(read("1,1,300,200,340,200,1\n2,1,400,200,240,300,1\n").person) == 2
+
+
 def test_boxes_of_another_class_are_counted_and_minus_one_is_no_class(read):
     found = read("1,1,10,10,5,5,1,-1,-1\n1,2,30,10,5,5,1,1,1\n1,3,50,10,5,5,1,7,1\n")
     assert found.person.tolist() == [1, 2]

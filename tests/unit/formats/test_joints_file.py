@@ -70,6 +70,19 @@ HALF_MISSING[0, 1, 0, 2] = np.nan
 
 
 @pytest.mark.parametrize(
+    "changes",
+    [
+        {"frames": np.arange(3) * 1.04},
+        {"person_ids": np.array([0.5, 1.5])},
+        {"views": np.full((3, 2, 17), 300)},
+    ],
+)
+def test_numbers_that_a_file_would_cut_are_refused(changes):
+    with pytest.raises(InputError, match=f"{next(iter(changes))}: expected whole numbers"):
+        JointTracks(**arrays(**changes))
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         (

@@ -103,6 +103,17 @@ def test_a_silent_file_is_told_by_its_lengths_on_each_route(tmp_path, names, kin
         assert_body(found.people)
 
 
+def test_neck_and_top_of_the_head_in_place_of_eyes_are_no_eyes(tmp_path):
+    names = ("nose", "neck", "head_top", *COCO17[3:])
+    values = np.reshape(points(names), (17, 3))
+    values[3:5] = 0.0
+    people = [{"image_id": n, "keypoints": values.ravel().tolist()} for n in (0, 1)]
+    (tmp_path / "a.json").write_text(json.dumps(people))
+    found = read_coco_results(tmp_path / "a.json")
+    assert found.kind == "PoseTrack18"
+    assert np.isfinite(found.people.confidence[0, 0]).tolist() == [False] * 5 + [True] * 12
+
+
 def test_a_stated_model_counts_if_its_size_fits(tmp_path):
     folder = frames(tmp_path / "a_json", BODY_25B)
     assert read_openpose_folder(folder, "BODY_25B").kind == "BODY_25B"

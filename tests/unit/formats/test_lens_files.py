@@ -131,6 +131,41 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
     assert [*read_lenses([tmp_path / "rig.json"], "left", SIZES)] == ["left"]
 
 
+@pytest.mark.parametrize(
+    "size",
+    [
+        {"image_size": {"width": 3840, "height": 2160}},
+        {"resolution": "3840x2160"},
+        {"img_size": "[3840, 2160]"},
+        {"DIM": [3840, 2160]},
+        {"img_shape": [3840.0, 2160.0]},
+        {"frame_size": [3840, 2160], "size": 25.0},
+    ],
+)
+def test_a_size_in_the_file_counts_in_any_form(tmp_path, size):
+    twice = {"K": np.diag([2.0, 2.0, 1.0]) @ MATRIX, "dist": DISTORTION}
+    lens = {key: value.tolist() for key, value in twice.items()}
+    file = tmp_path / "lens.json"
+    file.write_text(json.dumps({**lens, **size}))
+    found = read_lenses([file], "left", SIZES)["left"]
+    assert found.focal_px == pytest.approx(1402.0)
+    file.write_text(json.dumps({**lens, **dict.fromkeys(size, "large")}))
+    with pytest.raises(InputError, match="width and height of the calibrated images"):
+        read_lenses([file], "left", SIZES)
+    file.write_text(json.dumps(lens))
+    with pytest.raises(InputError, match=r"as no size is stated, found 1940.0, 1060.0, the middle"):
+        read_lenses([file], "left", SIZES)
+
+
+@pytest.mark.parametrize("lens", [[0.05, -0.02, 0.03, -0.015, 0.0], [-0.28, 0.09, -0.04, 0, 0]])
+def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
+    file = tmp_path / "lens.json"
+    for further in (0, 3, 7, 9):
+        file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens + [0.0] * further}))
+        with pytest.raises(InputError, match=r"p1 and p2 up to 0.01"):
+            read_lenses([file], "left", SIZES)
+
+
 LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}
 ENTRY = {"K": MATRIX.tolist(), "dist": DISTORTION[0].tolist(), "image_size": [1920, 1080]}
 
@@ -145,7 +180,11 @@ ENTRY = {"K": MATRIX.tolist(), "dist": DISTORTION[0].tolist(), "image_size": [19
         (
             "vector.json",
             json.dumps(
-                {"intrinsics": [1400.0] * 4, "intrinsic_matrix": MATRIX.tolist(), "d": [0.1] * 5}
+                {
+                    "intrinsics": [1400.0] * 4,
+                    "intrinsic_matrix": MATRIX.tolist(),
+                    "d": [0.1, 0.1, 0.0, 0.0, 0.1],
+                }
             ),
         ),
         (

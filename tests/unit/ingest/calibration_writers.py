@@ -225,10 +225,7 @@ def write_multical(folder, cameras):
         }
         for one in cameras
     }
-    poses = {
-        one.id + ("_to_a1" if one.id != "a1" else ""): {"R": one.rotation, "T": one.translation}
-        for one in cameras
-    }
+    poses = {one.id: {"R": one.rotation, "T": one.translation} for one in cameras}
     path = folder / "calibration.json"
     path.write_text(json.dumps({"cameras": lenses, "camera_poses": poses, "image_sets": {}}))
     return path

@@ -7,6 +7,7 @@ import pytest
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
 
@@ -212,6 +213,16 @@ def test_qualisys_numbers_may_have_decimal_commas(read):
     commas = re.sub(r'"(-?\d+)[.](\d+)"', r'"\1,\2"', QUALISYS.replace('x="1000"', 'x="1,0E+3"'))
     assert commas != QUALISYS
     assert read(commas, "rig.qca.txt") == read(QUALISYS, "rig.qca.txt")
+
+
+@pytest.mark.parametrize("word", ['calibrated="false"', 'calibrated="0"', 'active="False"'])
+def test_qualisys_cameras_that_are_off_are_left_out_by_name(tmp_path, word):
+    begin, one, end = re.split(r"(<camera active=\"1\".*?</camera>)", QUALISYS, flags=re.S)
+    two = re.sub('active="1"', word, one).replace("26580", "7")
+    (tmp_path / "rig.qca.txt").write_text(begin + one + two + end)
+    left_out = LeftOut()
+    assert [*read_calibration(tmp_path / "rig.qca.txt", left_out=left_out)] == ["26580"]
+    assert left_out.keys() == {"7", "1"}
 
 
 def test_qualisys_video_that_shows_a_part_of_the_sensor_moves_the_centre(read):

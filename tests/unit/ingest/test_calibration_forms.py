@@ -133,6 +133,49 @@ def test_openposes_cameras_take_the_size_of_the_videos(tmp_path):
         read_calibration(folder)
 
 
+@pytest.mark.parametrize("part", [0.5, 1 / 3, 2 / 3, 1.5])
+def test_videos_of_another_size_do_not_stand_for_a_size_that_is_not_stated(tmp_path, part):
+    (tmp_path / "openpose").mkdir()
+    folders = write_easymocap(tmp_path, rig(), sizes=False), tmp_path / "openpose"
+    write_openpose(folders[1], rig())
+    shown = dict.fromkeys(["a1", "b2", "c3"], tuple(round(part * side) for side in SIZE))
+    for folder in folders:
+        with pytest.raises(InputError, match=r"principal point: .*, the middle of about 1942 x"):
+            read_calibration(next(folder.rglob("a1.xml"), folder), shown)
+
+
+def test_a_stated_size_that_the_principal_point_contradicts_is_named(tmp_path):
+    path, left_out = WRITERS["multical"](tmp_path, rig()), LeftOut()
+    path.write_text(path.read_text().replace("[1920, 1080]", "[960, 540]"))
+    read_calibration(path, left_out=left_out)
+    assert "a1 is 970.5, 530.2, the middle of about 1942 x 1062 px; is the" in left_out.notes[0]
+
+
+def test_multicals_poses_may_be_counted_step_by_step(tmp_path):
+    known = rig()
+    path = WRITERS["multical"](tmp_path, known)
+    content = json.loads(path.read_text())
+    turns, moves = (
+        [np.array(one[key]) for one in content["camera_poses"].values()] for key in "RT"
+    )
+    steps = {}
+    for n, name in enumerate(("b2_to_a1", "c3_to_b2")):
+        turn = turns[n + 1] @ turns[n].T
+        steps[name] = {"R": turn.tolist(), "T": (moves[n + 1] - turn @ moves[n]).tolist()}
+    for first in ({"a1": content["camera_poses"]["a1"]}, {}):
+        path.write_text(json.dumps({**content, "camera_poses": {**first, **steps}}))
+        found = read_calibration(path)
+        turn, move = (turns[0], moves[0]) if not first else (np.eye(3), np.zeros(3))
+        for one in known:
+            center = turn @ center_of(one) + move
+            np.testing.assert_allclose(center_of(found[one.id]), center, atol=1e-9)
+    steps["b2_to_c3"] = steps.pop("b2_to_a1")
+    steps["a1"] = content["camera_poses"]["a1"]
+    path.write_text(json.dumps({**content, "camera_poses": steps}))
+    with pytest.raises(InputError, match="poses counted from one of the cameras"):
+        read_calibration(path)
+
+
 def test_opencaps_lens_without_a_pose_and_its_relative_path(tmp_path, monkeypatch):
     known = rig()
     file = next(write_opencap(tmp_path, known, STANDING).glob("a1/*.pickle"))
@@ -365,7 +408,7 @@ def test_a_file_in_another_unit_of_length_is_refused(tmp_path, form, factor, mes
     ("file", "old", "new", "message"),
     [
         ("intri.yml", "K_a1: ", "K_zz: ", "intri.yml: K_a1: expected a matrix, found nothing"),
-        ("intri.yml", "W_a1: .*", "", "Add its width and height .* W_a1: 1920"),
+        ("intri.yml", "W_a1: .*", "", "Add the width and height .* W_a1: 1920"),
         ("intri.yml", "names:", "cameras:", "names: expected a list of cameras"),
         ("intri.yml", "data: \\[ 1500.", "data: [ 1e12", "intri.yml: a1.K_a1: expected finite"),
         ("extri.yml", "T_a1: ", "T_zz: ", "extri.yml: T_a1: expected a matrix, found nothing"),

@@ -14,6 +14,7 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest.footage import read_unit
+from worldpose.ingest.importing import import_videos
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.video.files import write_video
@@ -130,6 +131,33 @@ def test_a_smaller_video_of_vicon_is_the_middle_of_the_sensor(trial, tmp_path):
     assert found.principal_point_px == (540.0, 540.0)
     assert found.translation == (-5.0, 0.0, 0.0)
     assert "cam02.mp4: the middle 1088 x 1080 px of the sensor" in notes
+
+
+def test_a_vicon_video_of_the_sensor_s_shape_is_refused_without_poses(trial, tmp_path):
+    (trial / "calibration" / "Calib.toml").unlink()
+    one, two = (XCP.format(name, 5000.0 * x, "") for x, name in enumerate(CAMERAS))
+    file = trial / "calibration" / "Calib.xcp"
+    file.write_text(one.replace("</Cameras>", two.removeprefix("<Cameras>")))
+    film(trial, (544, 960))
+    _, notes = import_pose2sim(trial, tmp_path / "m")
+    assert any("warning: cam01.mp4: the middle 544 x 960 px of the sensor, or" in n for n in notes)
+    with pytest.raises(
+        InputError, match=r"middle 544 x 960 px .* subtract 272, 480 from PRINCIPAL"
+    ):
+        import_videos(file, trial / "videos", tmp_path / "n")
+    shutil.rmtree(trial / "pose")
+    with pytest.raises(InputError, match="or the whole one resized"):
+        import_pose2sim(trial, tmp_path / "n")
+
+
+def test_poses_numbered_from_one_to_the_length_of_the_videos_are_shifted(trial, tmp_path):
+    film(trial, (1088, 1920))
+    for name in CAMERAS:
+        for number in (1, 14):
+            write_frame(trial / "pose" / f"{name}_json", number, [person(26, 3)[0]])
+    spec, notes = import_pose2sim(trial, tmp_path / "m")
+    assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (0, 14)
+    assert "2D poses are numbered from 1 to the videos' lengths: 1 is frame 0" in notes
 
 
 def test_black_bars_shift_the_calibration(trial, tmp_path):

@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +17,7 @@ from worldpose.errors import InputError, StoreError
 from worldpose.store.documents import canonical_json, digest
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import verify
-from worldpose.store.runs import list_pins, may_be_running, pin_run, unpin_run
+from worldpose.store.runs import alone, list_pins, may_be_running, pin_run, unpin_run
 from worldpose.store.store import Store, open_run
 
 
@@ -33,6 +36,30 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store: Store) -> No
 def reserve_some(url: str, outcome: object) -> None:
     store = Store.open(url)
     outcome.put([store.reserve_run("final") for _ in range(4)])  # type: ignore[attr-defined]
+
+
+def hold_and_die(url: str, outcome: object) -> None:
+    with alone(Store.open(url).blobs, "a", wait=False) as is_held:
+        outcome.put(is_held)  # type: ignore[attr-defined]
+        time.sleep(60.0)
+
+
+def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store: Store) -> None:
+    blobs, outcome = folder_store.blobs, PROCESSES.Queue()
+    other = PROCESSES.Process(target=hold_and_die, args=(folder_store.url, outcome))
+    other.start()
+    assert outcome.get(timeout=60)
+    with alone(blobs, "a", wait=False) as is_held, alone(blobs, "b", wait=False) as is_other:
+        assert (is_held, is_other) == (False, True)
+    other.kill()
+    other.join()
+    with alone(blobs, "a", wait=False) as is_held:
+        assert is_held
+    locks = Path(folder_store.url, "locks")
+    shutil.rmtree(locks)
+    locks.write_text("")  # as on a disk without locks
+    with alone(blobs, "a", wait=False) as is_held, alone(blobs, "a", wait=False) as is_second:
+        assert (is_held, is_second) == (True, False)
 
 
 def test_processes_get_different_numbers(store: Store) -> None:

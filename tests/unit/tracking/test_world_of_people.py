@@ -124,6 +124,8 @@ def test_what_the_user_states_holds(ring, people, seen):
     [
         (lambda pose: pose.inverse(), "of the cameras in the world, not the other way"),
         (lambda pose: Rigid(FLIP @ pose.rotation, pose.translation @ FLIP), "as OpenGL's: turn"),
+        (lambda pose: Rigid(pose.rotation.swapaxes(-1, -2), pose.translation), "transpose R"),
+        (lambda pose: Rigid(pose.rotation, pose.inverse().translation), "write -R t"),
     ],
 )
 def test_poses_that_mean_something_else_are_refused_with_what_they_mean(
@@ -133,6 +135,16 @@ def test_poses_that_mean_something_else_are_refused_with_what_they_mean(
     given = replace(true, cam_from_world=change(true.cam_from_world))
     with pytest.raises(InputError, match=f"They agree if .*{said}"):
         placed(true, given, poses(*seen(true, walk(people))))
+
+
+def test_points_with_y_before_x_are_refused(ring, people, seen):
+    true = ring(4)
+    given = {
+        name: replace(each, keypoints=each.keypoints[..., ::-1])
+        for name, each in poses(*seen(true, walk(people))).items()
+    }
+    with pytest.raises(InputError, match="agree alone if x and y are exchanged"):
+        placed(true, true, given)
 
 
 def test_a_calibration_of_larger_images_is_scaled_to_those_of_the_people(ring, people, seen):

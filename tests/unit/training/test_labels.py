@@ -47,18 +47,46 @@ def test_labels_come_back_as_they_were(tmp_path, picture):
         ("annotations", {"keypoints": [1.0] * 50}),
         ("annotations", {"bbox": [float("nan"), 0.0, 1.0, 1.0]}),
         ("annotations", {"image_id": 99}),
+        ("annotations", {"bbox": [9.0, 9.0, -1.0, 1.0]}),
+        ("annotations", {"keypoints": [1.0, 1.0, 0.93] * 17}),
+        ("annotations", {"category_id": 7}),
+        ("images", {"width": 480}),
+        ("categories", {"keypoints": ["nose", "left_foot"]}),
         ("images", {"file_name": "../../secret.jpg"}),
         ("images", {"id": None}),
     ],
 )
 def test_damaged_labels_are_refused(tmp_path, picture, part, change):
+    cv2.imwrite(str(picture.path), np.zeros((108, 192, 3), dtype=np.uint8))
     file = tmp_path / "labels.json"
-    write_labels(file, [picture], (1920, 1080))
+    write_labels(file, [picture], (192, 108))
+    assert len(read_labels(file)) == 1
     dataset = json.loads(file.read_text())
     dataset[part][0] |= change
     file.write_text(json.dumps(dataset))
     with pytest.raises(InputError, match=r"labels\.json"):
         read_labels(file)
+    dataset["images"] *= 2
+    file.write_text(json.dumps(dataset))
+    with pytest.raises(InputError, match=r"labels\.json"):
+        read_labels(file)
+
+
+def test_categories_say_who_is_a_person_and_in_which_order_joints_are(tmp_path, picture, caplog):
+    file = tmp_path / "labels.json"
+    write_labels(file, [picture], (1920, 1080))
+    dataset = json.loads(file.read_text())
+    dataset["categories"][0]["keypoints"].reverse()
+    dataset["categories"].append({"id": 2, "name": "ball"})
+    for person in dataset["annotations"]:
+        triples = np.reshape(person["keypoints"], (17, 3))[::-1]
+        person["keypoints"] = triples.ravel().tolist()
+    ball = {"id": 9, "image_id": 0, "category_id": 2, "bbox": [1, 1, 8, 8], "iscrowd": 0}
+    dataset["annotations"].append(ball)
+    file.write_text(json.dumps(dataset))
+    (read,) = read_labels(file)
+    np.testing.assert_array_equal(read.keypoints, picture.keypoints)
+    assert "left out 1 annotations" in caplog.text
 
 
 def test_yolo_labels_of_boxes_and_polygons(tmp_path):

@@ -116,6 +116,17 @@ def test_parts_share_nothing_and_neighbours_stay_together(tmp_path):
         assert len(holders) == 1
 
 
+@pytest.mark.parametrize("flag", [0, 1])
+def test_keypoints_that_nothing_measures_are_refused_before_the_training(tmp_path, flag):
+    labelled = pictures(tmp_path, 8)
+    split(labelled, FineTuningSettings(), "keypoints")
+    for picture in labelled:
+        picture.visible[:] = flag
+    split(labelled, FineTuningSettings(), "people")
+    with pytest.raises(InputError, match="34 px or more with a labelled torso and visible"):
+        split(labelled, FineTuningSettings(), "keypoints")
+
+
 @pytest.mark.parametrize(
     ("kind", "net"),
     [pytest.param("people", PeopleNet, marks=pytest.mark.slow), ("keypoints", KeypointNet)],

@@ -56,6 +56,15 @@ def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, se
     np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
 
 
+def test_cameras_are_taken_as_a_list_and_by_name_and_indices_as_a_list(ring, seen):
+    keypoints, confidence, index = seen(ring(3), some_joints())
+    given = as_detections(keypoints, confidence, index.tolist())
+    cameras = [ring(3)[n] for n in range(3)]
+    for rig in (cameras, dict(zip("abc", cameras, strict=True))):
+        result = triangulate_joints(rig, given, SETTINGS)
+        np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
+
+
 @pytest.mark.parametrize("count", [2, 4, 16])
 def test_noise_free_views_give_the_joint(ring, seen, count):
     # Two cameras of four, so that they do not face each other.

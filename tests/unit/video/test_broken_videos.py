@@ -95,6 +95,47 @@ def test_a_file_cut_off_ends_early_and_says_where(tmp_path):
     assert good[: len(good) // 10 * 10] == list(range(len(good) // 10 * 10))
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [("ts", "mpeg2video"), ("mp4", "libx264")])
+def test_a_video_that_begins_before_its_first_key_frame_is_read_from_there(tmp_path, suffix, codec):
+    options = {"bf": "2", "g": "12", "qmax": "2", "sc_threshold": "1000000000"}
+    whole, cut = tmp_path / f"whole.{suffix}", tmp_path / f"cut.{suffix}"
+    with av.open(str(whole), "w") as target:
+        stream = target.add_stream(codec, rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        for n, picture in enumerate(numbered(36)):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = n, Fraction(1, 25)
+            target.mux(stream.encode(frame))
+        target.mux(stream.encode(None))
+    with av.open(str(whole)) as source:
+        packets = [packet for packet in source.demux(video=0) if packet.size]
+        keys = [n for n, packet in enumerate(packets) if packet.is_keyframe]
+        # The second group of MPEG-2 is open: its first pictures in order are before its key frame.
+        begin = keys[1] if suffix == "ts" else keys[1] - 3
+        with av.open(str(cut), "w") as target:
+            stream = target.add_stream_from_template(source.streams.video[0])
+            for packet in packets[begin:]:
+                packet.stream = stream
+                target.mux(packet)
+    read = [number for _, number in numbers_read(cut)]
+    assert 24 < len(read) <= 28
+    assert read[-24:] == list(range(12, 36))
+
+
+def test_several_streams_of_video_are_refused(tmp_path):
+    with av.open(str(tmp_path / "two.mov"), "w") as target:
+        streams = [target.add_stream("mpeg4", rate=25) for _ in range(2)]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        for stream in streams:
+            target.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(1)[0], format="rgb24")))
+            target.mux(stream.encode(None))
+    with pytest.raises(
+        InputError, match="one video stream, found stream 0 of 64 x 48 px, stream 1"
+    ):
+        index_video(tmp_path / "two.mov")
+
+
 def test_a_damaged_stretch_is_missing_up_to_the_next_key_frame(tmp_path):
     path = encode(tmp_path / "damaged.mp4", 40 * np.arange(50))
     with av.open(str(path)) as container:
