@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 from operator import add
@@ -105,7 +105,7 @@ def _write_joints(
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
         measured = _health_arrays(inputs, clip, health, rows, result)
-        found = _find_changes(inputs, clip, health, kinds, settings, rows, result, stated)
+        found = _find_changes(inputs, clip, health, kinds, settings, rows, result)
         result.write(
             layout,
             arrays=spool.arrays()
@@ -200,7 +200,6 @@ def _find_changes(
     settings: TriangulationSettings,
     rows: NDArray[np.int64],
     result: ResultWriter,
-    stated: Callable[[Floats], Floats] | None,
 ) -> list[CameraChange]:
     """Return the changes of cameras, the known ones and further ones; warn of these.
 
@@ -250,9 +249,7 @@ def _find_changes(
         if len(names) - len(spoilt) < 3:
             break
         clip = open_tracked_clip(inputs, further=aside)
-        health = measure_departures(
-            clip.cameras, clip.detections, fps, settings, rows, stated=stated
-        )
+        health = measure_departures(clip.cameras, clip.detections, fps, settings, rows)
     warnings += [f"{describe_change(change)}." for change in new]
     clocks = [change for change in new if change.kind == "clock"]
     result.figures |= {CLOCK_CHANGE + each.camera: each.late_frames for each in clocks}

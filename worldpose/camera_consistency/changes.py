@@ -62,10 +62,10 @@ def find_changes(
 def _find(health: CameraHealth, c: int, kind: Kind, fps: float) -> Iterator[Change]:
     min_gain = 30.0
     # Of the clock [frame]; of the view [px], 2 cm at people. The camera's own share in the people
-    # hides up to a half of a change. An uncertain calibration displaces people who walk.
-    total_scale, terms, _, variance = health.sums[:, c].sum(axis=0)
-    scale, stated = total_scale / max(1.0, terms), np.sqrt(variance / max(1.0, terms))
-    min_size = 0.25 if kind == "clock" else max(1.5, 0.02 * scale, 0.5 * stated)
+    # hides up to a half of a change.
+    total_scale, terms, _ = health.sums[:, c].sum(axis=0)
+    scale = total_scale / max(1.0, terms)
+    min_size = 0.25 if kind == "clock" else max(1.5, 0.02 * scale)
     matrix, right = health.matrix[:, c], health.right[:, c]
     total = matrix.sum(axis=0)
     if len(matrix) < 8 or not _is_solvable(total):

@@ -46,8 +46,8 @@ class CameraHealth:
         every: of this many frames, one is compared.
         matrix: (bins, cameras, 5, 5) normal matrices.
         right: (bins, cameras, 5) right-hand sides.
-        sums: (bins, cameras, 4) sum of the image scale at people [px/m], number of terms, sum of
-            the robust loss of departures [1], and of their variance by the calibration [px^2].
+        sums: (bins, cameras, 3) sum of the image scale at people [px/m], number of terms, and sum
+            of the robust loss of departures [1].
     """
 
     length: int
@@ -64,12 +64,12 @@ class CameraHealth:
         every = length if frames * cameras * persons > 50_000 else 1
         shape = (-(-frames // length), cameras)
         matrix, right = np.zeros((*shape, UNKNOWNS, UNKNOWNS)), np.zeros((*shape, UNKNOWNS))
-        return cls(length, every, matrix, right, np.zeros((*shape, 4)))
+        return cls(length, every, matrix, right, np.zeros((*shape, 3)))
 
     @property
     def misfit(self) -> Floats:
         """Mean robust loss of each camera's departures (cameras,) [1]; at most 2 if none moves."""
-        _, terms, loss, _ = self.sums.sum(axis=0).T
+        _, terms, loss = self.sums.sum(axis=0).T
         return np.asarray(loss / np.maximum(1.0, 2.0 * terms))
 
     def over_time(self) -> Floats:
@@ -146,9 +146,7 @@ class CameraHealth:
             weight = cauchy_weight(squared / variance, 5.0) / variance
             loss = cauchy_loss(squared / (variance + stated), 5.0)
         use = np.isfinite(weight) & np.isfinite(speed).all(axis=-1) & (depth > 0.0)
-        terms = np.stack(
-            [scale, np.ones_like(scale), loss, np.broadcast_to(stated, loss.shape)], axis=-1
-        )
+        terms = np.stack([scale, np.ones_like(scale), loss], axis=-1)
         terms = np.where(use[..., None], terms, 0.0).sum(axis=1)
         around = image - camera.principal_point
         columns = np.zeros((*off.shape, UNKNOWNS))

@@ -8,7 +8,7 @@ until there is none.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -238,7 +238,7 @@ class _Trial:
         cost = freedom = 0.0
         for window in windows:
             one, joints = self._look(window, change, without)
-            _, terms, loss, _ = one.sums.sum(axis=(0, 1))
+            _, terms, loss = one.sums.sum(axis=(0, 1))
             cost += float(loss)
             freedom += 2.0 * float(terms) - 3.0 * joints
         return cost / max(1.0, freedom)
@@ -282,12 +282,10 @@ def measure_departures(
     settings: TriangulationSettings,
     rows: Integers,
     without: int | None = None,
-    stated: Callable[[Floats], Floats] | None = None,
 ) -> CameraHealth:
     """Return the departures of cameras in some rows of a clip, `fps` of them per second.
 
-    The people are placed by the stated noise, and `without` the views of a camera; `stated` is that
-    of `CameraHealth.add`.
+    The people are placed by the stated noise, and `without` the views of a camera.
     """
     _, count, persons = people.detection_index.shape
     health, length = CameraHealth.empty(len(rows), count, persons, fps), 512
@@ -295,7 +293,7 @@ def measure_departures(
         part = slice(max(0, start - 1), start + length + 1)
         seen = people[rows[part]]
         joints = triangulate_views(cameras, _without(seen, without), settings)
-        health.add(cameras, seen, joints, part.start, stated)
+        health.add(cameras, seen, joints, part.start)
     return health
 
 
