@@ -153,17 +153,18 @@ def trace_clocks(
     frames, count = detections.score.shape[:2]
     rig, length = Rig.from_cameras(cameras), max(1, round(0.2 * fps))
     parts = [ClockPart(c, "constant", 0, float(value)) for c, value in enumerate(late)]
-    for _ in range(3 * count + 6):
+    for _ in range(2 * count + 6):
         shifted, rest = shift_by_courses(detections, _courses(parts, count, frames))
         tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
         if lost := find_lost_views(cameras, shifted, tracks.joints, fps, ("clock",)):
-            change = lost[0]
-            where = change.found.camera, "step", change.found.row
-            parts.append(ClockPart(*where, float(change.amount[4])))
+            found, late_frames = lost[0].found, float(lost[0].amount[4])
+            parts.append(ClockPart(found.camera, "step", found.row, late_frames))
             continue
         index = tracks.detection_index
         moved = move_to_match_time(np.asarray(shifted.keypoints, np.float64), index, rest)
-        people = replace(shifted, keypoints=moved, detection_index=index)
+        # More people cost time and tell little more.
+        every = 1 + index.size // 300_000
+        people = replace(shifted, keypoints=moved, detection_index=index[:, :, ::every])
         sums = ClockSums.of(rig, people, fps, slice(0, frames), length)
         if not len(sums.rows):
             break
@@ -171,12 +172,9 @@ def trace_clocks(
         if len(fitted) == len(parts) == count or _is_settled(parts, fitted):
             break
         # A common offset changes no residual: most clocks keep theirs.
-        moved = [one.size - other.size for one, other in zip(fitted[:count], parts, strict=False)]
+        common = np.median([fitted[c].size - parts[c].size for c in range(count)])
         parts = [
-            replace(part, size=part.size - float(np.median(moved)))
-            if part.kind == "constant"
-            else part
-            for part in fitted
+            replace(part, size=part.size - common * (part.kind == "constant")) for part in fitted
         ]
     return _courses(parts, count, frames)
 
@@ -381,7 +379,7 @@ class _Fit:
             held.append(float(self.sums.matrix[side, own, own].sum()) + 1e-9)
             late.append(float(self.left[side, own].sum()) / held[-1])
         gain = (late[1] - late[0]) ** 2 / (1.0 / held[0] + 1.0 / held[1])
-        return gain > 12.0 * noise[part.camera]
+        return bool(gain > 12.0 * noise[part.camera])
 
 
 def _place_steps(
