@@ -237,7 +237,8 @@ def _read_videos(match: MatchFolder, new: Container[str]) -> None:
     broken: dict[str, InputError] = {}
     unseen: dict[str, list[InputError]] = {}
     for unit, path in match.videos.items():
-        if unit in match.detections or not (path.is_dir() or unit in new):
+        whole = unit in match.calibrated_views
+        if (unit in match.detections and not whole) or not (path.is_dir() or unit in new):
             continue
         try:
             index = index_video(path)
@@ -246,7 +247,7 @@ def _read_videos(match: MatchFolder, new: Container[str]) -> None:
                 raise
             broken[unit] = error
             continue
-        for clip, refusal in require_footage(match.spec, unit, path, index).items():
+        for clip, refusal in require_footage(match.spec, unit, path, index, whole=whole).items():
             unseen.setdefault(clip, []).append(refusal)
     for errors in unseen.values():
         if len(errors) + len(broken) >= len(static):

@@ -55,7 +55,7 @@ from worldpose.tracking.plane.tracker import (
     locate_tracks,
     track_on_plane,
 )
-from worldpose.video.folder import open_video, pictures_at
+from worldpose.video.folder import grey_on_clock, open_video, pictures_at
 
 SIZE_METRICS: Final = {
     "length": ("length_m", "length_std_m"),
@@ -75,26 +75,32 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
     It is found for every image of the video, also if its frame rate is not that of the match.
     """
     sources, clock = inputs.sources, image_clock(inputs)
-    start, stop = int(clock.images[0]), int(clock.images[-1]) + 1
+    start, fps = int(clock.images[0]), float(sources["fps"]) * clock.rate
     ((file, clicked),) = sources["key_frames"].items()
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        with open_video(inputs.file("video")) as video:
-            yield from (picture for _, picture in video.frames(start, stop, grey=True))
+    def pictures() -> Iterator[Image]:
+        return grey_on_clock(inputs.file("video"), clock.images, fps)
 
     seen, people, boxes = _people(inputs, clock)
     pitch = _open_pitch(inputs)
     key_frames = [
         KeyFrame(frame=int(frame), markings=clicked_markings(markings))
         for frame, markings in clicked.items()
-        if start <= int(frame) < stop
+        if int(frame) in clock.images
     ]
+    if beyond := clicked.keys() - {str(key.frame) for key in key_frames}:
+        result.warnings.append(
+            f"{file}: key frames {', '.join(sorted(beyond, key=int))} are outside of the clip's "
+            f"{start} to {clock.images[-1]} and are not used."
+        )
     settings, given = inputs.settings(BroadcastCalibrationSettings), None
+    is_proposed = not key_frames
     if "camera_data" in sources:
-        given, projected = _open_given(inputs, pitch, clock, _known_people(clock, people, seen))
+        known = _known_people(clock, people, seen)
+        given, projected = _open_given(inputs, pitch, clock, known, is_alone=is_proposed)
     if "side" in sources:
         key_frames = _propose(inputs, pitch, clock, people, seen)
-    elif given is not None and not clicked:
+    elif given is not None and is_proposed:
         file, key_frames = sources["camera_data"], projected
         given = replace(given, leads=True)
     calibration = calibrate_broadcast(
@@ -102,12 +108,12 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         BroadcastClip(
             key_frames,
             pictures,
-            float(sources["fps"]) * clock.rate,
+            fps,
             people=people,
             boxes=boxes,
             where=file,
             first=start,
-            proposed=not clicked,
+            proposed=is_proposed,
             smooth_weight=sources.get("smooth", 1.0),
             given=given,
         ),
@@ -159,12 +165,15 @@ def _propose(
     """Return key frames that are proposed from images spread over the clip."""
     images = clock.images
     many = min(len(images), PROPOSED_FRAMES)
-    numbers = np.linspace(images[0], images[-1], many).astype(int)
+    numbers = np.unique(np.linspace(images[0], images[-1], many).astype(int))
 
-    def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    def spread_out() -> Iterator[tuple[int, Image]]:
         with open_video(inputs.file("video")) as video:
-            for number in np.unique(numbers).tolist():
-                yield from video.frames(number, number + 1)
+            fps = float(inputs.sources["fps"]) * clock.rate
+            shown = video.index.shown(numbers, fps, str(inputs.file("video")))
+            for number, at in zip(numbers.tolist(), shown.tolist(), strict=True):
+                if at >= 0:
+                    yield number, video.frame(at)
 
     known = _known_people(clock, people, seen)
     where, side = str(inputs.file("video")), inputs.sources["side"]
@@ -172,9 +181,17 @@ def _propose(
 
 
 def _open_given(
-    inputs: UnitInputs, pitch: PitchTemplate, clock: ImageClock, people: KnownPeople | None
+    inputs: UnitInputs,
+    pitch: PitchTemplate,
+    clock: ImageClock,
+    people: KnownPeople | None,
+    *,
+    is_alone: bool,
 ) -> tuple[GivenCamera, list[KeyFrame]]:
-    """Return the camera data of the clip's images, and key frames as they project them."""
+    """Return the camera data of the clip's images, and key frames as they project them.
+
+    Without key frames, data are alone and must have the side of the people.
+    """
     with open_video(inputs.file("video")) as video:
         size = video.index.size
     rate = float(inputs.sources["fps"]) * clock.rate
@@ -185,7 +202,7 @@ def _open_given(
     found = given.propose_key_frames(pitch, size, prior)
     whole = given.camera(size, prior).camera
     cameras = {first + each.frame: whole[each.frame] for each in found}
-    if cameras and not any(inputs.sources["key_frames"].values()):
+    if cameras and is_alone:
         must_turn(cameras, pitch, "near", people, inputs.sources["camera_data"])
     moved = [each.model_copy(update={"frame": first + each.frame}) for each in found]
     return given, moved
@@ -287,12 +304,15 @@ def broadcast_tracking(inputs: UnitInputs, result: ResultWriter) -> None:
     sources, filmed = inputs.sources, open_broadcast(inputs)
     number = camera_frames(inputs.frames, sources["offset_frames"], sources["rate"])
     with open_video(inputs.file("video")) as video:
+        fps = float(sources["fps"])
+        number = video.index.shown(number, fps * sources["rate"], str(inputs.file("video")))
         positions = _locate_people(filmed, pictures_at(video, number))
     inputs.require_registered("video")
-    size, fps = (filmed.pitch.length, filmed.pitch.width), float(sources["fps"])
+    size = filmed.pitch.length, filmed.pitch.width
     given_people = {}
     if "boxes" in sources:
         given = read_kit_array(inputs.file("boxes"), "boxes")[number]
+        given[number < 0] = np.nan
         inputs.require_registered("boxes")
         found = find_given_people(given, filmed.detections.boxes)
         found[~np.isfinite(np.take_along_axis(positions.xy[:, 0, :, 0], found, axis=1))] = -1
@@ -388,13 +408,14 @@ def _locate_people(filmed: BroadcastInputs, images: Iterator[Image | None]) -> G
     covariance, cameras = static_covariance(moving, uncertainty), moving.camera
     parts = []
     for frame, image in zip(range(len(moving)), images, strict=True):
-        assert image is not None  # the calibration had it
         now = slice(frame, frame + 1)
         people = KeypointDetections.stack([seen[now]])
         found = locate_feet(cameras[now], people, filmed.pitch, camera_covariance=covariance[now])
-        shirts = measure_shirts(
-            image, seen.keypoints[frame], seen.confidence[frame], seen.boxes[frame]
-        )
+        shirts = np.full((seen.boxes.shape[1], 3), np.nan)
+        if image is not None:
+            shirts = measure_shirts(
+                image, seen.keypoints[frame], seen.confidence[frame], seen.boxes[frame]
+            )
         # Parts start tracks, too: in a duel one player is often a part of the other's box.
         parts.append(replace(found, is_whole=None, boxes=None, shirts=shirts[None, None]))
     return GroundPositions.concatenate(parts)

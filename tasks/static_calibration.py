@@ -208,9 +208,8 @@ def _filmed_still(folder: Path, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
     )
     chosen = every[np.linspace(0, len(every) - 1, min(STILL_FRAMES, len(every))).astype(int)]
     index = index_video(path)
-    clock = index.on_clock(float(filmed["fps"]), str(path))
     numbers = camera_frames(chosen, filmed["offset_frames"], filmed["rate"])
-    shown = clock[numbers[(numbers >= 0) & (numbers < len(clock))]]
+    shown = index.shown(numbers, float(filmed["fps"]), str(path))
 
     with open_video(path, index) as video:
         pictures = some_pictures(video, np.unique(shown[shown >= 0]))

@@ -37,7 +37,7 @@ from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.results import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.video.folder import open_video
+from worldpose.video.folder import grey_on_clock, open_video, pictures_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +117,12 @@ def find_people(match: MatchFolder, clip_id: str) -> KeypointDetections:
         else:
             clock, file = unit_frames(match.spec, camera.id), match.videos[camera.id]
             start, last = clock.numbers(clip.first_frame + np.array([0, clip.frame_count - 1]))
-            first = max(0, int(start))
+            number = np.arange(start, last + 1)
             with open_video(file) as video:
-                shown = detect_people(each for _, each in video.frames(first, int(last) + 1))
-            seen = clock.place(file, replace(shown, frame=shown.frame + first))
+                at = video.index.shown(number, match.spec.fps * clock.rate, str(file))
+                images = pictures_at(video, at[at >= 0])
+                shown = detect_people(each for each in images if each is not None)
+            seen = clock.place(file, replace(shown, frame=number[at >= 0]))
         after = seen.frame - clip.first_frame
         cameras.append(seen[np.flatnonzero((after >= 0) & (after < clip.frame_count))])
     return KeypointDetections.stack(cameras)
@@ -131,20 +133,19 @@ def calibrate_moving_camera(
 ) -> BroadcastCalibration:
     """Return the broadcast camera of each image: E_field + E_player, similarity and smoothness."""
     clock = image_clock(match.spec, view)
-    start, stop = int(clock.images[0]), int(clock.images[-1]) + 1
+    start, fps = int(clock.images[0]), match.spec.fps
+    rate = fps * clock.rate
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        with open_video(match.videos[view]) as video:
-            yield from (picture for _, picture in video.frames(start, stop, grey=True))
+        return grey_on_clock(match.videos[view], clock.images, rate)
 
     seen = read_unit(match, view)[0] if view in match.detections else None
-    keys, fps = list(match.key_frames[view].key_frames), match.spec.fps
+    keys = list(match.key_frames[view].key_frames)
     people = boxes = None
     if seen is not None:
         keypoints = seen.keypoints.astype(np.float64)
         people = People.in_images(bodies.joints, keypoints, fps, clock)
         boxes = boxes_of(keypoints)[clock.frame_of(clock.images)]
     weight = match.spec.broadcast_views[view].clip.broadcast_smooth_weight
-    rate = fps * clock.rate
     clip = BroadcastClip(keys, pictures, rate, people, boxes, view, start, smooth_weight=weight)
     return calibrate_broadcast(pitch, clip)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Floats, Image, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.reports.match_pictures import shown_pitch
 from flows.results.best_results import body_tracks, clip_title, joint_tracks
@@ -78,8 +79,7 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
             # An image between two match frames has no camera: the nearest one that has is drawn.
             place = clock.nearest_frame(video_number)
             number, video_number = int(frame[place]), int(clock.number[place])
-            with open_video(match.folder.videos[view]) as video:
-                still = video.frame(video_number)
+            (still,) = _pictures(match, view, frame[[place]])
             pictures.append(
                 CaptionedImage(
                     f"{clip_title(view)}, frame {number}, {video_number} of its video, among those "
@@ -126,8 +126,7 @@ def _before_and_after(
     place, person = largest_pose_changes(before, after, shared)
     number = int(both[place])
     (detected,) = seen_in_broadcast(match, view)
-    with open_video(match.folder.videos[view]) as video:
-        still = video.frame(unit_frames(match.folder.spec, view).number(number))
+    (still,) = _pictures(match, view, frame[frame == number])
     markings, players = (
         "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
     )
@@ -150,6 +149,17 @@ def _before_and_after(
     ]
 
 
+def _pictures(match: Match, view: str, frames: Integers) -> Iterator[Image]:
+    """Yield a view's images (height, width, 3) RGB at match frames; black where it has none."""
+    spec, path = match.folder.spec, match.folder.videos[view]
+    clock = unit_frames(spec, view)
+    with open_video(path) as video:
+        black = np.zeros((*video.index.size[::-1], 3), dtype=np.uint8)
+        shown = video.index.shown(clock.numbers(frames), spec.fps * clock.rate, str(path))
+        for picture in pictures_at(video, shown):
+            yield black if picture is None else picture
+
+
 def write_broadcast_video(run: Run, match: Match, view: str, file: Path) -> None:
     """Write a broadcast video with markings and people overlaid.
 
@@ -159,11 +169,10 @@ def write_broadcast_video(run: Run, match: Match, view: str, file: Path) -> None
     every = video_step(match)
     chosen = broadcast_video_frames(run, match, view)
     frames = run[f"broadcast_calibration/{view}"]["frame"].values[chosen]
-    numbers, clip = unit_frames(match.folder.spec, view).numbers(frames), clip_of(run, view)
-    with open_video(match.folder.videos[view]) as video, whole_file(file) as draft:
-        pictures = (each for each in pictures_at(video, numbers) if each is not None)
+    clip = clip_of(run, view)
+    with whole_file(file) as draft:
         drawn = overlay_frames(
-            pictures,
+            _pictures(match, view, frames),
             broadcast_cameras(run, view)[view][chosen],
             joint_tracks(run, clip),
             frames,
@@ -260,9 +269,7 @@ def flow_pictures(run: Run, match: Match, view: str, camera: Camera) -> list[Cap
         return []
     pair = int(np.argmin(np.where(known, traces, np.inf)))
     number = int(frames[pair])
-    numbers = unit_frames(match.folder.spec, view).numbers(frames[pair : pair + 2])
-    with open_video(match.folder.videos[view]) as video:
-        stills = [video.frame(int(each)) for each in numbers]
+    stills = list(_pictures(match, view, frames[pair : pair + 2]))
     boxes = None
     for unit in seen_in_broadcast(match, view):
         boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)

@@ -28,7 +28,7 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error
 from flows.web.images import encode_image
 from worldpose.errors import InputError, WorldposeError
-from worldpose.ingest.footage import read_still
+from worldpose.ingest.footage import read_still, unit_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.evidence import PitchDrawing, Preview, preview
 from worldpose.review.journal import MOST_KEPT
@@ -255,9 +255,14 @@ def _read(match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
     if owner not in folder.videos:
         raise HTTPException(404, "there is no picture")
     with open_video(folder.videos[owner]) as video:
-        if not 0 <= (frame or 0) < len(video):
+        number = 0
+        if frame is not None:
+            spec = folder.spec
+            fps = spec.fps * unit_frames(spec, owner).rate
+            number = int(video.index.shown(np.array([frame]), fps, owner)[0])
+        if not 0 <= number < len(video):
             raise HTTPException(404, "the video has no such frame")
-        return video.frame(frame or 0)
+        return video.frame(number)
 
 
 def _read_clicks(match: Match, owner: str, frame: int | None) -> ClickedMarkings:

@@ -94,7 +94,8 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
         index = indexes[path.relative_to(match.folder).as_posix()]
         assert isinstance(index, FrameIndex)  # all files are whole and read
         try:
-            require_footage(match.spec, unit, path, index)
+            whole = unit in match.calibrated_views
+            require_footage(match.spec, unit, path, index, whole=whole)
         except InputError as error:
             number = numbers[views[unit].camera.id if unit in views else unit]
             yield {**describe(error, match.folder), "place": f"cameras[{number}].video"}

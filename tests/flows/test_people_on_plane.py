@@ -1,6 +1,7 @@
 """A match of one camera: no person is triangulated, and every person has a pitch position."""
 
 import csv
+from datetime import UTC, datetime
 from types import SimpleNamespace
 from unittest.mock import patch
 
@@ -58,7 +59,7 @@ def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch
     text = str(IncompleteRunError(record))
     assert why in text
     assert "0 " not in text
-    last = SimpleNamespace(state="failed", message=text)
+    last = SimpleNamespace(state="failed", message=text, changed_at=datetime.now(UTC))
     served = SimpleNamespace(link=lambda run: "http://prefect")
     seen = SimpleNamespace(open=[], ended={match: last}, served=served)
     monkeypatch.setattr(Continuing, "_look", lambda self: seen)

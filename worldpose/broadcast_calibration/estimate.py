@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_contracts.arrays import Floats, Image
-from data_contracts.broadcast_calibration import KeyFrame
+from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, join_evidence
 from worldpose.broadcast_calibration.given_camera import GivenCamera
@@ -48,6 +48,7 @@ from worldpose.broadcast_calibration.tracking import Chain, Followed, chain, fol
 from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
 from worldpose.errors import InputError
 from worldpose.ingest.clock import row_rate
+from worldpose.ingest.footage import stretches
 from worldpose.pitch.template import PitchTemplate
 from worldpose.reference_method import require_torch
 
@@ -196,7 +197,7 @@ def refine(
         denied = given.contradiction(keys, tracked.keys.frames, settings.prior)
     for number in range(settings.passes):  # one or more
         samples = FieldSamples.of(pitch, learned.errors, surface)
-        lines, corrected = follow_lines(camera, samples, clip.pictures(), boxes, settings)
+        lines, corrected, searched = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = corrected if number == 0 else before
         parts = [learned.errors.rescale(clicks, first_errors), lines]
         if people is not None and settings.player_weight > 0.0:
@@ -253,6 +254,7 @@ def refine(
         weights,
         offset,
         learned.describe(pitch, problem, solution),
+        searched,
     )
     report = report_calibration(tracked, fit, pitch, settings, clip.first)
     if given is not None:
@@ -261,6 +263,7 @@ def refine(
             given.contradiction(solution.camera, every, settings.prior) if given.leads else denied
         )
         report = _report_given(clip, given, denied, report, solution.camera)
+    _require_markings(clip, report)
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
 
 
@@ -306,6 +309,26 @@ def _report_given(
         decisions=(*report.decisions, *given.describe(camera)),
         reasons=(*report.reasons, *([reason] if denied else [])),
     )
+
+
+def _require_markings(clip: BroadcastClip, report: BroadcastReport) -> None:
+    """Raise InputError if another camera's images follow a dissolve, or images without corners.
+
+    Motion blur and a player before the lens hide markings for less than 0.2 s, or hide some alone.
+    """
+    unsure = report.contradicted | (report.status == FRAME_STATUS.index("bridged"))
+    spans = [
+        [clip.first + begin, clip.first + end]
+        for begin, end in stretches(np.flatnonzero(unsure))
+        if report.contradicted[begin : end + 1].any() and end + 1 - begin >= 0.2 * clip.fps
+    ]
+    if spans:
+        raise InputError(
+            clip.where,
+            expected="one shot of one camera, and its markings where the camera projects them",
+            found=f"no markings there in frames {', '.join(f'{a} to {b}' for a, b in spans)}",
+            todo="End the clip before a dissolve or a black image, or click a key frame in these.",
+        )
 
 
 def _fit_and_learn(

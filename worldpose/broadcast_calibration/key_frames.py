@@ -238,7 +238,7 @@ def calibrate_keys(
                 )
             )
             if frame in pictures:
-                seen, _ = find_lines(single, samples, pictures[frame], None, settings)
+                seen = find_lines(single, samples, pictures[frame], None, settings)[0]
                 lines.append(seen.in_frame(index))
         clicks = join_evidence(parts)
         problem = ClipProblem(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -94,10 +95,10 @@ def estimate_flow_share(
         return 1.0
     # Four parameters per pair from twice as many coordinates as points.
     independent = deviation * np.sqrt(4.0 / np.median(points[points > 0]))
-    found = links.drift[np.isfinite(links.drift)]
-    if len(found):
-        gaps = np.diff(key_frames)[np.isfinite(links.drift)]
-        drift = float(np.sqrt(np.mean(found**2 / gaps)))
+    known = [links.determined[begin:end].all() for begin, end in pairwise(key_frames)]
+    whole = np.isfinite(links.drift) & np.array(known, dtype=np.bool_)
+    if whole.any():
+        drift = float(np.sqrt(np.mean((links.drift**2 / np.diff(key_frames))[whole])))
     return float(min(1.0, (independent / max(drift, 1e-6)) ** 2))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_contracts.arrays import Flags, Floats, Image
+from data_contracts.arrays import Flags, Floats, Image, Integers
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     PointEvidence,
@@ -81,19 +81,20 @@ def find_lines(
     picture: Image,
     people: Floats | None,
     settings: BroadcastCalibrationSettings,
-) -> tuple[PointEvidence, MovingCamera]:
+) -> tuple[PointEvidence, MovingCamera, Integers]:
     """Return the painted lines of a grey image (height, width), and its camera corrected by them.
 
     A first, wide search corrects rotation and zoom; a second, narrow search measures the lines.
-    Boxes (detections, 4) [px] of people occlude lines; None = no people.
+    Boxes (detections, 4) [px] of people occlude lines; None = no people. The last value (n, 2) is
+    the marking of each sample in view, and 1 where its paint was found.
     """
-    first = _measure_lines(camera, samples, picture, people, settings, settings.line_search_px)
+    reach = settings.line_search_px
+    first, searched = _measure_lines(camera, samples, picture, people, settings, reach)
     if len(first) < 15:
-        return PointEvidence.none(), camera
+        return PointEvidence.none(), camera, searched * np.array([1, 0])
     corrected = _correct_camera(camera, first, settings.field_weight)
-    return samples.lower(
-        _measure_lines(corrected, samples, picture, people, settings, 3.0)
-    ), corrected
+    found, searched = _measure_lines(corrected, samples, picture, people, settings, 3.0)
+    return samples.lower(found), corrected, searched
 
 
 def _measure_lines(
@@ -103,8 +104,8 @@ def _measure_lines(
     people: Floats | None,
     settings: BroadcastCalibrationSettings,
     reach: float,
-) -> PointEvidence:
-    """Return bars of paint within reach of one frame's projected lines."""
+) -> tuple[PointEvidence, Integers]:
+    """Return bars of paint within reach of one frame's projected lines, as `find_lines`."""
     line_width = 0.12  # [m]; the maximum of Law 1, which most pitches have
     lines = _select_near(camera, samples.lines)
     seen = project_lines(camera.camera[0], lines, line_width, EXACT_PAINT)
@@ -123,7 +124,7 @@ def _measure_lines(
         )
     ]
     if not len(index):
-        return PointEvidence.none()
+        return PointEvidence.none(), np.empty((0, 2), dtype=np.int64)
     sections = seen[index].sections
     offsets, variances = _locate_bars(picture, sections, reach)
     found = np.isfinite(offsets)
@@ -138,7 +139,8 @@ def _measure_lines(
         source=chosen.marking,
         loss=settings.loss_scale,
     )
-    return samples.errors.apply(seen_bars, chosen.ends, chosen.shares)
+    searched = np.column_stack([lines.marking[index], found])
+    return samples.errors.apply(seen_bars, chosen.ends, chosen.shares), searched
 
 
 def _locate_bars(picture: Image, sections: CrossSections, reach: float) -> tuple[Floats, Floats]:
@@ -200,13 +202,13 @@ def follow_lines(
     pictures: Iterable[Image],
     boxes: Floats | None,
     settings: BroadcastCalibrationSettings,
-) -> tuple[PointEvidence, MovingCamera]:
+) -> tuple[PointEvidence, MovingCamera, Integers]:
     """Return the painted lines of all grey images in order, and the cameras corrected by them.
 
     Each frame's correction initializes the next. Boxes (frames, detections, 4) [px] of people
-    occlude lines; None = no people.
+    occlude lines; None = no people. The last value (n, 3) has the frame before `find_lines`'s.
     """
-    parts, cameras = [], []
+    parts, cameras, searched = [], [], []
     before = after = camera.frames(slice(0, 1))
     for frame, picture in enumerate(pictures):
         single = camera.frames(slice(frame, frame + 1))
@@ -217,8 +219,9 @@ def follow_lines(
             focal=single.focal * after.focal / before.focal,
         )
         people = None if boxes is None else boxes[frame]
-        found, corrected = find_lines(begin, samples, picture, people, settings)
+        found, corrected, seen = find_lines(begin, samples, picture, people, settings)
+        searched.append(np.insert(seen, 0, frame, axis=1))
         parts.append(found.in_frame(frame))
         cameras.append(corrected)
         before, after = single, corrected
-    return join_evidence(parts), join_cameras(cameras)
+    return join_evidence(parts), join_cameras(cameras), np.concatenate(searched)

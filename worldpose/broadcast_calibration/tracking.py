@@ -52,8 +52,9 @@ def chain(
 ) -> Chain:
     """Return the cameras of all frames, tracked from each key frame to the next.
 
-    At the next key frame the tracked camera differs from the calibrated one by the drift, which is
-    distributed linearly over the frames between them. Inliers have smaller z-scores than `outlier`.
+    At the next key frame the tracked camera differs from the calibrated one by the drift. Pairs
+    that do not determine the motion have all of it, else it is distributed linearly over the pairs.
+    Inliers have smaller z-scores than `outlier`.
     """
     frames = len(followed) + 1
     cameras: list[MovingCamera | None] = [None] * frames
@@ -68,8 +69,9 @@ def chain(
         moved = turn(camera, points)
         with np.errstate(invalid="ignore"):
             kept[pair] = modified_z_scores(moved.residual) < outlier
+        kept[pair] &= points.step == 1
         residual[pair] = moved.residual
-        determined[pair] = moved.determined
+        determined[pair] = moved.determined and points.step == 1
         return moved.camera.frames(slice(1, 2))
 
     first = key_frames[0]
@@ -82,8 +84,9 @@ def chain(
             cameras[frame + 1] = advance(_require(cameras[frame]), frame, False)
         reached, key = _require(cameras[end]), keys.frames(slice(number + 1, number + 2))
         drift.append(_direction_error(reached, key))
-        for frame in range(begin + 1, end + 1):
-            share = (frame - begin) / (end - begin)
+        broken = ~determined[begin:end]
+        shares = np.cumsum(broken if broken.any() else ~broken) / (broken.sum() or end - begin)
+        for frame, share in enumerate(shares, begin + 1):
             cameras[frame] = _correct_drift(_require(cameras[frame]), reached, key, share)
     for frame in range(key_frames[-1], frames - 1):
         cameras[frame + 1] = advance(_require(cameras[frame]), frame, False)
@@ -209,11 +212,13 @@ class Followed:
         end: (n, 2) [px].
         inlier_share: share of the searched points that are inliers of one homography [1]; NaN with
             too few points.
+        step: number of frames from `start` to `end`; above 1, the pair only continues the chain.
     """
 
     start: Floats
     end: Floats
     inlier_share: float
+    step: int = 1
 
 
 def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list[Followed]:
@@ -222,9 +227,11 @@ def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list
     The function selects new corners in every frame, evenly over the image, so that errors do not
     accumulate along a track. Pyramidal Lucas-Kanade runs forward and backward; points with a large
     forward-backward error are dropped. People in boxes (frames, detections, 4) [px] move.
+    After a flash or a black frame, points of the last frame before it are followed.
     """
     followed: list[Followed] = []
     before: Image | None = None
+    good: tuple[int, Image] | None = None
     for number, picture in enumerate(pictures):
         size = picture.shape if before is None else before.shape
         if picture.ndim != 2 or picture.dtype != np.uint8 or picture.shape != size:
@@ -236,7 +243,14 @@ def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list
             )
         if before is not None:
             people = None if boxes is None else boxes[number - 1]
-            followed.append(_follow(before, picture, people, points))
+            pair = _follow(before, picture, people, points)
+            if good is not None and np.isnan(pair.inlier_share):
+                people = None if boxes is None else boxes[good[0]]
+                across = replace(_follow(good[1], picture, people, points), step=number - good[0])
+                pair = across if across.inlier_share > 0.5 else pair
+            followed.append(pair)
+        if before is None or not np.isnan(followed[-1].inlier_share):
+            good = number, picture
         before = picture
     return followed
 

@@ -191,14 +191,10 @@ def read_footage(
         expected = f"{image_size[0]} x {image_size[1]} px, the size in match.yaml"
         todo = "Correct width and height in match.yaml, or give the video in that size."
         raise InputError(str(path), expected, f"{index.size[0]} x {index.size[1]} as shown", todo)
-    clock = index.on_clock(fps, str(path))
     wanted = [np.arange(first, first + count, dtype=np.int64) for _, first, count in clips]
     frame = np.unique(np.concatenate(wanted))
-    number = frames.numbers(frame)
-    inside = (number >= 0) & (number < len(clock))
-    picture = np.full(len(frame), -1, dtype=np.int64)
-    picture[inside] = clock[number[inside]]
-    found = Footage(index, frame, picture, len(clock))
+    picture = index.shown(frames.numbers(frame), fps, str(path))
+    found = Footage(index, frame, picture, len(index.on_clock(fps, str(path))))
     if (picture < 0).all():
         raise no_images(path, found, frames, clips[0])
     return found
@@ -227,9 +223,16 @@ def footage_size(spec: MatchSpec, unit_id: str) -> tuple[int, int]:
 
 
 def require_footage(
-    spec: MatchSpec, unit_id: str, path: Path, index: FrameIndex | None = None
+    spec: MatchSpec,
+    unit_id: str,
+    path: Path,
+    index: FrameIndex | None = None,
+    *,
+    whole: bool = False,
 ) -> dict[str, InputError]:
     """Raise InputError as `read_footage` if a video contradicts match.yaml.
+
+    With `whole`, the video also has the first and the last frame of its clips.
 
     Returns:
         For each clip of which the video has no image, the error if no other camera has one.
@@ -237,6 +240,15 @@ def require_footage(
     frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
     fps = spec.fps * frames.rate
     footage = read_footage(path, fps, footage_size(spec, unit_id), frames, clips, index)
+    number = frames.numbers(footage.frame)
+    fits = int(np.count_nonzero((number >= 0) & (number < footage.length)))
+    if whole and fits < len(number):
+        raise InputError(
+            f"{path}: frame_count and broadcast_offset_frames of clip {clips[0][0]}",
+            expected=f"frames of this video, 0 to {footage.length - 1}",
+            found=f"{number[0]} to {number[-1]}",
+            todo=f"Correct the offset, or shorten the clip to the {fits} frames that fit.",
+        )
     unseen = [clip for clip in clips if not footage.shows(clip[1], clip[2])]
     return {clip[0]: no_images(path, footage, frames, clip) for clip in unseen}
 

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Image
+from data_contracts.arrays import Flags, Image, Integers
 from worldpose.errors import InputError
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.pictures import FrameIndex, Pictures
@@ -207,24 +207,35 @@ def some_pictures(
 
 
 def pictures_at(
-    video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
+    video: VideoReader | ImageFolder, numbers: NDArray[np.integer], *, grey: bool = False
 ) -> Iterator[Image | None]:
     """Yield the frame of each number; None for a negative one.
 
     Args:
         video: their source.
         numbers: (pictures,) rising, with repetitions.
+        grey: as of `Pictures.frames`.
 
     Raises:
         InputError: a frame cannot be decoded.
     """
     there = numbers[numbers >= 0]
-    shown = video.frames(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
+    span = (int(there[0]), int(there[-1]) + 1) if len(there) else (0, 0)
+    shown = video.frames(*span, grey=grey)
     at, picture = -1, None
     for number in numbers.tolist():
         while at < number:
             at, picture = next(shown)
         yield picture if number >= 0 else None
+
+
+def grey_on_clock(path: Path, numbers: Integers, fps: float) -> Iterator[Image]:
+    """Yield the grey image of each number of a camera's clock; black where the video has none."""
+    with open_video(path) as video:
+        black = np.zeros(video.index.size[::-1], dtype=np.uint8)
+        shown = video.index.shown(numbers, fps, str(path))
+        for picture in pictures_at(video, shown, grey=True):
+            yield black if picture is None else picture
 
 
 def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]:

@@ -98,6 +98,12 @@ class FrameIndex:
             raise self._rate_error(fps, where)
         return picture
 
+    def shown(self, number: Integers, fps: float, where: str) -> Integers:
+        """Return the video frame (n,) at numbers (n,) of `on_clock`; -1 if missing or beyond."""
+        clock = self.on_clock(fps, where)
+        inside = (number >= 0) & (number < len(clock))
+        return np.where(inside, clock[np.where(inside, number, 0)], -1)
+
     def _rate_error(self, fps: float, where: str) -> InputError:
         """Return the error of a video that does not follow a clock."""
         step = np.diff(self.times)

@@ -1,6 +1,7 @@
 """Whole clips of rendered images: every frame's camera against the true one."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
 from worldpose.geometry.pan_tilt import camera_angles
+from worldpose.simulation.scene import look_at
 from worldpose.simulation.settings import RenderingSettings
 
 FRAMES, FPS = 16, 25.0
@@ -143,6 +145,34 @@ def test_a_cut_is_found_and_refused(true, pictures, bare):
     whole = BroadcastClip([clicks(true, 2)], lambda: iter(map(np.ascontiguousarray, cut)), FPS)
     with pytest.raises(InputError, match=r"cuts before frame 8, 11 of 0 to 14"):
         calibrate_broadcast(clip.PITCH, whole, SETTINGS)
+
+
+def test_a_dissolve_and_a_cut_through_black_are_refused(true, pictures):
+    center = np.array([40.0, -60.0, 12.0])
+    aims = [
+        look_at(center, np.array([x, -2.0, 0.0]), 0.0).rotation for x in np.linspace(30, 34, FRAMES)
+    ]
+    other = replace(true, center=center, rotation=np.stack(aims))
+    others = [grey(p) for p in clip.film_empty_pitch(other.camera, 5, LOOK)]
+    weights = np.clip(np.arange(FRAMES) / 9.0, 0.0, 1.0)
+    mixed = zip(weights, pictures, others, strict=True)
+    dissolve = [np.uint8((1.0 - w) * before + w * after) for w, before, after in mixed]
+    black = [*pictures[:6], *2 * [np.zeros_like(pictures[0])], *others[8:]]
+    for cut in (dissolve, black):
+        whole = BroadcastClip([clicks(true, 0)], lambda cut=cut: iter(cut), FPS)
+        with pytest.raises(InputError, match=r"no markings there in frames \d+ to 15\. End the"):
+            calibrate_broadcast(clip.PITCH, whole, SETTINGS)
+
+
+def test_a_chain_that_black_images_break_is_held_by_the_key_frames_of_both_sides(true, pictures):
+    black = np.zeros_like(pictures[0])
+    order = [0, 1, 2, 3, 3, 3, 13, 13, 14, 15]
+    cut = [black if n in (4, 5) else pictures[each] for n, each in enumerate(order)]
+    keys = [clicks(true, 2), clicks(true, 14).model_copy(update={"frame": 8})]
+    found = calibrate_broadcast(clip.PITCH, BroadcastClip(keys, lambda: iter(cut), FPS), SETTINGS)
+    rest = np.array([0, 1, 2, 3, 6, 7, 8, 9])
+    errors = place_errors(found.camera.frames(rest), true.frames(np.array(order)[rest]))
+    assert np.percentile(errors, 95.0) < 1.5
 
 
 def test_without_any_paint_players_hold_the_camera(true, bare):

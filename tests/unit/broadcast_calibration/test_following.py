@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import turning_clip as clip
@@ -10,6 +11,7 @@ from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.tracking import (
     Followed,
     chain,
+    follow,
     modified_z_scores,
     turn,
 )
@@ -51,6 +53,29 @@ def test_a_chain_meets_its_key_frames_and_says_what_it_missed():
     assert links.determined.all()
     # 21 steps of about a hundredth of a pixel.
     assert 0.0 < links.drift[0] < 0.3
+
+
+def test_the_drift_over_a_broken_pair_is_all_in_that_pair():
+    rng = np.random.default_rng(6)
+    true = clip.moving(30)
+    pairs = pairs_of(true, rng)
+    pairs[20] = Followed(np.empty((0, 2)), np.empty((0, 2)), np.nan)
+    links = chain([3, 24], true.frames(np.array([3, 24])), pairs, 3.5)
+    turn = links.camera.rotation @ np.swapaxes(true.rotation, 1, 2)
+    # A pair turns by 4e-3; twenty pairs add up to 1e-4.
+    assert np.abs(turn - np.eye(3)).max() < 2e-4
+
+
+def test_points_are_followed_across_a_black_frame():
+    rng = np.random.default_rng(7)
+    wide = cv2.GaussianBlur(rng.integers(0, 255, (270, 500)).astype(np.uint8), (0, 0), 2.0)
+    shown = [np.ascontiguousarray(wide[:, 4 * n : 4 * n + 480]) for n in range(4)]
+    shown[1] = np.zeros_like(shown[1])
+    first, across, last = follow(shown, None, 100)
+    assert np.isnan(first.inlier_share) and not len(first.start)
+    assert (across.step, last.step) == (2, 1)
+    # Two frames of 4 px each.
+    np.testing.assert_allclose(np.median(across.end - across.start, axis=0), [-8.0, 0.0], atol=0.1)
 
 
 FRAMES, FPS = 120, 50.0
