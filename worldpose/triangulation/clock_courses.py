@@ -15,7 +15,6 @@ with what is left, r_b, and the normal matrix N of all other parts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -155,8 +154,7 @@ def trace_clocks(
     rig, length = Rig.from_cameras(cameras), max(1, round(0.2 * fps))
     parts = [ClockPart(c, "constant", 0, float(value)) for c, value in enumerate(late)]
     for _ in range(2 * count + 6):
-        courses = _courses(parts, count, frames)
-        shifted, rest = shift_by_courses(detections, courses)
+        shifted, rest = shift_by_courses(detections, _courses(parts, count, frames))
         tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
         if lost := find_lost_views(cameras, shifted, tracks.joints, fps, ("clock",)):
             found, late_frames = lost[0].found, float(lost[0].amount[4])
@@ -167,11 +165,7 @@ def trace_clocks(
         # More people cost time and tell little more.
         every = 1 + index.size // 300_000
         people = replace(shifted, keypoints=moved, detection_index=index[:, :, ::every])
-        # Where a camera begins or ends, joints jump by the errors of calibrations.
-        begin = max(0.0, *(course[0][1] for course in courses))
-        end = min(0.0, *(course[-1][1] for course in courses))
-        rows = slice(-int(-begin // length) * length, frames + math.floor(end) - length)
-        sums = ClockSums.of(rig, people, fps, rows, length)
+        sums = ClockSums.of(rig, people, fps, slice(0, frames), length)
         if not len(sums.rows):
             break
         fitted = fit_parts(sums, _place_steps(rig, people, fps, parts), frames, fps)
