@@ -50,6 +50,8 @@ class Arrival(Record):
     """
     deaths: Count = 0
     """How often the registering process died with these files."""
+    replaces: str | None = None
+    """Folder of the registered match whose next version it is; None of any other match."""
     match_id: str | None = None
     """Id of the registered match."""
     flow_run: str | None = None

@@ -19,6 +19,7 @@ from flows.registering import open_match
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead
 from flows.run_record import latest_run
+from flows.run_status import MAX_ITERATIONS
 from flows.running import RunRequest, require_whole, run_match, settle, shared_machines
 from flows.stage import Match
 from worldpose.store.store import Store
@@ -26,8 +27,6 @@ from worldpose.store.store import Store
 GAIN: Final = 0.01
 """Minimum relative decrease of the held-out error for a better iteration: rejecting the tails of
 a detector's noise alone causes smaller decreases."""
-MAX_ITERATIONS: Final = 6
-"""Maximum number of iterations if the caller gives none."""
 
 
 @dataclass(frozen=True)

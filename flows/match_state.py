@@ -15,7 +15,14 @@ from flows.review.descriptions import is_first_click
 from flows.review.verdicts import still_waiting
 from flows.run_plan import PlannedUnit, plan_run
 from flows.run_record import expected_work, latest_run, runs_at_work
-from flows.run_status import Cause, UnitState, plan_as_latest, unit_state, unit_status
+from flows.run_status import (
+    Cause,
+    UnitState,
+    last_iteration,
+    plan_as_latest,
+    unit_state,
+    unit_status,
+)
 from flows.settings import resolve
 from flows.stage import Match
 from worldpose.errors import WorldposeError
@@ -123,7 +130,8 @@ def _find(
         why = "The last run was asked to end earlier."
         return MatchState("stopped", "not run to the end", why, "Continue it.")
     if further:
-        why = f"{further[-1].iteration} iterations are set, and not all of them were run."
+        count = _count(further[-1].iteration, "iteration is", "iterations are")
+        why = f"{count} to be run by the settings, and not all of them were."
         return MatchState("outdated", "out of date because of its iterations", why, "Run it again.")
     usability = latest.usability
     words = "ready" if usability.verdict == "usable" else usability.verdict
@@ -134,8 +142,7 @@ def _find(
 def _further_iterations(store: Store, match: Match, latest: RunRecord) -> list[PlannedUnit]:
     """Return the units to compute in iterations that are set beyond that of the latest run."""
     found = resolve(match.layers)
-    most = found.general.iterations
-    numbers = range(latest.iteration + 1, 0 if most == "auto" else most + 1)
+    numbers = range(latest.iteration + 1, last_iteration(latest, found) + 1)
     plans = (plan_run(store, match, found.overrides, iteration=number) for number in numbers)
     return [unit for plan in plans for unit in plan if not unit.published]
 
@@ -196,6 +203,8 @@ def _why_outdated(
         return "because results were removed"
     if repaired and not differing:
         return "because the input of the failed step has changed"
+    if plan[0].iteration < latest.iteration:
+        return "because of its iterations"
     return f"because {_first_cause(store, latest, plan)}"
 
 

@@ -22,12 +22,15 @@ from worldpose.store.paths import is_name
 from worldpose.store.store import Run, Store
 
 
-def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[Match, bool]:
+def register(
+    store: Store, folder: Path, *, unfinished: bool = False, replaces: str | None = None
+) -> tuple[Match, bool]:
     """Validate and register a match folder; return whether it was new or changed.
 
     The same content under another name is the same match. A known match with changed videos,
-    detections or pitch is another match and needs another id. `unfinished` accepts it without all
-    cameras known; people click them on the pages.
+    detections or pitch is another match and needs another id, unless it is the next version of the
+    folder that it `replaces`: then runs, corrections and names stay. `unfinished` accepts it
+    without all cameras known; people click them on the pages.
 
     Raises:
         InputError: the folder is not a valid match, or its id or content is already registered.
@@ -38,12 +41,24 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
         at_home = previous is not None and previous.folder == str(folder.resolve())
     known = [file.path for file in previous.files] if previous is not None and at_home else ()
     match_folder = read_match(folder, known)
-    registration = register_match(match_folder, previous)
+    is_next = previous is not None and previous.folder == replaces
+    if replaces is not None and not is_next and not at_home:
+        raise InputError(
+            str(folder),
+            expected=f"the next version of {match_id} after that in {replaces}",
+            found="another version of it, registered meanwhile",
+            todo="Remove this one, and add its files again on the page of the match.",
+        )
+    registration = (
+        register_next(match_folder, previous)
+        if is_next and previous is not None
+        else register_match(match_folder, previous)
+    )
     match = corrected_match(store, match_folder, registration)
     if not unfinished:
         require_calibrated(match.folder)
     if previous is not None:
-        if previous.identity != registration.identity:
+        if previous.identity != registration.identity and not is_next:
             raise InputError(
                 f"{folder}: match.yaml: match_id",
                 expected=f"the videos, detections and pitch that {match_id} was registered with",
@@ -52,10 +67,19 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
             )
         if previous == registration:
             return match, False
-    _refuse_duplicate(store, registration)
+    _refuse_duplicate(store, registration, is_next=is_next)
     _read_new_files(match_folder, registration, previous)
     store.register(registration)
     return match, True
+
+
+def register_next(folder: MatchFolder, before: Registration) -> Registration:
+    """Return the registration of the next version of a match folder.
+
+    Files that were linked or copied with their times keep their digests.
+    """
+    at_home = before.model_copy(update={"folder": str(folder.folder.resolve())})
+    return register_match(folder, at_home)
 
 
 def open_match(store: Store, match_id: str) -> Match:
@@ -150,9 +174,10 @@ def find_match(store: Store, name: str, *, unfinished: bool = False) -> Match:
     return open_for_review(store, name) if unfinished else open_match(store, name)
 
 
-def _refuse_duplicate(store: Store, registration: Registration) -> None:
+def _refuse_duplicate(store: Store, registration: Registration, *, is_next: bool) -> None:
     """Refuse a second folder of known content; a moved folder does not count as a second one."""
-    for match_id in store.matches():
+    own = {registration.spec.match_id} if is_next else set()
+    for match_id in set(store.matches()) - own:
         try:
             known = store.registration(match_id)
         except CorruptionError:

@@ -20,7 +20,7 @@ from flows.method import METHOD, unit_order
 from flows.registering import open_match
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
 from flows.run_record import latest_run
-from flows.settings import Overrides, resolve, selected_stages
+from flows.settings import Overrides, ResolvedSettings, resolve, selected_stages
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.store.recipes import RecipeDifference, recipe_differences
@@ -139,9 +139,23 @@ def plan_as_latest(
         InputError: a setting of that run names a missing file.
     """
     found = resolve(match.layers, overrides)
-    most, iteration = found.general.iterations, 1 if latest is None else latest.iteration
-    iteration = iteration if most == "auto" else min(iteration, most)
+    iteration = min(latest.iteration, last_iteration(latest, found)) if latest else 1
     return plan_run(store, match, found.overrides, iteration=iteration)
+
+
+MAX_ITERATIONS: Final = 6
+"""Maximum number of iterations that are `auto`."""
+
+
+def last_iteration(latest: RunRecord, settings: ResolvedSettings) -> int:
+    """Return the last iteration that these settings ask for after a run.
+
+    `auto` asks for one more than the run kept: only one that is no better ends the iterations.
+    """
+    most = settings.general.iterations
+    if most != "auto":
+        return most
+    return min(latest.iteration + (latest.state == "complete"), MAX_ITERATIONS)
 
 
 def recorded_differences(
@@ -207,8 +221,7 @@ def run_status(
     match = open_match(store, match_id)
     until = last_stage(match, latest)
     found = resolve(match.layers, settings)
-    most = found.general.iterations if until is None else 1  # a part of the method has one
-    passes = latest.iteration if most == "auto" else most
+    passes = last_iteration(latest, found) if until is None else 1  # a part of the method has one
     stages, gates = selected_stages(None, until), found.general.gates or latest.gates
     gatekeeper = Gatekeeper(store, match, gates)
     units: list[UnitStatus] = []

@@ -76,23 +76,22 @@ _RULES: Final = (
         "tracking",
         "absent_share",
         "max_absent_share",
-        "people are missing in {unit} for {value} of the time{when}. Check the videos or 2D poses "
-        "there.",
+        "people are missing in {unit} for {value} of the time{when}. Look at the videos there.",
     ),
     _Rule(
         "tracking",
         "unmatched_share",
         "max_unmatched_share",
-        "{value} of the detections in {unit} belong to no track. Look for people beside the pitch, "
-        "or for a camera with a wrong clock or pose.",
+        "no track follows {value} of the people found in the images of {unit}. Look for people "
+        "beside the pitch, or for a camera whose clock or calibration is wrong.",
         is_required=True,
     ),
     _Rule(
         "tracking",
         "mean_ray_distance_m",
         "max_ray_distance_m",
-        "cameras disagree about the people in {unit} by {value}. Check the calibration and the "
-        "clocks of the cameras.",
+        "cameras disagree by {value} about where people are in {unit}. Check the calibration and "
+        "the clocks of the cameras.",
     ),
     _Rule(
         "triangulation",
@@ -156,7 +155,7 @@ _RULES: Final = (
         "broadcast_tracking",
         "unmatched_share",
         "max_unmatched_share",
-        "{value} of the detections of the broadcast camera in {unit} belong to no track. Look for "
+        "no track follows {value} of the people found by the broadcast camera in {unit}. Look for "
         "people beside the pitch, or for wrong key frames.",
     ),
     _Rule(
@@ -322,7 +321,7 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
     if outcome.lacks_results:
         yield "the run failed. Correct what the failed units say, and run again."
     if outcome.lacks_people:
-        yield "no person is placed. Check videos, 2D poses and calibration in the report."
+        yield "no person is placed. Look at the videos and at the calibration of the cameras."
     if outcome.waiting:
         yield (
             f"results that wait for review: {outcome.waiting}. Decide or correct them, "
@@ -336,6 +335,7 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
             yield f"people are missing in {unit} for more than {share}. Check the videos."
         if stage == "tracking" and own.get("unmatched_share", 0.0) > most:
             yield (
-                f"more than {quantity('unmatched_share', most)} of the detections in {unit} belong "
-                "to no track. A camera's pose or clock is wrong, or the nets do not fit the images."
+                f"no track follows more than {quantity('unmatched_share', most)} of the people "
+                f"found in the images of {unit}. The calibration or the clock of a camera is "
+                "wrong, or the detector was made for other images."
             )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts.camera_consistency import CAMERA_CONSISTENCY
-from tasks.clip_inputs import ClipInputs, open_clip, open_venue
+from tasks.clip_inputs import ClipInputs, camera_rates, open_clip, open_venue
 from tasks.unit import UnitInputs, require_registered, unit_task
 from worldpose.camera_consistency.consistency import (
     check_consistency,
@@ -38,7 +38,8 @@ def camera_consistency(inputs: UnitInputs, result: ResultWriter) -> None:
     )
     if doubt := _doubt_calibration(inputs, clip, found):
         result.warnings.append(doubt)
-    faults = describe_faults(found, names, sources["offset_frames"], clip.fps)
+    rates = camera_rates(inputs)
+    faults = describe_faults(found, names, sources["offset_frames"], rates, clip.fps)
     wrong = faulty_cameras(found) if settings.leave_out else set()
     result.write(
         CAMERA_CONSISTENCY,
@@ -100,9 +101,9 @@ def _doubt_calibration(inputs: UnitInputs, clip: ClipInputs, found: Consistency)
             "markings.",
         )
     if off and not alone:
-        whole = "has another world or pitch than the stills" if unpainted else "contradicts stills"
-        return f"calibration.toml {whole}: {fits}"
-    clocks = "calibration.toml is that of other cameras, the 2D poses are wrong, or the clocks"
+        whole = "is of another pitch than the stills" if unpainted else "contradicts stills"
+        return f"the calibration (calibration.toml) {whole}: {fits}"
+    clocks = "the calibration is of other cameras, the people found are wrong, or the clocks"
     return (
         f"{alone}: {clocks} differ by more than some frames (worldpose synchronize)"
         if alone

@@ -159,11 +159,11 @@ def open_detections(
     cameras: Sequence[xr.Dataset],
     frame: Integers,
     feedback: StoredFeedback,
-    correct: Callable[[Singles, Integers], Singles] | None = None,
+    correct: Callable[[Singles, slice], Singles] | None = None,
 ) -> KeypointDetections[ClipArray]:
     """Return the detections of all cameras, read in pages; NaN beyond a camera's number of them.
 
-    `correct` returns the keypoints of frames as cameras would show them that do not change.
+    `correct` returns the keypoints of rows as cameras would show them that do not change.
     """
     aligned, points = align_points(cameras)
     most = max(1, *(camera.sizes["detection"] for camera in cameras))
@@ -181,7 +181,7 @@ def open_detections(
             page = feedback.apply(name, page, rows)
             if correct is None or name not in ("keypoints", "extra_keypoints"):
                 return page
-            return correct(page, frame[rows])
+            return correct(page, rows)
 
         return PagedArray(shape, read)
 
@@ -254,25 +254,37 @@ def open_clip(
     feedback = StoredFeedback(
         seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
     )
-    changes = [*known_changes(inputs, inputs.unit), *further]
-    correct = _view_corrector(inputs, changes)
+    correct = _view_corrector(inputs, {inputs.unit: inputs.frames}, further)
     detections = open_detections(seen, inputs.frames, feedback, correct)
     return _open_inputs(inputs, detections)
 
 
 def _view_corrector(
-    inputs: UnitInputs, changes: Sequence[CameraChange]
-) -> Callable[[Singles, Integers], Singles] | None:
-    """Return the correction of cameras whose view changes; None if all stay as they are."""
-    views = [change for change in changes if change.kind == "view"]
-    if not views:
+    inputs: UnitInputs, frames: Mapping[str, Integers], further: Sequence[CameraChange] = ()
+) -> Callable[[Singles, slice], Singles] | None:
+    """Return the correction of cameras whose view changes; None if all stay as they are.
+
+    Rows are the match frames of one clip after the other. Clips may overlap in time: each is
+    corrected by the changes that were found in it, and all by `further`.
+    """
+    views = [
+        [each for each in (*known_changes(inputs, clip), *further) if each.kind == "view"]
+        for clip in frames
+    ]
+    if not any(views):
         return None
+    frame = np.concatenate(list(frames.values()))
+    clip_of = np.repeat(np.arange(len(frames)), [len(each) for each in frames.values()])
     names = tuple(inputs.sources["cameras"])
     cameras, _, _ = _load_cameras(inputs, names)
     known = {name: cameras[c] for c, name in enumerate(names)}
 
-    def correct(page: Singles, frame: Integers) -> Singles:
-        return correct_views(page, frame, known, views).astype(np.float32)
+    def correct(page: Singles, rows: slice) -> Singles:
+        out = page.copy()
+        for clip, own in enumerate(views):
+            here = clip_of[rows] == clip
+            out[here] = correct_views(page[here], frame[rows][here], known, own)
+        return out
 
     return correct
 
@@ -323,6 +335,12 @@ def _on_match_clock(
     )
 
 
+def camera_rates(inputs: UnitInputs) -> NDArray[np.float64]:
+    """Return the frames of each camera's video per match frame, (cameras,)."""
+    clocks = inputs.sources.get("clocks") or [[0, 1.0]] * len(inputs.sources["cameras"])
+    return np.array([rate for _, rate in clocks])
+
+
 def triangulation_settings(inputs: UnitInputs, clip: str) -> TriangulationSettings:
     """Return the settings of the first triangulation of a clip, which all clips share."""
     return inputs.made_from(f"triangulation/{clip}").settings(TriangulationSettings)
@@ -371,8 +389,7 @@ def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> 
     ]
     feedback = StoredFeedback(seen, _concatenate_clips(filtering) if filtering else None)
     frame = np.concatenate(list(frames.values()))
-    changes = [each for clip in frames for each in known_changes(inputs, clip)]
-    correct = _view_corrector(inputs, changes)
+    correct = _view_corrector(inputs, frames)
     detections = open_detections(seen, frame, feedback, correct)
     return _open_inputs(inputs, detections[: len(frame)])
 

@@ -451,17 +451,17 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
 def _pictures(
     inputs: UnitInputs, case: _CameraCase, places: NDArray[np.int64]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield the images of some frame indices in order, without those that the video lacks.
+    """Yield the images of some frame indices, as the video has them, without those it lacks.
 
     Decoding skips images without a search.
     """
     footage = inputs.open(f"ingest/{inputs.sources['camera']}")
     numbers = footage["picture_of_frame"].sel(frame=case.detected.frame[places]).values
     there = numbers >= 0
-    place_of = dict(zip(numbers[there].tolist(), places[there].tolist(), strict=True))
     with open_video(case.detection.file("video"), footage_index(footage)) as video:
-        for number, picture in some_pictures(video, numbers[there]):
-            yield place_of[number], picture
+        for number, picture in some_pictures(video, np.unique(numbers[there])):
+            # Several frames show one image of a camera with a lower frame rate than the match's.
+            yield from ((place, picture) for place in places[numbers == number].tolist())
 
 
 def _arrays(

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from data_contracts.arrays import Singles
+from data_contracts.arrays import Floats, Singles
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import TRACKING
 from data_contracts.triangulation import CameraChange
-from tasks.clip_inputs import ClipInputs, open_clip
+from tasks.clip_inputs import ClipInputs, camera_rates, open_clip
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.compiled import map_in_threads
+from worldpose.ingest.clock import offset_change
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import (
     Identities,
@@ -173,15 +174,16 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             settings,
             pitch_size=pitch_size,
             births=tracks.report.births,
+            rates=camera_rates(inputs),
         )
         said = f"{inputs.recipe.name} found no person: {reason.message}"
-    plane = None if pitch is None else _track_on_plane(clip, pitch, found)
+    plane = None if pitch is None else _track_on_plane(clip, pitch, found, camera_rates(inputs))
     if plane is not None:
         found, further, clocks = plane
         if not len(tracks.person):
             figures |= further
             said = (
-                f"{inputs.recipe.name} could not triangulate any person: {reason.message} "
+                f"{inputs.recipe.name} could place no person in 3D: {reason.message} "
                 f"{len(found.person)} people are placed on the pitch from their feet, without "
                 f"joints and bodies.{clocks}"
             )
@@ -336,7 +338,7 @@ def _estimate_clocks(
 
 
 def _track_on_plane(
-    clip: ClipInputs, pitch: PitchTemplate, found: Identities
+    clip: ClipInputs, pitch: PitchTemplate, found: Identities, rates: Floats
 ) -> tuple[Identities, dict[str, float], str] | None:
     """Add the people who are not triangulated, tracked by their feet.
 
@@ -374,18 +376,19 @@ def _track_on_plane(
         "plane_std_m": float(np.sqrt(np.nanmedian(variance))),
         "unmatched_share": 1.0 - np.count_nonzero(added.detection_index >= 0) / detections,
     }
-    # A video that is late shows an earlier time: its frames lie behind those of the others.
-    offsets = (clocks.seconds.max() - clocks.seconds) * clip.fps
-    errors = clocks.std * clip.fps
-    late = [
-        f"{name} {offsets[c]:+.1f} (standard deviation {errors[c]:.1f})"
-        for c, name in enumerate(clip.camera_ids)
-        if np.isfinite(errors[c]) and offsets[c] > 3.0 * errors[c]
+    # Images earlier than those of the latest camera with the same people, in their own frames.
+    late = clocks.seconds * clip.fps
+    changes = [
+        (clip.camera_ids[c], offset_change(late[c] - late[list(group)].max(), rates[c]))
+        for group in clocks.groups
+        for c in group
+        if late[list(group)].max() - late[c] > 3.0 * clocks.std[c] * clip.fps
     ]
+    whole = [f"{name} {change:+.0f}" for name, change in changes if round(float(change))]
     said = (
         " Running people show that clocks differ. That is corrected here; for the whole match, "
-        f"add to offset_frames in match.yaml: {', '.join(late)}."
-        if late
+        "add to the clock offsets (offset_frames in match.yaml): {}.".format(", ".join(whole))
+        if whole
         else ""
     )
     return added, figures, said

@@ -13,8 +13,9 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from flows.cli import console
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
 from flows.cli.options import WorkersOption
-from flows.cli.synchronize import choose_clip, compute_poses, load_detections
+from flows.cli.synchronize import compute_poses
 from flows.registering import find_match
+from flows.results.clock_offsets import choose_clip, load_detections
 from flows.results.outputs import require_new
 from flows.running import RunRequest
 from flows.stage import Match

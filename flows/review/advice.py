@@ -11,6 +11,8 @@ from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
 from data_contracts.triangulation import CLOCK_CHANGE
+from worldpose.ingest.clock import offset_change
+from worldpose.ingest.footage import unit_frames
 
 MIN_FREEDOM: Final = 10.0
 """Minimum degrees of freedom of all cameras for advice [1]."""
@@ -70,11 +72,13 @@ def clock_advice(metrics: Mapping[str, Mapping[str, float]], spec: MatchSpec) ->
         if not known or any(CLOCK_CHANGE + camera.id in each for each in metrics.values()):
             continue  # one offset cannot correct a clock that changes
         late, error = min(known, key=lambda each: each[1])
-        change = -round(late)
-        if abs(late) > max(MIN_OFFSET, MIN_STANDARD_ERRORS * error) and change:
+        exact = float(offset_change(late, unit_frames(spec, camera.id).rate))
+        change = round(exact)
+        is_clear = abs(late) > MIN_STANDARD_ERRORS * error
+        if is_clear and abs(exact) > MIN_OFFSET and change:
             offset = camera.offset_frames
             said.append(
-                f"camera {camera.id} shows {abs(late):.1f} frames "
+                f"camera {camera.id} shows {abs(late):.1f} match frames "
                 f"{'later' if late > 0 else 'earlier'} than the others: "
                 + (
                     f"add {change} to every offset of its offset_frames in match.yaml"

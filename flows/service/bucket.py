@@ -44,7 +44,8 @@ class BucketInbox:
         self._objects = ObjectBlobs.at(url)
         self._file = state.folder / "bucket.json"
         kept = json.loads(self._file.read_text()) if self._file.exists() else {}
-        # Fingerprints of a match's objects and of the files that became of them.
+        # Fingerprints of a match's objects, of the files that became of them, and of those of a
+        # copy that is on its way.
         self._copied: dict[str, list[str]] = kept
         self._since: dict[str, tuple[str, float]] = {}
         self._told: dict[str, str] = {}
@@ -71,9 +72,8 @@ class BucketInbox:
             else:
                 self._copy(name, objects)
                 fetched.append(name)
-                self._copied[name] = [fingerprint, _fingerprint_files(self.inbox / name)]
-                with whole_file(self._file) as draft:
-                    draft.write_text(json.dumps(self._copied, indent=2) + "\n")
+                self._keep(name, [fingerprint, self._copied[name][-1]])
+                self._told.pop(name, None)
         return fetched
 
     def _list_objects(self) -> dict[str, list[Entry]]:
@@ -98,7 +98,7 @@ class BucketInbox:
         except InputError as error:
             return str(error)
         target, made = self.inbox / name, self._copied.get(name, [])[1:]
-        if not target.exists() or made == [_fingerprint_files(target)]:
+        if not target.exists() or _fingerprint_files(target) in made:
             return None
         why = "was changed here since it was copied: move it away" if made else "is there already"
         return f"{target} {why}"
@@ -110,8 +110,14 @@ class BucketInbox:
         shutil.rmtree(draft, ignore_errors=True)
         for each in objects:
             self._objects.download(each.path, draft / each.path.removeprefix(f"{name}/"))
+        self._keep(name, [*self._copied.get(name, [""]), _fingerprint_files(draft)])
         shutil.rmtree(target, ignore_errors=True)
         draft.rename(target)
+
+    def _keep(self, name: str, fingerprints: list[str]) -> None:
+        self._copied[name] = fingerprints
+        with whole_file(self._file) as draft:
+            draft.write_text(json.dumps(self._copied, indent=2) + "\n")
 
 
 def _fingerprint(objects: list[Entry]) -> str:
@@ -120,7 +126,9 @@ def _fingerprint(objects: list[Entry]) -> str:
 
 def _fingerprint_files(folder: Path) -> str:
     files = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
-    return _digest([f"{path}\n{about.st_size} {about.st_mtime_ns}" for path, about in files])
+    return _digest(
+        [f"{it.relative_to(folder)}\n{about.st_size} {about.st_mtime_ns}" for it, about in files]
+    )
 
 
 def _digest(lines: list[str]) -> str:

@@ -35,7 +35,7 @@ from flows.results.automatic_exports import export_after_run
 from flows.run_plan import plan_ahead
 from flows.run_record import RunLog, alone_with, expected_work, latest_run
 from flows.running import RunRequest, settle
-from flows.service.inbox import take_in
+from flows.service.inbox import run_key, take_in
 from flows.service.match_runs import MatchRuns, match_runs_of, run_name, title_of
 from flows.service.plan import ServePlan
 from flows.settings import selected_stages
@@ -184,8 +184,7 @@ def ingest(plan: dict[str, Any]) -> list[str]:
 
     def begin(opened: Match, arrival: Arrival) -> str:
         # After a kill, or for a moved folder, a second call returns the existing run.
-        key = f"arrival-{opened.registration.identity}"
-        runs = MatchRuns.of_plan(served)
+        runs, key = MatchRuns.of_plan(served), run_key(opened, arrival)
         return runs.start(opened.match_id, priority=arrival.priority, key=key).flow_run
 
     decided = take_in(

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
@@ -176,14 +177,109 @@ Begin = Callable[[Match, Arrival], str]
 """Starts a match's run, only once however often it is called; returns the run's Prefect id."""
 
 
-def note_whole(state: StateFolder, path: Path, name: str, priority: Priority) -> None:
-    """Note an arrival that came in one step: no scan has to see that nothing of it changes."""
-    with suppress(RefusalError, WorldposeError, OSError):  # then scans wait as for any other
+def put_in(
+    state: StateFolder,
+    inbox: Path,
+    folder: Path,
+    name: str,
+    priority: Priority = "normal",
+    replaces: str | None = None,
+    corrects: str | None = None,
+) -> None:
+    """Move a whole match folder into the inbox in one step.
+
+    Args:
+        state: the state of the inbox.
+        inbox: on the disk of the folder.
+        folder: the match folder.
+        name: path in the inbox.
+        priority: when its run begins.
+        replaces: folder of the registered match whose next version it is.
+        corrects: folder of a refused arrival that it takes the place of.
+
+    Raises:
+        InputError: another next version of the match is on its way.
+    """
+    on_the_way = [it for it in state.arrivals().values() if it.state != "taken"]
+    for each in on_the_way if replaces is not None else ():
+        if each.replaces == replaces and str((inbox / each.name).resolve()) != corrects:
+            raise InputError(
+                name,
+                expected="no other new files of this match on their way",
+                found=f"{each.name}, {each.state}",
+                todo="Wait until they are taken in, or remove them in the list of matches.",
+            )
+    target = inbox / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if corrects is not None and Path(corrects).exists():
+        set_aside(inbox, Path(corrects))
+    folder.rename(target)
+    # No scan has to see that nothing of it changes.
+    with suppress(RefusalError, *(() if replaces else (WorldposeError, OSError))):
         arrival = Arrival(
-            name=name, state="arriving", priority=priority, changed_at=datetime.now(UTC)
+            name=name,
+            state="arriving",
+            priority=priority,
+            fingerprint=fingerprint_of(target),
+            replaces=replaces,
+            changed_at=datetime.now(UTC),
         )
-        seen = {"fingerprint": fingerprint_of(path)}
-        state.write_arrival(arrival.model_copy(update=seen))
+        state.write_arrival(arrival)
+
+
+def next_version(inbox: Path, name: str) -> str:
+    """Return the path in the inbox of the next version of a match."""
+    versions = (f"{name}.v{number}" for number in count(2))
+    return next(each for each in versions if not (inbox / each).exists())
+
+
+REMOVED: Final = ".removed"
+"""Folder of the inbox for what people removed; no scan looks into it."""
+
+
+def set_aside(inbox: Path, path: Path) -> Path:
+    """Move an entry out of the sight of scans, and return its new place; nothing is deleted."""
+    target = inbox / REMOVED / f"{datetime.now(UTC):%Y%m%d-%H%M%S-%f}-{path.name}"
+    target.parent.mkdir(exist_ok=True)
+    return path.rename(target)
+
+
+def find_refused(state: StateFolder, inbox: Path, name: str) -> tuple[Entry, Arrival]:
+    """Return an entry of the inbox that was not taken in, with what was found of it.
+
+    Raises:
+        InputError: there is none of this name: it was taken in or removed meanwhile.
+    """
+    found = state.arrivals().get(name)
+    for entry in entries(inbox):
+        if entry.name == name and found is not None and found.state in ("refused", "incomplete"):
+            return entry, found
+    todo = "Load the list of matches again."
+    raise InputError(name, "an arrival that was refused", "none any more", todo)
+
+
+def try_again(state: StateFolder, inbox: Path, name: str) -> None:
+    """Let the next scan take in a refused entry as if it had just come."""
+    _, arrival = find_refused(state, inbox, name)
+    again = {"fingerprint": "", "deaths": 0}
+    state.write_arrival(change_state(arrival, "arriving", "is tried again", **again))
+
+
+def remove_entry(state: StateFolder, inbox: Path, name: str) -> Path:
+    """Take a refused entry out of the inbox; return where its files are now."""
+    entry, _ = find_refused(state, inbox, name)
+    moved = set_aside(inbox, entry.path)
+    state.forget_arrival(name)
+    return moved
+
+
+def run_key(match: Match, arrival: Arrival) -> str:
+    """Return the key of the run that an arrival begins, once however often it is taken in.
+
+    The next version of a match can have the videos, detections and pitch of the one before.
+    """
+    version = f"-{arrival.fingerprint}" if arrival.replaces else ""
+    return f"arrival-{match.registration.identity}{version}"
 
 
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
@@ -297,7 +393,8 @@ def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arriv
         missing = missing_of(entry.path)
         if missing:
             return change_state(arrival, "incomplete", missing)
-        match, _ = register(store, entry.path.resolve(), unfinished=True)
+        path, replaces = entry.path.resolve(), arrival.replaces
+        match, _ = register(store, path, unfinished=True, replaces=replaces)
     except StoreError:
         raise  # the project is at fault, not the arrival
     except (RefusalError, WorldposeError) as refusal:

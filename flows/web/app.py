@@ -30,6 +30,7 @@ from flows.web import (
     evidence,
     history,
     identities,
+    offsets,
     queue,
     results,
     settings,
@@ -93,11 +94,12 @@ def create_app(project: str, access: Access, intake: Intake | None = None) -> Fa
         lifespan=lifespan,
     )
     add_answers(app)
-    app.include_router(_sessions(context))
+    app.include_router(_sessions(context, intake))
     tools = corrections, evidence, calibration, detections, identities
     for module in (queue, history, *tools, results, settings, status_page):
         app.include_router(module.routes(context))
-    app.include_router(routes_of_intake(context, intake))
+    for with_inbox in (routes_of_intake, offsets.routes):
+        app.include_router(with_inbox(context, intake))
     app.include_router(_files())
     app.add_middleware(Guard, access=access)
     return app
@@ -143,7 +145,7 @@ def address(access: Access, host: str, port: int) -> str:
     return f"{'https' if access.secure else 'http'}://{name}:{port}/login#token={access.token}"
 
 
-def _sessions(context: PageContext) -> APIRouter:
+def _sessions(context: PageContext, intake: Intake | None) -> APIRouter:
     router = APIRouter()
     access = context.access
 
@@ -186,10 +188,14 @@ def _sessions(context: PageContext) -> APIRouter:
         return answer
 
     @router.get("/api/session")
-    def session(request: Request, who: Person) -> dict[str, str]:
-        secret = access.form_secret(request.state.session)
-        role = request.state.role
-        return {"who": who, "role": role, "form_secret": secret, "project": context.store.url}
+    def session(request: Request, who: Person) -> dict[str, str | bool]:
+        return {
+            "who": who,
+            "role": request.state.role,
+            "form_secret": access.form_secret(request.state.session),
+            "project": context.store.url,
+            "takes_files": intake is not None and request.state.role == "approver",
+        }
 
     return router
 

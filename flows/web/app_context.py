@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 
+from data_contracts.match import Registration
 from data_contracts.operations import QueuedRun
 from data_contracts.review import ReviewRequest
 from data_contracts.run import EXIT_CODES
@@ -61,25 +62,32 @@ class PageContext:
         object.__setattr__(self, "overview", Overview(self.store))
         object.__setattr__(self, "continuing", Continuing(self.store))
 
-    def match(self, name: str) -> Match:
-        """Return a registered match with its current corrections.
+    def registration(self, name: str) -> Registration:
+        """Return the registration of a match.
 
         Raises:
             HTTPException: 404; a name from outside never becomes a path.
         """
-        if not is_name(name) or self.store.registration(name) is None:
+        found = self.store.registration(name) if is_name(name) else None
+        if found is None:
             raise HTTPException(404, "no such match")
-        return open_for_review(self.store, name)
+        return found
+
+    def match(self, name: str) -> Match:
+        """Return a registered match with its current corrections.
+
+        Raises:
+            HTTPException: as `registration`.
+        """
+        return open_for_review(self.store, self.registration(name).spec.match_id)
 
     def stored_match(self, name: str) -> Match:
         """Return a match to show its results, also while its folder is away.
 
         Raises:
-            HTTPException: as `match`.
+            HTTPException: as `registration`.
         """
-        if not is_name(name) or self.store.registration(name) is None:
-            raise HTTPException(404, "no such match")
-        return open_stored(self.store, name)
+        return open_stored(self.store, self.registration(name).spec.match_id)
 
     def review(self, name: str, request: str) -> tuple[Match, ReviewRequest]:
         """Return a match and one of its review requests.

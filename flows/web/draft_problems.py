@@ -6,14 +6,16 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
-import yaml
-from pydantic import JsonValue
+import numpy as np
+from pydantic import Field, JsonValue
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec, Side
+from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
 from flows.web.browser_words import in_browser
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
@@ -30,11 +32,10 @@ from worldpose.ingest.camera_videos import fit_to_video
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.footage import read_still, require_footage
 from worldpose.ingest.importing import describe_left_out, describe_people, import_lenses
-from worldpose.ingest.match_folder import MatchFolder, image_sizes, read_match, read_spec
-from worldpose.ingest.registration import register_match
+from worldpose.ingest.match_folder import MatchFolder, image_sizes, read_spec
 from worldpose.ingest.validation import list_problems
-from worldpose.store.store import Store
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
+from worldpose.video.folder import declared_size
 from worldpose.video.names import is_video
 from worldpose.video.pictures import FrameIndex
 
@@ -49,10 +50,76 @@ GIVEN_ENDINGS: Final = tuple(
 )
 """Endings of calibrations, clicks, 2D poses and lenses of other tools."""
 
+MATCH_FILES: Final = frozenset({"calibration.toml", "lenses.toml", "pitch.json"})
+"""Files that a person can add to videos and stills."""
+
+
+class DraftFile(Record):
+    """A file of a draft: on its way, or whole."""
+
+    id: Name = "new"
+    name: str = ""
+    """Path in the match folder, or in the draft for a file of another tool."""
+    title: str
+    """Its name where it comes from."""
+    size: Count
+    """[byte]"""
+    modified_ms: int = Field(default=0, ge=0, le=1 << 53)
+    """Time of its last change at its origin [ms]: tells whether a chosen file is the same."""
+    folder: int | None = None
+    """Index of the named folder that it is copied from; None if a browser sends it."""
+    source: str = ""
+    """Its path in that folder."""
+    is_kept: bool = False
+    """Whether it is of the match folder that the draft began with."""
+
+
+class Draft(Record):
+    """draft.json: a match that a person is creating."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    id: Name
+    who: str
+    created_at: datetime
+    revision: Count = 0
+    """Number of saved forms: tells whether another person saved in between."""
+    content: dict[str, JsonValue]
+    """match.yaml as filled in so far, valid or not."""
+    files: tuple[DraftFile, ...] = ()
+    match_id: Name | None = None
+    """The registered match of which this is the next version."""
+    replaces: str | None = None
+    """Folder of the version before."""
+    corrects: str | None = None
+    """Folder of the refused arrival that it began with."""
+    finished_as: str | None = None
+    """Path in the inbox, written before the match folder moves there."""
+
 
 def is_footage(name: str) -> bool:
     """Return whether a file is a video or a still, which belongs to a camera."""
     return is_video(name) or PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+
+
+def choose_name(title: str, taken: set[str]) -> str:
+    """Return a path in the match folder that is not taken, with safe characters only."""
+    if title in MATCH_FILES:
+        if title in taken:
+            raise InputError(title, "one such file", "a second one", "Remove the first one.")
+        return title
+    stem, suffix = PurePosixPath(title).stem, PurePosixPath(title).suffix.lower()
+    usual = "video" if is_video(title) else "still" if is_footage(title) else "file"
+    folder = f"{usual}s" if is_footage(title) else GIVEN.strip("/")
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or usual
+    names = (f"{folder}/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
+    return next(name for name in names if name not in taken)
+
+
+def still_size(path: Path) -> tuple[int, int]:
+    """Return width and height [px] of a still."""
+    size = declared_size(np.fromfile(path, dtype=np.uint8)) or (0, 0)
+    read_still(path, size)
+    return size
 
 
 def form_problems(
@@ -77,9 +144,10 @@ def form_problems(
             "uploading": f"{title}: {share}",
             "copying": f"{title}: {share}",
             "reading": f"{title} is being read",
-            "broken": f"{title}: {file['problem']}",
+            "broken": None if file["is_kept"] else f"{title}: {file['problem']}",
         }.get(state)
-        if said is None and is_footage(title) and file["name"] not in used:
+        is_spare = is_footage(title) and not file["is_kept"] and file["name"] not in used
+        if said is None and is_spare:
             said = f"{title} belongs to no camera: choose it at its camera, or remove it"
         if said is not None:
             found.append({"place": f"file {file['id']}", "message": said})
@@ -91,8 +159,9 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
     views = match.spec.broadcast_views
     numbers = {camera.id: number for number, camera in enumerate(match.spec.cameras)}
     for unit, path in match.videos.items():
-        index = indexes[path.relative_to(match.folder).as_posix()]
-        assert isinstance(index, FrameIndex)  # all files are whole and read
+        index = indexes.get(path.relative_to(match.folder).as_posix())
+        if not isinstance(index, FrameIndex):  # of a version before: the intake reads it
+            continue
         try:
             whole = unit in match.calibrated_views
             require_footage(match.spec, unit, path, index, whole=whole)
@@ -101,69 +170,13 @@ def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) ->
             yield {**describe(error, match.folder), "place": f"cameras[{number}].video"}
     for camera, path in match.stills.items():
         size = (match.spec.camera(camera).width, match.spec.camera(camera).height)
-        if indexes[path.relative_to(match.folder).as_posix()] == size:
+        if indexes.get(path.relative_to(match.folder).as_posix()) == size:
             continue
         try:
             read_still(path, size)
         except InputError as error:
             place = f"cameras[{numbers[camera]}].still"
             yield {**describe(error, match.folder), "place": place}
-
-
-def build(
-    store: Store,
-    content: Mapping[str, JsonValue],
-    draft: Path,
-    indexes: Mapping[str, Index | None],
-) -> tuple[list[Problem], list[str]]:
-    """Make the match folder again around its footage, with what all other files of a draft say.
-
-    Args:
-        store: its matches are not to be made again.
-        content: match.yaml.
-        draft: folder of the draft: `match` is the match folder with its footage, `own` has files
-            of a match folder, and `given` those of other tools.
-        indexes: frames of the videos and sizes of the stills, by path in the match folder.
-
-    Returns:
-        The errors that ingest finds, and sentences about what was taken from other tools' files.
-    """
-    folder, given, notes = draft / "match", draft / GIVEN, list[str]()
-    for each in folder.iterdir():
-        if each.is_file():
-            each.unlink()
-        elif each.name not in ("videos", "stills"):
-            shutil.rmtree(each)
-    for each in (draft / "own").glob("*"):
-        shutil.copyfile(each, folder / each.name)
-    text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
-    (folder / "match.yaml").write_text(text, encoding="utf-8")
-    try:
-        taken = take_given(given, folder, indexes) if given.is_dir() else []
-        # No paths of this machine, no options of commands.
-        notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
-        match = read_match(folder)
-    except InputError as error:
-        return [describe(error, folder, given)], notes
-    problems = list(footage_problems(match, indexes))
-    if not problems and (same := registered_as(store, match)):
-        said = (
-            f"These videos are the match {same}: open it in the list of matches, and discard this."
-        )
-        problems.append({"place": "", "message": said})
-    return problems, notes
-
-
-def registered_as(store: Store, match: MatchFolder) -> str | None:
-    """Return the registered match that has the content of a match folder; None if it is new."""
-    files = {*match.videos.values(), *match.detections.values()}
-    sizes = {str(file.relative_to(match.folder)): file.stat().st_size for file in files}
-    for name in store.matches():
-        if (known := store.registration(name)) is not None:
-            is_like = sizes.items() <= {file.path: file.size for file in known.files}.items()
-            if is_like and register_match(match, None).identity == known.identity:
-                return name
-    return None
 
 
 def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -> list[str]:
@@ -221,9 +234,16 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
                     found="a second one",
                     todo="Remove one of the two, or rename it after its own camera.",
                 )
+            (folder / "detections").mkdir(exist_ok=True)
+            if there := [*(folder / "detections").glob(f"{owner}.*")]:
+                raise InputError(
+                    str(file),
+                    expected=f"no 2D poses of {owner} yet",
+                    found=f"detections/{there[0].name}",
+                    todo="Remove one of the two.",
+                )
             read = read_people(file)
             people[owner] = read.people
-            (folder / "detections").mkdir(exist_ok=True)
             shutil.copyfile(file, folder / "detections" / f"{owner}{file.suffix.lower()}")
             notes += [f"{file.name}: 2D poses of {owner}", *describe_people({owner: read})]
     for owner, files in lenses.items():

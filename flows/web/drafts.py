@@ -19,43 +19,43 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from threading import Lock
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, JsonValue
+from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
-from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
-from flows.service.inbox import note_whole
+from flows.service.inbox import next_version, put_in
 from flows.service.layout import served_state
+from flows.web.draft_folder import build, take_over
 from flows.web.draft_problems import (
     GIVEN,
     GIVEN_ENDINGS,
+    MATCH_FILES,
+    Draft,
+    DraftFile,
     Index,
     Problem,
-    build,
+    choose_name,
     describe_broken,
     form_problems,
     is_footage,
+    still_size,
 )
 from flows.web.video_folders import open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import whole_file
-from worldpose.ingest.footage import read_still
 from worldpose.ingest.validation import validate_record
 from worldpose.store.store import Store
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
-from worldpose.video.folder import declared_size
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 
 DRAFTS: Final = ".drafts"
 """Folder of all drafts in the inbox."""
-MATCH_FILES: Final = frozenset({"calibration.toml", "lenses.toml", "pitch.json"})
-"""Files that a person can add to videos and stills."""
 MAX_FILES: Final = 200
 """Files of one draft."""
 MAX_DRAFTS: Final = 200
@@ -65,40 +65,6 @@ PIECE_BYTES: Final = 1 << 24
 """Bytes that are copied from a named folder in one step."""
 
 LOG: Final = logging.getLogger("worldpose.pages")
-
-
-class DraftFile(Record):
-    """A file of a draft: on its way, or whole."""
-
-    id: Name = "new"
-    name: str = ""
-    """Path in the match folder, or in the draft for a file of another tool."""
-    title: str
-    """Its name where it comes from."""
-    size: Count
-    """[byte]"""
-    modified_ms: int = Field(default=0, ge=0, le=1 << 53)
-    """Time of its last change at its origin [ms]: tells whether a chosen file is the same."""
-    folder: int | None = None
-    """Index of the named folder that it is copied from; None if a browser sends it."""
-    source: str = ""
-    """Its path in that folder."""
-
-
-class Draft(Record):
-    """draft.json: a match that a person is creating."""
-
-    contract: Literal[1] = CONTRACT_VERSION
-    id: Name
-    who: str
-    created_at: datetime
-    revision: Count = 0
-    """Number of saved forms: tells whether another person saved in between."""
-    content: dict[str, JsonValue]
-    """match.yaml as filled in so far, valid or not."""
-    files: tuple[DraftFile, ...] = ()
-    finished_as: str | None = None
-    """Path in the inbox, written before the match folder moves there."""
 
 
 @dataclass
@@ -131,20 +97,50 @@ class Drafts:
                 found.append(draft)
         return sorted(found, key=lambda draft: draft.created_at, reverse=True)
 
-    def create(self, who: str) -> Draft:
-        """Create an empty draft.
+    def create(self, who: str, match_id: str | None = None, corrects: Path | None = None) -> Draft:
+        """Create a draft: empty, or with the content of a match folder, which stays as it is.
+
+        Args:
+            who: the person who creates it.
+            match_id: the registered match of which the draft is the next version.
+            corrects: the folder of a refused arrival that it begins with.
 
         Raises:
-            InputError: there are too many drafts.
+            InputError: there are too many drafts, or no disk space for a copy.
         """
+        known = None if match_id is None else self.store.registration(match_id)
+        origin = corrects or (None if known is None else Path(known.folder))
         if len(self.all()) >= MAX_DRAFTS:
-            raise _refusal("drafts", f"at most {MAX_DRAFTS}", "more", "Finish or discard some.")
+            raise InputError("drafts", f"at most {MAX_DRAFTS}", "more", "Finish or discard some.")
         content: dict[str, JsonValue] = {"contract": 1, "cameras": [], "clips": []}
         draft = Draft(
-            id=secrets.token_hex(8), who=who, created_at=datetime.now(UTC), content=content
+            id=secrets.token_hex(8),
+            who=who,
+            created_at=datetime.now(UTC),
+            content=content,
+            match_id=match_id,
+            replaces=None if known is None else known.folder,
+            corrects=None if corrects is None else str(corrects),
         )
+        folder = self._folder(draft.id)
         for inner in ("match/videos", "parts"):
-            (self._folder(draft.id) / inner).mkdir(parents=True)
+            (folder / inner).mkdir(parents=True)
+        if origin is not None:
+            try:
+                if origin.stat().st_dev != folder.stat().st_dev:  # its files cannot be linked
+                    paths = (each for each in origin.rglob("*") if each.is_file())
+                    self._require_space(origin.name, sum(each.stat().st_size for each in paths))
+                if known is not None:
+                    content = known.spec.model_dump(mode="json", exclude_defaults=True)
+                content, kept = take_over(origin, folder, content)
+            except BaseException:
+                shutil.rmtree(folder)
+                raise
+            files = tuple(
+                DraftFile(id=secrets.token_hex(6), name=name, title=name, size=size, is_kept=True)
+                for name, size in kept.items()
+            )
+            draft = draft.model_copy(update={"content": content, "files": files})
         self._write(draft)
         return draft
 
@@ -157,7 +153,7 @@ class Drafts:
         try:
             content = (self._folder(draft_id) / "draft.json").read_bytes()
         except FileNotFoundError:
-            raise _refusal(
+            raise InputError(
                 "draft", "a match being created", "none: finished or discarded", "See the queue."
             ) from None
         return Draft.model_validate_json(content)
@@ -194,17 +190,17 @@ class Drafts:
         if title not in MATCH_FILES and not is_footage(title) and not is_given:
             known = f"a video ({' '.join(VIDEO_SUFFIXES)}), a still ({' '.join(IMAGE_SUFFIXES)})"
             sought = f"{known}, or calibration, clicks or 2D poses ({' '.join(GIVEN_ENDINGS)})"
-            raise _refusal(title, sought, "another file", "Convert it with the tool it is from.")
+            raise InputError(title, sought, "another file", "Convert it with the tool it is from.")
         with self._hold(draft_id):
             draft = self.read(draft_id)
             for each in draft.files:
                 if each == file.model_copy(update={"id": each.id, "name": each.name}):
                     return each
-            if len(draft.files) >= MAX_FILES or file.size == 0:
-                raise _refusal(
+            if sum(not it.is_kept for it in draft.files) >= MAX_FILES or file.size == 0:
+                raise InputError(
                     title, f"a file with content, one of at most {MAX_FILES}", "another", "Omit it."
                 )
-            name = _choose_name(title, {each.name for each in draft.files})
+            name = choose_name(title, {each.name for each in draft.files})
             chosen = file.model_copy(update={"id": secrets.token_hex(6), "name": name})
             with self._budget:
                 listed = [(it.id, other) for it in self.all() for other in it.files]
@@ -218,7 +214,7 @@ class Drafts:
         needed, free = size + SPARE_BYTES, shutil.disk_usage(self.inbox).free
         if needed > free:
             wanted, there = f"{needed / 1e9:.1f} GB of free disk space", f"{free / 1e9:.1f} GB"
-            raise _refusal(
+            raise InputError(
                 title, wanted, f"{there} at the inbox", "Free some, or ask the operator."
             )
 
@@ -229,7 +225,7 @@ class Drafts:
             files = tuple(each for each in draft.files if each.id != file_id)
             self._write(draft.model_copy(update={"files": files}))
             for path in (self._part(draft_id, file), self._whole(draft_id, file)):
-                path.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)  # of a kept one, this is a link or a copy
 
     def append(self, draft_id: str, file_id: str, offset: int, chunk: bytes) -> tuple[bool, int]:
         """Append a chunk that a browser sent; return whether it fitted, and the bytes now there.
@@ -245,7 +241,7 @@ class Drafts:
             if file.folder is not None or offset != received:
                 return False, received
             if received + len(chunk) > file.size:
-                raise _refusal(
+                raise InputError(
                     file.title, f"{file.size} bytes", "more", "Remove it, and choose it again."
                 )
             self._write_piece(draft_id, file, chunk)
@@ -260,12 +256,12 @@ class Drafts:
         _, file = self._find(draft_id, file_id)
         index = self._index(draft_id, file) if self._whole(draft_id, file).exists() else None
         if not isinstance(index, FrameIndex) or not 0 <= number < len(index):
-            raise _refusal(file.title, f"a video with frame {number}", "none", "Choose another.")
+            raise InputError(file.title, f"a video with frame {number}", "none", "Choose another.")
         with VideoReader(self._whole(draft_id, file), index) as video:
             for _, image in video.readable(number, number + 1, width=min(width, index.size[0])):
                 if image is not None:
                     return image
-        raise _refusal(file.title, f"frame {number}", "a damaged one", "Choose another frame.")
+        raise InputError(file.title, f"frame {number}", "a damaged one", "Choose another frame.")
 
     def view(self, draft_id: str) -> dict[str, Any]:
         """Return a draft for the pages, with all that is wrong or missing."""
@@ -278,6 +274,7 @@ class Drafts:
         problems, notes = (wrong, []) if wrong else self._folder_problems(draft)
         return {
             **draft.model_dump(include={"id", "who", "created_at", "revision", "content"}),
+            "adds_to": draft.match_id,
             "files": files,
             "problems": problems,
             "notes": notes,
@@ -293,21 +290,22 @@ class Drafts:
         with self._hold(draft_id):
             draft = self.read(draft_id)
             if problems := self._view(draft)["problems"]:
-                raise _refusal(
+                raise InputError(
                     "match", "nothing missing", problems[0]["message"], "Complete it, then finish."
                 )
-            match_id = str(draft.content["match_id"])
+            match_id, state = str(draft.content["match_id"]), served_state(self.store.url)
             name = match_id if priority == "normal" else f"{priority}/{match_id}"
-            folder, target = self._folder(draft_id), self.inbox / name
-            target.parent.mkdir(parents=True, exist_ok=True)
+            if draft.match_id is not None:
+                name = next_version(self.inbox, name)
+            folder = self._folder(draft_id)
             self._write(draft.model_copy(update={"finished_as": name}))
+            origin = draft.replaces, draft.corrects
             try:
-                (folder / "match").rename(target)
-            except OSError:
+                put_in(state, self.inbox, folder / "match", name, priority, *origin)
+            except (OSError, InputError):
                 self._write(draft)
                 raise
             shutil.rmtree(folder, ignore_errors=True)
-            note_whole(served_state(self.store.url), target, name, priority)
             return name
 
     def continue_copies(self) -> None:
@@ -322,7 +320,7 @@ class Drafts:
 
     def _folder(self, draft_id: str) -> Path:
         if not re.fullmatch(r"[0-9a-f]{16}", draft_id):
-            raise _refusal("draft", "the id of a draft", "another text", "See the queue.")
+            raise InputError("draft", "the id of a draft", "another text", "See the queue.")
         return self._root / draft_id
 
     def _part(self, draft_id: str, file: DraftFile) -> Path:
@@ -330,6 +328,7 @@ class Drafts:
 
     def _whole(self, draft_id: str, file: DraftFile) -> Path:
         top = "match" if is_footage(file.name) else "" if file.name.startswith(GIVEN) else "own"
+        top = "own" if file.is_kept else top
         return self._folder(draft_id) / top / file.name
 
     def _write(self, draft: Draft) -> None:
@@ -350,7 +349,7 @@ class Drafts:
         for file in draft.files:
             if file.id == file_id:
                 return draft, file
-        raise _refusal("file", "a file of this match", "one that was removed", "Choose it again.")
+        raise InputError("file", "a file of this match", "one that was removed", "Choose it again.")
 
     def _count_received(self, draft_id: str, file: DraftFile) -> int:
         if self._whole(draft_id, file).exists():
@@ -411,7 +410,7 @@ class Drafts:
                 return job(draft_id, file)
             except Exception as error:  # a bug: the page shows it, and polling does not repeat it
                 LOG.exception("%s of a match being created", file.title)
-                return _refusal(
+                return InputError(
                     file.title,
                     "a file that can be taken in",
                     type(error).__name__,
@@ -433,7 +432,7 @@ class Drafts:
     def _read_index(self, draft_id: str, file: DraftFile) -> Index:
         path = self._whole(draft_id, file)
         try:
-            return index_frames(path) if is_video(file.name) else _still_size(path)
+            return index_frames(path) if is_video(file.name) else still_size(path)
         except InputError as error:
             return error
 
@@ -461,40 +460,24 @@ class Drafts:
     def _folder_problems(self, draft: Draft) -> tuple[list[Problem], list[str]]:
         """Build the match folder; return the errors that ingest finds, and sentences about it."""
         spec = validate_record(MatchSpec, draft.content, "match.yaml")
-        is_taken = spec.match_id in self.store.matches()
         places = (self.inbox / at / spec.match_id for at in (".", "urgent", "background"))
-        if is_taken or any(place.exists() for place in places):
+        is_taken = any(it.exists() and str(it.resolve()) != draft.corrects for it in places)
+        is_taken = is_taken or spec.match_id in self.store.matches()
+        if draft.match_id is None and is_taken:
             message = "expected an id of its own, found that of another match. Choose another one."
             return [{"place": "match_id", "message": message}], []
+        if draft.match_id not in (None, spec.match_id):
+            message = f"expected {draft.match_id}, found another one. Write the id of the match."
+            return [{"place": "match_id", "message": message}], []
+        known = None if draft.match_id is None else self.store.registration(draft.match_id)
+        if known is not None and known.folder != draft.replaces:
+            message = "another person added files meanwhile: discard this, and begin again"
+            return [{"place": "", "message": message}], []
         key = (draft.revision, draft.files)
         if self._checked.get(draft.id, (None,))[0] != key:
             folder = self._folder(draft.id)
             footage = (it for it in draft.files if is_footage(it.name))
             indexes = {it.name: self._index(draft.id, it) for it in footage}
-            self._checked[draft.id] = (key, *build(self.store, draft.content, folder, indexes))
+            found = build(self.store, draft.content, folder, indexes, draft.match_id)
+            self._checked[draft.id] = (key, *found)
         return self._checked[draft.id][1:]
-
-
-def _choose_name(title: str, taken: set[str]) -> str:
-    """Return a path in the match folder that is not taken, with safe characters only."""
-    if title in MATCH_FILES:
-        if title in taken:
-            raise _refusal(title, "one such file", "a second one", "Remove the first one.")
-        return title
-    stem, suffix = PurePosixPath(title).stem, PurePosixPath(title).suffix.lower()
-    usual = "video" if is_video(title) else "still" if is_footage(title) else "file"
-    folder = f"{usual}s" if is_footage(title) else GIVEN.strip("/")
-    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or usual
-    names = (f"{folder}/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
-    return next(name for name in names if name not in taken)
-
-
-def _still_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of a still."""
-    size = declared_size(np.fromfile(path, dtype=np.uint8)) or (0, 0)
-    read_still(path, size)
-    return size
-
-
-def _refusal(where: str, expected: str, found: str, todo: str) -> InputError:
-    return InputError(where, expected=expected, found=found, todo=todo)

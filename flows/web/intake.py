@@ -17,12 +17,21 @@ from starlette.requests import ClientDisconnect
 
 from data_contracts.operations import Priority
 from data_contracts.records import Count, Record
+from flows.service.inbox import (
+    RefusalError,
+    find_refused,
+    fingerprint_of,
+    remove_entry,
+    try_again,
+)
 from flows.service.layout import served_state
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import in_browser
-from flows.web.drafts import DraftFile, Drafts
+from flows.web.draft_problems import DraftFile
+from flows.web.drafts import Drafts
 from flows.web.images import image_response
 from flows.web.video_folders import list_videos, open_video
+from worldpose.errors import InputError
 
 CHUNK_BYTES: Final = 1 << 23
 """Maximum size of one chunk of an upload [byte]."""
@@ -71,6 +80,21 @@ class Pick(Record):
     """Path in the folder."""
 
 
+class NewDraft(Record):
+    """The request to create a match, its next version, or a corrected arrival."""
+
+    match: str | None = None
+    """Id of the registered match whose next version it is."""
+    arrival: str | None = None
+    """Name of the refused arrival that it corrects."""
+
+
+class Named(Record):
+    """An entry of the inbox."""
+
+    name: str = Field(min_length=1, max_length=4096)
+
+
 class Finish(Record):
     """The request to put a match into the inbox."""
 
@@ -97,11 +121,48 @@ def routes(context: PageContext, intake: Intake | None) -> APIRouter:
     if intake is not None:
         drafts = Drafts(intake.inbox, intake.folders, context.store)
         Thread(target=drafts.continue_copies, daemon=True).start()
-        router.include_router(_draft_routes(drafts, intake))
+        router.include_router(_draft_routes(drafts, intake, context))
+        _add_ways_back(router, intake, context)
     return router
 
 
-def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
+def _add_ways_back(router: APIRouter, intake: Intake, context: PageContext) -> None:
+    """Add the routes of refused arrivals; a third one is a draft that corrects them."""
+    state = served_state(context.store.url)
+
+    @router.post("/api/inbox/again")
+    def again(given: Named) -> dict[str, Any]:
+        try_again(state, intake.inbox, given.name)
+        return {"again": given.name}
+
+    @router.post("/api/inbox/removal")
+    def remove(given: Named) -> dict[str, Any]:
+        return {"moved_to": str(remove_entry(state, intake.inbox, given.name))}
+
+
+def _begin(drafts: Drafts, intake: Intake, context: PageContext, who: str, given: NewDraft) -> str:
+    """Create a draft; return its id.
+
+    Raises:
+        HTTPException: 404, there is no such match.
+        InputError: the arrival cannot be corrected on a page.
+    """
+    if given.match is not None:
+        return drafts.create(who, context.registration(given.match).spec.match_id).id
+    if given.arrival is None:
+        return drafts.create(who).id
+    entry, arrival = find_refused(served_state(context.store.url), intake.inbox, given.arrival)
+    try:
+        fingerprint_of(entry.path)  # a link could lead to any file of this machine
+    except RefusalError as refusal:
+        todo = "Correct it where it came from, or remove it here."
+        raise InputError(given.arrival, "a folder with files", str(refusal), todo) from None
+    known = (context.store.registration(name) for name in context.store.matches())
+    ids = (it.spec.match_id for it in known if it is not None and it.folder == arrival.replaces)
+    return drafts.create(who, next(ids, None), entry.path.resolve()).id
+
+
+def _draft_routes(drafts: Drafts, intake: Intake, context: PageContext) -> APIRouter:
     router = APIRouter(prefix="/api/drafts")
 
     @router.get("")
@@ -111,6 +172,7 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
                 {
                     **draft.model_dump(include={"id", "who", "created_at"}),
                     "match_id": draft.content.get("match_id"),
+                    "adds_to": draft.match_id,
                     "files": len(draft.files),
                 }
                 for draft in drafts.all()
@@ -118,8 +180,8 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
         }
 
     @router.post("")
-    def create(who: Person) -> dict[str, Any]:
-        return {"id": drafts.create(who).id}
+    def create(who: Person, given: NewDraft) -> dict[str, Any]:
+        return {"id": _begin(drafts, intake, context, who, given)}
 
     @router.get("/videos")
     def videos(folder: int, path: Annotated[str, Query(max_length=4096)] = "") -> dict[str, Any]:

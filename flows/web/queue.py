@@ -19,6 +19,7 @@ from flows.overview import PAGE
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
+from flows.service.layout import served_state
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import in_browser
@@ -80,6 +81,11 @@ def routes(context: PageContext) -> APIRouter:
                 {"name": stage.name, "about": stage.about}
                 for stage in METHOD
                 if stage.units(opened)
+            ],
+            "next_versions": [
+                {"name": each.name, "state": each.state, "reason": in_browser(each.reason)}
+                for each in served_state(context.store.url).arrivals().values()
+                if each.replaces == opened.registration.folder and each.state != "taken"
             ],
             "left_out": {} if latest is None else latest.left_out,
             "warnings": [] if latest is None else [in_browser(each) for each in latest.warnings],

@@ -28,13 +28,22 @@ def figures(late, error=0.06):
 
 
 @pytest.mark.parametrize(
-    ("cameras", "late", "told"), [(3, 3.0, "3.0 frames later"), (6, -2.2, "2.2 frames earlier")]
+    ("cameras", "late", "told"),
+    [(3, 3.0, "3.0 match frames later"), (6, -2.2, "2.2 match frames earlier")],
 )
 def test_the_one_camera_out_of_step_is_told_its_offset(cameras, late, told):
     found = clock_advice(figures([late] + [0.0] * (cameras - 1)), match(cameras, offset=3))
     (text,) = found
     assert text.startswith(f"camera cam0 shows {told} than the others")
     assert f"set its offset_frames to {3 - round(late)} in match.yaml" in text
+
+
+def test_a_camera_with_a_frame_rate_of_its_own_is_told_its_own_frames():
+    spec = match(4, offset=7)
+    slow = spec.cameras[0].model_copy(update={"fps": spec.fps / 2})
+    spec = spec.model_copy(update={"cameras": (slow, *spec.cameras[1:])})
+    (text,) = clock_advice(figures([2.0, 0.0, 0.0, 0.0]), spec)
+    assert text.endswith("set its offset_frames to 6 in match.yaml")
 
 
 @pytest.mark.parametrize(("late", "error"), [(0.4, 0.01), (3.0, 1.0)])

@@ -172,4 +172,4 @@ def test_a_run_without_people_is_partial_and_says_why(match, tmp_path):
     answer = worldpose("run", match, "--project", tmp_path / "new", *asked)
     assert answer.code == 4
     assert "tracking/clip found no person" in answer.err
-    assert "tracking.min_angle_rad asks for 90 (1.57 rad)" in answer.err
+    assert "90 are needed (setting tracking.min_angle_rad, 1.57 rad)" in answer.err

@@ -28,7 +28,7 @@ def test_a_camera_with_clicks_of_the_other_end_is_named_and_left_out(tiny, tmp_p
     answer = worldpose("run", match, "--project", project, "--until", "tracking")
     assert answer.code == 0, answer.err
     warning = " ".join(answer.err.split())
-    assert "camera cam02 is left out: its calibration is rotated by 180 degrees" in warning
+    assert "camera cam02 is left out: its calibration is turned by half a turn" in warning
     run = open_run(project, TINY)
     assert list(run.record.left_out) == ["cam02"]
     (fault,) = run["camera_consistency/clip"].attrs["faults"]

@@ -98,7 +98,7 @@ def test_a_zoom_is_told_and_hides_no_knock_of_another_camera(imported, joints):
 def test_lost_frames_are_named_and_synchronized(imported, joints):
     match = imported(lambda pixels: np.concatenate([pixels[:60], pixels[64:]]))
     said, error = run(match, joints)
-    assert "camera cam2: its offset changes by -4.0 frames at frame 60" in said
+    assert "camera cam2: its images are 4.0 match frames later from frame 60 on" in said
     project = ("--project", match.parent / "project")
     applied = succeed("synchronize", match, "--apply", "--json", *project).json["applied"]
     assert list(applied) == [BAD]

@@ -31,7 +31,7 @@ def check_pages(folder, match):
         assert ada.get(f"{path}/results/exports/{form}").status_code == 200, form
     assert ada.get(f"{path}/results/report").status_code == 200
     (clip,) = found["clips"]
-    assert "one camera alone has detections" in clip["without_joints"]
+    assert "one camera alone shows people" in clip["without_joints"]
     assert "people are placed on the pitch from their feet" in clip["without_joints"]
     # A person without joints is seen, too: the image is where the detection is.
     person, *_ = ada.get(f"{path}/identities/clip").json()["people"]
@@ -52,7 +52,7 @@ def check_pages(folder, match):
 def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch):
     store = Store.open(str(project_copy))
     (match,) = store.matches()
-    why = "one camera alone has detections"
+    why = "one camera alone shows people"
     changed = {"run_id": store.reserve_run(match), "state": "partial", "warnings": (why,)}
     record = store.run(match).model_copy(update=changed)
     store.finish_run(record)
@@ -76,7 +76,7 @@ def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, 
     project = ("--project", tmp_path / "worldpose-data")
     answer = worldpose("run", tmp_path / "one", *project)
     assert answer.code == 4, answer.err
-    assert "one camera alone has detections" in answer.err
+    assert "one camera alone shows people" in answer.err
     assert "people are placed on the pitch from their feet" in answer.err
     assert "placed no joint" not in answer.err
     match = library.read_match(tmp_path / "one").spec.match_id

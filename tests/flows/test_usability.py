@@ -45,8 +45,12 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
             {"absent_share": 0.2, **ABSENT},
             "people are missing in clip for 20 % (limit 5 %) of the time, longest person 7 in ",
         ),
-        ("tracking/clip", {"unmatched_share": 0.3}, "30 % (limit 15 %) of the detections in clip"),
-        ("tracking/clip", {"mean_ray_distance_m": 0.2}, "cameras disagree about the people in "),
+        (
+            "tracking/clip",
+            {"unmatched_share": 0.3},
+            "no track follows 30 % (limit 15 %) of the people",
+        ),
+        ("tracking/clip", {"mean_ray_distance_m": 0.2}, "cameras disagree by 20 cm (limit 15 cm) "),
         ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
         (
             "retriangulation/clip",
@@ -204,4 +208,4 @@ def test_people_whom_the_nets_do_not_know_are_a_reservation_and_a_clip_not_filme
 def test_results_are_not_usable_where_most_detections_belong_to_nobody():
     found = judge("tracking/clip", figures={"unmatched_share": 0.63})
     assert found.verdict == "not usable"
-    assert found.reservations[0].startswith("more than 50 % of the detections in clip belong to no")
+    assert found.reservations[0].startswith("no track follows more than 50 % of the people")

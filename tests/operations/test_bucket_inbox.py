@@ -2,6 +2,8 @@
 
 import uuid
 from datetime import UTC, datetime
+from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -71,7 +73,9 @@ def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp
     assert files_of(tmp_path / "inbox") == {"m/match.yaml", "m/old.npz"}
 
 
-def test_a_copy_that_was_changed_here_stays_until_it_is_moved_away(arriving, tmp_path, caplog):
+def test_a_copy_that_was_changed_here_stays_until_it_is_moved_away(
+    arriving, tmp_path, caplog, monkeypatch
+):
     _, put = arriving
     inbox, copy = watched(arriving, tmp_path), tmp_path / "inbox" / "m"
     put("m/match.yaml", b"contract: 1")
@@ -84,7 +88,15 @@ def test_a_copy_that_was_changed_here_stays_until_it_is_moved_away(arriving, tmp
     assert files_of(copy) == {"match.yaml", "clicks.json"}
     assert caplog.text.count("was changed here") == 1
     copy.rename(tmp_path / "away")
-    assert inbox.fetch(40.0, QUIET) == ["m"]
+    put("m/notes.txt", b"later")
+    inbox.fetch(35.0, QUIET)
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):  # killed at the end
+        patched.setattr(Path, "rename", Mock(side_effect=KeyboardInterrupt))
+        inbox.fetch(50.0, QUIET)
+    (tmp_path / "inbox" / ".m.arriving").rename(copy)
+    inbox = watched(arriving, tmp_path)
+    inbox.fetch(60.0, QUIET)
+    assert inbox.fetch(70.0, QUIET) == ["m"]
     assert files_of(copy) == {"match.yaml", "notes.txt"}
 
 

@@ -1,9 +1,17 @@
 """A clip's detections as input of an iteration, corrected by the previous iteration's results."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
 import xarray as xr
+from camera_builders import look_at_camera
 
+from data_contracts.triangulation import CameraChange
+from tasks import clip_inputs, filtering
 from tasks.clip_inputs import PAGE, StoredFeedback, open_detections
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import camera_frames
 
 DIMS = {
     "keypoints": ("detection", "joint", "axis"),
@@ -78,3 +86,43 @@ def test_who_was_looked_for_again_is_taken_as_he_was_found_this_time():
     detected = read(StoredFeedback([one], redetected=False))
     np.testing.assert_array_equal(detected[:, 0, 0], 100.0)
     assert np.isnan(detected[:, 0, 1]).all()
+
+
+class Results(dict):
+    """Results by name, of one camera."""
+
+    sources = {"cameras": ["cam"], "camera": "cam"}
+
+    def open(self, name):
+        return self[name]
+
+
+def test_clips_that_overlap_are_each_corrected_by_their_own_changes(monkeypatch):
+    camera = Camera.stack([look_at_camera((0.0, -20.0, 5.0), (0.0, 0.0, 0.0), 1500.0)])
+    monkeypatch.setattr(clip_inputs, "_load_cameras", lambda *_: (camera, None, None))
+    frames = {"a": np.arange(0, 6), "b": np.arange(3, 9)}
+    stored = Results()
+    for clip, frame in frames.items():
+        given = {"first_frame": frame[0], "frame_count": 6, "shift_px": (40.0, 0.0), "std": 0.1}
+        change = CameraChange(camera="cam", kind="view", frame=4, **given)
+        stored[f"tracking/{clip}"] = SimpleNamespace(attrs={"changes": [change.model_dump()]})
+    correct = clip_inputs._view_corrector(stored, frames)
+    middle = np.asarray(camera.principal_point[0], np.float32)
+    seen = np.tile(middle, (12, 1, 1, 1, 1))
+    moved = (correct(seen, slice(0, 12)) - seen)[:, 0, 0, 0, 0]
+    knocked = np.concatenate(list(frames.values())) >= 4
+    np.testing.assert_allclose(moved, -40.0 * knocked, atol=0.1)
+
+
+def test_two_frames_that_show_one_image_are_both_searched(monkeypatch):
+    frame = np.arange(10)
+    numbers = camera_frames(frame, 0, 0.5)  # half the match's frame rate
+    footage = xr.Dataset({"picture_of_frame": ("frame", numbers)}, coords={"frame": frame})
+    case = SimpleNamespace(
+        detected=SimpleNamespace(frame=frame), detection=SimpleNamespace(file=lambda name: name)
+    )
+    monkeypatch.setattr(filtering, "footage_index", lambda _: None)
+    monkeypatch.setattr(filtering, "open_video", lambda *_: nullcontext())
+    monkeypatch.setattr(filtering, "some_pictures", lambda _, some: zip(some, some, strict=True))
+    shown = dict(filtering._pictures(Results({"ingest/cam": footage}), case, frame))
+    assert shown == dict(enumerate(numbers.tolist()))

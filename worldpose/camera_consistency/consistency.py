@@ -17,6 +17,7 @@ from worldpose.camera_consistency.hypotheses import OFF_AXIS
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import offset_change
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.tracking.diagnosis import match_pair, usable_rays
 
@@ -147,7 +148,11 @@ def faulty_cameras(found: Consistency) -> set[int]:
 
 
 def describe_faults(
-    found: Consistency, cameras: Sequence[str], offset_frames: Sequence[int | None], fps: float
+    found: Consistency,
+    cameras: Sequence[str],
+    offset_frames: Sequence[int | None],
+    rates: Floats,
+    fps: float,
 ) -> tuple[CameraFault, ...]:
     """Return the faults with the cameras' names and a reason that says what to do.
 
@@ -155,13 +160,14 @@ def describe_faults(
         found: result of the consistency check.
         cameras: ids in the order of the cameras.
         offset_frames: stated offset of each camera's video [frame]; None if it changes.
+        rates: (cameras,) frames of a camera's video per match frame.
         fps: frames per second of the match [1/s].
     """
     return tuple(
         CameraFault(
             camera=cameras[fault.camera],
             kind=fault.kind,
-            reason=_reason(fault, cameras, offset_frames[fault.camera], fps),
+            reason=_reason(fault, cameras, offset_frames[fault.camera], rates[fault.camera], fps),
             value=fault.value,
             other=None if fault.other is None else cameras[fault.other],
             share_now=fault.share_now,
@@ -171,54 +177,60 @@ def describe_faults(
     )
 
 
-def _reason(fault: Fault, cameras: Sequence[str], offset: int | None, fps: float) -> str:
+def _reason(
+    fault: Fault, cameras: Sequence[str], offset: int | None, rate: float, fps: float
+) -> str:
     """Return one sentence: the fault, the correction, and the share of detections in support."""
     other = "" if fault.other is None else cameras[fault.other]
     if fault.kind == "contradiction":
-        cause = _cause(fault, fault.cause or "pose", fault.detail, other, offset, fps)
+        cause = _cause(fault, fault.cause or "pose", fault.detail, other, offset, rate, fps)
         return (
             f"it contradicts camera {other}, and two cameras cannot tell which of them is wrong. "
             f"They agree if this holds for camera {cameras[fault.camera]}: {cause}"
         )
-    said = _cause(fault, fault.kind, fault.detail, other, offset, fps)
+    said = _cause(fault, fault.kind, fault.detail, other, offset, rate, fps)
     if fault.share_corrected:
         said += (
-            f". With that corrected {fault.share_corrected:.0%} of its detections agree with the "
-            f"other cameras, now {fault.share_now:.0%}"
+            f". With that corrected, the other cameras agree about {fault.share_corrected:.0%} of "
+            f"the people in its images, now about {fault.share_now:.0%}"
         )
     return said
 
 
-def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int | None, fps: float) -> str:
+def _cause(
+    fault: Fault, kind: str, detail: str, other: str, offset: int | None, rate: float, fps: float
+) -> str:
     """Return the fault and its correction in words."""
     value = fault.value or 1.0
     if detail == OFF_AXIS:
         return f"{OFF_AXIS}: calibrate it again"
     if kind == "clock":
         late = "later" if value < 0 else "earlier"
+        change = round(float(offset_change(-value, rate)))
         todo = (
-            f"add {round(value)} to its offset_frames"
+            f"add {change} to its clock offset"
             if offset is None
-            else f"set its offset_frames to {offset + round(value)}"
+            else f"set its clock offset to {offset + change}"
         )
-        return f"it shows {abs(value):.0f} frames {late} than the others: {todo} in match.yaml"
+        late = f"it shows {abs(value):.0f} match frames {late} than the others"
+        return f"{late}: {todo} (offset_frames in match.yaml)"
     if kind == "frame_rate":
         return (
-            f"its video has about {value * fps:.3g} frames per second, not {fps:g}: convert it, or "
-            "correct its frame numbers"
+            f"its video has about {value * fps * rate:.3g} frames per second, not "
+            f"{fps * rate:g}: convert it, or correct its frame numbers"
         )
     return {
-        "flipped": "its calibration is rotated by 180 degrees about the centre spot: check whether "
-        "its clicks have the names of the other end, or match.yaml states the wrong side",
+        "flipped": "its calibration is turned by half a turn about the centre spot: its clicks "
+        "have the names of the other end, or its side is stated wrongly",
         "mirrored": f"it is mirrored: {detail}. Correct its clicks, calibration or images",
-        "focal": f"its focal length is {value:.3g} times that which the other cameras show: "
+        "focal": f"its focal length (zoom) is {value:.3g} times that which the people show: "
         "correct its calibration",
-        "lens": f"its distortion is wrong: {detail}. worldpose reads k1 k2 p1 p2 k3, and k1 "
-        "to k4 of a lens that the file calls a fisheye",
+        "lens": f"the distortion of its lens is wrong: {detail}. worldpose reads k1 k2 p1 p2 k3, "
+        "and k1 to k4 of a lens that the file calls a fisheye",
         "swapped": f"its video is that of camera {other}: exchange the two files",
         "duplicate": f"its video is the same as that of camera {other}: give its own",
         "pose": f"its calibration is wrong: {detail}"
         if detail
-        else "it does not detect the people that the other cameras see in its image: check its "
-        "calibration, clock and video",
+        else "it does not show people where the other cameras see them: check its calibration, "
+        "clock and video",
     }[kind]

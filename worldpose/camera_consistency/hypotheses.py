@@ -31,7 +31,7 @@ LENS_ORDERS: Final = (
     (4, 0, 1, 2, 3),
 )
 """Possible positions of k1 k2 p1 p2 k3 among the five stated numbers."""
-OFF_AXIS: Final = "its principal point or orientation is off"
+OFF_AXIS: Final = "its direction or the centre of its image is off"
 """What an order of coefficients with larger shifts stands for: no such lens exists."""
 
 

@@ -231,7 +231,7 @@ def search_missing_people(
     image, and scores are comparable with those of a detector.
 
     Args:
-        pictures: images by index of the frame, rising, at least the frames to search in.
+        pictures: images by index of the frame, at least the frames to search in.
         sought: people and boxes.
         estimator: estimator of poses.
         least_keypoint: a keypoint below this confidence was not found [1].

@@ -59,6 +59,14 @@ def exact_frames(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Flo
     return np.asarray(frame * rate + np.interp(frame, at, there))
 
 
+def offset_change(late: Floats | float, rate: Floats | float) -> Floats:
+    """Return what to add to `offset_frames` if images are `late` [match frame]: [camera frame].
+
+    Camera frame n(f) shows f + late, and so match frame f is n(f - late) = f r + o - late r.
+    """
+    return np.asarray(-late * rate)
+
+
 def simplest_offset(frame: Integers, exact: Floats) -> ClockOffset:
     """Return the `offset_frames` with these values (n,) at rising match frames (n,).
 

@@ -20,6 +20,7 @@ from data_contracts.arrays import ClipArray, Flags, Floats, Integers
 from data_contracts.conventions import OTHER_UNITS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
+from worldpose.ingest.clock import offset_change
 from worldpose.tracking.epipolar import size_ratios
 from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
 from worldpose.tracking.settings import TrackingSettings
@@ -195,6 +196,7 @@ def diagnose_no_people(
     *,
     pitch_size: tuple[float, float] | None = None,
     births: int = 0,
+    rates: Floats | float = 1.0,
 ) -> NoPeople:
     """Return the reason why tracking found no person in the clip.
 
@@ -207,6 +209,7 @@ def diagnose_no_people(
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
         births: tracks that began and were dropped again.
+        rates: (cameras,) frames of a camera's video per match frame.
     """
     ground = pitch_size is not None
     joints = _count_joints(detections)
@@ -214,18 +217,16 @@ def diagnose_no_people(
     present = np.asarray(usable.any(axis=-1))
     counts = usable.sum(axis=(0, 2))
     detected = dict(zip(camera_ids, counts.tolist(), strict=True))
-    empty = _explain_missing_detections(present, detected, joints, settings)
-    if empty is not None:
+    if (empty := _explain_missing_detections(present, detected, joints, settings)) is not None:
         return empty
     frames = _common_window(present)
     rays = usable_rays(cameras, detections[frames], settings.min_joints)
-    extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
-    if extent < 1e-3:  # [m]
+    if (extent := float(np.ptp(cameras.center[counts > 0], axis=0).max())) < 1e-3:  # [m]
         together = " and ".join(name for name, count in detected.items() if count > 0)
         return NoPeople(
             "same_place",
-            f"{together} are at the same place ({extent:.3g} m apart): their rays meet nowhere but "
-            "there. Two cameras must stand apart; is one of them given twice?",
+            f"{together} are at the same place ({extent:.3g} m apart). Two cameras must stand "
+            "apart; is one of them given twice?",
         )
     matches = [
         match_pair(cameras, rays, pair, 0, settings.min_joints)
@@ -238,16 +239,14 @@ def diagnose_no_people(
     if best.agrees and not births and _all_pairs_have_rivals(cameras, rays, ground, settings):
         return NoPeople(
             "ambiguous_pairs",
-            f"detections of {a} and {b} fit each other in several ways, and in no frame one way is "
-            "clearly likelier: two cameras at the height of people see all of them on one line. "
-            "Add a camera, or mount one higher.",
+            f"in no frame it is clear which person of {a} is which of {b}: two cameras at the "
+            "height of people see all of them on one line. Add a camera, or mount one higher.",
         )
     # Cameras at nearly one position share few people if they look in different directions.
     some = [each for each in matches if (each.agrees if best.agrees else each.count)]
     if best.agrees or (some and max(each.angle for each in some) < settings.min_angle_rad):
         return _explain_limit(cameras, camera_ids, some, settings, pitch_size, births)
-    found = _explain_clock_offset(cameras, camera_ids, rays, matches, fps, settings)
-    if found is not None:
+    if found := _explain_clock_offset(cameras, camera_ids, rates, rays, matches, fps, settings):
         return found
     if not _views_overlap(cameras, rays, ground, settings):
         return NoPeople(
@@ -258,8 +257,8 @@ def diagnose_no_people(
     return NoPeople(
         "cameras_contradict",
         f"no two cameras agree on their people: of the best pair, {a} and {b}, {best.count} of "
-        f"{best.possible} detections have a partner on their epipolar lines. Camera poses or "
-        "lenses are wrong, files belong to other cameras, or the cameras show different people: "
+        f"{best.possible} people in the images can be the same person. The calibration or the lens "
+        "of a camera is wrong, files belong to other cameras, or the cameras show other people: "
         "compare each camera's projection of the scene with its image.",
     )
 
@@ -299,19 +298,20 @@ def _explain_missing_detections(
     if not seeing and joints.any():
         return NoPeople(
             "too_few_keypoints",
-            f"the most complete of {np.count_nonzero(joints)} detections has {joints.max()} "
-            f"keypoints; tracking.min_joints asks for {settings.min_joints}.",
+            f"the most complete of {np.count_nonzero(joints)} people in the images shows "
+            f"{joints.max()} joints, and {settings.min_joints} are needed (setting "
+            "tracking.min_joints).",
         )
     if not seeing:
         return NoPeople(
             "no_detections",
-            "no camera has a detection in this clip. Look at the detections, at the clip's frames "
-            "in match.yaml, and at what the pitch filter removed.",
+            "no camera shows a person in this clip. Look at the videos, at the frames of the clip, "
+            "and at who stands too far off the pitch.",
         )
     if len(seeing) == 1:
         counts = ", ".join(f"{name} {count}" for name, count in detected.items())
         return NoPeople(
-            "one_camera", f"one camera alone has detections ({counts}). A person needs two."
+            "one_camera", f"one camera alone shows people ({counts}). A person needs two."
         )
     if (np.count_nonzero(present, axis=1) >= 2).any():
         return None
@@ -322,8 +322,8 @@ def _explain_missing_detections(
     )
     return NoPeople(
         "never_together",
-        "no two cameras have detections in the same frame; frames of the clip with "
-        f"detections: {spans}. Look at offset_frames and at the clip's frames in match.yaml.",
+        "no two cameras show people in the same frame; frames of the clip with people: "
+        f"{spans}. Look at the clock offsets of the cameras and at the frames of the clip.",
     )
 
 
@@ -365,27 +365,27 @@ def _explain_limit(
     vertical = find_vertical(best.matches["joints"])
     known = best.matches["size"][np.isfinite(best.matches["size"])]
     size = float(np.median(known)) if len(known) else math.nan
-    seen = f"{best.count} of {best.possible} detections of {a} and {b} match"
+    seen = f"{best.count} of {best.possible} people in the images of {a} and {b} match"
     if best.agrees:
-        seen = f"{a} and {b} agree on their people ({best.count} of {best.possible} detections)"
+        seen = f"{a} and {b} agree on their people ({best.count} of {best.possible})"
     widest, least = max(each.angle for each in agreeing), settings.min_angle_rad
     (small, large), (low, high) = settings.size_range, settings.body_heights_m
     limits = (
         (
             widest < least,
             "narrow_angle",
-            f"the rays of one person meet at {math.degrees(angle):.2g} degrees and "
-            f"tracking.min_angle_rad asks for {math.degrees(least):.2g} ({least:g} rad): the "
-            f"cameras are {apart:.2f} m apart and people {depth:.0f} m away, so an error of one "
-            f"centimetre across the rays is {0.01 / max(angle, 1e-9):.1f} m along them. Add a "
+            f"both see them from nearly the same side, {math.degrees(angle):.2g} degrees apart, "
+            f"and {math.degrees(least):.2g} are needed (setting tracking.min_angle_rad, {least:g} "
+            f"rad): the cameras are {apart:.2f} m apart and people {depth:.0f} m away, so one "
+            f"centimetre of error sideways is {0.01 / max(angle, 1e-9):.1f} m in depth. Add a "
             "camera that sees them from another side.",
         ),
         (
             math.isfinite(size) and not small <= size <= large,
             "wrong_size",
-            f"these are {size:.3g} times as large as adults (tracking.size_range accepts "
-            f"{small:g} to {large:g}): {_guess_unit(size)}. Camera translations are read as "
-            f"metres; {a} and {b} are {apart:.4g} apart.",
+            f"these are {size:.3g} times as large as adults ({small:g} to {large:g} pass, setting "
+            f"tracking.size_range): {_guess_unit(size)}. Positions of cameras are read as metres; "
+            f"{a} and {b} are {apart:.4g} apart.",
         ),
         (
             vertical is not None and vertical.is_clear and not vertical.is_z,
@@ -404,15 +404,16 @@ def _explain_limit(
         (
             pitch_size is not None and not low <= height <= high,
             "wrong_height",
-            f"the middle of their bodies is at z = {height:.2f} m (tracking.body_heights_m accepts "
-            f"{low:g} to {high:g}). On a pitch people stand at z = 0 and z points up: look at the "
-            "world frame of the cameras, or write pitch: none.",
+            f"the middle of their bodies is at a height of {height:.2f} m ({low:g} to {high:g} m "
+            "pass, setting tracking.body_heights_m). On a pitch people stand at z = 0 and z points "
+            "up: look at the calibration of the cameras, or write pitch: none.",
         ),
         (
             distance > settings.epipolar_gate_m,
             "rays_miss",
-            f"the rays of one joint pass {distance:.2f} m apart and tracking.epipolar_gate_m "
-            f"accepts {settings.epipolar_gate_m:g}: the cameras are not known well enough.",
+            f"the cameras disagree by {distance:.2f} m about where a joint is, and "
+            f"{settings.epipolar_gate_m:g} m pass (setting tracking.epipolar_gate_m): their "
+            "calibration is not exact enough.",
         ),
     )
     for exceeded, cause, reason in limits:
@@ -421,16 +422,16 @@ def _explain_limit(
     if births:
         return NoPeople(
             "too_short",
-            f"{seen}, but none was seen for long enough: {births} tracks were started and dropped; "
-            f"tracking.min_track_s asks for {settings.min_track_s:g} s, and frames with fewer than "
-            f"{settings.birth_views} cameras count at most {settings.pair_evidence:g} where the "
-            f"odds that two detections are one person are below {settings.pair_odds:g}.",
+            f"{seen}, but nobody was seen for long enough: {births} people were followed for "
+            f"moments only, and {settings.min_track_s:g} s are needed (setting "
+            f"tracking.min_track_s). Frames in which fewer than {settings.birth_views} cameras see "
+            "a person count less where it can be another one.",
         )
     return NoPeople(
         "limits_together",
-        f"{seen}, and no limit of tracking alone refuses them (angle {math.degrees(widest):.2g} "
-        f"degrees, {distance:.2f} m between rays, {size:.2g} times an adult's size), but no group "
-        "of detections passes all of them. Loosen tracking.min_angle_rad, epipolar_gate_m or "
+        f"{seen}, and no limit alone refuses them ({math.degrees(widest):.2g} degrees between the "
+        f"views, {distance:.2f} m of disagreement, {size:.2g} times an adult's size), but nobody "
+        "passes all of them. Loosen the settings tracking.min_angle_rad, epipolar_gate_m or "
         "size_range.",
     )
 
@@ -438,12 +439,13 @@ def _explain_limit(
 def _guess_unit(size: float) -> str:
     """Return what translations that make people `size` times as large may be in."""
     off, unit = min((abs(math.log(size * m)), name) for name, m in OTHER_UNITS.items())
-    return f"translations seem to be in {unit}" if off < 0.3 else "is the unit the metre?"
+    return f"positions seem to be in {unit}" if off < 0.3 else "is the unit the metre?"
 
 
 def _explain_clock_offset(
     cameras: Camera,
     names: Sequence[str],
+    rates: Floats | float,
     rays: Floats,
     matched_pairs: list[PairMatches],
     fps: float,
@@ -452,26 +454,26 @@ def _explain_clock_offset(
     """Return the clock offset at which two cameras agree that otherwise do not, or None."""
     reach = min(len(rays) // 2, round(4.0 * fps))
     found: list[tuple[float, int, PairMatches]] = []
-    busiest = sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]
-    for now in busiest:
+    for now in sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]:
         for shift in range(-reach, reach + 1):
             then = match_pair(cameras, rays, now.cameras, shift, settings.min_joints)
             if then.agrees and then.share >= 2.0 * now.share:
                 found.append((then.share, shift, then))
     if not found:
         return None
-    top = max(share for share, _, _ in found)
     # A person who stands still agrees at many offsets: report the middle of the best ones.
-    near = sorted(shift for share, shift, _ in found if share >= 0.95 * top)
+    near = sorted(n for share, n, _ in found if share >= 0.95 * max(each[0] for each in found))
     shift = near[len(near) // 2]
     share, _, then = next(each for each in found if each[1] == shift)
     a, b = (names[n] for n in then.cameras)
     now = next(each for each in matched_pairs if each.cameras == then.cameras)
+    rate = np.broadcast_to(rates, len(names))[[*then.cameras]]
+    to_a, to_b = offset_change(np.array([shift, -shift]), rate)
     return NoPeople(
         "clock",
-        f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
-        f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
-        f"% as match.yaml has them: correct offset_frames of one of them by {abs(shift)}.",
+        f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken {abs(shift)} "
+        f"frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} % as stated: "
+        f"add {to_b:+.0f} to offset_frames of {b}, or {to_a:+.0f} to those of {a}.",
     )
 
 

@@ -265,9 +265,8 @@ def _body_distances(
 def located_frames(person: Person) -> LocatedFrames:
     """Return a track in the frames that determine its position."""
     frames, index, _, joints = person.sightings.stack()
-    order = np.argsort(frames)
-    order = order[np.isfinite(joints[order, :, 0]).any(axis=1)]
-    return LocatedFrames(frames[order], joints[order], index[order])
+    known = np.isfinite(joints[..., 0]).any(axis=1)
+    return LocatedFrames(frames[known], joints[known], index[known])
 
 
 def people_at_births(people: list[Person]) -> dict[int, list[Person]]:
@@ -321,4 +320,5 @@ def join_tracks(
         while chain[-1].number in after:
             chain.append(people[after[chain[-1].number]])
         chains.append(chain)
+    assert sum(map(len, chains)) == len(tracks)  # a track that is joined to itself begins no chain
     return joins, chains

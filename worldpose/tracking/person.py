@@ -47,7 +47,7 @@ Block = tuple[NDArray[np.int16], Singles, Singles]
 
 
 class Sightings(MutableMapping[int, Sighting]):
-    """Sightings by frame, in order of insertion; stored as int16 and float32."""
+    """Sightings by frame; stored as int16 and float32."""
 
     def __init__(self) -> None:
         self._place: dict[int, int] = {}
@@ -85,9 +85,9 @@ class Sightings(MutableMapping[int, Sighting]):
         del self._place[frame]
 
     def stack(self) -> tuple[Integers, NDArray[np.int16], Singles, Singles]:
-        """Return all sightings: frame (n,), and the arrays of a sighting, each (n, ...)."""
-        place = np.fromiter(self._place.values(), dtype=np.int64, count=len(self._place))
-        frame = np.fromiter(self._place, dtype=np.int64, count=len(self._place))
+        """Return all sightings: frame (n,), rising, and the arrays of a sighting, each (n, ...)."""
+        frame = np.array(sorted(self._place), dtype=np.int64)
+        place = np.array([self._place[each] for each in frame.tolist()], dtype=np.int64)
         index, ray_distance, joints = (
             np.concatenate(parts)[place] for parts in zip(*self._blocks, strict=True)
         )
@@ -200,11 +200,17 @@ class Person:
 
     def absorb(self, other: Person, since: int) -> None:
         """Move the other's sightings from frame `since` on to this person."""
+        share = other.evidence / max(1, other.fixed)
         for frame in [frame for frame in other.sightings if frame >= since]:
             theirs = other.sightings.pop(frame)
             own = self.sightings.get(frame)
             self.sightings[frame] = theirs if own is None else own.fill_from(theirs)
-            other.fixed -= bool(np.isfinite(theirs.joints).any())
+            if np.isfinite(theirs.joints).any():
+                is_new = own is None or not np.isfinite(own.joints).any()
+                self.fixed += is_new
+                self.evidence += is_new * share
+                self.last_fixed = max(self.last_fixed, frame)
+                other.fixed -= 1
         other.evidence = min(other.evidence, float(other.fixed))
 
 

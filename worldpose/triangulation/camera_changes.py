@@ -415,6 +415,7 @@ def describe_change(change: CameraChange) -> str:
     """Return a sentence about a change."""
     camera, late = change.camera, change.late_frames
     todo = "worldpose synchronize proposes offsets that change with it"
+    when, did = ("later", "lost") if late > 0.0 else ("earlier", "repeated")
     if not change.is_explained:
         what = "its clock changes" if change.kind == "clock" else "it moves"
         near = "" if change.frame is None else f", near frame {change.frame}"
@@ -424,18 +425,15 @@ def describe_change(change: CameraChange) -> str:
             f"drift explains{left}"
         )
     if change.kind == "clock" and change.frame is not None:
-        number = max(1, round(abs(late)))
-        plural = "s" if number > 1 else ""
-        did = "lost" if late > 0.0 else "repeated"
         return (
-            f"camera {camera}: its offset changes by {-late:+.1f} frames at frame {change.frame}: "
-            f"its recorder {did} {number} frame{plural} there. {todo}"
+            f"camera {camera}: its images are {abs(late):.1f} match frames {when} from frame "
+            f"{change.frame} on: its recorder {did} images there. {todo}"
         )
     if change.kind == "clock":
         rate = late / max(1.0, change.frame_count - 1.0)
         return (
-            f"camera {camera}: its offset changes by {-late:+.1f} frames within the clip: it "
-            f"takes {abs(rate):.3%} {'fewer' if rate > 0.0 else 'more'} images. {todo}"
+            f"camera {camera}: its images become {abs(late):.1f} match frames {when} within the "
+            f"clip: it takes {abs(rate):.3%} {'fewer' if rate > 0.0 else 'more'} images. {todo}"
         )
     parts = [f"{math.hypot(*change.shift_px):.0f} px"]
     if abs(change.zoom) > 0.003:

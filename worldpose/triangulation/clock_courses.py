@@ -197,6 +197,8 @@ def add_slow_drifts(
     min_score, min_frames, end_s = 5.0, 0.25, 30.0
     frames = len(detections.frame)
     span = min(frames // 2, round(end_s * fps))
+    if span < 2:
+        return list(courses)
     late, std, groups = [], [], []
     for rows in (slice(0, span), slice(frames - span, frames)):
         found = synchronize(cameras, detections[rows], fps, max_offset_s=max_offset_s, pitch=pitch)

@@ -99,8 +99,9 @@ def conditions(keypoints: AnyFloats) -> NDArray[np.uint8]:
     found: NDArray[np.uint8] = np.zeros(keypoints.shape[:-1], np.uint8)
     people, joints = found.shape[-2:]
     if joints == len(COCO17):
-        images = keypoints.reshape(-1, people, joints, 2), np.array(REACH)
-        _find_conditions(*images, found.reshape(-1, people, joints))
+        images = math.prod(found.shape[:-2])  # -1 is no number of images without people
+        shown = keypoints.reshape(images, people, joints, 2)
+        _find_conditions(shown, np.array(REACH), found.reshape(images, people, joints))
     return found
 
 

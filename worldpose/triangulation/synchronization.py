@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Final
 
 import numpy as np
@@ -128,10 +128,9 @@ def synchronize(
         )
     std[~known] = np.inf
     if not known.any() and pitch is not None:
-        late, std = _compare_places(cameras, detections, fps, pitch, max_offset_s)
+        late, std, groups = _compare_places(cameras, detections, fps, pitch, max_offset_s)
         known = np.isfinite(std)
         reasons = ["" if told else reason for told, reason in zip(known, reasons, strict=True)]
-        groups = [np.flatnonzero(known).tolist()]
     groups = [[camera for camera in sorted(group) if known[camera]] for group in groups]
     groups = sorted(group for group in groups if len(group) > 1)
     matches = np.full((count, len(table.shifts)), np.nan)
@@ -150,8 +149,8 @@ def _compare_places(
     fps: float,
     pitch: PitchTemplate,
     max_offset_s: float,
-) -> tuple[Floats, Floats]:
-    """Return offsets and standard deviations [frame] by the places of runners on the pitch."""
+) -> tuple[Floats, Floats, list[list[int]]]:
+    """Return offsets, standard deviations [frame] and groups by places of runners on the pitch."""
     clocks = estimate_plane_clocks(
         locate_feet(cameras, detections, pitch),
         fps,
@@ -159,10 +158,11 @@ def _compare_places(
         max_offset_s=max_offset_s,
     )
     # Largest standard error; places on the pitch are less accurate than joints.
-    known = clocks.runs & (clocks.std * fps <= 0.5)
-    if np.count_nonzero(known) < 2:
-        known[:] = False
-    return clocks.seconds * fps, np.where(known, clocks.std * fps, np.inf)
+    told = clocks.runs & (clocks.std * fps <= 0.5)
+    members = ([c for c in group if told[c]] for group in clocks.groups)
+    groups = [group for group in members if len(group) > 1]
+    known = np.isin(np.arange(len(told)), list(chain(*groups)))
+    return clocks.seconds * fps, np.where(known, clocks.std * fps, np.inf), groups
 
 
 def _refine(

@@ -80,6 +80,11 @@ export async function putBytes(path, bytes) {
   return { status: answer.status, content: await answer.json().catch(() => ({})) };
 }
 
+// Open the page that creates a match; `given` names a match whose next version it is, or an arrival that it corrects.
+export async function openDraft(given = {}) {
+  location.hash = `#/create/${(await post("/api/drafts", given)).id}`;
+}
+
 export const matchPath = (match) => `/api/matches/${encodeURIComponent(match)}`;
 
 export function picturePath(match, owner, part = "", frame = null) {

@@ -8,7 +8,8 @@ from camera_builders import look_at_camera
 
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency.consistency import check_consistency
+from worldpose.camera_consistency.consistency import check_consistency, describe_faults
+from worldpose.camera_consistency.diagnosis import Consistency, Fault
 from worldpose.camera_consistency.hypotheses import lens_hypotheses
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry.cameras import Camera
@@ -208,3 +209,11 @@ def test_four_coefficients_of_a_fisheye_read_as_browns_are_a_hypothesis():
     np.testing.assert_array_equal(found.camera.numbers, true.numbers)
     orders = [each for each in lens_hypotheses(true) if "order" in each.detail]
     assert not orders  # the order of a fisheye's coefficients is not in doubt
+
+
+def test_a_camera_with_a_frame_rate_of_its_own_is_told_its_own_frames():
+    faults = Fault(1, "clock", value=10.0), Fault(1, "frame_rate", value=0.5)
+    found = Consistency(faults, (0,), (), np.zeros((2, 2)))
+    clock, rate = describe_faults(found, "ab", [0, 20], np.array([1.0, 2.0]), 50.0)
+    assert "10 match frames earlier than the others: set its clock offset to 40" in clock.reason
+    assert "about 50 frames per second, not 100" in rate.reason

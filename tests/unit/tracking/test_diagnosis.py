@@ -55,14 +55,14 @@ def beside(ring, apart):
 @pytest.mark.parametrize(
     ("count", "blank", "cause", "said"),
     [
-        (4, [np.s_[:]], "no_detections", ["no camera has a detection"]),
+        (4, [np.s_[:]], "no_detections", ["no camera shows a person"]),
         (
             *(4, [np.s_[..., 4:, :]], "too_few_keypoints"),
-            ["1280 detections has 4 keypoints", "min_joints asks for 5"],
+            ["1280 people in the images shows 4 joints", "5 are needed"],
         ),
         (4, [np.s_[:, 1:]], "one_camera", ["cam0 320, cam1 0"]),
         (2, [np.s_[:40, 0], np.s_[40:, 1]], "never_together", ["cam0 40 to 79, cam1 0 to 39"]),
-        (4, [np.s_[3:]], "too_short", ["4 tracks were started"]),
+        (4, [np.s_[3:]], "too_short", ["4 people were followed for moments"]),
     ],
 )
 def test_what_is_not_seen(ring, people, seen, count, blank, cause, said):
@@ -79,10 +79,10 @@ def test_cameras_side_by_side(ring, people, seen):
     found = reason(cameras, *seen(cameras, walk(people), noise=0.3))
     assert found.cause == "narrow_angle"
     # 0.46 m at 30 m: 0.88 degrees.
-    angle = float(re.search(r"meet at ([0-9.]+) degrees", found.message)[1])
+    angle = float(re.search(r"same side, ([0-9.]+) degrees", found.message)[1])
     assert angle == pytest.approx(0.88, rel=0.2)
     assert "0.46 m apart" in found.message
-    assert "asks for 5.7 (0.1 rad)" in found.message
+    assert "5.7 are needed (setting tracking.min_angle_rad, 0.1 rad)" in found.message
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_world_whose_zero_is_not_the_ground(ring, people, seen):
     raised = moved(ring(4), ring(4).center + [0.0, 0.0, 4.0])
     found = reason(raised, keypoints, confidence)
     assert found.cause == "wrong_height"
-    height = float(re.search(r"at z = ([0-9.]+) m", found.message)[1])
+    height = float(re.search(r"at a height of ([0-9.]+) m", found.message)[1])
     assert height == pytest.approx(5.1, abs=0.2)
 
 
@@ -140,9 +140,10 @@ def test_a_clock_that_is_off(ring, people, seen):
         FPS,
         SETTINGS,
     )
-    found = diagnose_no_people(*given, pitch_size=(105.0, 68.0))
+    found = diagnose_no_people(*given, pitch_size=(105.0, 68.0), rates=np.array([0.5, 2.0]))
     assert found.cause == "clock"
-    assert f"by {abs(late)}" in found.message
+    # In the frames of each camera, of which there are half and twice as many.
+    assert "add +24 to offset_frames of cam1, or -6 to those of cam0" in found.message
 
 
 def test_cameras_that_contradict_each_other(ring, people, seen):

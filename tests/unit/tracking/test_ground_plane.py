@@ -10,8 +10,10 @@ from data_contracts.pitch import PitchSpec
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.parameters import step_camera
+from worldpose.tracking.plane import paths
 from worldpose.tracking.plane.clocks import estimate_plane_clocks
 from worldpose.tracking.plane.feet import ANKLE_HEIGHT, GroundPositions, locate_feet
+from worldpose.tracking.plane.paths import PlanePath, merge_paths
 from worldpose.tracking.plane.tracker import TriangulatedPeople, locate_tracks, track_on_plane
 
 detections = KeypointDetections.from_keypoints
@@ -185,3 +187,50 @@ def test_overlapping_boxes_are_two_people_where_their_joints_are_apart(ring, out
     keypoints[:, 0, 1] = keypoints[:, 0, 0] + 2.0  # a second box of the first person
     copied = replace(boxed, keypoints=keypoints)
     assert not locate_feet(camera, copied, PITCH).is_whole[:, 0, 1].any()
+
+
+def test_cameras_that_share_no_runner_have_clocks_of_two_groups():
+    rng = np.random.default_rng(7)
+    turn = rng.uniform(0.0, 6.0, (2, 6))
+
+    def places(frame, site):
+        phase = 0.8 * frame[:, None] / FPS + turn[site]
+        return 20.0 * (site - 0.5) + 5.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1)
+
+    frame = np.arange(100)
+    seen = np.stack([places(frame + late, c // 2) for c, late in enumerate((0, 5, 0, 2))], axis=1)
+    starts = 3.0 * np.arange(6)[:, None] * [0.0, 1.0]
+    clocks = estimate_plane_clocks(positions_at(seen + starts), FPS, pitch_size=SIZE)
+    assert clocks.groups == ((0, 1), (2, 3))
+    late = FPS * clocks.seconds
+    assert (late[1] - late[0], late[3] - late[2]) == pytest.approx((5.0, 2.0), abs=0.3)
+
+
+def path_of(first, frames, start, velocity, camera):
+    """A path at constant velocity, seen by a camera."""
+    xy = np.asarray(start) + np.arange(frames)[:, None] / FPS * np.asarray(velocity)
+    state = np.concatenate([xy, np.tile(velocity, (frames, 1))], axis=1)
+    index = {first + n: {camera: 0} for n in range(frames)}
+    return PlanePath(first, state, np.tile(0.01 * np.eye(4), (frames, 1, 1)), index)
+
+
+@pytest.mark.parametrize(("velocity", "people"), [(-6.0, 2), (6.0, 1)])
+def test_a_common_frame_joins_two_paths_with_one_velocity(velocity, people):
+    east = path_of(0, 101, (-24.0, 0.0), (6.0, 0.0), 0)
+    other = path_of(100, 101, (0.0, 0.9), (velocity, 0.0), 1)
+    none = positions_at(np.empty((201, 2, 0, 2)))
+    assert len(merge_paths([east, other], FPS, none)) == people
+
+
+def test_paths_without_a_common_frame_are_not_compared(monkeypatch):
+    compared = []
+
+    def compare(*given, compare=paths._is_same_person):
+        compared.append(given)
+        return compare(*given)
+
+    monkeypatch.setattr(paths, "_is_same_person", compare)
+    none = positions_at(np.empty((1000, 2, 0, 2)))
+    alone = [path_of(20 * n, 20, (0.0, 0.0), (0.0, 0.0), 0) for n in range(50)]
+    again = [path_of(20 * n, 20, (0.1, 0.0), (0.0, 0.0), 1) for n in range(50)]
+    assert len(merge_paths(alone + again, FPS, none)) == len(compared) == 50

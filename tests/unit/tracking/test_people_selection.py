@@ -106,6 +106,15 @@ def test_a_track_at_another_in_seven_tenths_of_its_frames_is_the_same_person(nea
     assert merged == 2 - len(left)
 
 
+@pytest.mark.parametrize(("span", "whole"), [((0.8, 1.8), (40, 149)), ((2.2, 3.2), (50, 159))])
+def test_a_duplicate_extends_the_track_that_takes_it_over(span, whole):
+    first = in_cameras(track(0, (1, 3), 0.0), LEFT)
+    second = in_cameras(track(1, span, 0.1), RIGHT)
+    (person,), _ = merge_duplicates([first, second], distance=0.2)
+    np.testing.assert_array_equal(person.sightings.stack()[0], np.arange(whole[0], whole[1] + 1))
+    assert (person.last_fixed, person.evidence) == (whole[1], 110.0)
+
+
 FRAME = np.arange(100, 200)
 
 

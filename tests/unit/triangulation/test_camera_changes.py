@@ -235,6 +235,8 @@ def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     rows, values = np.array(courses[BAD]).T
     assert rows.tolist() == [0, FRAMES - 1]
     np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
+    # Both ends of a clip of one frame are the same.
+    assert add_slow_drifts(given, cameras, untracked[:1], FPS, max_offset_s=0.4) == given
 
 
 def test_what_is_left_of_a_drifting_clock_is_counted_by_match_frames():

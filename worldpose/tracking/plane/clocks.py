@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.tracking.plane.feet import GroundPositions
@@ -27,12 +28,14 @@ class PlaneClocks:
         people: pairs of tracks that tell the offsets.
         runs: (cameras,), whether the camera sees enough people run. Standing people have the same
             places at all offsets.
+        groups: cameras that share runners, directly or by others; groups share none.
     """
 
     seconds: Floats
     std: Floats
     people: int
     runs: Flags
+    groups: tuple[tuple[int, ...], ...] = ()
 
 
 def estimate_plane_clocks(
@@ -71,7 +74,11 @@ def estimate_plane_clocks(
         values.append(found[0])
         weights.append(1.0 / found[1])
         count += found[2]
-    seconds, std = np.zeros(cameras), np.full(cameras, np.inf)
+    seconds, std, groups = (
+        np.zeros(cameras),
+        np.full(cameras, np.inf),
+        tuple[tuple[int, ...], ...](),
+    )
     if rows:
         scale = np.array(weights)
         matrix = np.stack(rows) * scale[:, None]
@@ -79,8 +86,11 @@ def estimate_plane_clocks(
         told = np.abs(matrix).sum(axis=0) > 0.0
         seconds = inverse @ matrix.T @ (np.array(values) * scale)
         std[told] = np.sqrt(np.diag(inverse))[told]
+        number, label = connected_components(matrix.T @ matrix)
+        members = (tuple(np.flatnonzero(label == k).tolist()) for k in range(number))
+        groups = tuple(group for group in members if len(group) > 1)
     runs = np.array([_see_runners(each.velocity) for each in alone], dtype=np.bool_)
-    return PlaneClocks(seconds, std, count, runs)
+    return PlaneClocks(seconds, std, count, runs, groups)
 
 
 def _see_runners(velocity: Floats) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
-from itertools import combinations
+from heapq import heapify, heappop, heappush
+from itertools import count
 from typing import Final
 
 import numpy as np
@@ -48,17 +50,24 @@ class PlanePath:
 
 
 def merge_paths(paths: list[PlanePath], fps: float, positions: GroundPositions) -> list[PlanePath]:
-    """Join paths that are one person's."""
-    merged = True
-    while merged:
-        merged = False
-        for a, b in combinations(range(len(paths)), 2):
-            if _is_same_person(paths[a], paths[b], fps, positions):
-                both = _join(paths[a], paths[b])
-                paths = [path for i, path in enumerate(paths) if i not in (a, b)] + [both]
-                merged = True
-                break
-    return paths
+    """Join paths that are one person's, in the order of the paths; a joined path is the last."""
+    left, number = dict(enumerate(paths)), count(len(paths))
+    by_start = sorted(left, key=lambda k: paths[k].first)
+    together: list[tuple[int, int]] = []  # a heap of the pairs with common frames
+    starts = [paths[k].first for k in by_start]
+    for place, k in enumerate(by_start):
+        later = by_start[place + 1 : bisect_right(starts, paths[k].last)]
+        together += [(min(k, n), max(k, n)) for n in later]
+    heapify(together)
+    while together:
+        a, b = heappop(together)
+        if a in left and b in left and _is_same_person(left[a], left[b], fps, positions):
+            both, new = _join(left.pop(a), left.pop(b)), next(number)
+            for k, path in left.items():
+                if path.first <= both.last and both.first <= path.last:
+                    heappush(together, (k, new))
+            left[new] = both
+    return list(left.values())
 
 
 def _common(a: PlanePath, b: PlanePath) -> tuple[slice, slice]:
@@ -92,7 +101,8 @@ def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPos
         for camera in set(a.index[frame]) & set(b.index[frame])
     ]
     if not both:
-        return bool(apart.mean() <= 1.0)
+        is_brief = len(apart) < MIN_TRACK_S * fps  # then two who pass each other are near, too
+        return bool(apart.mean() <= 1.0 and not (is_brief and _move_apart(a, b)))
     boxes, whole = positions.boxes, positions.is_whole
     if boxes is None or whole is None or len(both) < MIN_TRACK_S * fps:
         return False
@@ -112,6 +122,15 @@ def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPos
     overlapping = np.clip(high - low, 0.0, None).prod(axis=1) >= PART_OVERLAP * smaller
     # A detector gives two boxes for the person all the time, and two people part.
     return bool((overlapping & np.array(parts)).mean() >= 0.8)
+
+
+def _move_apart(a: PlanePath, b: PlanePath) -> bool:
+    """Return whether velocities contradict each other: by their covariance, in common frames."""
+    ours, theirs = _common(a, b)
+    off = (a.state[ours] - b.state[theirs])[:, 2:]
+    covariance = (a.covariance[ours] + b.covariance[theirs])[:, 2:, 2:]
+    squared = np.einsum("fi,fij,fj->f", off, np.linalg.inv(covariance), off)
+    return bool(squared.mean() > 9.2)  # of 99 % of normal errors in the plane
 
 
 def _join(a: PlanePath, b: PlanePath) -> PlanePath:

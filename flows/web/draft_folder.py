@@ -1,0 +1,196 @@
+"""Match folder of a draft: what it takes over, how it is built, and what a run then computes.
+
+A page never changes a registered match folder, which a run may be reading. It makes another folder
+with the same id, that replaces the registered one; runs, corrections and names are of the id, and
+stay.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import yaml
+from pydantic import JsonValue
+
+from flows.method import METHOD
+from flows.registering import register_next
+from flows.review.corrections import corrected_match
+from flows.run_record import expected_work, latest_run
+from flows.run_status import plan_as_latest
+from flows.service.inbox import SUMS
+from flows.web.draft_problems import (
+    GIVEN,
+    Index,
+    Problem,
+    describe,
+    footage_problems,
+    is_footage,
+    take_given,
+)
+from worldpose.errors import InputError
+from worldpose.formats.files import read_yaml
+from worldpose.ingest.match_folder import MatchFolder, read_match
+from worldpose.ingest.registration import register_match
+from worldpose.store.store import Store
+
+LINKED_BYTES: Final = 1 << 20
+"""Size from which a version of a match links a file in place of a copy [byte]."""
+
+
+def take_over(
+    origin: Path, draft: Path, instead: dict[str, JsonValue]
+) -> tuple[dict[str, JsonValue], dict[str, int]]:
+    """Link or copy the files of a match folder into a draft; the folder stays as it is.
+
+    Folders of images go to the draft's `match`, all other files to its `own`.
+
+    Returns:
+        match.yaml, or `instead` if that cannot be read, and the sizes of the files that a person
+        can remove, by path [byte].
+    """
+    content, own = instead, draft / "own"
+    with suppress(InputError):
+        found = read_yaml(origin / "match.yaml")
+        content = found if isinstance(found, dict) else instead
+    copy_version(origin, own)
+    (own / "match.yaml").unlink(missing_ok=True)
+    for each in (own / "videos").glob("*/"):
+        each.rename(draft / "match" / "videos" / each.name)
+    paths = sorted(each for each in own.rglob("*") if each.is_file())
+    sizes = {each.relative_to(own).as_posix(): each.stat().st_size for each in paths}
+    filmed = ("videos/", "stills/", "broadcast/")
+    sizes = {
+        name: size for name, size in sizes.items() if is_footage(name) == name.startswith(filmed)
+    }
+    sizes = {name: size for name, size in sizes.items() if not name.startswith("reference/")}
+    cameras = content.get("cameras")
+    for camera in cameras if isinstance(cameras, list) else ():
+        if isinstance(camera, dict) and (usual := f"videos/{camera.get('id')}.mp4") in sizes:
+            camera.setdefault("video", usual)
+    return json.loads(json.dumps(content, default=str)), sizes
+
+
+def copy_version(origin: Path, target: Path) -> None:
+    """Link or copy the files of a match folder into a new one."""
+    left = shutil.ignore_patterns(".*", SUMS)
+    shutil.copytree(origin, target, copy_function=_link, ignore=left)
+
+
+def _link(source: str, target: str) -> None:
+    """Link a large file, or copy it with its times where that is impossible."""
+    path = Path(source).resolve()
+    with suppress(OSError):
+        if path.stat().st_size >= LINKED_BYTES:
+            os.link(path, target)
+            return
+    shutil.copy2(path, target)
+
+
+def build(
+    store: Store,
+    content: Mapping[str, JsonValue],
+    draft: Path,
+    indexes: Mapping[str, Index | None],
+    match_id: str | None = None,
+) -> tuple[list[Problem], list[str]]:
+    """Make the match folder again around its footage, with what all other files of a draft say.
+
+    Args:
+        store: its matches are not to be made again.
+        content: match.yaml.
+        draft: folder of the draft: `match` is the match folder with its footage, `own` has files
+            of a match folder, and `given` those of other tools.
+        indexes: frames of the videos and sizes of the stills, by path in the match folder.
+        match_id: the registered match of which the draft is the next version.
+
+    Returns:
+        The errors that ingest finds, and sentences about what was taken from other tools' files.
+    """
+    folder, given, notes = draft / "match", draft / GIVEN, list[str]()
+    own = draft / "own"
+    for each in sorted(folder.rglob("*"), reverse=True):
+        name = each.relative_to(folder)
+        is_uploaded = name.as_posix() in indexes and not (own / name).exists()
+        is_image = name.parts[0] == "videos" and len(name.parts) > 2
+        if each.is_file() and not is_uploaded and not is_image:
+            each.unlink()
+    if own.is_dir():
+        shutil.copytree(own, folder, copy_function=_link, dirs_exist_ok=True)
+    text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
+    (folder / "match.yaml").write_text(text, encoding="utf-8")
+    try:
+        taken = take_given(given, folder, indexes) if given.is_dir() else []
+        # No paths of this machine, no options of commands.
+        notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
+        match = read_match(folder)
+    except InputError as error:
+        return [describe(error, folder, given)], notes
+    problems = list(footage_problems(match, indexes))
+    if not problems and match_id is not None:
+        try:
+            problem, told = foresee(store, match)
+        except InputError as error:  # a setting names a missing file
+            return [describe(error, folder)], notes
+        return problem, [*notes, *told]
+    if not problems and (same := registered_as(store, match)):
+        said = (
+            f"These videos are the match {same}: open it in the list of matches, and discard this."
+        )
+        problems.append({"place": "", "message": said})
+    return problems, notes
+
+
+def registered_as(store: Store, match: MatchFolder) -> str | None:
+    """Return the registered match that has the content of a match folder; None if it is new."""
+    files = {*match.videos.values(), *match.detections.values()}
+    sizes = {str(file.relative_to(match.folder)): file.stat().st_size for file in files}
+    for name in store.matches():
+        if (known := store.registration(name)) is not None:
+            is_like = sizes.items() <= {file.path: file.size for file in known.files}.items()
+            if is_like and register_match(match, None).identity == known.identity:
+                return name
+    return None
+
+
+def _is_sound(folder: Path) -> bool:
+    with suppress(InputError, OSError):
+        read_match(folder)
+        return True
+    return False
+
+
+def foresee(store: Store, folder: MatchFolder) -> tuple[list[Problem], list[str]]:
+    """Return what forbids the next version of a match, and sentences about what it recomputes."""
+    match_id = folder.spec.match_id
+    before = store.registration(match_id)
+    assert before is not None  # the draft began with its folder
+    now = register_next(folder, before)
+    files = [
+        {each.path: each.sha256 for each in it.files if each.path != "match.yaml"}
+        for it in (before, now)
+    ]
+    if files[0] == files[1] and before.spec == now.spec and _is_sound(Path(before.folder)):
+        return [{"place": "", "message": "nothing has changed yet: add files, or discard this"}], []
+    latest, match = latest_run(store, match_id), corrected_match(store, folder, now)
+    if match.folder.to_click:
+        names = ", ".join(match.folder.to_click)
+        return [], [f"Before the next run, {names} must be calibrated on the page of the match."]
+    plan = plan_as_latest(store, match, latest, {})
+    missing = [unit for unit in plan if not unit.published]
+    units: dict[str, list[str]] = {}
+    for stage, unit in (each.name.split("/", 1) for each in missing):
+        units.setdefault(stage, []).append(unit)
+    about = {stage.name: stage.about for stage in METHOD}
+    listed = "; ".join(f"{about[stage]} ({', '.join(names)})" for stage, names in units.items())
+    seconds = sum(expected_work(store, match, missing, latest).values())
+    minutes = max(1, round(seconds / 60 / max(1, os.cpu_count() or 1)))
+    kept = len(plan) - len(missing)
+    told = f"The next run computes, in about {minutes} min: {listed}. It keeps {kept} results."
+    return [], [told if missing else "The next run has nothing to compute."]

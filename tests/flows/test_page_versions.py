@@ -1,0 +1,198 @@
+"""Pages add files to a match by its next version, and lead back from matches that were refused."""
+
+import json
+import shutil
+
+import page_client
+import pytest
+import yaml
+from command_line import TINY
+from test_page_drafts import (
+    DRAFTS,
+    FPS,
+    SIZE,
+    a_match,
+    footage,  # noqa: F401
+    open_pages,
+    place,  # noqa: F401
+    put,
+    save,
+    settle,
+)
+
+from data_contracts.review import NamedTrack
+from flows.match_state import match_state
+from flows.registering import open_for_review, open_match
+from flows.review.corrections import keep_edits
+from flows.service.inbox import take_in, watch_once
+from flows.service.layout import served_state
+from worldpose.store.store import Store
+
+
+def add(browser, draft, name, content):
+    new = {"name": name, "size": len(content), "modified_ms": 1}
+    answer = browser.post(f"{DRAFTS}/{draft}/files", json=new)
+    assert answer.status_code == 200, answer.text
+    assert put(browser, draft, answer.json()["file"], 0, content).status_code == 200
+
+
+def arrive(place, begun=None):  # noqa: F811
+    """Take in what is complete in the inbox; return all arrivals by name."""
+    store = Store.open(str(place / "project"))
+    state = served_state(store.url)
+    watch_once(state, place / "inbox", 0.0)
+    take_in(store, state, place / "inbox", 0.0, lambda match, arrival: str(begun or ""))
+    return state.arrivals()
+
+
+def contents(folder):
+    return {
+        each.relative_to(folder): each.read_bytes() for each in folder.rglob("*") if each.is_file()
+    }
+
+
+@pytest.fixture
+def final(place, footage):  # noqa: F811
+    """The pages of a project with a match of one camera, and the folder of the match."""
+    ada = open_pages(place)
+    draft = ada.post(DRAFTS, json={}).json()["id"]
+    add(ada, draft, footage.name, footage.read_bytes())
+    view = settle(ada, draft)
+    name = view["files"][0]["name"]
+    save(ada, view, a_match(name, camera={"side": "near"}))
+    assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).status_code == 200
+    assert arrive(place)["final"].state == "taken"
+    return ada, place / "inbox" / "final"
+
+
+def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(place, footage, final):  # noqa: F811
+    ada, folder = final
+    before = contents(folder)
+    draft = ada.post(DRAFTS, json={"match": "final"}).json()["id"]
+    view = settle(ada, draft)
+    assert [file["name"] for file in view["files"]] == ["videos/near_left.mp4"]
+    assert view["problems"][0]["message"].startswith("nothing has changed yet")
+    add(ada, draft, "far.mp4", footage.read_bytes())
+    add(ada, draft, "far.json", clicks_of("far"))
+    view = settle(ada, draft)
+    content = view["content"]
+    assert "far.mp4 belongs to no camera" in view["problems"][0]["message"]
+    camera = {"id": "far", "width": SIZE[0], "height": SIZE[1], "video": "videos/far.mp4"}
+    view = save(ada, view, content | {"cameras": [*content["cameras"], camera]}).json()
+    assert view["is_ready"], view["problems"]
+    assert any(note.startswith("The next run computes") for note in view["notes"]), view["notes"]
+    another = ada.post(DRAFTS, json={"match": "final"}).json()["id"]
+    assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).json() == {"arrived": "final.v2"}
+    assert arrive(place)["final.v2"].state == "taken"
+    match = open_for_review(Store.open(str(place / "project")), "final")
+    assert match.folder.folder == place / "inbox" / "final.v2"
+    assert sorted(match.folder.videos) == ["far", "near_left"]
+    assert match.folder.clicked["far"].points[0].name == "center_mark"
+    assert contents(folder) == before
+    # Whoever began with the version before would drop these files again.
+    message = settle(ada, another)["problems"][0]["message"]
+    assert message.startswith("another person added files meanwhile")
+
+
+def clicks_of(camera):
+    image = {"id": 0, "file_name": f"{camera}.jpg", "width": SIZE[0], "height": SIZE[1]}
+    keypoints = {"id": 1, "name": "mark", "keypoints": ["center_mark"]}
+    shown = {"id": 1, "image_id": 0, "category_id": 1, "keypoints": [40, 30, 2]}
+    return json.dumps(
+        {"images": [image], "categories": [keypoints], "annotations": [shown]}
+    ).encode()
+
+
+def test_runs_and_names_outlast_the_next_version(project_copy, tiny):
+    store = Store.open(str(project_copy))
+    edits = {"name": NamedTrack(clip="clip", person=0, name="Ann")}
+    keep_edits(store, lambda: open_match(store, TINY), edits, who="Ada", note="")
+    inbox = project_copy / "inbox"
+    inbox.mkdir()
+    ada = page_client.log_in(page_client.served(project_copy), "Ada")
+    draft = ada.post(DRAFTS, json={"match": TINY}).json()["id"]
+    view = settle(ada, draft)
+    camera = view["content"]["cameras"][0]["id"]
+    kept = next(it for it in view["files"] if it["name"].startswith(f"detections/{camera}."))
+    suffix = kept["name"].rpartition(".")[2]
+    poses = next(tiny.glob(f"detections/{camera}.*")).read_bytes()
+    add(ada, draft, f"{camera}.{suffix}", poses)
+    message = settle(ada, draft)["problems"][0]["message"]
+    assert f"no 2D poses of {camera} yet" in message  # nothing is replaced in silence
+    for file in ada.get(f"{DRAFTS}/{draft}").json()["files"]:
+        if file["name"].startswith("given/") or f"/{camera}." in file["name"]:
+            ada.post(f"{DRAFTS}/{draft}/files/{file['id']}/removal", json={})
+    view = settle(ada, draft)
+    content = view["content"]
+    content["cameras"] = [each for each in content["cameras"] if each["id"] != camera]
+    view = save(ada, view, content).json()
+    assert view["is_ready"], view["problems"]
+    (said,) = (note for note in view["notes"] if note.startswith("The next run computes"))
+    assert "people" in said and "It keeps" in said
+    ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    state = served_state(store.url)
+    watch_once(state, inbox, 0.0)
+    take_in(store, state, inbox, 0.0, lambda match, arrival: "")
+    match = open_match(store, TINY)
+    assert match.folder.folder.name == f"{TINY}.v2"
+    assert len(store.runs(TINY)) == 1 and len(match.corrections) == 1
+    assert match_state(store, match).name == "outdated"
+
+
+def refuse(place, match_yaml):  # noqa: F811
+    folder = place / "inbox" / "cup"
+    (folder / "videos").mkdir(parents=True)
+    (folder / "match.yaml").write_text(yaml.safe_dump(match_yaml))
+    return folder
+
+
+def test_a_refused_match_can_be_corrected_tried_again_or_removed(place, footage):  # noqa: F811
+    ada = open_pages(place)
+    wrong = a_match("videos/near.mp4", match_id="cup", camera={"side": "near"}, fps=-25)
+    folder = refuse(place, wrong)
+    shutil.copy(footage, folder / "videos" / "near.mp4")
+    assert arrive(place)["cup"].state == "refused"
+    (shown,) = ada.get("/api/inbox").json()["arrivals"]
+    assert "fps" in shown["reason"]
+    # Try again: of what is still wrong, the reason comes again.
+    assert ada.post("/api/inbox/again", json={"name": "cup"}).status_code == 200
+    assert ada.get("/api/inbox").json()["arrivals"][0]["state"] == "arriving"
+    watch_once(served_state(str(place / "project")), place / "inbox", 0.0)
+    assert arrive(place)["cup"].state == "refused"
+    # Correct it: the form has all that it says, and the folder that came stays as it is.
+    draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
+    view = settle(ada, draft)
+    assert view["problems"][0]["place"] == "fps"
+    assert save(ada, view, view["content"] | {"fps": FPS}).json()["is_ready"]
+    assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).json() == {"arrived": "cup"}
+    assert arrive(place)["cup"].state == "taken"
+    (aside,) = (place / "inbox" / ".removed").iterdir()
+    assert yaml.safe_load((aside / "match.yaml").read_text())["fps"] == -25
+    assert open_for_review(Store.open(str(place / "project")), "cup").folder.spec.fps == FPS
+
+
+def test_an_arrival_without_a_readable_match_yaml_is_a_form_with_its_files(place, footage):  # noqa: F811
+    ada = open_pages(place)
+    folder = refuse(place, a_match("videos/near.mp4", match_id="cup"))
+    shutil.copy(footage, folder / "videos" / "near.mp4")
+    for text in ("{", None):
+        (folder / "match.yaml").unlink()
+        if text is not None:
+            (folder / "match.yaml").write_text(text)
+        assert arrive(place)["cup"].state == ("incomplete" if text is None else "refused")
+        draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
+        assert [file["name"] for file in settle(ada, draft)["files"]] == ["videos/near.mp4"]
+        ada.post(f"{DRAFTS}/{draft}/removal", json={})
+
+
+def test_a_removed_arrival_is_kept_out_of_sight_and_one_with_a_link_is_no_draft(place):  # noqa: F811
+    ada = open_pages(place)
+    folder = refuse(place, a_match("videos/near.mp4", match_id="cup"))
+    (folder / "videos" / "near.mp4").symlink_to("/etc/passwd")
+    assert arrive(place)["cup"].state == "refused"
+    answer = ada.post(DRAFTS, json={"arrival": "cup"})
+    assert answer.status_code == 422 and "link" in answer.json()["error"]
+    moved = ada.post("/api/inbox/removal", json={"name": "cup"}).json()["moved_to"]
+    assert moved.startswith(str(place / "inbox" / ".removed"))
+    assert arrive(place) == {} and not folder.exists()
+    assert ada.post("/api/inbox/removal", json={"name": "cup"}).status_code == 422
