@@ -134,27 +134,6 @@ def _leave_one_out(
     return replace(own[best], is_explained=bool(is_explained), is_left_out=is_left_out)
 
 
-def choose_change(
-    cameras: Camera,
-    people: KeypointDetections[ClipArray],
-    fps: float,
-    settings: TriangulationSettings,
-    found: Sequence[Change],
-) -> MeasuredChange | None:
-    """Return the change whose correction lets all cameras agree best; None if none helps.
-
-    It serves where several cameras change, so that no camera is the one without which the others
-    agree. Arguments are those of `explain_changes`.
-    """
-    trial = _Trial(cameras, people, fps, settings.model_copy(update={"max_deviation": 30.0}))
-    windows = trial.choose_windows(replace(found[0], is_sudden=False))
-    before, most = trial.misfit(windows), 6
-    measured = [trial.measure(each) for each in found[:most]]
-    after = [trial.misfit(windows, each) for each in measured]
-    best = int(np.argmin(after))
-    return measured[best] if after[best] < 0.98 * before else None
-
-
 def refine_change(
     cameras: Camera,
     people: KeypointDetections[ClipArray],

@@ -190,12 +190,14 @@ class MovingJoints:
         at: (n, 3) [m], world.
         velocity: (n, 3) [m/frame].
         person: (n,).
+        frame: (n,).
         rig: the cameras.
     """
 
     at: Floats
     velocity: Floats
     person: Integers
+    frame: Integers
     _known: NDArray[np.bool_]
     _pixels: AnyFloats
     _precision: Floats
@@ -218,7 +220,8 @@ class MovingJoints:
         at = joints[here]
         known = np.asarray(np.isfinite(at + velocity).all(axis=-1))
         seen = pixels[here], precision[here]
-        return cls(at[known], velocity[known], np.nonzero(known)[1], known, *seen, rig, settings)
+        frame, person, _ = np.nonzero(known)
+        return cls(at[known], velocity[known], person, frame + half, known, *seen, rig, settings)
 
     def look(self, camera: int) -> tuple[Floats, Floats, Floats, Floats]:
         """Return what a camera sees, all 0 where it does not see the joint.

@@ -203,6 +203,28 @@ def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
     np.testing.assert_allclose(values, [0.0, 0.0, 5.0], atol=0.15)
 
 
+def test_a_drift_with_a_step_and_a_step_of_another_camera_are_traced_together(cameras):
+    frames, rate = 600, 1.008
+    pixels, confidence, _ = detections(cameras, runner(frames + 10, 3), 1.0)
+    frame = np.arange(frames)
+    at = frame * rate + np.where(frame >= 370, -4.0, 0.0)  # 4 images come again
+    low = at.astype(int)
+    share = (at - low)[:, None, None, None]
+    seen = np.array(pixels[:frames])
+    seen[:, BAD] = (1.0 - share) * pixels[low, BAD] + share * pixels[low + 1, BAD]
+    seen[:, 0] = pixels[frame + np.where(frame >= 200, 3, 0), 0]
+    untracked = KeypointDetections.from_keypoints(seen, confidence[:frames], frame=frame)
+    courses = trace_clocks(cameras, untracked, FPS, np.zeros(4))
+    late = np.stack([np.interp(frame, *np.array(course).T) for course in courses])
+    first, last = [50, 150, 300, 350], [400, 450, 500, 550]
+    off = (late - late[1])[:, first + last]
+    np.testing.assert_allclose(off[3], 0.0, atol=0.1)
+    np.testing.assert_allclose(off[0], [0.0, 0.0, *[3.0] * 6], atol=0.15)
+    there = np.array(first + last)
+    drift = there - (there + np.repeat([0.0, 4.0], 4)) / rate
+    np.testing.assert_allclose(off[BAD], drift, atol=0.2)
+
+
 def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     people = view(cameras, partial(fast, rate=1.01))
     untracked = replace(people, detection_index=np.empty((0, 0, 0), np.int16))
