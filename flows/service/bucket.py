@@ -10,6 +10,7 @@ import json
 import logging
 import shutil
 from collections import defaultdict
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -107,12 +108,16 @@ class BucketInbox:
         """Copy the whole match to the folder, replacing an earlier copy."""
         target = self.inbox / name
         draft = target.with_name(f".{target.name}.arriving")
-        shutil.rmtree(draft, ignore_errors=True)
+        replaced = target.with_name(f".{target.name}.replaced")
+        for left in (draft, replaced):
+            shutil.rmtree(left, ignore_errors=True)
         for each in objects:
             self._objects.download(each.path, draft / each.path.removeprefix(f"{name}/"))
         self._keep(name, [*self._copied.get(name, [""]), _fingerprint_files(draft)])
-        shutil.rmtree(target, ignore_errors=True)
+        with suppress(FileNotFoundError):
+            target.rename(replaced)
         draft.rename(target)
+        shutil.rmtree(replaced, ignore_errors=True)
 
     def _keep(self, name: str, fingerprints: list[str]) -> None:
         self._copied[name] = fingerprints

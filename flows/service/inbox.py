@@ -94,8 +94,9 @@ def fingerprint_of(path: Path) -> str:
                 elif not stat.S_ISREG(status.st_mode):
                     raise RefusalError(f"{where} is neither a file nor a folder")
                 else:
-                    times = (status.st_mtime_ns, status.st_ctime_ns)
-                    lines.append(f"{where}\n{status.st_ino} {status.st_size} {times}")
+                    # Without the time of the inode: a link to the file, as in a draft, changes it.
+                    times = f"{status.st_ino} {status.st_size} {status.st_mtime_ns}"
+                    lines.append(f"{where}\n{times}")
                 if len(lines) > MOST_FILES:
                     raise RefusalError(f"more than {MOST_FILES} files")
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
@@ -177,6 +178,13 @@ Begin = Callable[[Match, Arrival], str]
 """Starts a match's run, only once however often it is called; returns the run's Prefect id."""
 
 
+REPLACES: Final = ".replaces"
+"""File in the next version of a match: its inode, and the folder that it replaces.
+
+It moves with the folder: neither a kill nor a scan in between loses the fact.
+"""
+
+
 def put_in(
     state: StateFolder,
     inbox: Path,
@@ -198,33 +206,48 @@ def put_in(
         corrects: folder of a refused arrival that it takes the place of.
 
     Raises:
-        InputError: another next version of the match is on its way.
+        InputError: another next version of the match is on its way, or the arrival to correct was
+            taken in meanwhile.
     """
-    on_the_way = [it for it in state.arrivals().values() if it.state != "taken"]
-    for each in on_the_way if replaces is not None else ():
-        if each.replaces == replaces and str((inbox / each.name).resolve()) != corrects:
-            raise InputError(
-                name,
-                expected="no other new files of this match on their way",
-                found=f"{each.name}, {each.state}",
-                todo="Wait until they are taken in, or remove them in the list of matches.",
-            )
     target = inbox / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    if corrects is not None and Path(corrects).exists():
-        set_aside(inbox, Path(corrects))
-    folder.rename(target)
-    # No scan has to see that nothing of it changes.
-    with suppress(RefusalError, *(() if replaces else (WorldposeError, OSError))):
-        arrival = Arrival(
-            name=name,
-            state="arriving",
-            priority=priority,
-            fingerprint=fingerprint_of(target),
-            replaces=replaces,
-            changed_at=datetime.now(UTC),
-        )
-        state.write_arrival(arrival)
+    if replaces is not None:
+        (folder / REPLACES).write_text(f"{folder.stat().st_ino} {replaces}", encoding="utf-8")
+    fingerprint = ""  # what cannot be taken in is refused by the next scan
+    with suppress(RefusalError):
+        fingerprint = fingerprint_of(folder)
+    with state.only_one("versions", wait=True):
+        on_the_way = [it for it in state.arrivals().values() if it.state != "taken"]
+        for each in on_the_way if replaces is not None else ():
+            if each.replaces == replaces and str((inbox / each.name).resolve()) != corrects:
+                raise InputError(
+                    name,
+                    expected="no other new files of this match on their way",
+                    found=f"{each.name}, {each.state}",
+                    todo="Wait until they are taken in, or remove them in the list of matches.",
+                )
+        for old in [it.name for it in entries(inbox) if str(it.path.resolve()) == corrects]:
+            remove_entry(state, inbox, old)
+        folder.rename(target)
+        # No scan has to see that nothing of it changes.
+        with suppress(WorldposeError, OSError):
+            arrival = Arrival(
+                name=name,
+                state="arriving",
+                priority=priority,
+                fingerprint=fingerprint,
+                replaces=replaces,
+                changed_at=datetime.now(UTC),
+            )
+            state.write_arrival(arrival)
+
+
+def _replaced_by(path: Path) -> str | None:
+    """Return the folder that the next version of a match replaces; None for a copy of it."""
+    with suppress(OSError, ValueError):
+        number, _, replaces = (path / REPLACES).read_text(encoding="utf-8").partition(" ")
+        return replaces if number == str(path.stat().st_ino) else None
+    return None
 
 
 def next_version(inbox: Path, name: str) -> str:
@@ -367,6 +390,8 @@ def _look_at(entry: Entry, before: Arrival | None, quiet: float) -> tuple[Arriva
     except OSError as error:  # it changes during the scan, or is not readable
         reason = f"cannot be read: {error.strerror}"
         return change_state(arrival, "incomplete", reason, fingerprint=""), False
+    if arrival.replaces is None:
+        arrival = arrival.model_copy(update={"replaces": _replaced_by(entry.path)})
     is_same = arrival.fingerprint == fingerprint
     if is_same and arrival.state in ("refused", "incomplete"):
         return arrival, False

@@ -42,6 +42,8 @@ from worldpose.store.store import Store
 
 LINKED_BYTES: Final = 1 << 20
 """Size from which a version of a match links a file in place of a copy [byte]."""
+SPARE_BYTES: Final = 1 << 30
+"""Disk space that a new file leaves free: results need some [byte]."""
 
 
 def take_over(
@@ -78,19 +80,35 @@ def take_over(
 
 
 def copy_version(origin: Path, target: Path) -> None:
-    """Link or copy the files of a match folder into a new one."""
+    """Link large files of a match folder into another one; copy all that cannot be linked.
+
+    Raises:
+        InputError: the disk is too small for what has to be copied.
+    """
+    copied: list[tuple[Path, str]] = []
+
+    def link(source: str, name: str) -> None:
+        path = Path(source).resolve()
+        with suppress(OSError):
+            if path.stat().st_size >= LINKED_BYTES:
+                os.link(path, name)
+                return
+        copied.append((path, name))
+
     left = shutil.ignore_patterns(".*", SUMS)
-    shutil.copytree(origin, target, copy_function=_link, ignore=left)
+    shutil.copytree(origin, target, copy_function=link, ignore=left, dirs_exist_ok=True)
+    if (size := sum(path.stat().st_size for path, _ in copied)) >= LINKED_BYTES:
+        require_space(target, origin.name, size)
+    for path, name in copied:
+        shutil.copy2(path, name)
 
 
-def _link(source: str, target: str) -> None:
-    """Link a large file, or copy it with its times where that is impossible."""
-    path = Path(source).resolve()
-    with suppress(OSError):
-        if path.stat().st_size >= LINKED_BYTES:
-            os.link(path, target)
-            return
-    shutil.copy2(path, target)
+def require_space(folder: Path, title: str, size: int) -> None:
+    """Refuse bytes that would not leave `SPARE_BYTES` of the folder's disk."""
+    needed, free = size + SPARE_BYTES, shutil.disk_usage(folder).free
+    if needed > free:
+        wanted, there = f"{needed / 1e9:.1f} GB of free disk space", f"{free / 1e9:.1f} GB"
+        raise InputError(title, wanted, f"{there} at the inbox", "Free some, or ask the operator.")
 
 
 def build(
@@ -121,11 +139,11 @@ def build(
         is_image = name.parts[0] == "videos" and len(name.parts) > 2
         if each.is_file() and not is_uploaded and not is_image:
             each.unlink()
-    if own.is_dir():
-        shutil.copytree(own, folder, copy_function=_link, dirs_exist_ok=True)
     text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
     (folder / "match.yaml").write_text(text, encoding="utf-8")
     try:
+        if own.is_dir():
+            copy_version(own, folder)
         taken = take_given(given, folder, indexes) if given.is_dir() else []
         # No paths of this machine, no options of commands.
         notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]

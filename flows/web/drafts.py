@@ -12,6 +12,7 @@ import os
 import re
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -29,7 +30,7 @@ from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
 from flows.service.inbox import next_version, put_in
 from flows.service.layout import served_state
-from flows.web.draft_folder import build, take_over
+from flows.web.draft_folder import build, require_space, take_over
 from flows.web.draft_problems import (
     GIVEN,
     GIVEN_ENDINGS,
@@ -59,8 +60,8 @@ DRAFTS: Final = ".drafts"
 MAX_FILES: Final = 200
 """Files of one draft."""
 MAX_DRAFTS: Final = 200
-SPARE_BYTES: Final = 1 << 30
-"""Disk space that a new file leaves free: results need some [byte]."""
+HALF_MADE_SECONDS: Final = 86400.0
+"""Age at which a draft that was not made, or not removed, to the end is removed [s]."""
 PIECE_BYTES: Final = 1 << 24
 """Bytes that are copied from a named folder in one step."""
 
@@ -88,8 +89,12 @@ class Drafts:
     def all(self) -> list[Draft]:
         """Return all drafts, the newest first; one that was finished is removed."""
         found = []
-        for folder in self._root.glob("[!.]*"):
+        for folder in self._root.glob("*"):
             with suppress(WorldposeError, OSError, ValueError):  # damaged, or just removed
+                if folder.name.startswith(".") or not (folder / "draft.json").exists():
+                    if time.time() - folder.stat().st_mtime > HALF_MADE_SECONDS:  # killed
+                        shutil.rmtree(folder, ignore_errors=True)
+                    continue
                 draft = self.read(folder.name)
                 if draft.finished_as is not None and not (folder / "match").exists():
                     shutil.rmtree(folder, ignore_errors=True)  # killed after the match had moved
@@ -127,9 +132,6 @@ class Drafts:
             (folder / inner).mkdir(parents=True)
         if origin is not None:
             try:
-                if origin.stat().st_dev != folder.stat().st_dev:  # its files cannot be linked
-                    paths = (each for each in origin.rglob("*") if each.is_file())
-                    self._require_space(origin.name, sum(each.stat().st_size for each in paths))
                 if known is not None:
                     content = known.spec.model_dump(mode="json", exclude_defaults=True)
                 content, kept = take_over(origin, folder, content)
@@ -205,18 +207,9 @@ class Drafts:
             with self._budget:
                 listed = [(it.id, other) for it in self.all() for other in it.files]
                 underway = sum(other.size - self._count_received(at, other) for at, other in listed)
-                self._require_space(title, file.size + underway)
+                require_space(self.inbox, title, file.size + underway)
                 self._write(draft.model_copy(update={"files": (*draft.files, chosen)}))
             return chosen
-
-    def _require_space(self, title: str, size: int) -> None:
-        """Refuse bytes that would not leave `SPARE_BYTES` of the disk."""
-        needed, free = size + SPARE_BYTES, shutil.disk_usage(self.inbox).free
-        if needed > free:
-            wanted, there = f"{needed / 1e9:.1f} GB of free disk space", f"{free / 1e9:.1f} GB"
-            raise InputError(
-                title, wanted, f"{there} at the inbox", "Free some, or ask the operator."
-            )
 
     def remove(self, draft_id: str, file_id: str) -> None:
         """Remove a file from a draft."""
@@ -360,7 +353,7 @@ class Drafts:
 
     def _write_piece(self, draft_id: str, file: DraftFile, piece: bytes) -> None:
         """Append bytes to a file that is on its way, all or none; move it when it is whole."""
-        self._require_space(file.title, len(piece))
+        require_space(self.inbox, file.title, len(piece))
         part = self._part(draft_id, file)
         with part.open("ab", buffering=0) as opened:
             before = opened.seek(0, os.SEEK_END)
@@ -460,6 +453,10 @@ class Drafts:
     def _folder_problems(self, draft: Draft) -> tuple[list[Problem], list[str]]:
         """Build the match folder; return the errors that ingest finds, and sentences about it."""
         spec = validate_record(MatchSpec, draft.content, "match.yaml")
+        registered = map(self.store.registration, self.store.matches() if draft.corrects else ())
+        if any(it is not None and it.folder == draft.corrects for it in registered):
+            message = "it was taken in meanwhile: discard this, and open it in the list of matches"
+            return [{"place": "", "message": message}], []
         places = (self.inbox / at / spec.match_id for at in (".", "urgent", "background"))
         is_taken = any(it.exists() and str(it.resolve()) != draft.corrects for it in places)
         is_taken = is_taken or spec.match_id in self.store.matches()

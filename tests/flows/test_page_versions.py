@@ -1,7 +1,11 @@
 """Pages add files to a match by its next version, and lead back from matches that were refused."""
 
 import json
+import os
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import page_client
 import pytest
@@ -10,6 +14,7 @@ from command_line import TINY
 from test_page_drafts import (
     DRAFTS,
     FPS,
+    FRAMES,
     SIZE,
     a_match,
     footage,  # noqa: F401
@@ -24,8 +29,10 @@ from data_contracts.review import NamedTrack
 from flows.match_state import match_state
 from flows.registering import open_for_review, open_match
 from flows.review.corrections import keep_edits
-from flows.service.inbox import take_in, watch_once
-from flows.service.layout import served_state
+from flows.service.inbox import put_in, take_in, watch_once
+from flows.service.layout import StateFolder, served_state
+from flows.web.draft_folder import LINKED_BYTES, SPARE_BYTES
+from worldpose.errors import InputError
 from worldpose.store.store import Store
 
 
@@ -65,7 +72,12 @@ def final(place, footage):  # noqa: F811
     return ada, place / "inbox" / "final"
 
 
-def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(place, footage, final):  # noqa: F811
+def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(
+    place,  # noqa: F811
+    footage,  # noqa: F811
+    final,
+    monkeypatch,
+):
     ada, folder = final
     before = contents(folder)
     draft = ada.post(DRAFTS, json={"match": "final"}).json()["id"]
@@ -82,8 +94,13 @@ def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(pla
     assert view["is_ready"], view["problems"]
     assert any(note.startswith("The next run computes") for note in view["notes"]), view["notes"]
     another = ada.post(DRAFTS, json={"match": "final"}).json()["id"]
-    assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).json() == {"arrived": "final.v2"}
-    assert arrive(place)["final.v2"].state == "taken"
+    with monkeypatch.context() as full:  # of whom it is the next version is known nevertheless
+        full.setattr(StateFolder, "write_arrival", Mock(side_effect=OSError(28, "full")))
+        assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).json() == {"arrived": "final.v2"}
+    copied = shutil.copytree(place / "inbox" / "final.v2", place / "inbox" / "copied")
+    arrivals = arrive(place)
+    assert (arrivals["final.v2"].state, arrivals["copied"].replaces) == ("taken", None)
+    shutil.rmtree(copied)
     match = open_for_review(Store.open(str(place / "project")), "final")
     assert match.folder.folder == place / "inbox" / "final.v2"
     assert sorted(match.folder.videos) == ["far", "near_left"]
@@ -169,6 +186,70 @@ def test_a_refused_match_can_be_corrected_tried_again_or_removed(place, footage)
     (aside,) = (place / "inbox" / ".removed").iterdir()
     assert yaml.safe_load((aside / "match.yaml").read_text())["fps"] == -25
     assert open_for_review(Store.open(str(place / "project")), "cup").folder.spec.fps == FPS
+
+
+def test_a_match_taken_in_while_it_is_corrected_keeps_its_folder(place, footage):  # noqa: F811
+    ada = open_pages(place)
+    right = a_match("videos/near.mp4", match_id="cup", camera={"side": "near"})
+    folder = refuse(place, right | {"fps": -25})
+    shutil.copy(footage, folder / "videos" / "near.mp4")
+    assert arrive(place)["cup"].state == "refused"
+    draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
+    view = settle(ada, draft)
+    clips = [{"id": "goal", "frame_count": FRAMES - 1}]
+    content = right | {"match_id": "another", "clips": clips}
+    assert save(ada, view, content).json()["is_ready"]
+    (folder / "match.yaml").write_text(yaml.safe_dump(right))  # corrected where it is
+    state, inbox = served_state(str(place / "project")), place / "inbox"
+    watch_once(state, inbox, 0.0)
+    late = shutil.copytree(folder, inbox / ".late")
+    with pytest.raises(InputError, match="none any more"):  # before it is registered, and after
+        put_in(state, inbox, late, "another", corrects=str(folder))
+    assert arrive(place)["cup"].state == "taken"
+    answer = ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    assert answer.status_code == 422 and "taken in meanwhile" in answer.json()["error"]
+    assert (folder / "match.yaml").exists() and not (inbox / "another").exists()
+
+
+def test_of_two_versions_at_the_same_time_one_arrives(place, final, monkeypatch):  # noqa: F811
+    ada, _ = final
+    finish = []
+    for priority in ("urgent", "normal"):
+        draft = ada.post(DRAFTS, json={"match": "final"}).json()["id"]
+        view = settle(ada, draft)
+        roster = [{"id": priority, "name": "Ann"}]
+        assert save(ada, view, view["content"] | {"roster": roster}).json()["is_ready"]
+        finish.append((f"{DRAFTS}/{draft}/finish", {"priority": priority}))
+    read = StateFolder.arrivals
+
+    def slowly(state):
+        found = read(state)
+        time.sleep(0.3)
+        return found
+
+    monkeypatch.setattr(StateFolder, "arrivals", slowly)
+    with ThreadPoolExecutor(2) as threads:
+        answers = list(threads.map(lambda it: ada.post(it[0], json=it[1]), finish))
+    assert sorted(answer.status_code for answer in answers) == [200, 422]
+
+
+def test_what_cannot_be_linked_has_to_fit_on_the_disk(place, final, monkeypatch):  # noqa: F811
+    ada, folder = final
+    (folder / "notes.bin").write_bytes(bytes(LINKED_BYTES))
+    usage = shutil.disk_usage(place)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=SPARE_BYTES))
+    assert ada.post(DRAFTS, json={"match": "final"}).status_code == 200
+    monkeypatch.setattr(os, "link", Mock(side_effect=PermissionError))  # another user's files
+    answer = ada.post(DRAFTS, json={"match": "final"})
+    assert answer.status_code == 422 and "free disk space" in answer.json()["error"]
+    # What a kill left half made is removed when it is old.
+    half = [place / "inbox" / ".drafts" / name for name in ("0" * 16, "." + "1" * 16, "2" * 16)]
+    for each in half:
+        each.mkdir()
+    for each in half[:2]:
+        os.utime(each, (0, 0))
+    assert len(ada.get(DRAFTS).json()["drafts"]) == 1
+    assert [each.exists() for each in half] == [False, False, True]
 
 
 def test_an_arrival_without_a_readable_match_yaml_is_a_form_with_its_files(place, footage):  # noqa: F811

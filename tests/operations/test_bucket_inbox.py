@@ -1,5 +1,6 @@
 """An inbox in object storage: what is whole is copied once, and nothing leads out of the folder."""
 
+import shutil
 import uuid
 from datetime import UTC, datetime
 from pathlib import Path
@@ -59,7 +60,9 @@ def test_a_match_is_copied_once_when_it_is_whole_and_quiet(arriving, tmp_path, s
     assert again.fetch(0.0, QUIET) == again.fetch(20.0, QUIET) == []
 
 
-def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp_path):
+def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(
+    arriving, tmp_path, monkeypatch
+):
     _, put = arriving
     inbox = watched(arriving, tmp_path)
     put("m/match.yaml", b"contract: 0")
@@ -68,7 +71,20 @@ def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp
     assert inbox.fetch(10.0, QUIET) == ["m"]
     put("m/match.yaml", b"contract: 1\n")
     inbox.fetch(20.0, QUIET)
-    assert inbox.fetch(30.0, QUIET) == ["m"]
+    remove = shutil.rmtree
+
+    def remove_half(folder, **more):
+        if (folder / "old.npz").exists():
+            (folder / "old.npz").unlink()
+            raise KeyboardInterrupt
+        remove(folder, **more)
+
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(shutil, "rmtree", remove_half)
+        inbox.fetch(30.0, QUIET)
+    inbox = watched(arriving, tmp_path)
+    inbox.fetch(40.0, QUIET)
+    assert inbox.fetch(50.0, QUIET) == ["m"]
     assert (tmp_path / "inbox" / "m" / "match.yaml").read_bytes() == b"contract: 1\n"
     assert files_of(tmp_path / "inbox") == {"m/match.yaml", "m/old.npz"}
 
