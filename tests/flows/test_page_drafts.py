@@ -17,8 +17,8 @@ from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
 from flows.service.layout import served_state
 from flows.web.access import access_for
 from flows.web.app import create_app
-from flows.web.draft_problems import take_given
 from flows.web.draft_folder import SPARE_BYTES
+from flows.web.draft_problems import take_given
 from flows.web.intake import CHUNK_BYTES, Intake
 from worldpose.errors import InputError
 from worldpose.formats.calibration_writer import write_calibration_toml

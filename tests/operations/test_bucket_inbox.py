@@ -60,9 +60,7 @@ def test_a_match_is_copied_once_when_it_is_whole_and_quiet(arriving, tmp_path, s
     assert again.fetch(0.0, QUIET) == again.fetch(20.0, QUIET) == []
 
 
-def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(
-    arriving, tmp_path, monkeypatch
-):
+def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp_path, monkeypatch):
     _, put = arriving
     inbox = watched(arriving, tmp_path)
     put("m/match.yaml", b"contract: 0")
@@ -74,8 +72,8 @@ def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(
     remove = shutil.rmtree
 
     def remove_half(folder, **more):
-        if (folder / "old.npz").exists():
-            (folder / "old.npz").unlink()
+        if (old := Path(folder) / "old.npz").exists():
+            old.unlink()
             raise KeyboardInterrupt
         remove(folder, **more)
 

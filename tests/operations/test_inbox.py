@@ -230,6 +230,8 @@ def test_a_match_that_ends_the_process_stops_no_other_and_is_refused(desk, drop)
     assert "died 2 times" in decided[0].reason
     assert "out of memory?" in decided[0].reason
     assert (desk.look(), desk.take_in()) == (0, [])
+    os.link(desk.inbox / "aaa" / "match.yaml", desk.inbox / ".linked")  # as a draft of it does
+    assert (desk.look(), desk.take_in()) == (0, [])
     (desk.inbox / "aaa" / "notes.txt").write_text("smaller now")
     desk.look()
     assert [each.state for each in desk.take_in()] == ["taken"]
