@@ -122,12 +122,12 @@ def test_a_part_before_the_questions_adds_one_record_at_most_and_keeps_them(stor
 
     monkeypatch.setattr(deployed, "run_stages", no_machines)
     part = RunRequest({}, until_stage="ingest", gates="auto")
-    assert deployed._run_until_decided(store, TINY, part) == waits
+    assert deployed._run_until_decided(store, TINY, part)[1] == waits
     # A run of which only a later stage asks anything ends as well.
     store.finish_run(
         waits.model_copy(update={"run_id": store.reserve_run(TINY), "overrides": {"ingest": {}}})
     )
-    record = deployed._run_until_decided(store, TINY, part)
+    _, record = deployed._run_until_decided(store, TINY, part)
     assert begun == [record.run_id] and record.waiting == waits.waiting
 
 
