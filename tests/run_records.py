@@ -32,6 +32,9 @@ class StubRun(Mapping):
         about |= {"left_out": {}, "body_folder": None, "usability": Usability(verdict="usable")}
         self.record = SimpleNamespace(**(about | stated))
 
+    def manifest(self, name):
+        return SimpleNamespace(recipe=SimpleNamespace(sources={}))
+
     def __getitem__(self, name):
         return self.results[name]
 

@@ -80,9 +80,11 @@ def test_people_of_a_video_are_placed_on_match_frames(monkeypatch, fps, images):
         def __exit__(self, *_):
             pass
 
-        def frames(self, start, stop):
-            assert [start, stop - 1] == images
-            return ((n, np.float32(n)) for n in range(start, stop))
+        index = SimpleNamespace(shown=lambda number, fps, where: number)
+
+    def read(video, numbers):
+        assert [numbers[0], numbers[-1]] == images
+        return (np.float32(n) for n in numbers)
 
     def find(pictures):
         shown = np.array(list(pictures))
@@ -99,6 +101,7 @@ def test_people_of_a_video_are_placed_on_match_frames(monkeypatch, fps, images):
     )
     given = find(range(900, 920))
     monkeypatch.setattr(pipeline, "open_video", lambda _: Video())
+    monkeypatch.setattr(pipeline, "pictures_at", read)
     monkeypatch.setattr(pipeline, "detect_people", find)
     monkeypatch.setattr(
         pipeline, "read_unit", lambda *_: (replace(given, frame=np.arange(900, 920)), None)
