@@ -67,14 +67,18 @@ def frame_pictures(
     if file is None or not file.exists():  # results outlive their videos
         yield from (None for _ in frames)
         return
-    numbers = _numbers(store, match, owner, np.asarray(frames, dtype=np.int64))
+    spec, wanted = match.folder.spec, np.asarray(frames, dtype=np.int64)
+    numbers = _known_numbers(store, match, owner, wanted)
     with open_video(file) as video:
+        if numbers is None:
+            clock = unit_frames(spec, owner)
+            numbers = video.index.shown(clock.numbers(wanted), spec.fps * clock.rate, str(file))
         numbers[numbers >= len(video)] = -1
         yield from pictures_at(video, numbers)
 
 
-def _numbers(store: Store, match: Match, owner: str, frames: Integers) -> Integers:
-    """Return the video frames of match frames; -1 if there is none."""
+def _known_numbers(store: Store, match: Match, owner: str, frames: Integers) -> Integers | None:
+    """Return the video frames of match frames, -1 if there is none, as ingest found them."""
     results = store.run(match.match_id).results if store.runs(match.match_id) else {}
     key = results.get(f"ingest/{owner}")
     if key is not None:
@@ -82,4 +86,4 @@ def _numbers(store: Store, match: Match, owner: str, frames: Integers) -> Intege
         if "picture_of_frame" in footage:
             known = footage["picture_of_frame"].reindex(frame=frames, fill_value=-1)
             return known.values.astype(np.int64)
-    return np.maximum(-1, unit_frames(match.folder.spec, owner).numbers(frames))
+    return None

@@ -116,10 +116,10 @@ def match(
     if runs is not None:
         link_pages(runs.pages, match_id)
     with alone_with(store, match_id, wait=True):
-        opened, request = settle(store, open_match(store, match_id), request)
+        _, request = settle(store, open_match(store, match_id), request)
         request = replace(request, gates=request.gates or "auto")
         compute = _run_until_decided if request.most_iterations == 1 else _iterate_until_decided
-        record = compute(store, match_id, request)
+        opened, record = compute(store, match_id, request)
         try:
             export_after_run(store, opened, record)
         except (WorldposeError, OSError):
@@ -128,20 +128,23 @@ def match(
         return require_complete(record)
 
 
-def _iterate_until_decided(store: Store, match_id: str, request: RunRequest) -> RunRecord:
-    """Iterate a match now and after each verdict."""
+def _iterate_until_decided(
+    store: Store, match_id: str, request: RunRequest
+) -> tuple[Match, RunRecord]:
+    """Iterate a match now and after each verdict; return it as it was at the end."""
     request, most = _on_own_workers(request), request.most_iterations
     while True:
         with reporting_to(Reporter()):
-            record = iterate_match(store, open_match(store, match_id), request, most).record
+            opened = open_match(store, match_id)
+            record = iterate_match(store, opened, request, most).record
         open_questions = waiting_for_verdicts(record.waiting)
         if record.failed or not open_questions:
-            return record
+            return opened, record
         take_verdict(store, match_id, open_questions)
 
 
-def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunRecord:
-    """Run a match now and after each verdict; only plan it if the latest run has all results."""
+def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> tuple[Match, RunRecord]:
+    """Do as `_iterate_until_decided` once; only plan it if the latest run has all results."""
     stages = selected_stages(request.from_stage, request.until_stage)
     policy: GatePolicy = request.gates or "auto"
     while True:
@@ -154,13 +157,13 @@ def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunR
                 take_verdict(store, match_id, open_questions)
                 continue
             if latest.state == "complete" or (latest.state == "waiting" and not plan.waiting):
-                return latest
+                return opened, latest
         with reporting_to(Reporter()):
             reporter().run_planned(expected_work(store, opened, plan.missing, latest))
             log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
             record = run_stages(log, request.time_limits)
         if record.failed or not waiting_for_verdicts(plan.of_its_part(record.waiting)):
-            return record
+            return opened, record
 
 
 def _on_own_workers(request: RunRequest) -> RunRequest:

@@ -19,6 +19,7 @@ from typing import Final
 import yaml
 from pydantic import JsonValue
 
+from data_contracts.match import MatchSpec
 from flows.method import METHOD
 from flows.registering import register_next
 from flows.review.corrections import corrected_match
@@ -38,6 +39,7 @@ from worldpose.errors import InputError
 from worldpose.formats.files import read_yaml
 from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.ingest.registration import register_match
+from worldpose.ingest.validation import reachable
 from worldpose.store.store import Store
 
 LINKED_BYTES: Final = 1 << 20
@@ -89,8 +91,10 @@ def copy_version(origin: Path, target: Path) -> None:
 
     def link(source: str, name: str) -> None:
         path = Path(source).resolve()
+        with reachable(path):  # a link in a match folder can lead nowhere
+            size = Path(source).stat().st_size
         with suppress(OSError):
-            if path.stat().st_size >= LINKED_BYTES:
+            if size >= LINKED_BYTES:
                 os.link(path, name)
                 return
         copied.append((path, name))
@@ -150,7 +154,12 @@ def build(
         match = read_match(folder)
     except InputError as error:
         return [describe(error, folder, given)], notes
-    problems = list(footage_problems(match, indexes))
+    owners = {*(each.id for each in match.spec.cameras), *match.spec.broadcast_views}
+    for each in sorted(folder.glob("reference/cameras/*.npz")):
+        if each.stem not in owners:
+            each.unlink()
+            notes.append(f"{each.relative_to(folder)} is left out: there is no such camera")
+    problems = list(footage_problems(match, indexes, is_next=match_id is not None))
     if not problems and match_id is not None:
         try:
             problem, told = foresee(store, match)
@@ -184,6 +193,15 @@ def _is_sound(folder: Path) -> bool:
     return False
 
 
+def _with_usual_videos(spec: MatchSpec) -> MatchSpec:
+    """Return match.yaml with the videos that a camera has without naming them, as forms do."""
+    cameras = (
+        each.model_copy(update={"video": each.video or f"videos/{each.id}.mp4"})
+        for each in spec.cameras
+    )
+    return spec.model_copy(update={"cameras": tuple(cameras)})
+
+
 def foresee(store: Store, folder: MatchFolder) -> tuple[list[Problem], list[str]]:
     """Return what forbids the next version of a match, and sentences about what it recomputes."""
     match_id = folder.spec.match_id
@@ -194,7 +212,8 @@ def foresee(store: Store, folder: MatchFolder) -> tuple[list[Problem], list[str]
         {each.path: each.sha256 for each in it.files if each.path != "match.yaml"}
         for it in (before, now)
     ]
-    if files[0] == files[1] and before.spec == now.spec and _is_sound(Path(before.folder)):
+    said = [_with_usual_videos(it.spec) for it in (before, now)]
+    if files[0] == files[1] and said[0] == said[1] and _is_sound(Path(before.folder)):
         return [{"place": "", "message": "nothing has changed yet: add files, or discard this"}], []
     latest, match = latest_run(store, match_id), corrected_match(store, folder, now)
     if match.folder.to_click:

@@ -154,20 +154,34 @@ def form_problems(
     return found
 
 
-def footage_problems(match: MatchFolder, indexes: Mapping[str, Index | None]) -> Iterator[Problem]:
-    """Yield the problems of whole videos and stills, given their indexes by name."""
+def footage_problems(
+    match: MatchFolder, indexes: Mapping[str, Index | None], *, is_next: bool
+) -> Iterator[Problem]:
+    """Yield the problems of whole videos and stills, given their indexes by name.
+
+    Intake leaves out broken videos of static cameras if two cameras remain, and does not read
+    those of a version before.
+    """
+    static, broken = {each.id for each in match.spec.static_cameras}, dict[str, InputError]()
     views = match.spec.broadcast_views
     numbers = {camera.id: number for number, camera in enumerate(match.spec.cameras)}
     for unit, path in match.videos.items():
         index = indexes.get(path.relative_to(match.folder).as_posix())
-        if not isinstance(index, FrameIndex):  # of a version before: the intake reads it
+        whole = unit in match.calibrated_views
+        if isinstance(index, InputError) and (whole or unit not in match.detections):
+            broken[unit] = index
+        if not isinstance(index, FrameIndex):
             continue
         try:
-            whole = unit in match.calibrated_views
             require_footage(match.spec, unit, path, index, whole=whole)
         except InputError as error:
             number = numbers[views[unit].camera.id if unit in views else unit]
             yield {**describe(error, match.folder), "place": f"cameras[{number}].video"}
+    for unit, refusal in () if is_next else broken.items():
+        if unit not in static or len(static - broken.keys()) < 2:
+            number = numbers[views[unit].camera.id if unit in views else unit]
+            message = f"{match.videos[unit].name}: {describe_broken(refusal)}"
+            yield {"place": f"cameras[{number}].video", "message": message}
     for camera, path in match.stills.items():
         size = (match.spec.camera(camera).width, match.spec.camera(camera).height)
         if indexes.get(path.relative_to(match.folder).as_posix()) == size:

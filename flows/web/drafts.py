@@ -48,7 +48,7 @@ from flows.web.draft_problems import (
 from flows.web.video_folders import open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import whole_file
-from worldpose.ingest.validation import validate_record
+from worldpose.ingest.validation import reachable, validate_record
 from worldpose.store.store import Store
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
@@ -111,10 +111,13 @@ class Drafts:
             corrects: the folder of a refused arrival that it begins with.
 
         Raises:
-            InputError: there are too many drafts, or no disk space for a copy.
+            InputError: there are too many drafts, no disk space for a copy, or files are gone.
         """
         known = None if match_id is None else self.store.registration(match_id)
         origin = corrects or (None if known is None else Path(known.folder))
+        if origin is not None:
+            with reachable(origin):
+                origin.stat()
         if len(self.all()) >= MAX_DRAFTS:
             raise InputError("drafts", f"at most {MAX_DRAFTS}", "more", "Finish or discard some.")
         content: dict[str, JsonValue] = {"contract": 1, "cameras": [], "clips": []}

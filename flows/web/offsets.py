@@ -63,7 +63,7 @@ class Proposals:
             raise InputError(match_id, "a run with people", "none yet", "Run the match first.")
         plan = plan_as_latest(self.context.store, match, record, {})
         made = {unit.name: unit.key for unit in plan if unit.name.startswith(COMPARED)}
-        if not made.items() <= record.results.items():
+        if any(record.results.get(name, key) != key for name, key in made.items()):
             found, todo = "a run from before the last changes", "Run it again first."
             raise InputError(match_id, "a run of the match as it is now", found, todo)
         made_from = (match_id, record.run_id, match.registration.model_dump_json())

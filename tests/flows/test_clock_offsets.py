@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.cli.app import app
 from flows.results.clock_offsets import propose
+from flows.run_record import latest_run
 from flows.service.inbox import run_key, take_in, watch_once
 from flows.service.layout import served_state
 from worldpose.errors import UsageError
@@ -52,7 +53,7 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
 
 
 def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
-    server, tiny, tmp_path
+    server, tiny, tmp_path, monkeypatch
 ):
     project, inbox = tmp_path / "p", tmp_path / "p" / "inbox"
     folder = shift(tiny, tmp_path / "m")
@@ -66,6 +67,12 @@ def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
     row = next(each for each in found["cameras"] if each["camera"] == "cam02")
     assert (row["stated"], row["proposed"]) == (5, 0) and abs(row["found"]) < 0.2
     assert ada.get(f"{offsets}/plot").content.startswith(b"\x89PNG")
+    with monkeypatch.context() as patch:  # a unit that failed changed nothing
+        record = latest_run(Store.open(str(project)), page_client.TINY)
+        rest = {unit: key for unit, key in record.results.items() if unit != "detection/cam05"}
+        part = record.model_copy(update={"results": rest})
+        patch.setattr("flows.web.offsets.latest_run", lambda *_: part)
+        assert ada.get(offsets).status_code == 200
     assert ada.post(offsets, json={"offsets": {"cam02": 1}}).status_code == 422  # not the proposal
     assert ada.post(offsets, json={"offsets": found["changed"]}).status_code == 200
     (coming,) = ada.get(page_client.MATCH).json()["next_versions"]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import suppress
 from datetime import UTC, datetime
 
 import pytest
@@ -12,8 +13,9 @@ from data_contracts.review import MovedPoint, ReviewDecision
 from flows.cli.app import app
 from flows.cli.synchronize import compute_poses
 from flows.gates import GATES, Gatekeeper
+from flows.match import IncompleteRunError
 from flows.method import METHOD
-from flows.registering import open_match
+from flows.registering import open_match, register
 from flows.review.verdicts import (
     correct,
     decide,
@@ -29,6 +31,7 @@ from flows.running import RunRequest, run_match
 from flows.service import deployed
 from tasks.static_calibration import static_calibration
 from worldpose.errors import InputError
+from worldpose.ingest.writing import write_offsets
 from worldpose.review.journal import say
 from worldpose.store.integrity import verify
 
@@ -122,13 +125,35 @@ def test_a_part_before_the_questions_adds_one_record_at_most_and_keeps_them(stor
 
     monkeypatch.setattr(deployed, "run_stages", no_machines)
     part = RunRequest({}, until_stage="ingest", gates="auto")
-    assert deployed._run_until_decided(store, TINY, part) == waits
+    assert deployed._run_until_decided(store, TINY, part)[1] == waits
     # A run of which only a later stage asks anything ends as well.
     store.finish_run(
         waits.model_copy(update={"run_id": store.reserve_run(TINY), "overrides": {"ingest": {}}})
     )
-    record = deployed._run_until_decided(store, TINY, part)
+    _, record = deployed._run_until_decided(store, TINY, part)
     assert begun == [record.run_id] and record.waiting == waits.waiting
+
+
+def test_a_run_that_waited_is_exported_as_the_version_that_it_then_took(
+    store, tmp_path, monkeypatch
+):
+    waits = run(store, "auto")
+    ended = waits.model_copy(update={"state": "complete", "waiting": ()})
+    before, exported = open_match(store, TINY).folder.folder, []
+
+    def decide_after_next_version(*_):
+        after = shutil.copytree(before, tmp_path / "v2")
+        write_offsets(after, {"cam02": 1})
+        register(store, after, replaces=str(before))
+
+    monkeypatch.setattr(deployed, "take_verdict", decide_after_next_version)
+    monkeypatch.setattr(deployed, "run_stages", lambda log, limits: ended)
+    monkeypatch.setattr(
+        deployed, "export_after_run", lambda store, match, record: exported.append(match)
+    )
+    with suppress(IncompleteRunError):
+        deployed.match.fn(store.url, TINY, gates="auto")
+    assert [match.folder.folder.name for match in exported] == ["v2"]
 
 
 def test_the_policy_is_kept_where_a_unit_failed(store):

@@ -146,14 +146,50 @@ def test_runs_and_names_outlast_the_next_version(project_copy, tiny):
     assert view["is_ready"], view["problems"]
     (said,) = (note for note in view["notes"] if note.startswith("The next run computes"))
     assert "people" in said and "It keeps" in said
+    truth = f"reference/cameras/{camera}.npz"
+    assert f"{truth} is left out: there is no such camera" in view["notes"]
     ada.post(f"{DRAFTS}/{draft}/finish", json={})
     state = served_state(store.url)
     watch_once(state, inbox, 0.0)
     take_in(store, state, inbox, 0.0, lambda match, arrival: "")
     match = open_match(store, TINY)
     assert match.folder.folder.name == f"{TINY}.v2"
+    assert (tiny / truth).exists() and not (match.folder.folder / truth).exists()
     assert len(store.runs(TINY)) == 1 and len(match.corrections) == 1
     assert match_state(store, match).name == "outdated"
+
+
+def test_an_untouched_draft_is_no_change_where_match_yaml_names_no_video(place, footage):  # noqa: F811
+    ada, content = open_pages(place), a_match("", match_id="cup", camera={"side": "near"})
+    del content["cameras"][0]["video"]
+    shutil.copy(footage, refuse(place, content) / "videos" / "near_left.mp4")
+    assert arrive(place)["cup"].state == "taken"
+    draft = ada.post(DRAFTS, json={"match": "cup"}).json()["id"]
+    (problem,) = settle(ada, draft)["problems"]
+    assert problem["message"].startswith("nothing has changed yet")
+
+
+def test_a_match_whose_files_are_gone_is_no_draft(place, final):  # noqa: F811
+    ada, folder = final
+    for spoil, told in (
+        (lambda: (folder / "notes").symlink_to(place / "nowhere"), "notes"),
+        (lambda: folder.rename(place / "elsewhere"), "final"),
+    ):
+        spoil()
+        answer = ada.post(DRAFTS, json={"match": "final"})
+        assert answer.status_code == 422, answer.text
+        assert f"{told}: expected a match folder" in answer.json()["error"]
+    assert list((place / "inbox" / ".drafts").iterdir()) == []
+
+
+def test_the_form_tells_the_broken_video_for_which_a_match_was_refused(place, footage):  # noqa: F811
+    ada = open_pages(place)
+    folder = refuse(place, a_match("videos/near.mp4", match_id="cup", camera={"side": "near"}))
+    (folder / "videos" / "near.mp4").write_bytes(footage.read_bytes()[:300])
+    assert arrive(place)["cup"].state == "refused"
+    draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
+    (problem,) = settle(ada, draft, "broken")["problems"]
+    assert problem["place"] == "cameras[0].video" and "near.mp4" in problem["message"]
 
 
 def refuse(place, match_yaml):  # noqa: F811

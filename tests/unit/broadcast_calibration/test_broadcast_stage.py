@@ -14,6 +14,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from flows.registering import register
+from flows.reports.match_pictures import frame_pictures
 from flows.run_plan import plan_run
 from flows.stages.broadcast_calibration import uncalibrated_warnings
 from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
@@ -282,6 +283,8 @@ def test_images_are_those_of_the_clock_and_only_key_frames_of_the_clip_count(tmp
     with pytest.raises(InputError, match=r"0 to 15, found 0 to 19.* the 16 frames that fit"):
         register(store, write(20))
     match, _ = register(store, write(12))
+    shown = frame_pictures(store, match, "goal", range(4, 9))
+    assert [image is None for image in shown] == [False, False, True, False, False]
     planned = {unit.name: unit for unit in plan_run(store, match, {})}
     ingest.fn(planned["ingest/goal"].work(store.url, match, "0001"))
     work = planned["broadcast_calibration/goal"]
