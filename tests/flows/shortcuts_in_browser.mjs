@@ -74,7 +74,7 @@ await page.keyboard.press("s");
 await page.waitForFunction((count) => document.querySelectorAll("[data-person]").length > count, people);
 await state("outdated").waitFor();
 seen.words = await state("outdated").locator(".words").innerText();
-seen.button = await state("outdated").locator("button").innerText();
+seen.button = await state("outdated").locator("button.first").innerText();
 await shootSizes(page, seen, "outdated");
 await page.goto(`${task.base}/#/`);
 seen.home = await page.locator("li.panel .state").first().textContent();
