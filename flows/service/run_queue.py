@@ -95,11 +95,13 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
             if ended.wait(BEAT_SECONDS):
                 return
 
-    threading.Thread(target=write, name="heartbeat", daemon=True).start()
+    writer = threading.Thread(target=write, name="heartbeat", daemon=True)
+    writer.start()
     try:
         yield
     finally:
         ended.set()
+        writer.join(5.0)  # a last heartbeat must not follow the run's end; a disk can be frozen
 
 
 def _describe(reporter: Reporter | None) -> tuple[float, str, int]:

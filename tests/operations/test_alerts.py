@@ -252,11 +252,13 @@ def plan(tmp_path):
 
 
 def test_a_question_is_no_alert_before_its_time(plan):
+    now = datetime.now(UTC)  # not that of the import: the suite takes minutes
+
     def waiting(*hours, run="0001"):
         unit = "static_calibration/cam04"
         asked = [
             Question(
-                id="q", unit=unit, since=NOW - timedelta(hours=it), reasons=("clicks_wrong is 1",)
+                id="q", unit=unit, since=now - timedelta(hours=it), reasons=("clicks_wrong is 1",)
             )
             for it in hours
         ]
