@@ -262,6 +262,8 @@ def fit_parts(
         late[:, 5 * part.camera] += part.size * part.share(sums.rows, frames)
         if part.kind == "step":  # its place is known to some frames, and lost frames have no image
             there &= np.abs(sums.rows - part.row) > 0.2 * fps + max(0.0, part.size)
+    if not there.any():  # a clip that is shorter than what a step leaves open
+        return list(parts)
     full = sums.score + (sums.matrix @ late[..., None])[..., 0]  # of clocks that are not corrected
     sums = ClockSums(sums.matrix[there], full[there], sums.rows[there])
     parts, most, noise = list(parts), len(parts) + 4, sums.noise(fps)

@@ -14,7 +14,14 @@ from worldpose.camera_consistency.changes import find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import correct_views, explain_changes, triangulate_views
-from worldpose.triangulation.clock_courses import add_slow_drifts, shift_by_courses, trace_clocks
+from worldpose.triangulation.clock_courses import (
+    ClockPart,
+    ClockSums,
+    add_slow_drifts,
+    fit_parts,
+    shift_by_courses,
+    trace_clocks,
+)
 from worldpose.triangulation.lost_views import find_lost_views
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -298,3 +305,10 @@ def test_cameras_that_all_sway_agree_with_nobody(cameras):
 
     assert misfit(0.0) < 1.0
     assert misfit(30.0) > 3.0
+
+
+def test_a_step_that_covers_a_short_clip_stays_as_it_is():
+    parts = [ClockPart(0, "constant", 0, 0.0), ClockPart(0, "step", 12, 12.0)]
+    rows = np.arange(2.0, 25.0, 5.0)
+    sums = ClockSums(np.tile(np.eye(5), (len(rows), 1, 1)), np.zeros((len(rows), 5)), rows)
+    assert fit_parts(sums, parts, 25, 25.0) == parts
