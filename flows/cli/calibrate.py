@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from data_contracts.arrays import Image
-from flows.cli.console import JsonOption, errors, line, print_json, print_table
+from flows.cli.console import errors, line, print_json, print_table
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.video.names import is_video
 
@@ -25,13 +25,12 @@ def calibrate(
     columns: Annotated[int, typer.Option(min=2, max=100)],
     rows: Annotated[int, typer.Option(min=2, max=100)],
     square: Annotated[float, typer.Option(min=0.0001, max=10.0)],
-    out: Annotated[Path, typer.Option()],
+    out: Path,
     camera: str | None = None,
     charuco: Annotated[str | None, typer.Option(metavar="DICTIONARY")] = None,
     marker: float | None = None,
     every: Annotated[float, typer.Option(min=0.01, max=60.0)] = 0.5,
     plot: Path | None = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Compute the lenses of cameras from images or videos of a checkerboard or ChArUco board.
 
@@ -82,9 +81,7 @@ def calibrate(
         write_lens_toml(draft, {name: fit.lens for name, fit in fits.items()})
     if plot is not None:
         draw_lens_fits(fits, plot)
-    if as_json:
-        print_json({"lenses": str(out), "cameras": {n: _as_json(f) for n, f in fits.items()}})
-        return
+    print_json({"lenses": str(out), "cameras": {n: _as_json(f) for n, f in fits.items()}})
     _print(fits, files)
     line(f"wrote {out}; worldpose import --lens {out} --out MATCH adds it to a match")
 

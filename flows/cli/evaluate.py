@@ -12,17 +12,8 @@ import numpy as np
 import typer
 
 from data_contracts.evaluation import MethodScore
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    RunOption,
-    StageOption,
-    errors,
-    line,
-    print_json,
-    print_table,
-)
+from flows.cli.console import errors, line, print_json, print_table
+from flows.cli.options import DEFAULT_PROJECT
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,26 +24,21 @@ TableForm = Literal["text", "csv", "latex"]
 
 
 def evaluate(
-    prediction: Annotated[
-        list[str] | None, typer.Option("--prediction", metavar="[NAME=]PATH")
-    ] = None,
+    prediction: Annotated[list[str] | None, typer.Option(metavar="[NAME=]PATH")] = None,
     reference: str | None = None,
-    run: RunOption = "latest",
-    stage: StageOption = None,
-    match_in: Annotated[str | None, typer.Option("--match-in", metavar="CAMERA")] = None,
-    fps: Annotated[float | None, typer.Option("--fps", min=0.001)] = None,
-    ablation: Annotated[int, typer.Option("--ablation", metavar="SEEDS", min=0)] = 0,
-    method: Annotated[list[str] | None, typer.Option("--method", metavar="NAME=PATH")] = None,
+    run: str = "latest",
+    stage: str | None = None,
+    match_in: Annotated[str | None, typer.Option(metavar="CAMERA")] = None,
+    fps: Annotated[float | None, typer.Option(min=0.001)] = None,
+    ablation: Annotated[int, typer.Option(metavar="SEEDS", min=0)] = 0,
+    method: Annotated[list[str] | None, typer.Option(metavar="NAME=PATH")] = None,
     body: str | None = None,
     markers: Path | None = None,
     first_frame: int | None = None,
-    method_fps: Annotated[
-        list[str] | None, typer.Option("--method-fps", metavar="NAME=FPS")
-    ] = None,
+    method_fps: Annotated[list[str] | None, typer.Option(metavar="NAME=FPS")] = None,
     table: TableForm = "text",
     picture: Path | None = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Score joints and cameras against a reference; definitions in docs/reference/metrics.md.
 
@@ -89,7 +75,7 @@ def evaluate(
     if ablation:
         named = {"--prediction": prediction, "--reference": reference, "--method": method}
         _require_effect("--ablation", {**given, **named}, ())
-        print_ablation(ablation, as_json=as_json)
+        print_ablation(ablation)
         return
     if reference is not None and prediction and not method:
         from worldpose.dataset.benchmark import is_data_set, score_folders
@@ -109,7 +95,7 @@ def evaluate(
                     draft.write_bytes(plot_methods(sample))
             for place, note in (each for score in results for each in score.notes.items()):
                 line(f"{place}: {note}", to=errors)
-            print_methods(results, table, as_json=as_json)
+            print_methods(results, table)
             return
     if method and reference is not None and not prediction and picture is None:
         from flows.results.baselines import score_methods
@@ -125,7 +111,7 @@ def evaluate(
             fps=fps,
             seen_fps=named_rates(method_fps or ()),
         )
-        print_methods(found, table, as_json=as_json)
+        print_methods(found, table)
         return
     if not prediction or reference is None or picture is not None or method:
         raise UsageError(
@@ -138,7 +124,7 @@ def evaluate(
 
     if is_submission(Path(prediction[0])) and is_submission(Path(reference)):
         _require_effect("submissions", given, ())
-        _print_challenge(Path(prediction[0]), Path(reference), as_json=as_json)
+        _print_challenge(Path(prediction[0]), Path(reference))
         return
     from flows.results.evaluation import Reading, is_of_files, score
 
@@ -158,7 +144,7 @@ def evaluate(
     )
     if scores.later_run:
         line(scores.later_run, to=errors)
-    _print_scores(scores, as_json=as_json)
+    _print_scores(scores)
 
 
 def _require_effect(kind: str, given: Mapping[str, object], allowed: Sequence[str]) -> None:
@@ -189,33 +175,29 @@ def named_folders(given: Sequence[str]) -> dict[str, Path]:
     return folders
 
 
-def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:
+def _print_challenge(prediction: Path, reference: Path) -> None:
     from worldpose.evaluation.challenge import ALL, score_submission
     from worldpose.formats.challenge import submission_clips
 
     found = {name: each.row() for name, each in score_submission(prediction, reference).items()}
     if unknown := [clip for clip in submission_clips(prediction) if clip not in found]:
         line(f"not scored, as the reference lacks them: {', '.join(unknown)}", to=errors)
-    if as_json:
-        print_json({**found.pop(ALL), "clips": found})
-        return
+    print_json({**found[ALL], "clips": {name: each for name, each in found.items() if name != ALL}})
     rows = [(name, *(f"{value:.4g}" for value in row.values())) for name, row in found.items()]
     print_table("", ("clip", *(f">{name}" for name in found[ALL])), rows)
 
 
-def _print_scores(scores: Scores, *, as_json: bool) -> None:
+def _print_scores(scores: Scores) -> None:
     from worldpose.reports.run_report import score_rows
 
     alignment = scores.alignment
-    if as_json:
-        metrics = scores.evaluation.model_dump(exclude_none=True)
-        if alignment is not None:
-            metrics["reference_offset_s"] = alignment.offset
-            metrics["reference_residual_m"] = alignment.residual
-        if scores.notes:
-            metrics["notes"] = scores.notes
-        print_json(metrics)
-        return
+    metrics = scores.evaluation.model_dump(exclude_none=True)
+    if alignment is not None:
+        metrics["reference_offset_s"] = alignment.offset
+        metrics["reference_residual_m"] = alignment.residual
+    if scores.notes:
+        metrics["notes"] = scores.notes
+    print_json(metrics)
     if alignment is not None:
         line(
             f"the reference's clock is {alignment.offset:.4f} s at match frame 0; after a rigid "
@@ -266,7 +248,7 @@ def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object
     print_table("", (kind, *(f">{title}" for title in columns.values())), shown)
 
 
-def print_ablation(seeds: int, *, as_json: bool) -> None:
+def print_ablation(seeds: int) -> None:
     """Simulate trials and print every row's mean and standard deviation over them.
 
     Seeds count from 0; JSON has every trial's metrics.
@@ -277,17 +259,15 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
     )
     names = [field.name for field in fields(Score)]
-    if as_json:
-        print_json(
-            {
-                clicks: {
-                    row: {name: [getattr(trial[row], name) for trial in found] for name in names}
-                    for row in found[0]
-                }
-                for clicks, found in trials.items()
+    print_json(
+        {
+            clicks: {
+                row: {name: [getattr(trial[row], name) for trial in found] for name in names}
+                for row in found[0]
             }
-        )
-        return
+            for clicks, found in trials.items()
+        }
+    )
     columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px")
     for clicks, found in trials.items():
         for how in (*TRIANGULATIONS, BY_PAPER):
@@ -349,14 +329,13 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
     return rates
 
 
-def print_methods(scores: Sequence[MethodScore], form: TableForm, *, as_json: bool) -> None:
+def print_methods(scores: Sequence[MethodScore], form: TableForm) -> None:
     """Print scores of methods as text, CSV or LaTeX, or in full as JSON."""
     from flows.results import baselines
 
-    if as_json:
-        rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
-        print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
-    elif form == "text":
+    rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
+    print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
+    if form == "text":
         # Brackets would be parsed as markup.
         titles = (
             f">{title.replace('[', '').replace(']', '')}" for title in baselines.COLUMNS.values()

@@ -8,8 +8,6 @@ from typing import Annotated
 import typer
 
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption, RunOption
-from flows.cli.options import MoreSettingsOption
 from flows.registering import find_registration
 from flows.results.comparison import (
     KINDS,
@@ -25,10 +23,9 @@ from worldpose.store.store import Store
 
 
 def diff(
+    store: Store,
     run_a: Annotated[str, typer.Argument(metavar="A")],
     run_b: Annotated[str, typer.Argument(metavar="B")],
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Show what changed between two runs: keys, reasons and metrics, and which parts improved.
 
@@ -43,20 +40,17 @@ def diff(
         run_a: A run, as MATCH/NUMBER.
         run_b: Another run, as MATCH/NUMBER.
     """
-    store = Store.open(project)
     a, b = find_run(store, run_a), find_run(store, run_b)
     changes = run_difference(store, a, b)
     is_one_match = a.match_id == b.match_id
     compared = compare_runs(store, a, b) if is_one_match else []
     pictures = largest_pose_changes(store, a, b) if is_one_match else []
-    if as_json:
-        found = {
-            "units": [asdict(each) for each in changes],
-            "compared": [asdict(each) for each in compared],
-            "moved": [asdict(each) for each in pictures],
-        }
-        console.print_json({"a": run_a, "b": run_b, **found})
-        return
+    found = {
+        "units": [asdict(each) for each in changes],
+        "compared": [asdict(each) for each in compared],
+        "moved": [asdict(each) for each in pictures],
+    }
+    console.print_json({"a": run_a, "b": run_b, **found})
     rows = [
         (
             change.unit,
@@ -105,10 +99,9 @@ def _print_compared(compared: list[SubjectChange]) -> None:
 
 
 def why(
+    store: Store,
     unit: Annotated[str, typer.Argument(metavar="UNIT")],
-    assignments: MoreSettingsOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    more_settings: list[str] | None = None,
 ) -> None:
     """Show whether a unit's result is current, and if not, what made it stale.
 
@@ -121,26 +114,18 @@ def why(
     Options:
         unit: A unit, as MATCH/STAGE/UNIT.
     """
-    found = explain_unit(Store.open(project), unit, parse_overrides(assignments or []))
+    found = explain_unit(store, unit, parse_overrides(more_settings or []))
     reasons = (f"  {reason}" for reason in found.reasons)
-    console.answer(as_json, asdict(found), f"{found.unit}: {found.state}", *reasons)
+    console.answer(asdict(found), f"{found.unit}: {found.state}", *reasons)
 
 
-def timings(
-    match: MatchArgument,
-    run: RunOption = "latest",
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
-) -> None:
+def timings(store: Store, match: str, run: str = "latest") -> None:
     """Print the time of each stage of a run, the idle time, core hours and bytes.
 
     Example: worldpose timings matches/tiny
     """
-    store = Store.open(project)
     found = run_time(store, find_registration(store, match).spec.match_id, run)
-    if as_json:
-        console.print_json(asdict(found))
-        return
+    console.print_json(asdict(found))
     columns = ("stage", ">units", ">elapsed s", ">of the run %", ">work s", ">longest unit s")
     whole = max(found.seconds, 1e-9)
     rows = [

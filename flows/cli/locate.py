@@ -4,26 +4,27 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
 
 from data_contracts.cameras import CameraCalibration, LensCalibration
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
-from flows.cli.options import WorkersOption
+from flows.cli.options import DEFAULT_PROJECT
 from flows.cli.synchronize import compute_poses
 from flows.registering import find_match
 from flows.results.clock_offsets import choose_clip, load_detections
 from flows.results.outputs import require_new
 from flows.running import RunRequest
 from flows.stage import Match
+from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength
+from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimate
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.formats.files import whole_file
+from worldpose.ingest.match_folder import LENS_FILE
 from worldpose.store.store import Store
-
-if TYPE_CHECKING:
-    from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength
 
 UNKNOWN_FOCAL: Final = 0.3
 """Relative deviation of a focal length that nothing is known of [1]."""
@@ -38,17 +39,16 @@ STATURE_STD_M: Final = 0.01
 
 
 def locate_cameras(
-    match: MatchArgument,
+    match: str,
     stature: Annotated[float | None, typer.Option(min=0.5, max=2.5)] = None,
     distance: Annotated[
         tuple[str, str, float] | None, typer.Option(metavar="CAMERA CAMERA METRES")
     ] = None,
     clip: str | None = None,
     out: Path | None = None,
-    apply: Annotated[bool, typer.Option("--apply")] = False,
-    workers: WorkersOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    apply: bool = False,
+    workers: int | None = None,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Find the poses of static cameras from people who walk through their views, without a pitch.
 
@@ -65,9 +65,6 @@ def locate_cameras(
         out: Calibration (TOML) to write.
         apply: Write calibration.toml into the match folder.
     """
-    from worldpose.bundle_adjustment.people_cameras import KnownLength
-    from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimate
-
     if (stature is None) == (distance is None):
         raise UsageError(
             "--stature",
@@ -107,9 +104,7 @@ def locate_cameras(
     found = estimate(lenses, detections, folder.spec.fps, known)
     calibrations = {name: found.cameras[c].to_calibration(name) for c, name in enumerate(names)}
     written = _write(calibrations, folder.folder if apply else None, out)
-    if as_json:
-        console.print_json({"clip": chosen, "written": written, **_as_json(found, names)})
-        return
+    console.print_json({"clip": chosen, "written": written, **_as_json(found, names)})
     _print(found, names, written, known)
 
 
@@ -147,8 +142,6 @@ def _lens(match: Match, camera: str) -> LensCalibration:
 
 def _distance(given: tuple[str, str, float], names: list[str]) -> KnownLength:
     """Return the measured distance of two cameras."""
-    from worldpose.bundle_adjustment.people_cameras import KnownLength
-
     one, other, metres = given
     if one not in names or other not in names or one == other or not metres > 0.0:
         raise UsageError(
@@ -164,10 +157,6 @@ def _write(
     calibrations: dict[str, CameraCalibration], folder: Path | None, out: Path | None
 ) -> list[str]:
     """Write the calibration to a file, and into a match folder in place of its lenses."""
-    from worldpose.formats.calibration_writer import write_calibration_toml
-    from worldpose.formats.files import whole_file
-    from worldpose.ingest.match_folder import LENS_FILE
-
     places = [] if out is None else [out]
     if folder is not None:
         places.append(folder / "calibration.toml")

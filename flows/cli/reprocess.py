@@ -9,8 +9,6 @@ import typer
 from pydantic import JsonValue
 
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, VerboseOption
-from flows.cli.options import DaskOption, MoreSettingsOption, TimeLimitOption, WorkersOption
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
 from flows.reprocess import Reprocessed, State, reprocess_matches
@@ -26,16 +24,15 @@ JSON_STATES: Final = {"current": "untouched", "stale": "touched"}
 
 
 def reprocess(
+    store: Store,
     matches: Annotated[list[str] | None, typer.Argument(metavar="[MATCH]...")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run")] = False,
-    retry: Annotated[bool, typer.Option("--retry")] = False,
-    assignments: MoreSettingsOption = None,
-    dask: DaskOption = None,
-    workers: WorkersOption = None,
-    time_limits: TimeLimitOption = None,
-    verbose: VerboseOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    dry_run: bool = False,
+    retry: bool = False,
+    more_settings: list[str] | None = None,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: list[str] | None = None,
+    verbose: bool = False,
 ) -> None:
     """Recompute results that an edit, a setting, a detector or new code made stale.
 
@@ -50,8 +47,7 @@ def reprocess(
         dry_run: Only list the units to compute, with reasons.
         retry: Retry failed units, even without an edit.
     """
-    overrides = parse_overrides(assignments or [])
-    store = Store.open(project)
+    overrides = parse_overrides(more_settings or [])
     wanted = [find_registration(store, name).spec.match_id for name in matches or ()]
     limits = parse_time_limits(time_limits or ())
     request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
@@ -59,13 +55,10 @@ def reprocess(
         states, told = set(), []
         for each in reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run):
             states.add(each.state)
-            if as_json:
-                told.append(_as_json(each))
-            else:
-                _print(each)
-    if as_json:
-        console.print_json({"matches": told})
-    elif not states:
+            told.append(_as_json(each))
+            _print(each)
+    console.print_json({"matches": told})
+    if not states:
         console.line("No match is registered. Register one: worldpose ingest FOLDER.")
     raise typer.Exit(exit_code(states))
 

@@ -13,14 +13,8 @@ import typer
 from pydantic import JsonValue
 
 from data_contracts.run import EXIT_CODES, GatePolicy, RunRecord
-from flows.cli import console, options
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    VerboseOption,
-)
+from flows.cli import console
+from flows.cli.options import DEFAULT_PROJECT
 from flows.cli.settings import print_known
 from flows.iterate import Iteration, Iterations, iterate_match
 from flows.orchestration.time_limits import parse_time_limits
@@ -40,27 +34,27 @@ from worldpose.store.store import Run, Store
 if TYPE_CHECKING:
     from flows.results.comparison import Mark
 
+Marks = list[dict[str, str]]
 MAX_LISTED = 5
 """Number of waiting units listed by name."""
 
 
 def run(
-    match: MatchArgument,
+    match: str,
     from_stage: Annotated[str | None, typer.Option("--from")] = None,
     until_stage: Annotated[str | None, typer.Option("--until")] = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="STAGE.NAME=VALUE")
     ] = None,
-    default_settings: Annotated[bool, typer.Option("--default-settings")] = False,
-    dask: options.DaskOption = None,
-    workers: options.WorkersOption = None,
-    time_limits: options.TimeLimitOption = None,
+    default_settings: bool = False,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: list[str] | None = None,
     gates: Annotated[GatePolicy | None, typer.Option(metavar="POLICY")] = None,
     iterations: Annotated[str | None, typer.Option(metavar="N")] = None,
-    body_folder: options.BodyFolderOption = None,
-    verbose: VerboseOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    body_folder: Path | None = None,
+    verbose: bool = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Compute a match's missing and stale results, and nothing else.
 
@@ -82,7 +76,7 @@ def run(
     """
     started = time.monotonic()
     if assignments == ["list"]:
-        print_known(as_json=as_json)
+        print_known()
         return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
@@ -115,32 +109,31 @@ def run(
         *clock_advice(record.figures, opened.folder.spec),
         *click_advice(record.figures, record.settings),
     ]
-    if as_json:
-        console.print_json(
-            {
-                "run": record.run_id,
-                "executed": len(record.executed),
-                "reused": len(record.reused),
-                "failed": len(record.failed),
-                "waiting": len(record.waiting),
-                "seconds": round(seconds, 3),
-                "blocked": len(record.blocked),
-                "failures": [failure.model_dump() for failure in record.failed],
-                "gates": record.gates,
-                "reviews": [unit.model_dump() for unit in record.waiting],
-                "left_out": record.left_out,
-                "warnings": warned,
-                "usability": record.usability.model_dump(mode="json"),
-                **({"exports": [str(path) for path in exported]} if exported else {}),
-                **({} if passes is None else _iterations_json(store, passes)),
-            }
-        )
-    else:
-        if passes is not None:
-            print_iterations(store, passes)
-        _print(record, store.url, seconds)
-        for path in exported:
-            console.line(f"exported {path}")
+    marks = [] if passes is None else marks_of(store, passes)
+    console.print_json(
+        {
+            "run": record.run_id,
+            "executed": len(record.executed),
+            "reused": len(record.reused),
+            "failed": len(record.failed),
+            "waiting": len(record.waiting),
+            "seconds": round(seconds, 3),
+            "blocked": len(record.blocked),
+            "failures": [failure.model_dump() for failure in record.failed],
+            "gates": record.gates,
+            "reviews": [unit.model_dump() for unit in record.waiting],
+            "left_out": record.left_out,
+            "warnings": warned,
+            "usability": record.usability.model_dump(mode="json"),
+            **({"exports": [str(path) for path in exported]} if exported else {}),
+            **({} if passes is None else _iterations_json(passes, marks)),
+        }
+    )
+    if passes is not None:
+        print_iterations(passes, marks)
+    _print(record, store.url, seconds)
+    for path in exported:
+        console.line(f"exported {path}")
     reservations = record.usability.reservations
     for text in dict.fromkeys((*reservations, *warned)):
         kind = "reservation" if text in reservations else "warning"
@@ -248,12 +241,12 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
     }
 
 
-def marks_of(store: Store, found: Iterations) -> list[dict[str, str]]:
+def marks_of(store: Store, found: Iterations) -> Marks:
     """Compare cameras, clips and players of each iteration with the iteration before."""
     # Imported here: it takes 0.7 s, before Prefect and Dask can start, and few runs iterate.
     from flows.results.comparison import KINDS, compare_runs, count_marks
 
-    marks: list[dict[str, str]] = [{}]
+    marks: Marks = [{}]
     for before, after in pairwise(found.passes):
         changes = compare_runs(store, before.record, after.record)
         marks.append({kind: _in_short(count_marks(changes, kind)) for kind in KINDS})
@@ -265,7 +258,7 @@ def _in_short(marks: Mapping[Mark, int]) -> str:
     return " / ".join(str(marks.get(mark, 0)) for mark in shown)
 
 
-def _iterations_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
+def _iterations_json(found: Iterations, marks: Marks) -> dict[str, JsonValue]:
     """Return all iterations with their metrics, and the kept one."""
     return {
         "iterations": [
@@ -273,23 +266,22 @@ def _iterations_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
                 "iteration": each.number,
                 "run": each.record.run_id,
                 **figures_of(each),
-                "better_worse_mixed_unchanged": dict(marks),
+                "better_worse_mixed_unchanged": dict(changes),
             }
-            for each, marks in zip(found.passes, marks_of(store, found), strict=True)
+            for each, changes in zip(found.passes, marks, strict=True)
         ],
         "kept": found.kept.number,
         "ended": found.ended,
     }
 
 
-def print_iterations(store: Store, found: Iterations) -> None:
+def print_iterations(found: Iterations, marks: Marks) -> None:
     """Print one column per iteration, and the kept one."""
     columns = [figures_of(each) for each in found.passes]
     rows = [
         (name, *("" if column[name] is None else f"{column[name]:.4g}" for column in columns))
         for name in columns[0]
     ]
-    marks = marks_of(store, found)
     kinds = dict.fromkeys(kind for each in marks for kind in each)
     rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in kinds]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]

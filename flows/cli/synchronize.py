@@ -11,8 +11,7 @@ import typer
 
 from data_contracts.match import ClockOffset
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
-from flows.cli.options import WorkersOption
+from flows.cli.options import DEFAULT_PROJECT
 from flows.registering import find_match
 from flows.results.clock_offsets import ClockOffsets, choose_clip, find_offsets
 from flows.results.outputs import claim_file
@@ -24,14 +23,13 @@ from worldpose.store.store import Run, Store
 
 
 def synchronize(
-    match: MatchArgument,
+    match: str,
     clip: str | None = None,
     max_offset: Annotated[float, typer.Option(min=0.1, max=60.0)] = 2.0,
     plot: Path | None = None,
-    apply: Annotated[bool, typer.Option("--apply")] = False,
-    workers: WorkersOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    apply: bool = False,
+    workers: int | None = None,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Find the clock offsets of the static cameras from moving people, and propose offset_frames.
 
@@ -66,16 +64,14 @@ def synchronize(
         from worldpose.ingest.writing import write_offsets
 
         write_offsets(opened.folder.folder, changed)
-    if as_json:
-        console.print_json(
-            {
-                "clip": chosen_clip,
-                "cameras": [row._asdict() for row in rows],
-                "applied": changed if apply else {},
-            }
-        )
-    else:
-        _print(offsets, plot, applied=apply)
+    console.print_json(
+        {
+            "clip": chosen_clip,
+            "cameras": [row._asdict() for row in rows],
+            "applied": changed if apply else {},
+        }
+    )
+    _print(offsets, plot, applied=apply)
     if offsets.warning:
         console.line(f"warning: {offsets.warning}", to=console.errors)
     is_known = np.isfinite(found.late).all() and not offsets.warning
