@@ -206,24 +206,17 @@ def _print(fits: dict[str, LensFit], files: dict[str, list[str]]) -> None:
     """Print a table of the lenses, and what is to know about the images."""
     rows = []
     for name, fit in fits.items():
-        lens = fit.lens
-        x, y = lens.principal_point_px
+        lens, (x, y) = fit.lens, fit.lens.principal_point_px
+        kind = "fisheye " if lens.lens_model == "fisheye" else ""
         rows.append(
-            (
-                name,
-                f"{fit.used.sum()} of {len(fit.used)}",
-                f"{fit.rms_px:.2f}",
-                f"{lens.focal_px:.1f} +- {lens.focal_std_px:.1f}",
-                f"{x:.1f}, {y:.1f} +- {lens.principal_point_std_px:.1f}",
-                ("fisheye " if lens.lens_model == "fisheye" else "")
-                + " ".join(f"{one:.4f}" for one in lens.distortion[:4]),
-                f"{100 * fit.coverage:.0f}",
-            )
+            f"{name}\t{fit.used.sum()} of {len(fit.used)}\t{fit.rms_px:.2f}\t"
+            f"{lens.focal_px:.1f} +- {lens.focal_std_px:.1f}\t"
+            f"{x:.1f}, {y:.1f} +- {lens.principal_point_std_px:.1f}\t"
+            f"{kind}{' '.join(f'{one:.4f}' for one in lens.distortion[:4])}\t"
+            f"{100 * fit.coverage:.0f}"
         )
-    head = (
-        *("camera", ">images", ">residual px", ">focal length px", ">principal point px"),
-        *("k1 k2 p1 p2, fisheye k1 to k4", ">coverage %"),
-    )
+    head = "camera\t>images\t>residual px\t>focal length px\t>principal point px\t"
+    head += "k1 k2 p1 p2, fisheye k1 to k4\t>coverage %"
     print_table("lenses", head, rows)
     for name, fit in fits.items():
         for file, reason in zip(files[name], fit.reasons, strict=True):

@@ -47,20 +47,27 @@ def answer(value: Mapping[str, Any], *lines: str) -> None:
         line(text)
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def print_table(
+    title: str, columns: str | Sequence[str], rows: Iterable[str | Sequence[str]]
+) -> None:
     """Print a plain table; columns that start with ">" are right-aligned.
 
-    Nothing is truncated: a cell too wide for the terminal wraps, and a file or pipe, which people
-    search, gets whole lines.
+    Cells that are numbers and names can be given as one text with tabs between them. Nothing is
+    truncated: a cell too wide for the terminal wraps, and a file or pipe, which people search, gets
+    whole lines.
     """
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
-    for column in columns:
+    for column in _cells(columns):
         justify: Literal["left", "right"] = "right" if column.startswith(">") else "left"
         table.add_column(column.lstrip(">"), justify=justify, overflow="fold")
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*map(Text, _cells(row)))
     to = output if output.is_terminal else Console(width=NO_WIDTH, quiet=output.quiet)
     to.print(table, soft_wrap=False)
+
+
+def _cells(row: str | Sequence[str]) -> Sequence[str]:
+    return row.split("\t") if isinstance(row, str) else row
 
 
 UNIT_WIDTH = 25

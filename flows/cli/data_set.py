@@ -57,20 +57,12 @@ def statistics(
         with whole_file(page) as draft:
             draft.write_text(data_set_page(title, found, checks), encoding="utf-8")
     print_json(found.model_dump(mode="json"))
-    rows = [
-        (
-            name,
-            clip.camera or "-",
-            f"{clip.frames}",
-            f"{clip.seconds:.1f}",
-            f"{clip.persons}",
-            f"{clip.poses}",
-            f"{sum(clip.trajectories_m):.0f}",
-        )
+    rows = (
+        f"{name}\t{clip.camera or '-'}\t{clip.frames}\t{clip.seconds:.1f}\t{clip.persons}\t"
+        f"{clip.poses}\t{sum(clip.trajectories_m):.0f}"
         for name, clip in found.clips.items()
-    ]
-    titles = ("frames", "s", "people", "poses", "distance m")
-    print_table("", ("clip", "camera", *(f">{title}" for title in titles)), rows)
+    )
+    print_table("", "clip\tcamera\t>frames\t>s\t>people\t>poses\t>distance m", rows)
     line(
         f"{len(found.clips)} clips, {found.minutes:.1f} min, {found.frames} frames, "
         f"{found.poses} poses, {found.distance_km:.2f} km, camera {found.camera or '-'}"
@@ -115,20 +107,13 @@ def _print_check(report: CheckReport) -> None:
     for note in report.notes:
         line(note, to=errors)
     print_json({**report.model_dump(mode="json"), "passed": not report.findings})
-    rows = [
-        (
-            name,
-            f"{figures.frames}",
-            f"{figures.persons}",
-            f"{figures.cameras}",
-            f"{figures.compared}",
-            _format_value(figures.reprojection_median_px),
-            _format_value(figures.plausible_share),
-        )
-        for name, figures in report.clips.items()
-    ]
-    titles = ("frames", "people", "cameras", "compared", "reprojection px", "plausible")
-    print_table("", ("clip", *(f">{title}" for title in titles)), rows)
+    rows = (
+        f"{name}\t{it.frames}\t{it.persons}\t{it.cameras}\t{it.compared}\t"
+        f"{_format_value(it.reprojection_median_px)}\t{_format_value(it.plausible_share)}"
+        for name, it in report.clips.items()
+    )
+    heads = "clip\t>frames\t>people\t>cameras\t>compared\t>reprojection px\t>plausible"
+    print_table("", heads, rows)
     for finding in report.findings:
         figures = ", ".join(f"{name} {value:.4g}" for name, value in finding.figures.items())
         line(f"{finding.fault}: {finding.says} [{', '.join(finding.where)}] {figures}".rstrip())

@@ -287,22 +287,14 @@ def _is_of(row: str, how: str) -> bool:
     return max(ends, key=len) == how
 
 
-def _row(name: str, scores: list[Score]) -> tuple[str, str, str, str, str]:
-    def values(figure: str) -> list[float]:
-        return [getattr(score, figure) for score in scores]
-
-    def mean(figure: str, digits: int) -> str:
-        return f"{np.mean(values(figure)):.{digits}f}"
-
-    def mean_and_deviation(metric: str) -> str:
-        return f"{mean(metric, 1)} ± {np.std(values(metric)):.1f}"
-
+def _row(name: str, scores: list[Score]) -> str:
+    g, pa, ground, marking = (
+        np.array([getattr(score, figure) for score in scores])
+        for figure in ("g_mpjpe_mm", "pa_mpjpe_mm", "ground_error_m", "marking_error_px")
+    )
     return (
-        name,
-        mean_and_deviation("g_mpjpe_mm"),
-        mean_and_deviation("pa_mpjpe_mm"),
-        mean("ground_error_m", 3),
-        mean("marking_error_px", 2),
+        f"{name}\t{g.mean():.1f} ± {g.std():.1f}\t{pa.mean():.1f} ± {pa.std():.1f}\t"
+        f"{ground.mean():.3f}\t{marking.mean():.2f}"
     )
 
 

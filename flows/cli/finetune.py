@@ -115,19 +115,12 @@ def finetune(
 
 
 def _print(versions: list[NetVersion], folder: Path) -> None:
-    rows = [
-        (
-            v.net,
-            v.figure,
-            f"{v.before:.3f}",
-            f"{v.after:.3f}",
-            str(len(v.held_out)),
-            "adopted" if v.adopted else "not better: the old version stays",
-        )
+    rows = (
+        f"{v.net}\t{v.figure}\t{v.before:.3f}\t{v.after:.3f}\t{len(v.held_out)}\t"
+        + ("adopted" if v.adopted else "not better: the old version stays")
         for v in versions
-    ]
-    columns = ("net", "metric", ">before", ">after", ">held-out images", "")
-    console.print_table("fine-tuning", columns, rows)
+    )
+    console.print_table("fine-tuning", "net\tmetric\t>before\t>after\t>held-out images\t", rows)
     chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
     if chosen:
         console.line(f"use it with: worldpose run MATCH {' '.join(chosen)}")

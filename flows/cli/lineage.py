@@ -63,14 +63,12 @@ def diff(
     console.print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "metrics"), rows)
     _print_compared(compared)
     if pictures:
-        console.print_table(
-            "images with the largest changes of people",
-            ("clip", "camera", ">frame", ">person", ">px"),
-            [
-                (each.clip, each.camera, str(each.frame), str(each.person), f"{each.moved_px:.2f}")
-                for each in pictures
-            ],
+        shown = (
+            f"{each.clip}\t{each.camera}\t{each.frame}\t{each.person}\t{each.moved_px:.2f}"
+            for each in pictures
         )
+        title = "images with the largest changes of people"
+        console.print_table(title, "clip\tcamera\t>frame\t>person\t>px", shown)
 
 
 def _print_compared(compared: list[SubjectChange]) -> None:
@@ -126,21 +124,15 @@ def timings(store: Store, match: str, run: str = "latest") -> None:
     """
     found = run_time(store, find_registration(store, match).spec.match_id, run)
     console.print_json(asdict(found))
-    columns = ("stage", ">units", ">elapsed s", ">of the run %", ">work s", ">longest unit s")
-    whole = max(found.seconds, 1e-9)
+    columns = "stage\t>units\t>elapsed s\t>of the run %\t>work s\t>longest unit s"
+    percent = 100.0 / max(found.seconds, 1e-9)
     rows = [
-        (
-            each.stage,
-            str(each.units),
-            f"{each.elapsed:.2f}",
-            f"{100.0 * each.elapsed / whole:.1f}",
-            f"{each.work:.2f}",
-            f"{each.longest:.2f}",
-        )
+        f"{each.stage}\t{each.units}\t{each.elapsed:.2f}\t{percent * each.elapsed:.1f}\t"
+        f"{each.work:.2f}\t{each.longest:.2f}"
         for each in found.stages
     ]
     for name, seconds in (("start", found.start), ("between units", found.between)):
-        rows.append((name, "", f"{seconds:.2f}", f"{100.0 * seconds / whole:.1f}", "", ""))
+        rows.append(f"{name}\t\t{seconds:.2f}\t{percent * seconds:.1f}\t\t")
     console.print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
     console.line(f"all its results, also those of earlier runs: {found.cost}")
     if not found.stages:

@@ -207,21 +207,14 @@ def _print(
         x, y, z = found.cameras.center[c]
         held = found.held_out_px[c]
         rows.append(
-            (
-                name,
-                f"{x:.2f}, {y:.2f}, {z:.2f} +- {found.std[c, 0]:.2f}",
-                f"{np.degrees(found.std[c, 1]):.2f}",
-                f"{found.cameras.focal[c, 0]:.0f} +- {100 * found.std[c, 2]:.1f} %",
-                str(found.keypoints[c]),
-                f"{found.residual_px[c]:.1f}",
-                "-" if np.isnan(held) else f"{held:.1f}",
-                f"{100 * found.coverage[c]:.0f}",
-            )
+            f"{name}\t{x:.2f}, {y:.2f}, {z:.2f} +- {found.std[c, 0]:.2f}\t"
+            f"{np.degrees(found.std[c, 1]):.2f}\t"
+            f"{found.cameras.focal[c, 0]:.0f} +- {100 * found.std[c, 2]:.1f} %\t"
+            f"{found.keypoints[c]}\t{found.residual_px[c]:.1f}\t"
+            f"{'-' if np.isnan(held) else f'{held:.1f}'}\t{100 * found.coverage[c]:.0f}"
         )
-    head = (
-        *("camera", ">position m", ">rotation +- deg", ">focal length px", ">keypoints"),
-        *(">residual px", ">held out px", ">coverage %"),
-    )
+    head = "camera\t>position m\t>rotation +- deg\t>focal length px\t>keypoints\t"
+    head += ">residual px\t>held out px\t>coverage %"
     console.print_table("cameras by the people", head, rows)
     by = "standing feet" if found.on_feet else "upright bodies"
     console.line(

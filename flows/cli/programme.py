@@ -91,17 +91,13 @@ def clips(
             ],
         }
     )
-    columns = ("take", ">begins at", ">seconds", ">pan in widths", ">% grass")
-    rows = [
-        (
-            f"{shot.first}:{shot.first + shot.count}",
-            "{:.0f}:{:04.1f}".format(*divmod(shot.first / index.fps, 60.0)),
-            f"{shot.seconds:.1f}",
-            f"{shot.pan:.2f}",
-            f"{100.0 * shot.grass:.0f}",
-        )
+    rows = (
+        f"{shot.first}:{shot.first + shot.count}\t"
+        + "{:.0f}:{:04.1f}".format(*divmod(shot.first / index.fps, 60.0))
+        + f"\t{shot.seconds:.1f}\t{shot.pan:.2f}\t{100.0 * shot.grass:.0f}"
         for shot in proposed
-    ]
+    )
+    columns = "take\t>begins at\t>seconds\t>pan in widths\t>% grass"
     print_table("proposed clips", columns, rows)
     reasons = sorted({reason for shot in shots for reason in shot.unfit})
     for reason in reasons:
