@@ -27,15 +27,15 @@ from flows.layers import (
     write_layer,
 )
 from flows.method import METHOD, task_modules
-from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
     keep_workers,
+    require_room,
+    require_workers,
     start_cluster,
     wait_for_worker,
     workers_for,
 )
 from flows.orchestration.prefect_environment import has_server, prefect_server
-from flows.orchestration.time_limits import TimeLimits
 from flows.overview import make_summary
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
@@ -44,6 +44,7 @@ from flows.run_status import last_stage
 from flows.settings import (
     Overrides,
     ResolvedSettings,
+    TimeLimits,
     as_text,
     flatten,
     resolve,

@@ -1,13 +1,13 @@
-"""Command run: make a match's results current."""
+"""Commands run and reprocess: make the results of one match, or of all, current."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 from pydantic import JsonValue
@@ -17,16 +17,17 @@ from flows.cli import console
 from flows.cli.options import DEFAULT_PROJECT
 from flows.cli.settings import print_known
 from flows.iterate import Iteration, Iterations, iterate_match
-from flows.orchestration.time_limits import parse_time_limits
-from flows.registering import find_match
+from flows.registering import find_match, find_registration
+from flows.reprocess import Reprocessed, State, reprocess_matches
 from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
 from flows.review.corrections import objections_of
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
 from flows.run_record import alone_with
+from flows.run_status import RunStatus
 from flows.running import RunRequest, run_match, settle
-from flows.settings import parse_overrides, selected_stages
+from flows.settings import parse_overrides, parse_time_limits, selected_stages
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.store import Run, Store
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
     from flows.results.comparison import Mark
 
 Marks = list[dict[str, str]]
+MAX_REASONS: Final = 3
+"""Printed reasons per unit; --json has them all."""
+JSON_STATES: Final = {"current": "untouched", "stale": "touched"}
+"""Words of --json for states that have no run of their own, as programs know them."""
 MAX_LISTED = 5
 """Number of waiting units listed by name."""
 
@@ -312,3 +317,111 @@ def _last_bodies(record: RunRecord) -> dict[str, float]:
                 clip = unit.partition("/")[2]
                 found |= {f"{clip}.{name}": value for name, value in figures.items()}
     return found
+
+
+def reprocess(
+    store: Store,
+    matches: Annotated[list[str] | None, typer.Argument(metavar="[MATCH]...")] = None,
+    dry_run: bool = False,
+    retry: bool = False,
+    more_settings: list[str] | None = None,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: list[str] | None = None,
+    verbose: bool = False,
+) -> None:
+    """Recompute results that an edit, a setting, a detector or new code made stale.
+
+    Each match is run as worldpose settings MATCH says, up to the last stage of its latest run. Exit
+    code 0: all matches are current or at work; 1: none could be run; 3: some wait for review; 4:
+    some failed.
+
+    Example: worldpose reprocess --dry-run
+
+    Options:
+        matches: Ids or folders; all matches by default.
+        dry_run: Only list the units to compute, with reasons.
+        retry: Retry failed units, even without an edit.
+    """
+    overrides = parse_overrides(more_settings or [])
+    wanted = [find_registration(store, name).spec.match_id for name in matches or ()]
+    limits = parse_time_limits(time_limits or ())
+    request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
+    with console.progress(verbose=verbose):
+        states, told = set(), []
+        for each in reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run):
+            states.add(each.state)
+            told.append(_outcome_json(each))
+            _print_outcome(each)
+    console.print_json({"matches": told})
+    if not states:
+        console.line("No match is registered. Register one: worldpose ingest FOLDER.")
+    raise typer.Exit(exit_code(states))
+
+
+def exit_code(states: Set[State]) -> int:
+    """Return the exit code of the command for the states of the matches."""
+    if states & {"failed", "partial"}:
+        return 1 if states == {"failed"} else 4
+    return 3 if "waiting" in states else 0
+
+
+def _print_outcome(each: Reprocessed) -> None:
+    if each.state in ("never run", "current", "at work"):
+        console.line(f"{each.match_id}: {_nothing_to_do(each)}")
+        return
+    count = 0 if each.status is None else len(each.status.to_compute)
+    run = "" if each.record is None else f", run {each.record.run_id}"
+    console.line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
+    if each.status is not None:
+        _print_units(each.status)
+    if each.problem is not None:
+        console.line(f"error: {each.problem}", to=console.errors)
+
+
+def _nothing_to_do(each: Reprocessed) -> str:
+    record = each.record
+    if each.state == "at work":
+        return f"at work. {each.problem}"
+    if record is None:
+        return f"no run yet; start one: worldpose run {each.match_id}"
+    if record.state in ("failed", "partial"):
+        return (
+            f"nothing was edited since run {record.run_id}, which is {record.state}; "
+            "--retry repeats its failed units"
+        )
+    return "every result is current"
+
+
+def _print_units(status: RunStatus) -> None:
+    rows = []
+    for unit in status.units:
+        name = unit.unit if status.latest.iteration == 1 else f"{unit.iteration}: {unit.unit}"
+        own = [str(reason) for reason in unit.own_reasons]
+        more = [f"and {len(own) - MAX_REASONS} more"] * (len(own) > MAX_REASONS)
+        inputs = [f"changed inputs: {', '.join(unit.changed_inputs)}"] * bool(unit.changed_inputs)
+        rows.append((name, unit.state.value, "\n".join([*own[:MAX_REASONS], *more, *inputs])))
+    console.print_table(f"since run {status.latest.run_id}", ("unit", "state", "why"), rows)
+
+
+def _outcome_json(each: Reprocessed) -> dict[str, JsonValue]:
+    status = each.status
+    ran = None if each.state in JSON_STATES else each.record
+    return {
+        "match": each.match_id,
+        "state": JSON_STATES.get(each.state, each.state),
+        "run": None if each.record is None else each.record.run_id,
+        "executed": [] if ran is None else list(ran.executed),
+        "problem": each.problem,
+        "to_compute": 0 if status is None else len(status.to_compute),
+        "units": [
+            {
+                "unit": unit.unit,
+                "iteration": unit.iteration,
+                "state": unit.state.value,
+                "edited": bool(unit.own_reasons),
+                "reasons": list(unit.describe()),
+            }
+            for unit in (() if status is None else status.units)
+        ],
+    }

@@ -12,14 +12,12 @@ from flows.cli import options
 from flows.cli.console import answer, errors, line
 from flows.cli.options import DEFAULT_PROJECT
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
-from flows.orchestration.time_limits import parse_time_limits
 from flows.service.channels import channels_of, send_test
 from flows.service.health import check as check_service
 from flows.service.layout import StateFolder, state_folder
-from flows.service.plan import ServePlan
-from flows.service.schedules import parse_schedules
-from flows.service.service_secrets import METRICS_TOKEN, PAGES_TOKEN, secrets_of
+from flows.service.plan import METRICS_TOKEN, PAGES_TOKEN, ServePlan, parse_schedules, secrets_of
 from flows.service.serving import serve as serve_all
+from flows.settings import parse_time_limits
 from flows.web.access import access_for
 from worldpose.errors import UsageError
 from worldpose.store.store import open_blobs

@@ -12,7 +12,9 @@ import fcntl
 import os
 import re
 import secrets
+import shutil
 import socket
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -20,16 +22,19 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import certifi
 
-from flows.orchestration.prefect_database import begin_database, keep_database
+from worldpose.cache_folder import user_cache
 from worldpose.errors import InputError, WorldposeError
 
+DATABASE_FILE = "prefect.db"
+"""Name of the database file in PREFECT_HOME."""
 START_SECONDS = 120.0
 """The very first start creates Prefect's database, which took 15 s on two busy cores."""
 
@@ -361,3 +366,62 @@ def problem_at(address: str) -> str:
         return f"{address} answers {error.code}"
     except (OSError, ValueError) as error:
         return f"{address} does not answer: {getattr(error, 'reason', error)}"
+
+
+def begin_database(home: Path) -> bool:
+    """Copy an empty database to `home`, PREFECT_HOME of a server that will be started.
+
+    Prefect creates one with a hundred migrations, which takes as long as the rest of its start. The
+    first one of a version is kept in the user's cache. Its files are for this account alone: SQLite
+    gives the rights of the database to its log.
+
+    Returns:
+        Whether the server must create the first one of its version there, to be kept then.
+
+    Raises:
+        StoreError: `home` is not writable.
+    """
+    # Imported here and below: with them, the server's process would import numba and scipy.
+    from worldpose.formats.files import whole_file
+    from worldpose.store.blobs import storage_errors
+
+    kept, database = kept_database(), home / DATABASE_FILE
+    if database.exists() and database.stat().st_size:
+        for file in home.glob(f"{DATABASE_FILE}*"):
+            file.chmod(0o600)
+        return False
+    with storage_errors(str(database)):
+        home.mkdir(parents=True, exist_ok=True)
+        if kept is None or not os.access(kept, os.R_OK):
+            database.touch(0o600)
+            return True
+        with whole_file(database) as draft:
+            draft.touch(0o600)
+            try:
+                shutil.copyfile(kept, draft)
+            except OSError as error:  # a copy error names the source file first, whichever failed
+                raise OSError(error.errno, error.strerror) from error
+    return False
+
+
+def keep_database(home: Path) -> None:
+    """Keep a copy of the unused database that a server has created in `home`."""
+    from worldpose.formats.files import whole_file
+
+    kept, database = kept_database(), home / DATABASE_FILE
+    if kept is None or not database.exists() or not database.stat().st_size:
+        return  # no home, or the environment names another database
+    # If the cache is not writable, every project creates its own.
+    with (
+        suppress(OSError, sqlite3.Error),
+        whole_file(kept) as draft,
+        closing(sqlite3.connect(database)) as made,
+        closing(sqlite3.connect(draft)) as copy,
+    ):
+        made.backup(copy)
+
+
+def kept_database() -> Path | None:
+    """Return the path of the kept empty database of this Prefect version; None without a home."""
+    cache = user_cache()
+    return None if cache is None else cache / "worldpose" / f"prefect-{version('prefect')}.db"

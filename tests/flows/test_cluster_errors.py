@@ -11,7 +11,7 @@ from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
 from flows.orchestration import local_cluster
-from flows.orchestration.cluster_errors import LostWorkersError, require_workers
+from flows.orchestration.local_cluster import LostWorkersError, require_workers
 from flows.orchestration.prefect_environment import local_cluster_options
 from worldpose.errors import WorldposeError
 

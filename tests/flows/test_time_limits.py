@@ -5,8 +5,8 @@ import re
 import pytest
 
 from flows.method import METHOD
-from flows.orchestration.time_limits import DEFAULT_MINUTES, parse_time_limits, seconds_of
-from flows.service.schedules import parse_schedules
+from flows.service.plan import parse_schedules
+from flows.settings import DEFAULT_MINUTES, parse_time_limits, seconds_of
 from worldpose.errors import UsageError
 
 
