@@ -13,7 +13,7 @@ import typer
 
 from data_contracts.evaluation import MethodScore
 from flows.cli.console import errors, line, print_json, print_table
-from flows.cli.options import DEFAULT_PROJECT
+from flows.cli.options import DEFAULT_PROJECT, given_options
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
@@ -66,15 +66,10 @@ def evaluate(
         table: Table of methods: text, csv or latex.
         picture: With a data set, a PNG of each method's people in the camera and from the side.
     """
-    given = {
-        **{"--run": run != "latest", "--stage": stage, "--match-in": match_in, "--fps": fps},
-        **{"--body": body, "--markers": markers, "--first-frame": first_frame is not None},
-        **{"--method-fps": method_fps, "--table": table != "text", "--picture": picture},
-    }
+    given = given_options(evaluate, locals())
     allowed: tuple[str, ...]
     if ablation:
-        named = {"--prediction": prediction, "--reference": reference, "--method": method}
-        _require_effect("--ablation", {**given, **named}, ())
+        _require_effect("--ablation", given, ())
         print_ablation(ablation)
         return
     if reference is not None and prediction and not method:
@@ -147,9 +142,12 @@ def evaluate(
     _print_scores(scores)
 
 
-def _require_effect(kind: str, given: Mapping[str, object], allowed: Sequence[str]) -> None:
+def _require_effect(kind: str, given: Sequence[str], allowed: Sequence[str]) -> None:
     """Raise UsageError if an option is given that has no effect."""
-    idle = [name for name, value in given.items() if value and name not in allowed]
+    always = (
+        {"--prediction", "--reference", "--method", "--project"} if kind != "--ablation" else ()
+    )
+    idle = [name for name in given if name not in (*allowed, *always)]
     if idle:
         raise UsageError(
             f"worldpose evaluate {' '.join(idle)}",

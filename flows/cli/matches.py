@@ -13,7 +13,7 @@ from data_contracts.cameras import COEFFICIENTS
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
 from flows.cli.console import answer, errors, line, print_json, print_table
-from flows.cli.options import DEFAULT_PROJECT
+from flows.cli.options import DEFAULT_PROJECT, given_options
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
@@ -91,30 +91,9 @@ def import_command(
         up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
             By default people who stand tell it.
     """
-    options = {
-        "--calibration": calibration,
-        "--detections": detections,
-        "--videos": videos,
-        "--boxes": None if videos else boxes,  # with videos, they are a part of the match
-        "--pose2sim": pose2sim,
-        "--challenge": challenge,
-        "--fps": fps,
-        "--match-id": match_id,
-        "--pitch": pitch,
-        "--clicks": clicks,
-        "--camera": camera,
-        "--lens": lens,
-        "--camera-data": camera_data,
-        "--first-frame": first_frame is not None,
-        "--freed-camera": freed_camera is not None,
-        "--zoom-table": zoom_table,
-        "--left-handed": left_handed,
-        "--template": template,
-        "--unit": unit,
-        "--up": up,
-        "--join": join and not videos,
-    }
-    given = {name for name, value in options.items() if value}
+    given = set(given_options(import_command, locals()))
+    if videos is not None:  # then they are a part of the match
+        given -= {"--boxes", "--join"}
     kind = next((name for name in ALONE if name in given), None)
     if kind is not None:
         _require_alone(kind, given)

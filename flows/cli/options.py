@@ -157,6 +157,15 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def given_options(command: Callable[..., None], values: Mapping[str, object]) -> list[str]:
+    """Return the options of a command whose values, by parameter, are not its defaults."""
+    return [
+        f"--{name.replace('_', '-')}"
+        for name, each in inspect.signature(command).parameters.items()
+        if each.default is not Parameter.empty and values[name] not in (each.default, None, [])
+    ]
+
+
 def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
     """Return both files, or None if neither is given.
 
