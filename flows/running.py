@@ -342,7 +342,7 @@ def _machines(
     is_watched = has_server()
     if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
-    server = prefect_server(store.url, is_local=request.dask is None)
+    server = prefect_server(is_local=request.dask is None)
     with end_at_once(), server as wait_until_ready, ExitStack() as stack:
         cluster: PrivateCluster | None = None
         ask_for: Callable[[int], None] = _no_more

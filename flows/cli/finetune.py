@@ -95,7 +95,7 @@ def finetune(
     shown = _Lines()
     logger.addHandler(shown)
     try:
-        with prefect_server(project) as wait_until_ready:
+        with prefect_server() as wait_until_ready:
             from prefect.logging.handlers import APILogHandler
 
             from flows.finetune import FOLDER, fine_tune_nets

@@ -1,4 +1,4 @@
-"""Prefect's environment for this project: no telemetry, its database with the project.
+"""Prefect's environment for this project: no telemetry, and a server of each run's own.
 
 With PREFECT_API_URL set, runs use that server and appear in its dashboard. Otherwise a run starts
 its own server on loopback for its duration. Only this module reads and sets the environment; it
@@ -8,7 +8,6 @@ must be called before Prefect is imported.
 from __future__ import annotations
 
 import base64
-import fcntl
 import os
 import re
 import secrets
@@ -198,12 +197,12 @@ def has_server() -> bool:
 
 
 @contextmanager
-def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable[[], None]]:
+def prefect_server(*, is_local: bool = False) -> Iterator[Callable[[], None]]:
     """Set up environment and server for Prefect; yield a function that waits for its API.
 
     Prefect, which takes seconds to import, can then be imported while its server starts. The
-    function raises WorldposeError if our own server does not answer. A local project also holds
-    Prefect's database; `is_local` says that all its clients see this machine's files.
+    function raises WorldposeError if our own server does not answer. Its database lasts as long as
+    it does. `is_local` says that all its clients see this machine's files.
 
     Raises:
         InputError: a given server does not answer.
@@ -216,39 +215,14 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
             yield lambda: None
             return
         with (
-            tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch,
-            _home(project, Path(scratch)) as home,
-            _environment({"PREFECT_HOME": str(home)}),
-            _environment(one_authority(Path(scratch)) if is_local else {}),
+            tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as home,
+            _environment({"PREFECT_HOME": home}),
+            _environment(one_authority(Path(home)) if is_local else {}),
             _environment({CLIENT_LOGIN: new_login()}),
-            _embedded_server(home, Path(scratch) / "server.log") as (address, wait_until_ready),
+            _embedded_server(Path(home)) as (address, wait_until_ready),
             _environment({"PREFECT_API_URL": address}),
         ):
             yield wait_until_ready
-
-
-@contextmanager
-def _home(project: str, scratch: Path) -> Iterator[Path]:
-    """Return the folder of Prefect's database: a local project's, which saves its creation.
-
-    While another run of the project uses that folder, or on object storage, it is a temporary one:
-    two servers that create one database at once destroy it.
-    """
-    from worldpose.store.blobs import storage_errors  # the server's process needs none
-
-    if "://" in project:
-        yield scratch
-        return
-    home = Path(project).resolve() / "prefect"
-    with storage_errors(str(home)):
-        home.mkdir(parents=True, exist_ok=True)
-        lock = (home / "in-use").open("w")
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            home = scratch
-        yield home
 
 
 @contextmanager
@@ -266,8 +240,8 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
-    is_first = begin_database(home)
+def _embedded_server(home: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+    is_first, log = begin_database(home), home / "server.log"
     with socket.create_server(("127.0.0.1", 0)) as listening, log.open("wb") as output:
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/api"
         # The server ends when its standard input closes, so a killed run leaves none behind. It

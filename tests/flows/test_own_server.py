@@ -10,6 +10,7 @@ import ssl
 import subprocess
 import sys
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
@@ -36,7 +37,7 @@ from flows.orchestration.private_cluster import PrivateCluster
 from flows.service.child import PARTS
 from flows.service.plan import METRICS_TOKEN, ServePlan, secrets_of
 from flows.service.serving import environment_of
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import InputError
 
 
 @pytest.fixture
@@ -54,21 +55,20 @@ def tables(database):
         return set(opened.execute("select type, name, sql from sqlite_master"))
 
 
-def test_a_server_answers_its_run_alone_and_later_ones_begin_with_its_database(
-    tmp_path, kept, monkeypatch
-):
+def test_a_server_answers_its_run_alone_and_later_ones_begin_with_its_database(kept, monkeypatch):
     for name in ("PREFECT_API_URL", CLIENT_LOGIN, SERVER_LOGIN):  # of a server of other tests
         monkeypatch.delenv(name, raising=False)
-    first, second = tmp_path / "first", tmp_path / "second"
-    with prefect_server(str(first), is_local=True) as wait_until_ready:
+    with prefect_server(is_local=True) as wait_until_ready:
         wait_until_ready()
-        made = tables(first / "prefect" / DATABASE_FILE)
+        made = tables(Path(os.environ["PREFECT_HOME"]) / DATABASE_FILE)
         login = require_answers_for_its_run_alone()
     assert CLIENT_LOGIN not in os.environ
     assert len(made) > 50
     assert [file.name for file in kept.parent.iterdir()] == [kept.name]
-    with prefect_server(str(second), is_local=True) as wait_until_ready:
-        assert tables(second / "prefect" / DATABASE_FILE) == made  # before the server is up
+    with prefect_server(is_local=True) as wait_until_ready:
+        assert (
+            tables(Path(os.environ["PREFECT_HOME"]) / DATABASE_FILE) == made
+        )  # before the server is up
         assert os.environ[CLIENT_LOGIN] != login
         wait_until_ready()
     assert tables(kept) == made
@@ -92,15 +92,6 @@ def require_answers_for_its_run_alone():
     assert ask(**right, Host="evil.example") == 421
     assert ask(**right, Origin="http://evil.example") == 403
     return login
-
-
-def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
-    (tmp_path / "prefect").touch()  # a file where the folder should be
-    with (
-        pytest.raises(StoreError, match=r"File exists.*run again.*results are unchanged"),
-        prefect_server(str(tmp_path), is_local=True),
-    ):
-        pass
 
 
 def test_a_prefect_server_without_a_login_does_not_start():
