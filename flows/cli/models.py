@@ -17,26 +17,11 @@ from worldpose.errors import WorldposeError, unknown_name
 
 commands = typer.Typer(name="models", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
-CatalogOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--catalog",
-        envvar="WORLDPOSE_MODEL_CATALOG",
-        help="YAML file with checkpoints of your own: name, address, digest.",
-    ),
-]
-FolderOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--folder",
-        help="Folder of pulled checkpoints; by default WORLDPOSE_MODEL_FOLDER, or the cache.",
-    ),
-]
 SETTING = {"detector": "detection.detector", "pose": "detection.pose"}
 
 
 @commands.command(name="list")
-def list_models(catalog: CatalogOption = None, folder: FolderOption = None) -> None:
+def list_models(catalog: Path | None = None, folder: Path | None = None) -> None:
     """List the checkpoints that can be pulled, and those that are there.
 
     Example: worldpose models list
@@ -98,8 +83,8 @@ def _describe(checkpoint: Checkpoint, is_pulled: bool) -> dict[str, object]:
 @commands.command(name="pull")
 def pull_model(
     name: Annotated[str, typer.Argument(metavar="NAME")],
-    catalog: CatalogOption = None,
-    folder: FolderOption = None,
+    catalog: Path | None = None,
+    folder: Path | None = None,
 ) -> None:
     """Download a checkpoint, check its SHA-256, and keep it in the cache.
 
@@ -134,7 +119,7 @@ def pull_model(
 @commands.command(name="verify")
 def verify_models(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...")] = None,
-    folder: FolderOption = None,
+    folder: Path | None = None,
 ) -> None:
     """Compare pulled checkpoints with their digests, and remove damaged ones.
 

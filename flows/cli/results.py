@@ -16,11 +16,6 @@ from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Store
 
-OverwriteOption = Annotated[
-    bool,
-    typer.Option("--overwrite", help="Also replace files of another match, or of unknown origin."),
-]
-
 
 def export(
     store: Store,
@@ -43,7 +38,7 @@ def export(
     filled: bool = False,
     surface: bool = False,
     video: bool = False,
-    overwrite: OverwriteOption = False,
+    overwrite: bool = False,
 ) -> None:
     """Write a run's results as files that other tools read.
 
@@ -149,7 +144,7 @@ def report(
     camera: str | None = None,
     figures: Annotated[Path | None, typer.Option(metavar="FOLDER")] = None,
     run: str = "latest",
-    overwrite: OverwriteOption = False,
+    overwrite: bool = False,
 ) -> None:
     """Write one HTML page about a run, with its settings, metrics and images.
 
