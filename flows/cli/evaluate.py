@@ -137,16 +137,16 @@ def evaluate(
         match_in=match_in,
         reading=Reading(markers, first_frame),
     )
-    if scores.later_run:
-        line(scores.later_run, to=errors)
+    if scores.age:
+        line(scores.age, to=errors)
     _print_scores(scores)
 
 
 def _require_effect(kind: str, given: Sequence[str], allowed: Sequence[str]) -> None:
     """Raise UsageError if an option is given that has no effect."""
-    always = (
-        {"--prediction", "--reference", "--method", "--project"} if kind != "--ablation" else ()
-    )
+    always = ["--project", "--ablation"]
+    if kind != "--ablation":
+        always = ["--project", "--prediction", "--reference", "--method"]
     idle = [name for name in given if name not in (*allowed, *always)]
     if idle:
         raise UsageError(
