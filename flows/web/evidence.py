@@ -120,7 +120,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def thin_curve(values: NDArray[np.float64], every: int) -> NDArray[np.float64]:
-    """Thin values (n,): the least and the largest of each 2 * `every`, in order; NaN without any."""
+    """Thin values (n,) to the least and largest of each 2 * `every`, in order; NaN without any."""
     if every <= 1:
         return values
     padded = np.pad(values, (0, -len(values) % (2 * every)), constant_values=np.nan)
