@@ -40,7 +40,8 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
-from worldpose.store.store import LATEST, Run, Store
+from worldpose.store.runs import LATEST
+from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
 BROADCAST_FORMATS: Final = ("challenge", "challenge-2025", "tracks", "slahmr-cameras")
