@@ -1,4 +1,6 @@
-"""Cameras adjusted to people and markings, against known truth."""
+"""Cameras are adjusted by people and markings, given ones are kept, and held-out views judge."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 
@@ -8,8 +10,11 @@ from rigs import errors
 
 from worldpose.bundle_adjustment.clip import Clicks
 from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.held_out_validation import held_out_errors
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
 from worldpose.errors import InputError
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.triangulation.estimate import triangulate_joints
 
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 
@@ -106,3 +111,138 @@ def test_the_papers_adjustment_finds_the_cameras_of_exact_markings_and_people(cl
     tangential = replace(made.cameras, distortion=made.cameras.distortion + 0.001)
     with pytest.raises(InputError, match="tangential"):
         adjust_unguarded(replace(made, cameras=tangential), settings, frames, frames)
+
+
+CASES = {
+    "exact": ([0.0] * 3, [0.0] * 3, 1.0),
+    "small": ([1e-4] * 3, [0.005] * 3, 1.0),
+    "large": ([5e-3] * 3, [0.3] * 3, 1.0),
+    "focal": ([0.0] * 3, [0.0] * 3, 1.1),
+}
+"""Errors about and along the axes [rad, m], and a factor of the focal length of camera 1."""
+
+
+def given(clip, cameras, **changes):
+    """The clip without clicks, with exact covariances of these cameras."""
+    seen = changes.get("detections", clip.detections)
+    placed = triangulate_joints(cameras, seen, clip.triangulation)
+    return replace(
+        clip,
+        cameras=cameras,
+        covariance=np.zeros_like(clip.covariance),
+        clicks=(Clicks.none(),) * len(cameras.focal),
+        joints=placed.joints,
+        views=placed.views.astype(np.int64),
+        **changes,
+    )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_joints_are_never_worse_than_with_the_given_cameras(clip, case):
+    made, true, joints = clip(cameras=4, frames=40, lasting=1.0, seed=3)
+    turn, shift, focal = CASES[case]
+    rng = np.random.default_rng(5)
+    step = np.zeros((4, 12))
+    step[:, :6] = np.array([*turn, *shift]) * rng.standard_normal((4, 6))
+    step[1, 6] = np.log(focal)
+    made = given(made, step_camera(true, step))
+    adjusted = adjust_cameras(made)
+    told = adjusted.covariance if adjusted.accepted.all() else None
+    after = triangulate_joints(adjusted.cameras, made.detections, made.triangulation, told).joints
+    before, after = (
+        np.nanmean(np.linalg.norm(each - joints, axis=-1)) for each in (made.joints, after)
+    )
+    assert after < before + 0.001
+    if case in ("exact", "small"):
+        assert not adjusted.accepted.any()
+        np.testing.assert_array_equal(adjusted.motion, 0.0)
+        assert all(reason.startswith("refused") for reason in adjusted.reasons)
+    else:
+        assert after < 0.9 * before
+
+
+def test_refused_given_cameras_do_not_pull_the_others(clip):
+    made, true, _ = clip(cameras=8, frames=60, lasting=1.0, seed=1)
+    # Two cameras err by 5 cm together, and have too few keypoints for a change.
+    step = np.zeros((8, 12))
+    scale = np.array([1e-3] * 3 + [0.1] * 3)
+    step[:, :6] = scale * np.random.default_rng(2).standard_normal((8, 6))
+    step[:2, 3:6] = true.cam_from_world.rotation[:2] @ [0.3, 0.0, 0.0]
+    cameras = step_camera(true, step)
+    confidence = made.detections.confidence.copy()
+    confidence[:, :2, :, ::2] = 0.0
+    seen = replace(made.detections, confidence=confidence)
+    made = given(made, cameras, detections=seen)
+    adjusted = adjust_cameras(made, BundleAdjustmentSettings(min_judges=1200))
+    np.testing.assert_array_equal(adjusted.accepted, [False] * 2 + [True] * 6)
+    np.testing.assert_array_equal(adjusted.cameras.numbers[:2], cameras.numbers[:2])
+    others = seen.detection_index.copy()
+    others[:, :2] = -1
+    before, after = (
+        triangulate_joints(each, seen.assign_people(others), made.triangulation).joints
+        for each in (cameras, adjusted.cameras)
+    )
+    # No more than their share of eight cameras.
+    assert np.linalg.norm(np.nanmean(after - before, axis=(0, 1, 2))) < 0.3 * 2 / 8
+
+
+QUICK_CHECK = BundleAdjustmentSettings(max_frames=8, folds=2)
+WRONG = 2
+
+
+def placed_again(clip):
+    """The clip with its people triangulated with the cameras that it has now."""
+    detections = clip.detections
+    placed = triangulate_joints(clip.cameras, detections, clip.triangulation)
+    return replace(clip, joints=placed.joints, views=placed.views.astype(np.int64))
+
+
+@pytest.fixture
+def honest(clip):
+    """A clip of eight cameras, the true ones, and the errors that adjustment leaves them."""
+    made, true, _ = clip(cameras=8, seed=3)
+    # Calibrations of one or two pixels, not of ten: three views or more agree about every joint.
+    covariance = 0.02 * made.covariance
+    spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    step = spread * np.random.default_rng(7).standard_normal((8, 12))
+    made = placed_again(replace(made, cameras=step_camera(true, step), covariance=covariance))
+    adjusted = adjust_cameras(made, QUICK_CHECK)
+    assert adjusted.accepted.all()
+    return made, true, errors(adjusted.cameras, true)
+
+
+def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
+    made, true, _ = clip(cameras=8, seed=3)
+    exact = placed_again(replace(made, cameras=true, covariance=1e-4 * made.covariance))
+    adjusted = adjust_cameras(exact, QUICK_CHECK)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, true.numbers)
+    np.testing.assert_array_equal(adjusted.covariance, exact.covariance)
+    # By chance the loss of some falls and that of others rises.
+    falls = adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]
+    assert falls.any()
+    assert all("standard errors" in adjusted.reasons[c] for c in np.flatnonzero(falls))
+    assert adjusted.evidence.shift > 0.0  # that of the proposed change
+
+
+def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(honest):
+    made, true, clean = honest
+    step = np.zeros((8, 12))
+    step[WRONG, 1] = 0.02  # 40 px, two hundred times what its calibration states
+    adjusted = adjust_cameras(
+        placed_again(replace(made, cameras=step_camera(made.cameras, step))), QUICK_CHECK
+    )
+    assert adjusted.accepted.all()
+    left = errors(adjusted.cameras, true)
+    # It had a say in where the world is: without it the others lose an eighth of their knowledge.
+    assert np.delete(left, WRONG).mean() < 1.25 * np.delete(clean, WRONG).mean()
+    # A hundredth of what it was, and more than the others': people alone place it.
+    assert left[WRONG] < 0.4
+
+
+def test_true_cameras_are_judged_by_the_noise_alone(clip):
+    made, true, _ = clip(cameras=6, noise=1.0)
+    frames = np.arange(24)
+    held = held_out_errors(made, true, frames, np.ones((24, 6), dtype=bool), robust_scale=100.0)
+    # Two axes of unit variance, and what the joint of five other views adds: 2 (1 + 3 / (2 x 5)).
+    assert np.nanmean(held.loss) == pytest.approx(2.6, rel=0.05)
