@@ -1,23 +1,31 @@
-"""A season of `worldpose serve` in minutes: history, kills, a frozen engine, a lost database."""
+"""A season of `worldpose serve` in minutes: history, kills, restarts, settings that last."""
 
 import os
+import random
 import shutil
 import signal
 import subprocess
 import time
 import urllib.request
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from itertools import pairwise
 
 import psutil
 import pytest
-from command_line import TINY, WORLDPOSE
+from command_line import TINY, WORLDPOSE, succeed
+from faults.checker import doubled
 from many_matches import copy_match, queue_history
 from service import Browser, wait_until
 
 from flows.registering import register
 from flows.service.run_queue import find_process
+from worldpose.body.body_file import load_open_body, save_body
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.blobs import LocalBlobs
+from worldpose.store.integrity import verify
 from worldpose.store.run_queue import RunQueue
 from worldpose.store.store import Store
 
@@ -140,3 +148,194 @@ def test_the_lists_of_a_season_are_there_within_a_second(served, project_copy):
     kept = RunQueue(LocalBlobs(project_copy)).runs()  # the last of each match, and those of a day
     assert len(kept) < len(runs) / 2
     assert served.end() == 0
+
+
+@pytest.fixture
+def matches(served, tmp_path):
+    """A function that registers so many small matches in the project before it is served."""
+
+    def make(count, first=0):
+        store = Store.create(str(served.project))
+        names = []
+        for seed in range(first, first + count):
+            folder = tmp_path / "matches" / str(seed)
+            simulate_match(SCENARIOS["tiny"], seed, folder, MatchOptions(**SMALL))
+            match, _ = register(store, folder)
+            names.append(match.match_id)
+        return store, names
+
+    return make
+
+
+def at_prefect(served):
+    return served.ask("/flow_runs/filter", {"flows": {"name": {"any_": ["match"]}}, "limit": 200})
+
+
+def moment(text):
+    return datetime.fromisoformat(text.replace("Z", "+00:00"))
+
+
+def run_from_pages(served, names):
+    """Start all matches on their pages, the first of them twice; return Prefect's runs."""
+    browser = Browser(served)
+    for name in [names[0], *names]:
+        answer = browser.ask(f"/api/matches/{name}/runs", {"gates": "never"})
+        assert answer["state"] == "running"
+    at_work = [browser.ask(f"/api/matches/{name}")["at_work"] for name in names]
+    assert all(each["state"] == "running" and each["prefect"] for each in at_work), at_work
+    assert "before it" in at_work[-1]["lines"][0]
+    ended = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
+
+    def count_ended():
+        return sum(run["state_type"] in ended for run in at_prefect(served))
+
+    for count in range(1, len(names) + 1):  # each in its own time
+        wait_until(lambda count=count: count_ended() >= count, served.explain)
+    return at_prefect(served)
+
+
+def require_one_after_another(served, store, names, runs):
+    assert sorted(run["parameters"]["match_id"] for run in runs) == sorted(names)
+    assert {run["state_name"] for run in runs} == {"Completed"}, served.explain()
+    assert {run["work_pool_name"] for run in runs} == {"worldpose"}
+    deployment = served.ask("/deployments/name/match/worldpose-match")["id"]
+    assert {run["deployment_id"] for run in runs} == {deployment}
+    times = sorted((moment(run["start_time"]), moment(run["end_time"])) for run in runs)
+    assert all(end <= start for (_, end), (start, _) in pairwise(times))
+    for run in runs:
+        asked = {"artifacts": {"flow_run_id": {"any_": [run["id"]]}}}
+        found = {each["key"]: each for each in served.ask("/artifacts/filter", asked)}
+        (link,) = [found[key] for key in found if key.startswith("review-")]
+        match_id = run["parameters"]["match_id"]
+        assert f":{served.ports['pages']}/#/match/{match_id})" in link["data"]
+    for name in names:
+        (record,) = [store.run(name, run_id) for run_id in store.runs(name)]
+        assert record.state == "complete"
+        assert store.unfinished_runs(name) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_matches_started_on_pages_run_one_after_another(served, matches):
+    store, names = matches(2)
+    served.options = {"--max-concurrent": 1, "--workers": 1}
+    served.begin()
+    require_one_after_another(served, store, names, run_from_pages(served, names))
+    # A second start of a match whose results are current computes and records nothing.
+    Browser(served).ask(f"/api/matches/{names[0]}/runs", {"gates": "never"})
+    wait_until(
+        lambda: sum(run["state_type"] == "COMPLETED" for run in at_prefect(served)) == 3,
+        served.explain,
+    )
+    assert store.runs(names[0]) == ("0001",)
+    assert served.end() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(served, matches, small_match):
+    """Its runs began on pages and in the inbox; it is killed three times while they are at work."""
+    rng = random.Random(1)
+    store, names = matches(2, first=100)
+    served.options = {"--max-concurrent": 2, "--workers": 1, "--poll-interval": 5}
+    served.begin()
+    arriving = served.project / "inbox" / ".arriving"
+    shutil.copytree(small_match, arriving)
+    arriving.rename(arriving.with_name("arrived"))
+    browser = Browser(served)
+    for name in names:  # a person starts a run again that was not acknowledged
+        start = partial(browser.ask, f"/api/matches/{name}/runs", {"gates": "never"})
+        wait_until(start, served.explain)
+    for _ in range(3):
+        time.sleep(rng.uniform(1.0, 60.0))
+        assert served.end(signal.SIGKILL) == 0
+        served.begin()
+
+    def has_ended():
+        browser = Browser(served)
+        for name in store.matches():
+            browser.approve_all(name)  # the match in the inbox may have questions
+        runs = at_prefect(served)
+        states = {run["state_name"] for run in runs}
+        assert not states & {"Failed", "Cancelled"}, served.explain()
+        return len(runs) >= 3 and states == {"Completed"}
+
+    wait_until(has_ended, served.explain)
+    everything = store.matches()
+    assert len(everything) == 3 and set(names) < set(everything)
+    runs = at_prefect(served)
+    assert sorted(run["parameters"]["match_id"] for run in runs) == sorted(everything)
+    assert [store.run(name).state for name in everything] == ["complete"] * 3
+    assert list(doubled(store)) == []
+    assert list(verify(store)) == []
+    assert served.end() == 0
+
+
+NIGHT = {"cron": "0 3 * * *", "timezone": "Europe/Vienna"}
+
+
+def schedules(served):
+    found = served.ask("/deployments/name/reprocess/worldpose-reprocess")
+    keep = ("id", "slug", "active", "schedule")
+    kept = [{name: each[name] for name in keep} for each in found["schedules"]]
+    return sorted(kept, key=lambda each: each["id"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_schedules_and_settings_outlast_two_restarts(served, small_match, tmp_path):
+    bodies = tmp_path / "bodies"
+    bodies.mkdir()
+    save_body(bodies / "smpl-test.npz", replace(load_open_body(), name="smpl-test"))
+    stated = ("body_fitting.body_model=smpl-test", "iterations=2", "detection.stride=2")
+    stated = (*stated, "tracking.gate_m=0.6", "gates=never", f"body_folder={bodies}")
+    options = [text for each in stated for text in ("--set", each)]
+    alone = tmp_path / "alone"
+    succeed("init", alone)
+    succeed("settings", *options, "--project", alone)
+    succeed("run", small_match, "--project", alone)
+    own = Store.open(alone)
+    (match_id,) = own.matches()
+    expected = [own.run(match_id, run_id).results for run_id in own.runs(match_id)]
+    assert {len(own.runs(match_id))} <= {2, 3}
+
+    succeed("init", served.project)
+    succeed("settings", *options, "--project", served.project)
+    served.options = {"--workers": 1, "--schedule": "reprocess=0 3 * * * Europe/Vienna"}
+    served.begin()
+    made = schedules(served)
+    assert [each["schedule"]["cron"] for each in made] == ["0 3 * * *"]
+    shutil.copytree(small_match, served.project / "inbox" / ".small")
+    (served.project / "inbox" / ".small").rename(served.project / "inbox" / "small")
+    store = Store.open(served.project)
+
+    def completed(count):
+        runs = served.runs(match_id)
+        assert not [run for run in runs if run["state_type"] in ("FAILED", "CRASHED")], runs
+        return sum(run["state_type"] == "COMPLETED" for run in runs) >= count
+
+    wait_until(lambda: completed(1), served.explain)
+    found = [store.run(match_id, run_id).results for run_id in store.runs(match_id)]
+    assert found == expected
+    assert store.run(match_id).body_folder == str(bodies)
+    # A person makes a schedule of their own, in Prefect's page or by its API.
+    other = {"interval": 86400.0, "timezone": "Asia/Tokyo"}
+    deployment = served.ask("/deployments/name/reprocess/worldpose-reprocess")["id"]
+    served.ask(f"/deployments/{deployment}/schedules", [{"schedule": other, "active": True}])
+    before = schedules(served)
+    assert len(before) == 2
+    for options in ({"--workers": 1}, served.options):
+        assert served.end() == 0
+        served.options = options
+        served.begin()
+        assert schedules(served) == before
+    # By a page and by a schedule's run, nothing is left to compute: the keys are the same.
+    Browser(served).ask(f"/api/matches/{match_id}/runs", {"gates": "auto"})
+    wait_until(lambda: completed(2), served.explain)
+    run = served.ask(f"/deployments/{deployment}/create_flow_run", {"name": "nightly"})
+    asked = f"/flow_runs/{run['id']}"
+    wait_until(lambda: served.ask(asked)["state_type"] == "COMPLETED", served.explain)
+    assert len(store.runs(match_id)) == len(found)
+    assert served.end() == 0
+    told = succeed("reprocess", "--dry-run", "--project", served.project, "--json").json
+    assert [each["state"] for each in told["matches"]] == ["untouched"]
