@@ -1,15 +1,12 @@
 """Evaluation on files alone, and the paper's ablation."""
 
-import json
 import shutil
 
 import numpy as np
 import pytest
 from command_line import succeed
 
-from flows.cli.evaluate import print_ablation
-from flows.results import ablation
-from flows.results.ablation import CLICKS, Score, trial
+from flows.results.ablation import CLICKS, trial
 from flows.results.evaluation import score
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
@@ -104,29 +101,6 @@ def test_markers_are_laid_over_and_scored(tiny, tmp_path):
     # Micrometres in the file; the offset is found to a tenth of a millisecond.
     assert figures["mpjpe_mm"] == pytest.approx(0.0, abs=1.0)
     assert figures["persons"] == 1
-
-
-@pytest.fixture
-def two_trials(monkeypatch):
-    scores = [
-        {"true cameras": Score(60.0, 50.0, 0.0, 1.0, 0.0), "base": Score(g, 60.0, 0.1, 0.5, 0.0)}
-        for g in (70.0, 74.0)
-    ]
-    monkeypatch.setattr(ablation, "ablation", lambda seeds, progress: {"few clicks": scores})
-
-
-def test_rows_have_mean_and_spread_and_the_paper_is_apart(two_trials, capsys):
-    print_ablation(2, as_json=False)
-    trials, paper = capsys.readouterr().out.split("the paper's trial, real people")
-    base = next(line for line in trials.splitlines() if line.startswith("base"))
-    assert "72.0 ± 2.0" in base
-    assert base.split()[-1] == "0.50"
-    told = {line.split("  ")[0]: line.split()[-2:] for line in paper.splitlines() if line}
-    assert told["base"] == ["83.5", "70.8"]
-    assert told["+ BA + SMPL"] == ["80.0", "66.3"]
-    print_ablation(2, as_json=True)
-    told = json.loads(capsys.readouterr().out)
-    assert told["few clicks"]["base"]["g_mpjpe_mm"] == [70.0, 74.0]
 
 
 @pytest.mark.slow

@@ -6,18 +6,12 @@ from pathlib import Path
 import pytest
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.usability import UsableLimits
-from flows import usability
 from flows.gates import GATES
 from flows.method import METHOD
 from flows.review.advice import click_advice, clock_advice
 from flows.review.metric_words import UNITS, all_reasons, in_short, metric_words, reason_words
-from worldpose.camera_consistency import consistency
-from worldpose.camera_consistency.diagnosis import Fault
 
-CAMERAS, PEOPLE, IDENTITIES = (
-    GATES[stage] for stage in ("static_calibration", "detection", "tracking")
-)
+CAMERAS, PEOPLE = GATES["static_calibration"], GATES["detection"]
 ADJUSTMENT, ACCEPTANCE = GATES["bundle_adjustment"], GATES["body_fitting"]
 
 
@@ -150,26 +144,6 @@ def test_metrics_have_their_unit_behind_the_value():
     )
     assert metric_words("expected_error_median_px") == ("expected error of the drawn pitch", "px")
     assert all_reasons(["a_m is 2, at most 1 passes", "b"]) == "a: 2 m, limit 1 m; b"
-
-
-JARGON = re.compile(
-    r"detection|epipolar|\bray|\bposes?\b|\bnets?\b|keypoint|translation|orientation"
-)
-
-
-@pytest.mark.parametrize("stage", ["tracking", "camera_consistency", "broadcast_tracking"])
-def test_reasons_of_tracking_are_in_operators_words(stage):
-    said = [rule.says for rule in usability._RULES if rule.stage == stage]
-    if (gate := GATES.get(stage)) is not None:
-        said += [gate.question, gate.to_correct]
-        said += [metric_words(name)[0] for name in gate.limits]
-    lacks = {"lacks_people": True, "figures": {f"{stage}/clip": {"unmatched_share": 0.9}}}
-    said += usability.judge_run(usability.RunOutcome(**lacks), UsableLimits()).reservations
-    kinds = ("clock", "frame_rate", "flipped", "mirrored", "focal", "swapped", "duplicate", "pose")
-    for kind in kinds if stage == "camera_consistency" else ():
-        fault = Fault(0, kind, value=3.0, other=1, share_now=0.1, share_corrected=0.9)
-        said.append(consistency._reason(fault, ("a", "b"), 0, 1.0, 25.0))
-    assert said and not [text for text in said if JARGON.search(text)]
 
 
 def test_the_pages_know_the_same_units():

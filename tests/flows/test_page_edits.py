@@ -218,21 +218,3 @@ def test_an_undo_that_is_repeated_is_done_and_goes_on_to_the_one_before(
     )
     assert [each["id"] for each in again.json()["kept"]] == [ids[2]]
     assert [*read_journal(unrun_store, TINY).standing] == ids[:1]
-
-
-def test_what_is_refused_on_a_page_names_no_command(ada_before_runs):
-    gone = ada_before_runs.post(f"{MATCH}/withdrawals", json={"correction": "none"})
-    assert gone.status_code == 422
-    assert "no such correction" in gone.json()["error"]
-    note = ada_before_runs.get(f"{MATCH}/detections/cam00").json()["note"]
-    assert "found none. Run the match on its page." in note
-    for path in ("results", "results/report", "identities/clip"):
-        answer = ada_before_runs.get(f"{MATCH}/{path}")
-        assert answer.status_code >= 400
-        said = str(answer.json().get("error", answer.json()))
-        assert "worldpose run" not in said
-        assert "`worldpose" not in said
-    for page in ("/login", "/login/page.js", "/status"):
-        text = ada_before_runs.get(page).text
-        assert "worldpose serve" not in text
-        assert "command" not in text

@@ -213,12 +213,3 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
         answer = worldpose("report", tiny, "--project", tiny_run, "--no-videos", *asked)
         assert answer.code == 1 and "a file of unknown origin" in answer.err
         assert (file.read_text(), out.read_text()) == ("other", page)
-
-
-def test_a_run_without_joints_cannot_be_exported(ingested, tmp_path):
-    answer = worldpose(
-        *("export", TINY, "--format", "joints", "--out", tmp_path / "out", "--project", ingested)
-    )
-    assert answer.code == 1
-    assert "Run the match to the end" in answer.err
-    assert not (tmp_path / "out").exists()

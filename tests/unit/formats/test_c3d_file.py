@@ -382,11 +382,3 @@ def test_the_file_comes_back_from_pandas(straight_model, tmp_path):
     np.testing.assert_allclose(table.to_numpy()[:, 1:], coordinates, atol=5.1e-6)
     # Two turns in 59 steps, without a jump of 360 degrees.
     np.testing.assert_allclose(np.diff(table.pelvis_rotation), 700.0 / 59, atol=1e-4)
-
-
-def test_frames_without_a_body_are_refused(tmp_path):
-    with pytest.raises(InputError, match="frames that all have a body"):
-        write_opensim_motion(tmp_path / "p.mot", np.full((2, 27), np.nan), np.zeros(2), {})
-    with pytest.raises(InputError, match="found no frames"):
-        write_opensim_motion(tmp_path / "p.mot", np.zeros((0, 27)), np.zeros(0), {})
-    assert not (tmp_path / "p.mot").exists()

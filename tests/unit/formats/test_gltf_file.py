@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyParameters
-from worldpose.errors import InputError
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
 from worldpose.geometry.cameras import Camera
 
@@ -154,10 +153,3 @@ def test_without_a_surface_the_file_has_joints_alone(model, tmp_path):
     names = {node["name"] for node in content["nodes"]}
     assert {f"person_007_{joint}" for joint in SKELETONS["smpl24"]} <= names
     assert content["asset"]["extras"] == NOTES
-
-
-def test_a_clip_without_bodies_is_refused(model, tmp_path):
-    nobody = BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), np.full((4, 3), np.nan))
-    with pytest.raises(InputError, match=r"a person with a fitted body, found none\. Run"):
-        write(tmp_path / "a.glb", model, people=[AnimatedBody("person_001", nobody, {})])
-    assert not (tmp_path / "a.glb").exists()

@@ -14,7 +14,6 @@ from viewer_clips import CENTER, bodies_clip, mixed_clip
 from worldpose.errors import InputError
 from worldpose.formats import viewer_file
 from worldpose.formats.viewer_file import (
-    ViewerClip,
     decode_bodies,
     decode_part,
     encode_frames,
@@ -139,17 +138,6 @@ def test_a_file_holds_several_clips_and_videos_and_its_notes(tmp_path):
     text = (tmp_path / "v.html").read_text()
     assert "<title>m &amp; n: half, other</title>" in text
     assert text.index("data-clip") < text.index("<script>1")
-
-
-def empty(clip) -> ViewerClip:
-    gone = np.full_like(clip.bodies.transl, np.nan)
-    return replace(clip, bodies=replace(clip.bodies, transl=gone))
-
-
-def test_a_file_without_anyone_is_refused(tmp_path):
-    with pytest.raises(InputError, match="a person with joints, a body or a place on the pitch"):
-        write_viewer(tmp_path / "v.html", PAGE, [empty(bodies_clip(frames=3))], {})
-    assert not (tmp_path / "v.html").exists()
 
 
 def test_a_file_that_browsers_refuse_is_not_written(tmp_path, monkeypatch):

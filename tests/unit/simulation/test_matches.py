@@ -89,7 +89,7 @@ def test_every_scenario_makes_a_match(name, tmp_path):
 
 
 SOURCES = Path(foreign_rigs.__file__).parent
-LAB, MIXED = FOREIGN_SCENARIOS["foreign-lab"], FOREIGN_SCENARIOS["foreign-mixed"]
+LAB = FOREIGN_SCENARIOS["foreign-lab"]
 
 
 def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
