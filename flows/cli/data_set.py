@@ -218,7 +218,7 @@ def release(
         )
     from flows.cli.results import read_licence
     from flows.registering import find_registration
-    from flows.results.best_results import Origin, describe_later_run, open_results
+    from flows.results.best_results import Origin, describe_age, open_results
     from worldpose.store.store import Store
 
     licences: dict[str, str] = {}
@@ -231,7 +231,7 @@ def release(
     for match, run in runs.items():
         registration = find_registration(store, match)
         opened = open_results(store, registration.spec.match_id, run)
-        if run == "latest" and (later := describe_later_run(store, opened.record)):
+        if run == "latest" and (later := describe_age(store, opened.record)):
             line(later, to=errors)
         origin = Origin(opened, registration)
         if absent := sorted({clip.id for clip in registration.spec.clips} - {*origin.clips}):

@@ -156,8 +156,8 @@ def evaluate(
         match_in=match_in,
         reading=Reading(markers, first_frame),
     )
-    if scores.later_run:
-        line(scores.later_run, to=errors)
+    if scores.age:
+        line(scores.age, to=errors)
     _print_scores(scores, as_json=as_json)
 
 

@@ -73,7 +73,7 @@ def export(
         video: With viewer, also embed the clip's overlay video.
     """
     from flows.registering import find_registration, open_match
-    from flows.results.best_results import Footage, Origin, describe_later_run, open_results
+    from flows.results.best_results import Footage, Origin, describe_age, open_results
     from flows.results.export import LENS_ERRORS
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
@@ -98,7 +98,7 @@ def export(
     registration = find_registration(store, match)
     name = registration.spec.match_id
     opened = open_results(store, name, run)
-    if run == LATEST and (later := describe_later_run(store, opened.record)):
+    if run == LATEST and (later := describe_age(store, opened.record)):
         line(later, to=errors)
     for text in opened.record.usability.reservations:
         line(f"reservation: {text}", to=errors)
@@ -177,7 +177,7 @@ def report(
     """
     from flows.registering import find_match, open_stored
     from flows.reports.report import write_report
-    from flows.results.best_results import describe_later_run, open_results
+    from flows.results.best_results import describe_age, open_results
     from flows.results.outputs import record_owner, require_own
 
     store = Store.open(project)
@@ -200,7 +200,7 @@ def report(
         names = {file.name: None for file in files}
         require_own(place, names, (known.match_id,), overwrite=overwrite)
     opened = open_results(store, known.match_id, run).record
-    if run == LATEST and (later := describe_later_run(store, opened)):
+    if run == LATEST and (later := describe_age(store, opened)):
         line(later, to=errors)
     films = write_report(
         store,

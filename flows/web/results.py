@@ -23,7 +23,7 @@ from flows.reports.viewer import describe_video, viewer_clip
 from flows.results.best_results import (
     Origin,
     clips_of,
-    describe_later_run,
+    describe_age,
     find_clips,
     joint_tracks,
     open_results,
@@ -243,7 +243,7 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     return {
         "run": record.run_id,
         "state": record.state,
-        "later": describe_later_run(context.store, record),
+        "later": describe_age(context.store, record),
         "formats": list(formats),
         "purposes": EXPORT_PURPOSES,
         "clips": [

@@ -140,7 +140,18 @@ def test_results_stay_reachable_when_a_later_run_has_none(ada, project_copy, tmp
     ):
         answer = worldpose(*command, "--project", project_copy)
         assert (answer.code, later in answer.err) == (0, True), answer.err
-    assert score(TINY, str(tmp_path / "out"), str(project_copy)).later_run == later
+    assert score(TINY, str(tmp_path / "out"), str(project_copy)).age == later
+
+
+def test_results_say_which_change_made_them_old(ada, project_copy, tmp_path):
+    store = Store.open(str(project_copy))
+    edits = {"split": SplitTrack(clip="clip", person=0, first_frame_of_new=12)}
+    keep_edits(store, lambda: open_match(store, TINY), edits, who="Ada", note="")
+    said = "These results are out of date because of 1 correction. Run it again."
+    assert ada.get(f"{MATCH}/results").json()["later"] == said
+    out = ["--out", str(tmp_path / "out"), "--project", project_copy]
+    answer = worldpose("export", TINY, "--format", "joints", *out)
+    assert (answer.code, said in answer.err) == (0, True), answer.err
 
 
 def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
