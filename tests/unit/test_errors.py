@@ -165,7 +165,7 @@ TREE = {
 
 
 @pytest.fixture
-def tree(tmp_path: Path) -> Path:
+def tree(tmp_path):
     for name, text in TREE.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -175,19 +175,19 @@ def tree(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def version_of(tree: Path) -> dict[str, str]:
+def version_of(tree):
     forget()
     return code_version("tasks.tracking", (tree,))
 
 
-def forget() -> None:
+def forget():
     """Read sources again, as a new process would."""
     code_version.cache_clear()
     _read_module.cache_clear()
     _source_cache.cache_clear()
 
 
-def edited(tree: Path, name: str, old: str, new: str) -> set[str]:
+def edited(tree, name, old, new):
     """The modules whose digest an edit of `name` changes."""
     before = version_of(tree)
     text = (tree / name).read_text()
@@ -197,7 +197,7 @@ def edited(tree: Path, name: str, old: str, new: str) -> set[str]:
     return {module for module, version in after.items() if before.get(module) != version}
 
 
-def test_nothing_is_executed(tree: Path) -> None:
+def test_nothing_is_executed(tree):
     path = tree / "worldpose/tracking/affinity.py"
     path.write_text("raise SystemExit('executed')\nimport sys\n")
     assert "worldpose.tracking.affinity" in version_of(tree)
@@ -214,7 +214,7 @@ def test_nothing_is_executed(tree: Path) -> None:
         ("def track", "\n\n\ndef track"),
     ],
 )
-def test_edit_that_computes_the_same_changes_nothing(tree: Path, old: str, new: str) -> None:
+def test_edit_that_computes_the_same_changes_nothing(tree, old, new):
     assert edited(tree, "worldpose/tracking/tracker.py", old, new) == set()
 
 
@@ -225,9 +225,7 @@ def test_edit_that_computes_the_same_changes_nothing(tree: Path, old: str, new: 
         ("unrelated", "x = 1", "x = 2", set()),
     ],
 )
-def test_edit_that_computes_something_else_changes_its_module_only(
-    tree: Path, module: str, old: str, new: str, changed: set[str]
-) -> None:
+def test_edit_that_computes_something_else_changes_its_module_only(tree, module, old, new, changed):
     assert edited(tree, f"worldpose/{module}.py", old, new) == changed
 
 

@@ -124,16 +124,16 @@ def made_pose(made, step):
     )
 
 
-def plane_camera(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0) -> Camera:
+def plane_camera(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0):
     """A camera whose pixels are the distorted coordinates on the plane z = 1."""
     return plain_camera(1.0, (0.0, 0.0), Rigid.identity(), (2, 2), lens=(k1, k2, p1, p2, k3))
 
 
-def on_plane(points) -> np.ndarray:
+def on_plane(points):
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
-def spokes(radii, count=12) -> np.ndarray:
+def spokes(radii, count=12):
     angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return (np.asarray(radii)[:, None, None] * directions).reshape(-1, 2)

@@ -15,7 +15,7 @@ from worldpose.geometry.rays import Rays, RayStatus, intersect_rays
 from worldpose.geometry.rigid import Rigid
 
 
-def simple_camera(**changes) -> Camera:
+def simple_camera(**changes):
     """A camera at the world's origin with its axes along the world's."""
     fields = {
         "focal": np.array([1000.0, 1000.0]),
@@ -124,7 +124,7 @@ def test_wrong_shapes_are_refused_with_both_shapes(make, expected, found):
         make()
 
 
-def calibration(**changes) -> CameraCalibration:
+def calibration(**changes):
     rotation = Rigid.from_rotvec([2.0, -0.3, 0.4], np.zeros(3)).rotation
     fields = {
         "id": "north",
@@ -189,7 +189,7 @@ def test_senseless_calibration_is_refused(change):
 
 
 @st.composite
-def stadium_cameras(draw, tangential=True) -> Camera:
+def stadium_cameras(draw, tangential=True):
     """Cameras 40 to 120 m from the pitch, with the lenses of real broadcast cameras and wider."""
     focal = draw(st.floats(2400.0, 7100.0))
     spread = st.floats(-1.0, 1.0)
@@ -207,7 +207,7 @@ def stadium_cameras(draw, tangential=True) -> Camera:
     )
 
 
-def points_in_view(camera: Camera, seed: int, count: int = 20) -> np.ndarray:
+def points_in_view(camera, seed, count=20):
     """World points that a camera without distortion sees inside the image, 30 to 150 m deep."""
     rng = np.random.default_rng(seed)
     size = camera.image_size.astype(float)
@@ -218,7 +218,7 @@ def points_in_view(camera: Camera, seed: int, count: int = 20) -> np.ndarray:
     return camera.cam_from_world.inverse().apply(points_cam)
 
 
-def opencv(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def opencv(camera, points):
     matrix = np.diag([*camera.focal, 1.0])
     matrix[:2, 2] = camera.principal_point
     image, jacobian = cv2.projectPoints(
@@ -250,10 +250,10 @@ def test_projection_equals_opencv(camera, seed):
     )
 
 
-def central_differences(function, size: int, step: float) -> np.ndarray:
+def central_differences(function, size, step):
     """Derivatives by `size` parameters around zero, of order step^4, as the last dimension."""
 
-    def difference(k: int, h: float) -> np.ndarray:
+    def difference(k, h):
         delta = np.zeros(size)
         delta[k] = h
         return (function(delta) - function(-delta)) / (2.0 * h)
@@ -274,7 +274,7 @@ def test_jacobians_equal_finite_differences(camera, seed):
     points = points[radius < 0.9 * fold_radius(camera.coefficients)]
     found = camera.project_with_jacobians(points)
 
-    def changed(**parts) -> Camera:
+    def changed(**parts):
         fields = ("focal", "principal_point", "distortion", "cam_from_world", "image_size")
         return Camera(**{name: parts.get(name, getattr(camera, name)) for name in fields})
 
@@ -320,20 +320,20 @@ def test_pixel_to_ray_to_pixel_returns(camera, seed):
     assert np.isin(rays.status, [RayStatus.OK, RayStatus.BEYOND_FOLD]).all()
 
 
-def rays_through(origins, targets) -> Rays:
+def rays_through(origins, targets):
     origins, targets = np.broadcast_arrays(np.asarray(origins, float), np.asarray(targets, float))
     offset = targets - origins
     directions = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
     return Rays(origins, directions, np.zeros(directions.shape[:-1], np.uint8))
 
 
-def without(rays: Rays, *index) -> Rays:
+def without(rays, *index):
     directions, status = rays.directions.copy(), rays.status.copy()
     directions[index], status[index] = np.nan, RayStatus.BEYOND_FOLD
     return Rays(rays.origins, directions, status)
 
 
-def random_rays(rng: np.random.Generator, *shape: int) -> Rays:
+def random_rays(rng, *shape):
     return rays_through(rng.uniform(-50, 50, (*shape, 3)), rng.uniform(-50, 50, (*shape, 3)))
 
 

@@ -18,7 +18,7 @@ angles = st.floats(-1.0, 1.0)
 rotvecs = st.tuples(angles, angles, angles).map(np.array)
 
 
-def quarter_turn_about_z() -> Rigid:
+def quarter_turn_about_z():
     return Rigid.from_rotvec([0.0, 0.0, np.pi / 2], [10.0, 0.0, 0.0])
 
 

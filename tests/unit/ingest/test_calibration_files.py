@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 
-from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import read_calibration
@@ -204,7 +203,7 @@ def test_qualisys_camera_projects_as_it_stands(read):
     np.testing.assert_allclose(pixel([1.0, 3.0, 0.0]), [960, 430], atol=1e-9)
 
 
-def _matrix(camera: CameraCalibration):
+def _matrix(camera):
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 

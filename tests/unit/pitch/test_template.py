@@ -19,21 +19,21 @@ ROUNDING = 1e-13
 
 
 @pytest.fixture(scope="module")
-def flat() -> PitchTemplate:
+def flat():
     return PitchTemplate.from_spec(PitchSpec(crown=0.0))
 
 
 @pytest.fixture(scope="module")
-def standard() -> PitchTemplate:
+def standard():
     return PitchTemplate.standard()
 
 
-def marking(template: PitchTemplate, name: str, spacing: float = 0.5) -> np.ndarray:
+def marking(template, name, spacing=0.5):
     samples = template.sample_lines(spacing)
     return samples.points_world[samples.marking == samples.names.index(name)]
 
 
-def extent(points: np.ndarray) -> float:
+def extent(points):
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 

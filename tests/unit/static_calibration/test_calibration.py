@@ -204,9 +204,7 @@ SPREAD_OUT = ClickSettings()
 FEW = ClickSettings(clustered=1.0, clustered_points=(5, 7))
 
 
-def share_inside(
-    scenario: str, clicks: ClickSettings, cameras: int, *, stated: float, lines: bool = False
-) -> float:
+def share_inside(scenario, clicks, cameras, *, stated, lines=False):
     """Share of independent cameras, clicks and surveys whose 95 % region has the true camera.
 
     Args:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +34,7 @@ from worldpose.store.store import Store
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+def undisturbed(tmp_path_factory):
     """The project that an undisturbed run leaves."""
     with pytest.MonkeyPatch.context() as patch:
         # A module's fixture is made before a test's: the chunks must be the same small ones.
@@ -47,7 +45,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         yield store
 
 
-def check_never_half(store: Store) -> None:
+def check_never_half(store):
     """All visible results are complete and correct."""
     assert verify(store) == ()
     for result in store.results():
@@ -63,8 +61,8 @@ def check_never_half(store: Store) -> None:
 @pytest.mark.faults
 @pytest.mark.parametrize("point", COMMIT_POINTS)
 def test_killed_run_leaves_nothing_half_and_the_next_gives_the_same_answer(
-    store: Store, undisturbed: Store, point: str
-) -> None:
+    store, undisturbed, point
+):
     process = run_process(run_and_die, store.url, point)
     process.join(60)
     assert process.exitcode == 9
@@ -91,18 +89,16 @@ def test_killed_run_leaves_nothing_half_and_the_next_gives_the_same_answer(
     assert compare_stores(store, undisturbed) == []
 
 
-def test_every_file_and_folder_is_on_disk_before_the_rename(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_file_and_folder_is_on_disk_before_the_rename(folder_store, monkeypatch):
     synced: set[int] = set()
     synced_at_rename: set[int] = set()
     fsync, rename = os.fsync, Path.rename
 
-    def record_fsync(descriptor: int) -> None:
+    def record_fsync(descriptor):
         fsync(descriptor)
         synced.add(os.fstat(descriptor).st_ino)
 
-    def record_rename(self: Path, target: Path) -> Path:
+    def record_rename(self, target):
         synced_at_rename.update(synced)
         return rename(self, target)
 
@@ -118,10 +114,8 @@ def test_every_file_and_folder_is_on_disk_before_the_rename(
 
 
 @pytest.mark.parametrize("point", ["after_write", "during_publish", "before_commit"])
-def test_interruption_by_hand_leaves_no_staging(
-    folder_store: Store, tmp_path: Path, point: str
-) -> None:
-    def interrupt(name: str) -> None:
+def test_interruption_by_hand_leaves_no_staging(folder_store, tmp_path, point):
+    def interrupt(name):
         if name == point:
             raise KeyboardInterrupt
 
@@ -137,7 +131,7 @@ def test_interruption_by_hand_leaves_no_staging(
 NOW = timedelta(0)
 
 
-def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) -> None:
+def test_what_no_run_reaches_is_listed_first_and_removed_second(store):
     run_once(store)
     publish(store, sample_recipe("unused"))
     leftover = ResultId(*place(sample_recipe("dead"))).path
@@ -154,7 +148,7 @@ def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) ->
     assert verify(store) == ()
 
 
-def test_match_with_a_run_at_work_is_left_alone(folder_store: Store) -> None:
+def test_match_with_a_run_at_work_is_left_alone(folder_store):
     store = folder_store
     publish(store)
     other = sample_recipe(match_id="semi")
@@ -171,10 +165,8 @@ def test_match_with_a_run_at_work_is_left_alone(folder_store: Store) -> None:
     assert store.unfinished_runs("final") == ()
 
 
-def test_result_of_which_something_was_removed_is_not_published(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def removed(*given: Any) -> Any:
+def test_result_of_which_something_was_removed_is_not_published(folder_store, monkeypatch):
+    def removed(*given):
         for staged in folder_store.blobs.staged_entries():
             folder_store.blobs.delete_tree(staged.path, "manifest.json")
         return array_parts(*given)
@@ -187,9 +179,7 @@ def test_result_of_which_something_was_removed_is_not_published(
 
 
 @pytest.mark.parametrize("damaged", ["run", "manifest", "pin", "reservation"])
-def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(
-    folder_store: Store, damaged: str
-) -> None:
+def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(folder_store, damaged):
     run_once(folder_store)
     publish(folder_store, sample_recipe("spare"))
     publish(folder_store, sample_recipe(match_id="semi"))
@@ -209,14 +199,12 @@ def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(
     assert folder_store.has(*place(sample_recipe("spare")))
 
 
-def test_interrupted_collection_is_finished_by_the_next(
-    folder_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_collection_is_finished_by_the_next(folder_store, monkeypatch):
     store = folder_store
     run_once(store, sample_recipe("one"), sample_recipe("two"))
     run_once(store, sample_recipe("three"))
 
-    def stop(*_: object) -> None:
+    def stop(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

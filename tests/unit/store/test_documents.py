@@ -6,7 +6,6 @@ import json
 import math
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +41,7 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_value_comes_back_and_is_written_the_same_again(value: object) -> None:
+def test_value_comes_back_and_is_written_the_same_again(value):
     data = canonical_json(value)
     assert json.loads(data) == value
     assert canonical_json(json.loads(data)) == data
@@ -62,9 +61,7 @@ def test_value_comes_back_and_is_written_the_same_again(value: object) -> None:
         ("\u00e9", "e\u0301"),
     ],
 )
-def test_values_that_are_nearly_the_same_have_bytes_of_their_own(
-    one: object, other: object
-) -> None:
+def test_values_that_are_nearly_the_same_have_bytes_of_their_own(one, other):
     assert canonical_json(one) != canonical_json(other)
 
 
@@ -86,7 +83,7 @@ ENDLESS.append(ENDLESS)
         ENDLESS,
     ],
 )
-def test_value_that_json_cannot_say_exactly_is_refused(value: object) -> None:
+def test_value_that_json_cannot_say_exactly_is_refused(value):
     with pytest.raises(InputError, match="plain JSON"):
         canonical_json(value)
 
@@ -95,7 +92,7 @@ DOCUMENT = seal(sample_record("0001", sample_recipe()))
 
 
 @given(st.integers(0, len(DOCUMENT) - 1), st.integers(0, 7))
-def test_every_flipped_bit_is_corruption(index: int, bit: int) -> None:
+def test_every_flipped_bit_is_corruption(index, bit):
     flipped = bytearray(DOCUMENT)
     flipped[index] ^= 1 << bit
     with pytest.raises(CorruptionError, match="the place is damaged"):
@@ -105,7 +102,7 @@ def test_every_flipped_bit_is_corruption(index: int, bit: int) -> None:
 @pytest.mark.parametrize(
     "data", [b"", b"\xff", b"[]", b"1", b"null", b"{}", b"[" * 100_000, DOCUMENT + b" "]
 )
-def test_other_json_is_corruption(data: bytes) -> None:
+def test_other_json_is_corruption(data):
     with pytest.raises(CorruptionError):
         unseal(RunRecord, data, "the place")
 
@@ -131,13 +128,13 @@ def describe(old, new):
         ({"libraries": {"numpy": "2.5.0"}}, "library numpy: 2.4.0 -> 2.5.0"),
     ],
 )
-def test_every_change_has_its_own_line_and_its_own_key(change: dict[str, Any], line: str) -> None:
+def test_every_change_has_its_own_line_and_its_own_key(change, line):
     changed = sample_recipe(**change)
     assert describe(sample_recipe(), changed) == [line]
     assert recipe_key(changed) != recipe_key(sample_recipe())
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in folder.rglob("*")
@@ -145,13 +142,13 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def write(folder: Path, **changes: Any) -> dict[str, bytes]:
+def write(folder, **changes):
     arrays = {**all_sample_arrays(), **changes}
     write_group(folder, LAYOUT, arrays, sample_coordinates(), ATTRIBUTES)
     return contents(folder)
 
 
-def test_equal_arrays_give_equal_files(tmp_path: Path) -> None:
+def test_equal_arrays_give_equal_files(tmp_path):
     one = write(tmp_path / "one")
     arrays = dict(reversed(all_sample_arrays().items()))
     # Another memory order, other sequence types and orders of names: the same content.
@@ -176,9 +173,7 @@ def test_equal_arrays_give_equal_files(tmp_path: Path) -> None:
         ({"unplanned": np.zeros(3)}, "unknown: unplanned"),
     ],
 )
-def test_array_that_breaks_the_layout_is_refused(
-    tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_array_that_breaks_the_layout_is_refused(tmp_path, changes, message):
     with pytest.raises(InternalError, match=message):
         write(tmp_path, **changes)
     assert list(tmp_path.iterdir()) == [], "checked before anything is written"
@@ -194,9 +189,7 @@ def test_array_that_breaks_the_layout_is_refused(
         ({**ATTRIBUTES, "detector": float("nan")}, "plain JSON"),
     ],
 )
-def test_attribute_that_breaks_the_layout_is_refused(
-    tmp_path: Path, attributes: dict[str, Any], message: str
-) -> None:
+def test_attribute_that_breaks_the_layout_is_refused(tmp_path, attributes, message):
     with pytest.raises(InternalError, match=message):
         write_group(tmp_path, LAYOUT, all_sample_arrays(), sample_coordinates(), attributes)
 
@@ -205,7 +198,7 @@ def test_attribute_that_breaks_the_layout_is_refused(
 @given(
     st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]), st.data()
 )
-def test_any_array_of_any_shape_comes_back(dtype: Any, data: st.DataObject) -> None:
+def test_any_array_of_any_shape_comes_back(dtype, data):
     import tempfile
 
     shape = data.draw(hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=40))
@@ -223,7 +216,7 @@ def test_any_array_of_any_shape_comes_back(dtype: Any, data: st.DataObject) -> N
         np.testing.assert_array_equal(stored[...], values)  # type: ignore[index]
 
 
-def test_xarray_opens_the_folder_itself_without_a_warning(tmp_path: Path) -> None:
+def test_xarray_opens_the_folder_itself_without_a_warning(tmp_path):
     write(tmp_path / "group")
     (tmp_path / "group" / "manifest.json").write_text("{}")  # as in the store
     with warnings.catch_warnings():

@@ -21,13 +21,12 @@ from worldpose.store.garbage import plan_gc
 from worldpose.store.integrity import repair, verify
 from worldpose.store.paths import ResultId
 from worldpose.store.runs import list_pins, pin_run
-from worldpose.store.store import Store
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @pytest.fixture
-def full(folder_store: Store) -> Store:
+def full(folder_store):
     """A project with every kind of file in it."""
     store = folder_store
     store.register(sample_registration())
@@ -36,12 +35,12 @@ def full(folder_store: Store) -> Store:
     return store
 
 
-def all_paths(store: Store) -> list[str]:
+def all_paths(store):
     tops = ("results", "runs", "matches")
     return ["project.json", *(entry.path for top in tops for entry in store.blobs.entries(top))]
 
 
-def flip(store: Store, path: str, number: int) -> bytes:
+def flip(store, path, number):
     """Flips one bit of a file and returns what it was."""
     data = store.blobs.read(path)
     assert data is not None
@@ -51,11 +50,11 @@ def flip(store: Store, path: str, number: int) -> bytes:
     return data
 
 
-def is_document(path: str) -> bool:
+def is_document(path):
     return not path.startswith("results/") or path.endswith("/manifest.json")
 
 
-def test_flipped_bits_in_all_data_are_found_in_one_go(full: Store) -> None:
+def test_flipped_bits_in_all_data_are_found_in_one_go(full):
     damaged = [path for path in all_paths(full) if not is_document(path)]
     assert len(damaged) > 20
     for number, path in enumerate(damaged):
@@ -65,7 +64,7 @@ def test_flipped_bits_in_all_data_are_found_in_one_go(full: Store) -> None:
     assert all(finding.path in finding.problem for finding in found)
 
 
-def test_flipped_bit_in_any_record_or_manifest_is_found_there(full: Store) -> None:
+def test_flipped_bit_in_any_record_or_manifest_is_found_there(full):
     damaged = [path for path in all_paths(full) if is_document(path)]
     # The project, two manifests, a run, a reservation and a registration.
     assert len(damaged) == 6
@@ -76,7 +75,7 @@ def test_flipped_bit_in_any_record_or_manifest_is_found_there(full: Store) -> No
     assert verify(full) == ()
 
 
-def test_foreign_file_is_found(full: Store) -> None:
+def test_foreign_file_is_found(full):
     foreign = [
         f"{ResultId(*place()).path}/joints/c/9/0/0",
         "results/final/tracking/stray",
@@ -92,7 +91,7 @@ def test_foreign_file_is_found(full: Store) -> None:
     assert repair(full, findings)[1] == (), "it is not ours to move"
 
 
-def test_foreign_files_break_no_reader(full: Store) -> None:
+def test_foreign_files_break_no_reader(full):
     """macOS and back-up programs put files of their own on shares."""
     names = (
         *("matches/.x.json", "matches/._final.json", "matches/a/b.json", "runs/.DS_Store"),
@@ -112,7 +111,7 @@ def test_foreign_files_break_no_reader(full: Store) -> None:
     assert full.reserve_run("final") == "0003"
 
 
-def test_repair_sets_damaged_records_aside_and_readers_go_on(full: Store) -> None:
+def test_repair_sets_damaged_records_aside_and_readers_go_on(full):
     run_once(full)
     pin_run(
         full.blobs, Pin(name="v1", match_id="final", run_id="0001", who="A", why="", pinned_at=NOW)
@@ -133,7 +132,7 @@ def test_repair_sets_damaged_records_aside_and_readers_go_on(full: Store) -> Non
     assert full.reserve_run("final") == "0004", "the number of a damaged run is not given again"
 
 
-def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
+def test_whole_file_in_a_wrong_place_is_found(folder_store):
     full = folder_store
     full.blobs.put("runs/final/0007.json", seal(sample_record("0008")))
     full.blobs.put("matches/semi.json", seal(sample_registration("final")))
@@ -143,7 +142,7 @@ def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
     ]
 
 
-def test_repair_withdraws_what_is_damaged_and_nothing_else(full: Store) -> None:
+def test_repair_withdraws_what_is_damaged_and_nothing_else(full):
     path = f"{ResultId(*place()).path}/joints/c/0/0/0"
     full.blobs.put(path, b"changed")
     assert repair(full, verify(full)) == ((ResultId(*place()),), ())

@@ -4,10 +4,8 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import pytest
 from store_samples import PROCESSES, run_once, run_process, sample_recipe
@@ -21,7 +19,7 @@ from worldpose.store.runs import alone, list_pins, may_be_running, pin_run, unpi
 from worldpose.store.store import Store, open_run
 
 
-def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store: Store) -> None:
+def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store):
     store = folder_store
     run_once(store)
     assert store.reserve_run("final") == "0002"
@@ -33,18 +31,18 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store: Store) -> No
         store.run("final", "0002")
 
 
-def reserve_some(url: str, outcome: object) -> None:
+def reserve_some(url, outcome):
     store = Store.open(url)
     outcome.put([store.reserve_run("final") for _ in range(4)])  # type: ignore[attr-defined]
 
 
-def hold_and_die(url: str, outcome: object) -> None:
+def hold_and_die(url, outcome):
     with alone(Store.open(url).blobs, "a", wait=False) as is_held:
         outcome.put(is_held)  # type: ignore[attr-defined]
         time.sleep(60.0)
 
 
-def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store: Store) -> None:
+def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store):
     blobs, outcome = folder_store.blobs, PROCESSES.Queue()
     other = PROCESSES.Process(target=hold_and_die, args=(folder_store.url, outcome))
     other.start()
@@ -62,7 +60,7 @@ def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store:
         assert (is_held, is_second) == (True, False)
 
 
-def test_processes_get_different_numbers(store: Store) -> None:
+def test_processes_get_different_numbers(store):
     outcome = PROCESSES.Queue()
     processes = [run_process(reserve_some, store.url, outcome) for _ in range(3)]
     numbers = [number for _ in processes for number in outcome.get(timeout=60)]
@@ -76,20 +74,20 @@ def test_processes_get_different_numbers(store: Store) -> None:
 NOW = timedelta(0)
 
 
-def pin(name: str, run_id: str = "0001", why: str = "") -> Pin:
+def pin(name, run_id="0001", why=""):
     return Pin(
         match_id="final", name=name, run_id=run_id, who="Ada", why=why, pinned_at=datetime.now(UTC)
     )
 
 
 @pytest.fixture
-def two_runs(folder_store: Store) -> Store:
+def two_runs(folder_store):
     run_once(folder_store, sample_recipe("first"))
     run_once(folder_store, sample_recipe("second"))
     return folder_store
 
 
-def test_a_pinned_run_and_its_results_outlast_all_others(two_runs: Store) -> None:
+def test_a_pinned_run_and_its_results_outlast_all_others(two_runs):
     pin_run(two_runs.blobs, pin("paper"))
     plan = plan_gc(two_runs, keep_last=1, older_than=NOW)
     assert plan.garbage == ()
@@ -100,7 +98,7 @@ def test_a_pinned_run_and_its_results_outlast_all_others(two_runs: Store) -> Non
     assert two_runs.runs("final") == ("0002",)
 
 
-def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs: Store) -> None:
+def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs):
     plan = plan_gc(two_runs, keep_last=1, older_than=NOW)
     pin_run(two_runs.blobs, pin("paper"))
     with pytest.raises(StoreError, match="Make a new plan"):
@@ -108,7 +106,7 @@ def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs: Store) -> 
     assert two_runs.runs("final") == ("0001", "0002")
 
 
-def test_a_name_is_as_good_as_a_number(two_runs: Store) -> None:
+def test_a_name_is_as_good_as_a_number(two_runs):
     pin_run(two_runs.blobs, pin("paper"))
     assert two_runs.run("final", "paper").run_id == "0001"
     assert open_run(two_runs.url, "final", "paper").record.run_id == "0001"
@@ -116,7 +114,7 @@ def test_a_name_is_as_good_as_a_number(two_runs: Store) -> None:
         two_runs.run("final", "other")
 
 
-def test_a_name_is_one_run_s_for_good(two_runs: Store) -> None:
+def test_a_name_is_one_run_s_for_good(two_runs):
     kept = pin_run(two_runs.blobs, pin("paper", why="first"))
     assert pin_run(two_runs.blobs, pin("paper", why="again")) == kept
     with pytest.raises(InputError, match="run 0001 pinned under"):
@@ -127,7 +125,7 @@ def test_a_name_is_one_run_s_for_good(two_runs: Store) -> None:
         unpin_run(two_runs.blobs, "final", "other")
 
 
-def rewrite(store: Store, path: str, change: Callable[[dict[str, Any]], None]) -> None:
+def rewrite(store, path, change):
     """A document as another version would have sealed it."""
     fields = json.loads(store.blobs.read(path) or b"")
     del fields["checksum"]
@@ -136,7 +134,7 @@ def rewrite(store: Store, path: str, change: Callable[[dict[str, Any]], None]) -
     store.blobs.put(path, canonical_json(sealed) + b"\n")
 
 
-def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_store: Store) -> None:
+def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_store):
     run_once(folder_store)
     rewrite(folder_store, "project.json", lambda fields: fields.update(store_format="0"))
     with pytest.raises(InputError, match=r"store_format.*expected '3', found '0'") as refused:
@@ -153,9 +151,7 @@ def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_sto
         (lambda fields: fields.pop("usability"), "no field usability"),
     ],
 )
-def test_a_run_that_another_version_recorded_is_refused_as_such(
-    folder_store: Store, change: Callable[[dict[str, Any]], None], found: str
-) -> None:
+def test_a_run_that_another_version_recorded_is_refused_as_such(folder_store, change, found):
     run_once(folder_store)
     rewrite(folder_store, "runs/final/0001.json", change)
     with pytest.raises(InputError, match=f"found {found}: another version") as refused:

@@ -187,7 +187,7 @@ def test_noise_is_not_taken_for_an_exchange(ring):
     assert found.exchanged.any(axis=-1).mean() < 0.01
 
 
-def standing(x: float, bottom: float, height: float) -> np.ndarray:
+def standing(x, bottom, height):
     """Keypoints (17, 2) [px] of an upright person whose trunk is a third of the height."""
     up = {"shoulder": 0.8, "hip": 0.8 - 1 / 3, "knee": 0.25, "ankle": 0.0, "elbow": 0.65}
     rows = [up.get(name.split("_")[-1], 0.9) for name in COCO17]

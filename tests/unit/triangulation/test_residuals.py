@@ -5,7 +5,6 @@ import pytest
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.estimate import reconstruct_joints, triangulate_joints
 from worldpose.triangulation.noise_model import shared_variance
 from worldpose.triangulation.residuals import (
@@ -242,7 +241,7 @@ def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
             assert (cost(moved) > best).all()
 
 
-def monte_carlo(cameras: Camera, seen, scale):
+def monte_carlo(cameras, seen, scale):
     """Errors and covariances of one joint under white noise of `scale` [px], 4000 times."""
     joint = np.array([1.0, -2.0, 1.2])
     keypoints, confidence, index = seen(cameras, np.broadcast_to(joint, (4000, 1, 1, 3)))
