@@ -32,8 +32,7 @@ def test_a_broadcast_clip_is_calibrated_scored_and_shown(server, tmp_path):
     assert "known least" in page.read_text()
     # 60 frames at 50 a second are shown at 25.
     with VideoReader(tmp_path / "page-clip.mp4") as video:
-        assert len(video) == 30
-        assert video.frame(0).shape == (540, 960, 3)
+        assert (len(video), video.frame(0).shape) == (30, (540, 960, 3))
     assert told["videos"] == [str(tmp_path / "page-clip.mp4")]
 
 

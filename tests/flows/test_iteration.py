@@ -147,9 +147,7 @@ def looped(monkeypatch):
 def test_the_loop_ends_by_itself_when_left_out_cameras_are_foreseen_no_better(looped):
     found, ran = looped([0.040, 0.0399, 0.02], None)
     # The first stands, and is made the latest run again.
-    assert ran == [1, 2, 1]
-    assert found.kept.number == 1
-    assert found.record.iteration == 1
+    assert (ran, found.kept.number, found.record.iteration) == ([1, 2, 1], 1, 1)
     assert found.ended == "iteration 2 is no better"
 
 
@@ -160,9 +158,7 @@ def test_the_loop_goes_on_while_it_helps_and_keeps_the_best(looped):
 
 def test_a_run_that_waits_or_fails_ends_the_loop_and_is_what_the_loop_says(looped):
     found, ran = looped([0.040, None, 0.03], 3, {2: "waiting"})
-    assert ran == [1, 2]
-    assert found.record.state == "waiting"
-    assert found.kept.number == 1
+    assert (ran, found.record.state, found.kept.number) == ([1, 2], "waiting", 1)
 
 
 @pytest.mark.parametrize(("most", "ran"), [(None, [1, 2, 1]), (3, [1, 2, 3, 1])])

@@ -177,8 +177,7 @@ def test_corrections_are_grouped_by_person_camera_and_session(unrun_store, ada_b
     ]
     assert [len(page) for page in pages] == [200, 200, 100, 0]
     ids = [each["id"] for page in pages for each in page]
-    assert len(set(ids)) == SESSION
-    assert ids[-1] == found[1]["id"]
+    assert (len(set(ids)), ids[-1]) == (SESSION, found[1]["id"])
 
 
 def test_a_group_is_undone_as_a_whole_and_only_as_it_was_seen(unrun_store, ada_before_runs):

@@ -30,9 +30,7 @@ def run_json(*arguments, **keywords):
 def test_a_finished_match_has_nothing_to_do_and_starts_nothing(tiny, project_copy):
     # Any import of Prefect or Dask ends this process at once.
     answer = run_json(tiny, "--project", project_copy, environment=NO_ORCHESTRATOR)
-    assert answer["executed"] == 0
-    assert answer["failed"] == 0
-    assert answer["run"] == "0001"
+    assert (answer["executed"], answer["failed"], answer["run"]) == (0, 0, "0001")
     assert Store.open(str(project_copy)).runs(TINY) == ("0001",)
 
 

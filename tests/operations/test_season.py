@@ -104,8 +104,7 @@ def test_a_service_survives_kills_frozen_runs_and_the_loss_of_its_database(
     shutil.rmtree(served.project / "operations" / "prefect")
     served.begin()
     wait_until(lambda: runs_of(names[0])[-1].state == "complete", served.explain)
-    assert len(runs_of(names[0])) == count
-    assert served.end() == 0
+    assert (len(runs_of(names[0])), served.end()) == (count, 0)
 
 
 @pytest.mark.slow  # summaries of all matches are made
@@ -210,9 +209,7 @@ def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(served, ma
         ]
         assert any(f"/#/match/{run['parameters']['match_id']})" in each["data"] for each in found)
     assert [store.run(name).state for name in everything] == ["complete"] * 3
-    assert list(doubled(store)) == []
-    assert list(verify(store)) == []
-    assert served.end() == 0
+    assert (list(doubled(store)), list(verify(store)), served.end()) == ([], [], 0)
 
 
 def schedules(served):
@@ -257,8 +254,7 @@ def test_schedules_and_settings_outlast_two_restarts(served, small_match, tmp_pa
 
     wait_until(lambda: completed(1), served.explain)
     found = [store.run(match_id, run_id).results for run_id in store.runs(match_id)]
-    assert found == expected
-    assert store.run(match_id).body_folder == str(bodies)
+    assert (found, store.run(match_id).body_folder) == (expected, str(bodies))
     # A person makes a schedule of their own, in Prefect's page or by its API.
     other = {"interval": 86400.0, "timezone": "Asia/Tokyo"}
     deployment = served.ask("/deployments/name/reprocess/worldpose-reprocess")["id"]
@@ -276,7 +272,6 @@ def test_schedules_and_settings_outlast_two_restarts(served, small_match, tmp_pa
     run = served.ask(f"/deployments/{deployment}/create_flow_run", {"name": "nightly"})
     asked = f"/flow_runs/{run['id']}"
     wait_until(lambda: served.ask(asked)["state_type"] == "COMPLETED", served.explain)
-    assert len(store.runs(match_id)) == len(found)
-    assert served.end() == 0
+    assert (len(store.runs(match_id)), served.end()) == (len(found), 0)
     told = succeed("reprocess", "--dry-run", "--project", served.project, "--json").json
     assert [each["state"] for each in told["matches"]] == ["untouched"]

@@ -199,9 +199,7 @@ def test_origins_tell_absent_automatic_filled_and_corrected_joints(tmp_path):
     tracks = JointTracks(np.arange(2), np.array([4]), joints, views=views)
     origin = origins_of(tracks, corrected)
     names = np.array(ORIGINS)[origin]
-    assert names[0, 0, 5] == "filled"
-    assert names[0, 0, 7] == "corrected"
-    assert names[1, 0, 3] == "absent"
-    assert (names == "automatic").sum() == 2 * 17 - 3
+    assert (names[0, 0, 5], names[0, 0, 7]) == ("filled", "corrected")
+    assert (names[1, 0, 3], (names == "automatic").sum()) == ("absent", 2 * 17 - 3)
     write_origins(tmp_path / "A_1.npz", tracks, origin)
     np.testing.assert_array_equal(np.load(tmp_path / "A_1.npz")["origin"], origin)

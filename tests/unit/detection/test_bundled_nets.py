@@ -286,8 +286,7 @@ def test_who_is_hidden_by_half_is_found_once_with_his_own_box_and_pose():
 @pytest.mark.parametrize("people", [found(FRONT, FAR), found(FRONT, HIDDEN, FAR), found()])
 def test_where_all_are_known_nobody_is_found(people):
     (others,) = run_together([find_occluded_people(people)], Told(*people.boxes))
-    assert others.boxes.shape == (0, 4)
-    assert others.score.shape == (0,)
+    assert (others.boxes.shape, others.score.shape) == ((0, 4), (0,))
     assert others.keypoints.shape == (0, 17, 2)
     assert others.confidence.shape == (0, 17)
 

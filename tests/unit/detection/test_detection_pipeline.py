@@ -166,8 +166,7 @@ def test_a_gap_is_filled_evenly_and_a_longer_one_is_not():
         frames, cleaner = followed(seen, max_gap_frames=5)
         assert [number for number, _ in frames] == list(range(30))
         counts = [len(one.scores) for _, one in frames]
-        assert counts.count(1) == 30 - gap + filled
-        assert cleaner.bridged == filled
+        assert (counts.count(1), cleaner.bridged) == (30 - gap + filled, filled)
         if filled:
             np.testing.assert_allclose(frames[12][1].boxes, [walker(12)])
 

@@ -131,8 +131,7 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     def classes(names, asked=None):
         return _person_classes("net.onnx", FORMS["yolov8"], outputs, names, asked)
 
-    assert classes(football) == (1, 2, 3)
-    assert classes(football, [2]) == (2,)
+    assert (classes(football), classes(football, [2])) == ((1, 2, 3), (2,))
     assert classes({}, [1, 2]) == (1, 2)
     with pytest.raises(InputError, match="4 classes without names"):
         classes({})

@@ -121,8 +121,7 @@ def test_frames_without_an_estimate_lower_coverage_alone():
     focal = true.focal.copy()
     focal[2] = np.nan
     found = errors(replace(true, focal=focal), true)
-    assert found.coverage == 0.75
-    assert found.center_error_m == 0.0
+    assert (found.coverage, found.center_error_m) == (0.75, 0.0)
     nothing = errors(replace(true, focal=np.full((4, 2), np.nan)), true)
     assert nothing.model_dump(exclude_none=True) == {"coverage": 0.0, "cameras": 1}
 

@@ -57,8 +57,7 @@ def test_case_c_a_missing_joint_lowers_joint_coverage_not_the_error():
     scores = score(tracks([[predicted]]), tracks([[person()]]))
     assert scores.mpjpe_mm == pytest.approx(50.0, abs=MM)
     assert scores.joint_coverage == pytest.approx(16 / 17, abs=1e-15)
-    assert scores.coverage == 1.0
-    assert scores.pcp3d == 90.0
+    assert (scores.coverage, scores.pcp3d) == (1.0, 90.0)
 
 
 def test_case_d_left_and_right_exchanged():
@@ -133,8 +132,7 @@ def people(frames=60, persons=4):
 def test_regions_of_the_true_size_hold_the_stated_share(level):
     found = region_counts(*people(), level)
     inside, count = np.array(list(found.values())).sum(axis=0)
-    assert count == 60 * 4 * 17
-    assert inside / count == pytest.approx(level, abs=0.02)
+    assert (count, inside / count) == (60 * 4 * 17, pytest.approx(level, abs=0.02))
 
 
 def test_missing_joints_frames_and_unseen_joints_do_not_count():
@@ -186,8 +184,7 @@ def test_case_q_one_person_lost_for_two_frames():
 def test_case_r_hota_counts_the_distances_that_are_reached():
     near = line(*[0] * 10, distance=0.3)
     # 0.7 alike: the levels 0.05, 0.10, ..., 0.70 are reached, 14 of 19.
-    assert near.hota == pytest.approx(14 / 19, abs=1e-15)
-    assert near.idf1 == 1.0
+    assert (near.hota, near.idf1) == (pytest.approx(14 / 19, abs=1e-15), 1.0)
 
 
 def test_case_s_two_people_exchange_ids():

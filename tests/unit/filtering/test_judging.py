@@ -115,5 +115,4 @@ def test_who_would_not_be_seen_well_is_not_looked_for(where, deviation):
 
 def test_who_is_hidden_is_not_looked_for_and_counted():
     behind = expected((0.0, 0.0), (0.0, 1.0))
-    assert sought(behind, 0) == ([], 1)
-    assert sought(behind, 1) == ([0], 0)
+    assert (sought(behind, 0), sought(behind, 1)) == (([], 1), ([0], 0))

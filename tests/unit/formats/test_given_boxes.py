@@ -28,8 +28,7 @@ def read(tmp_path):
 
 def test_lines_become_boxes_sorted_by_frame(read):
     found = read("2,7,11.5,21.5,10,20,0.9,-1,-1,-1\n\n1,3,1.5,1.5,4,8,-1,-1,-1,-1\r\n")
-    assert found.frame.tolist() == [0, 1]
-    assert found.person.tolist() == [3, 7]
+    assert (found.frame.tolist(), found.person.tolist()) == ([0, 1], [3, 7])
     # (1, 1) there is the corner of the first pixel, (0, 0) here its centre.
     np.testing.assert_allclose(found.box, [[0.0, 0.0, 4.0, 8.0], [10.0, 20.0, 20.0, 40.0]])
     np.testing.assert_allclose(found.score, [1.0, 0.9])
@@ -120,8 +119,7 @@ def test_boxes_of_an_array_have_its_rows_as_people(tmp_path):
     boxes[0, 1], boxes[2, 0] = [10.0, 20.0, 30.0, 60.0], [1.5, 2.0, 8.0, 9.0]
     np.save(tmp_path / "clip.npy", boxes)
     given = read_boxes(tmp_path / "clip.npy", (1920, 1080), 3)
-    assert given.frame.tolist() == [0, 2]
-    assert given.person.tolist() == [1, 0]
+    assert (given.frame.tolist(), given.person.tolist()) == ([0, 2], [1, 0])
     np.testing.assert_array_equal(given.box, [boxes[0, 1], boxes[2, 0]])
     with pytest.raises(InputError, match=r"expected 4 frames"):
         read_boxes(tmp_path / "clip.npy", (1920, 1080), 4)

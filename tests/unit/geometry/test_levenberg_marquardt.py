@@ -235,8 +235,7 @@ def test_half_a_pixel_has_half_its_samples_and_mixes_with_what_is_behind():
     expected = np.full((3, 3), 100)
     expected[1, 1] = 150
     np.testing.assert_array_equal(picture[..., 0], expected)
-    assert seen.tolist() == [2]
-    assert np.flatnonzero(persons == 0).tolist() == [4]
+    assert (seen.tolist(), np.flatnonzero(persons == 0).tolist()) == ([2], [4])
 
 
 def test_intersection_over_union_of_every_pair():

@@ -91,8 +91,7 @@ def test_anipose_camera_is_called_by_its_name(read):
     cameras = read(ANIPOSE)
     assert list(cameras) == ["left"]
     camera = cameras["left"]
-    assert camera.image_size == (1032, 776)
-    assert camera.focal_px == (1063.5, 1071.8)
+    assert (camera.image_size, camera.focal_px) == ((1032, 776), (1063.5, 1071.8))
     assert camera.principal_point_px == (511.7, 350.1)
     assert camera.distortion == (-0.1, 0.02, 0.001, -0.002, 0.003)
     assert camera.translation == (-0.5, 0.9, 2.6)

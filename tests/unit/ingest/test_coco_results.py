@@ -94,8 +94,7 @@ def test_data_set_annotations_may_carry_visibility(read):
     hidden["keypoints"][3 * 4 + 2] = 1
     hidden["keypoints"][3 * 5 + 2] = 0
     people = read({"images": [], "annotations": [hidden]})
-    assert people.confidence[0, 0, 4] == 1
-    assert people.confidence[0, 0, 6] == 1
+    assert (people.confidence[0, 0, 4], people.confidence[0, 0, 6]) == (1, 1)
     assert np.isnan(people.confidence[0, 0, 5])
 
 

@@ -38,8 +38,7 @@ def refusal(folder):
 
 def test_a_complete_folder_is_read(match_folder, spec, make_camera):
     match = read_match(match_folder)
-    assert match.spec == spec
-    assert match.folder == match_folder
+    assert (match.spec, match.folder) == (spec, match_folder)
     assert list(match.calibrations) == ["cam1", "cam2"]
     assert match.calibrations["cam1"].image_size == (1920, 1080)
     assert {name: path.name for name, path in match.detections.items()} == {
@@ -47,8 +46,7 @@ def test_a_complete_folder_is_read(match_folder, spec, make_camera):
         "cam2": "cam2.npz",
         "goal": "goal.npz",
     }
-    assert match.videos == {}
-    assert match.pitch == PitchSpec()
+    assert (match.videos, match.pitch) == ({}, PitchSpec())
     (match_folder / "detections" / "README.txt").write_text("x")
     (match_folder / "detections" / "._cam1.json").write_text("x")
     assert read_match(match_folder).detections == match.detections

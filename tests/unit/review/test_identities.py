@@ -67,8 +67,7 @@ def same(a, b):
 def test_a_merged_person_goes_on_as_the_kept_one():
     replay = replay_identities(identities(), [merge(0, 1)])
     after = replay.identities
-    assert replay.objections == (None,)
-    assert after.person.tolist() == [0, 2]
+    assert (replay.objections, after.person.tolist()) == ((None,), [0, 2])
     assert (after.detection_index[:, :, 0] == 0).all()
     assert after.joints[:, 0, 0, 0].tolist() == [0, 0, 0, 1, 1, 1]
     assert [(track.first_frame, track.last_frame, track.views) for track in after.tracks] == [

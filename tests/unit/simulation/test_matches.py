@@ -45,8 +45,7 @@ def scene():
 
 def test_the_folder_is_a_match_with_clicks_detections_and_a_surveyed_pitch(match, scene):
     read = read_match(match)
-    assert read.spec.match_id == "tiny-1"
-    assert read.calibrations == {}
+    assert (read.spec.match_id, read.calibrations) == ("tiny-1", {})
     assert not (match / "stills").exists()
     assert read.pitch == scene.surveyed
     for name, observations in scene.observations.items():

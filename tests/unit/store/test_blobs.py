@@ -35,8 +35,7 @@ def test_what_is_put_is_read(store):
 def test_new_is_put_once(store):
     assert store.blobs.put_new("a/b", b"first")
     assert not store.blobs.put_new("a/b", b"second")
-    assert store.blobs.read("a/b") == b"first"
-    assert store.blobs.staged_entries() == []
+    assert (store.blobs.read("a/b"), store.blobs.staged_entries()) == (b"first", [])
 
 
 def test_of_many_that_put_one_new_file_one_succeeds(store):

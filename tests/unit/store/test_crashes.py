@@ -144,8 +144,7 @@ def test_what_no_run_reaches_is_listed_first_and_removed_second(store):
     assert store.has(*place(sample_recipe("unused"))), "planning removes nothing"
     assert collect(store, plan) == plan.size > 4
     assert store.results() == (ResultId(*place()),)
-    assert store.blobs.entries(leftover) == []
-    assert verify(store) == ()
+    assert (store.blobs.entries(leftover), verify(store)) == ([], ())
 
 
 def test_match_with_a_run_at_work_is_left_alone(folder_store):
@@ -158,11 +157,9 @@ def test_match_with_a_run_at_work_is_left_alone(folder_store):
     assert [item.path for item in plan.garbage] == [ResultId(*place(other)).path]
     assert f"forget final/{run_id}" in plan.held[0]
     plan = plan_gc(store, older_than=NOW, forget=[f"final/{run_id}"])
-    assert plan.held == ()
-    assert len(plan.garbage) == 3
+    assert (plan.held, len(plan.garbage)) == ((), 3)
     collect(store, plan)
-    assert store.results() == ()
-    assert store.unfinished_runs("final") == ()
+    assert (store.results(), store.unfinished_runs("final")) == ((), ())
 
 
 def test_result_of_which_something_was_removed_is_not_published(folder_store, monkeypatch):
@@ -211,7 +208,6 @@ def test_interrupted_collection_is_finished_by_the_next(folder_store, monkeypatc
         patch.setattr(type(store.blobs), "delete_tree", stop)
         with pytest.raises(KeyboardInterrupt):
             collect(store, plan_gc(store, older_than=NOW, keep_last=1))
-    assert verify(store) == ()
-    assert store.runs("final") == ("0002",)
+    assert (verify(store), store.runs("final")) == ((), ("0002",))
     collect(store, plan_gc(store, older_than=NOW))
     assert {result.unit for result in store.results()} == {"three"}

@@ -101,8 +101,7 @@ def test_foreign_files_break_no_reader(full):
     )
     for path in names:
         full.blobs.put(path, b"{}")
-    assert full.matches() == ("final",)
-    assert full.runs("final") == ("0001",)
+    assert (full.matches(), full.runs("final")) == (("final",), ("0001",))
     assert full.run("final").run_id == "0001"
     assert [each.run_id for each in full.unfinished_runs("final")] == ["0002"]
     assert list_pins(full.blobs, "final") == ()
@@ -123,10 +122,8 @@ def test_repair_sets_damaged_records_aside_and_readers_go_on(full):
     for read in (full.run, full.registration, full.unfinished_runs):
         with pytest.raises(CorruptionError, match="verify --repair"):
             read("final")
-    assert repair(full, verify(full)) == ((), tuple(damaged))
-    assert verify(full) == ()
-    assert full.run("final").run_id == "0001"
-    assert full.matches() == ()
+    assert (repair(full, verify(full)), verify(full)) == (((), tuple(damaged)), ())
+    assert (full.run("final").run_id, full.matches()) == ("0001", ())
     assert list_pins(full.blobs, "final") == ()
     assert len(full.blobs.read("runs/final/0003.json.damaged") or b"") == 40
     assert full.reserve_run("final") == "0004", "the number of a damaged run is not given again"

@@ -79,8 +79,7 @@ def test_many_writers_of_one_key_make_one_result(store):
         writer.join(60)
         assert writer.exitcode == 0
     assert contents == {store.manifest(*place()).content}
-    assert verify(store) == ()
-    assert store.blobs.staged_entries() == []
+    assert (verify(store), store.blobs.staged_entries()) == ((), [])
 
 
 def test_manifest_of_another_result_is_corruption(folder_store):
@@ -122,8 +121,7 @@ def test_failing_disk_is_a_store_error_and_a_retry_succeeds(tmp_path, monkeypatc
     assert str(tmp_path / "project") in str(caught.value)
     assert "Published results are unchanged" in str(caught.value)
     assert not store.has(*place())
-    assert verify(store) == ()
-    assert store.blobs.staged_entries() == []
+    assert (verify(store), store.blobs.staged_entries()) == ((), [])
     publish(store)
     assert verify(store) == ()
 
@@ -140,8 +138,7 @@ def test_absent_bucket_is_a_store_error_that_names_it(bucket):
 def test_run_gives_its_results_by_unit(store):
     run_once(store, sample_recipe("late"), sample_recipe())
     run = worldpose.open_run(store.url, "final")
-    assert list(run) == ["tracking/clip", "tracking/late"]
-    assert len(run) == 2
+    assert (list(run), len(run)) == (["tracking/clip", "tracking/late"], 2)
     assert run.record.run_id == "0001"
     assert "tracking/clip" in run
     np.testing.assert_array_equal(run["tracking/clip"].joints, sample_arrays()["joints"])

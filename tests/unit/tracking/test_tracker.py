@@ -31,8 +31,7 @@ def test_nothing_to_see_gives_no_tracks(ring, shape):
         ring(4), detections(keypoints, np.full((*shape, 17), np.nan)), FPS, SETTINGS
     )
     assert result.detection_index.shape == (shape[0], 4, 0)
-    assert result.joints.shape == (shape[0], 0, 17, 3)
-    assert result.tracks == ()
+    assert (result.joints.shape, result.tracks) == ((shape[0], 0, 17, 3), ())
     assert result.report.unmatched_share is None
     assert result.report.mean_ray_distance_m is None
 
@@ -90,8 +89,7 @@ def test_lost_person_is_found_again_under_the_same_identity(ring, people, seen):
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[50:90] = np.nan
     result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
-    assert len(result.tracks) == 1
-    assert result.tracks[0].frames_seen == 110
+    assert (len(result.tracks), result.tracks[0].frames_seen) == (1, 110)
     assert (result.detection_index[50:90] == -1).all()
     assert np.isnan(result.joints[50:90]).all()
     assert np.isnan(result.ray_distance[50:90]).all()
@@ -104,8 +102,7 @@ def test_ghosts_of_two_people_in_two_cameras_make_no_tracks(ring, people, seen):
     result = track_people(
         camera, detections(*seen(camera, still(people, 40, places))), FPS, SETTINGS
     )
-    assert sorted(owners(result)) == [0, 1]
-    assert result.report.births == 2
+    assert (sorted(owners(result)), result.report.births) == ([0, 1], 2)
 
 
 def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):

@@ -187,8 +187,7 @@ def test_noise_free_views_give_the_joint(ring, seen, count):
     np.testing.assert_array_equal(result.views, count)
     assert result.inliers.all()
     assert result.reprojection_error.max() < 1e-8
-    assert result.joints.dtype == np.float64
-    assert result.views.dtype == np.uint8
+    assert (result.joints.dtype, result.views.dtype) == (np.float64, np.uint8)
     assert result.reprojection_error.dtype == np.float32
     assert result.report.rejected_share == (0.0,) * count
 
