@@ -1,7 +1,5 @@
 """Inputs of a pose challenge, and their truth, from a simulated match."""
 
-from __future__ import annotations
-
 import shutil
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Comparison of two projects: whether their computations give the same results."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

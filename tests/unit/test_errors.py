@@ -1,7 +1,5 @@
 """Errors, digests of sources, compiled kernels, and benchmarks."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

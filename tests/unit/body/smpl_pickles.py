@@ -1,7 +1,5 @@
 """Pickles like those of SMPL, with the classes that its authors used; no number is SMPL's."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Bodies fitted to known joints: shape, objective, points and constraints by rays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

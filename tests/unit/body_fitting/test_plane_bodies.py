@@ -1,7 +1,5 @@
 """Bodies of people that one camera alone sees, from monocular poses and places on the pitch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

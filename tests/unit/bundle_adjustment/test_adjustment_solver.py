@@ -1,7 +1,5 @@
 """The solver of bundle adjustment: its derivatives, its answers on known scenes, and its report."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

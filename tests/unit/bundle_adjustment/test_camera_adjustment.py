@@ -1,7 +1,5 @@
 """Cameras are adjusted by people and markings, given ones are kept, and held-out views judge."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

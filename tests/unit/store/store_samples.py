@@ -1,7 +1,5 @@
 """A small stage for the store's tests, and the processes that are killed while writing it."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import tempfile

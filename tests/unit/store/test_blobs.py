@@ -1,7 +1,5 @@
 """One behaviour of two media."""
 
-from __future__ import annotations
-
 import errno
 import os
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Killed writers and collectors leave nothing half and remove nothing that counts."""
 
-from __future__ import annotations
-
 import os
 from datetime import timedelta
 from pathlib import Path

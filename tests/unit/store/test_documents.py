@@ -1,7 +1,5 @@
 """Sealed documents and groups of arrays: what is written is read, and damage is found."""
 
-from __future__ import annotations
-
 import json
 import math
 import warnings
@@ -212,7 +210,7 @@ def test_any_array_of_any_shape_comes_back(dtype, data):
     with tempfile.TemporaryDirectory() as folder:
         write_group(Path(folder), layout, {"x": values}, {}, {})
         stored = zarr.open_group(folder, mode="r")["x"]
-        np.testing.assert_array_equal(stored[...], values)  # type: ignore[index]
+        np.testing.assert_array_equal(stored[...], values)
 
 
 def test_xarray_opens_the_folder_itself_without_a_warning(tmp_path):

@@ -1,7 +1,5 @@
 """Every damage is found and named (F15)."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -43,7 +41,6 @@ def all_paths(store):
 def flip(store, path, number):
     """Flips one bit of a file and returns what it was."""
     data = store.blobs.read(path)
-    assert data is not None
     flipped = bytearray(data)
     flipped[(number * 37) % len(data)] ^= 1 << (number % 8)
     store.blobs.put(path, bytes(flipped))

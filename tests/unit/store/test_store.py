@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import errno
 import os
 import pickle
@@ -53,7 +51,6 @@ def test_result_comes_back_with_labels_units_and_conventions(store):
     assert "centre spot" in data.attrs["conventions"]["world"]
     assert data.attrs["detector"] == "none"
     assert (data.attrs["match"], data.attrs["stage"], data.attrs["unit"]) == place()[:3]
-    assert manifest is not None
     assert manifest.figures == {"mean_views": 2.5}
     assert manifest == store.manifest(*place())
 
@@ -66,9 +63,9 @@ def test_unknown_result_is_a_store_error_that_says_what_to_run(store):
 
 def publish_together(url, barrier, outcome):
     store = Store.open(url)
-    barrier.wait(30)  # type: ignore[attr-defined]
+    barrier.wait(30)
     writer = publish(store, run_id=f"{os.getpid()}")
-    outcome.put(writer.manifest.content)  # type: ignore[attr-defined,union-attr]
+    outcome.put(writer.manifest.content)
 
 
 def test_many_writers_of_one_key_make_one_result(store):
@@ -86,7 +83,6 @@ def test_manifest_of_another_result_is_corruption(folder_store):
     publish(folder_store)
     other = sample_recipe("other")
     data = folder_store.blobs.read(ResultId(*place()).manifest_path)
-    assert data is not None
     folder_store.blobs.put(ResultId(*place(other)).manifest_path, data)
     with pytest.raises(CorruptionError, match="of another result"):
         folder_store.manifest(*place(other))
@@ -180,9 +176,8 @@ def test_work_that_breaks_the_rules_is_not_published(folder_store, change, write
 def test_a_key_is_computed_once_and_other_bytes_are_an_error(store, tmp_path):
     twin = Store.create(tmp_path / "twin")
     first = publish(store, run_id="0001").manifest
-    assert first is not None
     assert publish(store, run_id="0002").manifest == first
-    assert publish(twin).manifest.content == first.content  # type: ignore[union-attr]
+    assert publish(twin).manifest.content == first.content
     # 40 frames of 72 bytes in chunks of at least 512 bytes: 8 frames each, two chunks in a file;
     # views are all zero, and written nevertheless.
     files = [file.path for file in first.files]
@@ -203,7 +198,6 @@ def test_lost_or_changed_chunk_is_corruption_and_never_a_fill_value(store):
     publish(store)
     path = f"{ResultId(*place()).path}/joints/c/1/0/0"
     data = store.blobs.read(path)
-    assert data is not None
     # Frames 16 to 23 and 24 to 31, then the index of places and sizes with its CRC-32C.
     (_, second), (start, _) = np.frombuffer(data[-36:-4], "<u8").reshape(2, 2).tolist()
     assert start == second

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -33,12 +31,12 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store):
 
 def reserve_some(url, outcome):
     store = Store.open(url)
-    outcome.put([store.reserve_run("final") for _ in range(4)])  # type: ignore[attr-defined]
+    outcome.put([store.reserve_run("final") for _ in range(4)])
 
 
 def hold_and_die(url, outcome):
     with alone(Store.open(url).blobs, "a", wait=False) as is_held:
-        outcome.put(is_held)  # type: ignore[attr-defined]
+        outcome.put(is_held)
         time.sleep(60.0)
 
 
