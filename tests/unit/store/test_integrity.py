@@ -1,24 +1,32 @@
-"""Every damage is found and named (F15)."""
+"""Every damage is found and named; runs are numbered, locked, pinned and read."""
 
+import json
+import os
+import shutil
+import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 from store_samples import (
+    PROCESSES,
     place,
     publish,
     run_once,
+    run_process,
     sample_recipe,
     sample_record,
     sample_registration,
 )
 
 from data_contracts.pin import Pin
-from worldpose.errors import CorruptionError
-from worldpose.store.documents import seal
-from worldpose.store.garbage import plan_gc
+from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.store.documents import canonical_json, digest, seal
+from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair, verify
 from worldpose.store.paths import ResultId
-from worldpose.store.runs import list_pins, pin_run
+from worldpose.store.runs import alone, list_pins, may_be_running, pin_run, unpin_run
+from worldpose.store.store import Store, open_run
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -144,3 +152,146 @@ def test_repair_withdraws_what_is_damaged_and_nothing_else(full):
     assert full.has(*place(sample_recipe("late")))
     publish(full)
     assert verify(full) == ()
+
+
+def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store):
+    store = folder_store
+    run_once(store)
+    assert store.reserve_run("final") == "0002"
+    assert store.run("final").run_id == "0001"
+    (unfinished,) = store.unfinished_runs("final")
+    assert (unfinished.run_id, unfinished.pid) == ("0002", os.getpid())
+    assert may_be_running(unfinished)
+    with pytest.raises(InputError, match="an unfinished run"):
+        store.run("final", "0002")
+
+
+def reserve_some(url, outcome):
+    store = Store.open(url)
+    outcome.put([store.reserve_run("final") for _ in range(4)])
+
+
+def hold_and_die(url, outcome):
+    with alone(Store.open(url).blobs, "a", wait=False) as is_held:
+        outcome.put(is_held)
+        time.sleep(60.0)
+
+
+def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store):
+    blobs, outcome = folder_store.blobs, PROCESSES.Queue()
+    other = PROCESSES.Process(target=hold_and_die, args=(folder_store.url, outcome))
+    other.start()
+    assert outcome.get(timeout=60)
+    with alone(blobs, "a", wait=False) as is_held, alone(blobs, "b", wait=False) as is_other:
+        assert (is_held, is_other) == (False, True)
+    other.kill()
+    other.join()
+    with alone(blobs, "a", wait=False) as is_held:
+        assert is_held
+    locks = Path(folder_store.url, "locks")
+    shutil.rmtree(locks)
+    locks.write_text("")  # as on a disk without locks
+    with alone(blobs, "a", wait=False) as is_held, alone(blobs, "a", wait=False) as is_second:
+        assert (is_held, is_second) == (True, False)
+
+
+def test_processes_get_different_numbers(store):
+    outcome = PROCESSES.Queue()
+    processes = [run_process(reserve_some, store.url, outcome) for _ in range(3)]
+    numbers = [number for _ in processes for number in outcome.get(timeout=60)]
+    for process in processes:
+        process.join(60)
+    assert sorted(numbers) == [f"{number:04d}" for number in range(1, 13)]
+    unfinished = store.unfinished_runs("final")
+    assert [may_be_running(run) for run in unfinished] == [False] * 12
+
+
+PLAN_NOW = timedelta(0)
+
+
+def pin(name, run_id="0001", why=""):
+    return Pin(
+        match_id="final", name=name, run_id=run_id, who="Ada", why=why, pinned_at=datetime.now(UTC)
+    )
+
+
+@pytest.fixture
+def two_runs(folder_store):
+    run_once(folder_store, sample_recipe("first"))
+    run_once(folder_store, sample_recipe("second"))
+    return folder_store
+
+
+def test_a_pinned_run_and_its_results_outlast_all_others(two_runs):
+    pin_run(two_runs.blobs, pin("paper"))
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    assert plan.garbage == ()
+    unpin_run(two_runs.blobs, "final", "paper")
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    assert {item.reason for item in plan.garbage} == {"run forgotten", "no kept run reaches it"}
+    collect(two_runs, plan)
+    assert two_runs.runs("final") == ("0002",)
+
+
+def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs):
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    pin_run(two_runs.blobs, pin("paper"))
+    with pytest.raises(StoreError, match="Make a new plan"):
+        collect(two_runs, plan)
+    assert two_runs.runs("final") == ("0001", "0002")
+
+
+def test_a_name_is_as_good_as_a_number(two_runs):
+    pin_run(two_runs.blobs, pin("paper"))
+    assert two_runs.run("final", "paper").run_id == "0001"
+    assert open_run(two_runs.url, "final", "paper").record.run_id == "0001"
+    with pytest.raises(InputError, match="no such run"):
+        two_runs.run("final", "other")
+
+
+def test_a_name_is_one_run_s_for_good(two_runs):
+    kept = pin_run(two_runs.blobs, pin("paper", why="first"))
+    assert pin_run(two_runs.blobs, pin("paper", why="again")) == kept
+    with pytest.raises(InputError, match="run 0001 pinned under"):
+        pin_run(two_runs.blobs, pin("paper", run_id="0002"))
+    pin_run(two_runs.blobs, pin("best", run_id="0001"))
+    assert [each.name for each in list_pins(two_runs.blobs, "final")] == ["best", "paper"]
+    with pytest.raises(InputError, match="best, paper"):
+        unpin_run(two_runs.blobs, "final", "other")
+
+
+def rewrite(store, path, change):
+    """A document as another version would have sealed it."""
+    fields = json.loads(store.blobs.read(path) or b"")
+    del fields["checksum"]
+    change(fields)
+    sealed = {**fields, "checksum": digest(canonical_json(fields))}
+    store.blobs.put(path, canonical_json(sealed) + b"\n")
+
+
+def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_store):
+    run_once(folder_store)
+    rewrite(folder_store, "project.json", lambda fields: fields.update(store_format="0"))
+    with pytest.raises(InputError, match=r"store_format.*expected '3', found '0'") as refused:
+        Store.open(folder_store.url)
+    assert "Use the version of worldpose that made the project" in str(refused.value)
+    with pytest.raises(InputError, match="store_format"):
+        Store.create(folder_store.url)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda fields: fields.update(mood="good"), "the unknown field mood"),
+        (lambda fields: fields.pop("usability"), "no field usability"),
+    ],
+)
+def test_a_run_that_another_version_recorded_is_refused_as_such(folder_store, change, found):
+    run_once(folder_store)
+    rewrite(folder_store, "runs/final/0001.json", change)
+    with pytest.raises(InputError, match=f"found {found}: another version") as refused:
+        folder_store.run("final")
+    assert "worldpose run FOLDER --project NEW" in str(refused.value)
+    # It is not damaged, but it is said.
+    (finding,) = verify(folder_store)
+    assert "another version" in finding.problem
