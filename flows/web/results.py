@@ -184,8 +184,8 @@ def routes(context: PageContext) -> APIRouter:
         match, run = open_asked(match_id, run_id)
 
         def draw(file: Path) -> None:
-            opened = run.record.run_id
-            write_report(context.store, match, file, run_id=opened, videos=False)
+            run_id = run.record.run_id
+            write_report(context.store, match, file, run_id=run_id, videos=False)
 
         there = match.at_hand().folder  # nothing while the folder is away
         seen = [*there.videos, *there.stills, *there.clicked, *there.calibrations]
