@@ -8,11 +8,9 @@ import sys
 import pytest
 import typer
 import yaml
-from run_records import run_record
+from run_records import calibration, match_spec, run_record
 from typer.testing import CliRunner
 
-from data_contracts.cameras import CameraCalibration
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import COMMANDS, app, summary
@@ -90,13 +88,8 @@ def test_a_misspelt_command_names_the_one_that_may_be_meant():
 
 def made(folder, match_id, pitch=None):
     """A match with two cameras, one of them calibrated, that saw people in frames 0 to 9."""
-    spec = MatchSpec(
-        match_id=match_id,
-        fps=25.0,
-        cameras=tuple(CameraSpec(id=f"cam{c}", width=640, height=480) for c in range(2)),
-        clips=(ClipSpec(id="clip", frame_count=10),),
-        pitch=pitch,
-    )
+    clips = {"clip": {"frame_count": 10}}
+    spec = match_spec(["cam0", "cam1"], clips, (640, 480), match_id=match_id, pitch=pitch)
     (folder / "detections").mkdir(parents=True)
     (folder / "match.yaml").write_text(yaml.safe_dump(spec.model_dump(mode="json")))
     for place, camera in enumerate(spec.cameras):
@@ -111,20 +104,8 @@ def made(folder, match_id, pitch=None):
             for frame in range(10)
         ]
         (folder / "detections" / f"{camera.id}.json").write_text(json.dumps(people))
-    write_calibration_toml(
-        folder / "calibration.toml",
-        {
-            "cam0": CameraCalibration(
-                id="cam0",
-                image_size=(640, 480),
-                focal_px=(600.0, 600.0),
-                principal_point_px=(320.0, 240.0),
-                distortion=(0.0,) * 5,
-                rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                translation=(0.0, 0.0, 30.0),
-            )
-        },
-    )
+    small = calibration("cam0", image_size=(640, 480), principal_point_px=(320.0, 240.0))
+    write_calibration_toml(folder / "calibration.toml", {"cam0": small})
     return folder
 
 

@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 import pytest
+from run_records import match_spec
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.gates import GATES
 from flows.method import METHOD
 from flows.review.advice import click_advice, clock_advice
@@ -152,15 +152,8 @@ def test_the_pages_know_the_same_units():
 
 
 def match(cameras, offset=0, clips=("clip",)):
-    return MatchSpec(
-        match_id="m",
-        fps=25.0,
-        cameras=tuple(
-            CameraSpec(id=f"cam{c}", width=10, height=10, offset_frames=0 if c else offset)
-            for c in range(cameras)
-        ),
-        clips=tuple(ClipSpec(id=clip, frame_count=9) for clip in clips),
-    )
+    offsets = {f"cam{c}": {"offset_frames": 0 if c else offset} for c in range(cameras)}
+    return match_spec(offsets, {clip: {"frame_count": 9} for clip in clips})
 
 
 def figures(late, error=0.06):
