@@ -108,10 +108,7 @@ PAGES = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "words.js
 @pytest.mark.parametrize(
     ("reason", "words"),
     [
-        (
-            "offset_rms_m is 0.05, at most 0.03 passes",
-            "distance of bodies from the seen joints: 5 cm",
-        ),
+        ("offset_rms_m is 0.05, at most 0.03 passes", "distance of bodies from the seen joints"),
         (
             "held_out_certain_excess_m is 0.03 (knee, ankle), at most 0.01 passes",
             "bodies are worse than joints by: 3 cm (knee, ankle), limit 1 cm",

@@ -369,14 +369,8 @@ def test_a_planted_fault_is_found(written, tmp_path, name):
     [
         ({"hidden": None}, "--hidden: expected a folder for the test part"),
         ({"licences": {"poses": "x"}}, "set: joints: expected no contradiction, found no licence"),
-        (
-            {"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")},
-            "footage: expected no contradiction, found no licence",
-        ),
-        (
-            {"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"},
-            "keeper: expected no contradiction, found the subject is in train and val",
-        ),
+        ({"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")}, "footage: expected no"),
+        ({"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"}, "keeper: expected no contradiction"),
         ({"subjects": "keeper: [ann-1/A/77]"}, "keeper: expected a list of MATCH/NAME"),
         ({"subjects": "[keeper]"}, "expected a list of MATCH/NAME"),
         ({"name": "my set"}, "expected 1 to 64 letters, .* found 'release-my set'"),
