@@ -32,18 +32,16 @@ def test_every_command_loads_and_is_listed_with_its_help(name):
     assert f"\n  {name} " in listed
 
 
-def test_a_run_imports_nothing_that_only_draws():
-    script = (
-        "import sys\n"
-        "import flows.cli.run, flows.match, tasks.preload\n"
-        "assert 'matplotlib' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)
-
-
-def test_pages_import_what_opens_results_when_somebody_looks_at_one():
-    # xarray and pandas take 90 MB, of the 500 that a process of a service may have.
-    script = "import sys, flows.web.app\nassert not {'xarray', 'pandas'} & set(sys.modules)\n"
+@pytest.mark.parametrize(
+    ("modules", "unwanted"),
+    [
+        ("flows.cli.run, flows.match, tasks.preload", "matplotlib"),
+        # 90 MB, of the 500 that a process of a service may have.
+        ("flows.web.app", "xarray pandas"),
+    ],
+)
+def test_runs_and_pages_import_nothing_that_only_draws_or_opens_results(modules, unwanted):
+    script = f"import sys, {modules}\nassert not set({unwanted.split()}) & set(sys.modules)\n"
     subprocess.run([sys.executable, "-c", script], check=True)
 
 

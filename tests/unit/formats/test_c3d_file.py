@@ -205,11 +205,6 @@ def test_joints_come_back_in_millimetres_with_y_up(tracks_with_gaps, tmp_path):
 MOTION_FRAMES = 40
 
 
-@pytest.fixture(scope="module")
-def model():
-    return load_open_body()
-
-
 def motion(seed=0):
     rng = np.random.default_rng(seed)
     return BodyParameters(
