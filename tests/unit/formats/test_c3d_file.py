@@ -374,3 +374,12 @@ def test_the_file_comes_back_from_pandas(straight_model, tmp_path):
     np.testing.assert_allclose(table.to_numpy()[:, 1:], coordinates, atol=5.1e-6)
     # Two turns in 59 steps, without a jump of 360 degrees.
     np.testing.assert_allclose(np.diff(table.pelvis_rotation), 700.0 / 59, atol=1e-4)
+
+
+@pytest.mark.parametrize(("frames", "told"), [(2, "that all have a body"), (0, "found no frames")])
+def test_frames_without_a_body_are_refused(tmp_path, frames, told):
+    with pytest.raises(InputError, match=told):
+        write_opensim_motion(
+            tmp_path / "p.mot", np.full((frames, 27), np.nan), np.zeros(frames), {}
+        )
+    assert not (tmp_path / "p.mot").exists()
