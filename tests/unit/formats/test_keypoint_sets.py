@@ -274,7 +274,7 @@ def test_files_of_several_clips_are_refused(tmp_path):
     people = [{"image_id": f"{name}.jpg", "keypoints": points(COCO17)} for name in names]
     (tmp_path / "b.json").write_text(json.dumps(people))
     for read, file in ((read_openpose_folder, "a_json"), (read_coco_results, "b.json")):
-        with pytest.raises(InputError, match="rises by image .*several clips or times"):
+        with pytest.raises(InputError, match=r"rises by image .*several clips or times"):
             read(tmp_path / file)
 
 
