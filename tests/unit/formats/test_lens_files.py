@@ -5,8 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from run_records import calibration
 
-from data_contracts.cameras import COEFFICIENTS, CameraCalibration
+from data_contracts.cameras import COEFFICIENTS
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
@@ -340,16 +341,10 @@ ROS = {"fisheye": "equidistant", "rational": "rational_polynomial"}
 
 def camera_of(model, **changes):
     values = {
-        "id": "a",
-        "image_size": (640, 480),
-        "focal_px": (400.0, 402.0),
-        "principal_point_px": (319.5, 239.5),
-        "distortion": LENSES[model],
-        "lens_model": model,
-        "rotation": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-        "translation": (0.1, 1.2, 4.0),
+        **{"image_size": (640, 480), "focal_px": (400.0, 402.0), "distortion": LENSES[model]},
+        **{"principal_point_px": (319.5, 239.5), "translation": (0.1, 1.2, 4.0)},
     }
-    return CameraCalibration(**{**values, **changes})
+    return calibration("a", **{"lens_model": model, **values, **changes})
 
 
 def opencv(one, points):
