@@ -88,9 +88,18 @@ def finetune(
             todo="Train in a local project: settings name weights by file.",
         )
     kinds = tuple(_kind(name, "--net") for name in nets or NETS)
-    begin = {
-        _kind(name, "--start"): Path(file) for name, file in map(_split_assignment, starts or [])
-    }
+    begin: dict[NetKind, Path] = {}
+    for start in starts or []:
+        name, file = _split_assignment(start)
+        kind = _kind(name, "--start")
+        if kind in begin or kind not in kinds:
+            raise UsageError(
+                f"--start {start}",
+                expected=f"initial weights of each trained net once: {', '.join(kinds)}",
+                found="the second of this net" if kind in begin else "a net that is not trained",
+                todo="Leave it out, or name the net with --net.",
+            )
+        begin[kind] = Path(file)
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
@@ -162,7 +171,11 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
         name, text = _split_assignment(assignment)
         group, _, field = name.rpartition(".")
         groups.setdefault(group, {})[field] = parse_value(text)
-    given = {**groups.pop(""), **groups}
+    given = groups.pop("")
+    for group, fields in groups.items():
+        whole = given.get(group, {})
+        # The contract refuses what is no mapping.
+        given[group] = {**whole, **fields} if isinstance(whole, dict) else whole
     try:
         return FineTuningSettings.model_validate(given)
     except ValidationError as error:

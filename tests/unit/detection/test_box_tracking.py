@@ -1,6 +1,7 @@
 """Boxes become tracks: half hidden people are kept, gaps filled, flickers dropped."""
 
 import numpy as np
+import pytest
 
 from worldpose.detection.box_tracking import BoxCleaner, BoxTracker, detect_strided
 from worldpose.detection.interfaces import People
@@ -66,3 +67,33 @@ def test_looks_at_every_third_frame_give_boxes_in_all_of_them():
         if picture is not None:
             # Constant speed: boxes between two looks are where the person is.
             np.testing.assert_allclose(one.boxes, [walker(number)], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("lost", "begin", "settings"),
+    [
+        ({50}, 0, {"stride": 10}),
+        ({50, 51, 52}, 0, {"stride": 10}),
+        (set(), 30, {"stride": 10, "min_hits": 3}),
+        (set(), 30, {"min_hits": 12}),
+    ],
+)
+def test_no_frame_of_a_true_track_is_lost(lost, begin, settings):
+    def look(pictures):
+        numbers = [int(picture[0, 0, 0]) for picture in pictures]
+        return [people(*[[*walker(n, speed=0.1), 0.9]] * (n >= begin)) for n in numbers]
+
+    asked = DetectionSettings(**settings)
+    frames = ((n, None if n in lost else np.full((4, 4, 3), n, np.uint8)) for n in range(100))
+    found = BoxCleaner(asked).clean(detect_strided(frames, look, asked.stride, asked.batch))
+    shown = {number for number, _, one in found if len(one.scores)}
+    assert shown == set(range(begin, 100)) - lost
+
+
+def test_frames_in_memory_do_not_grow_with_batch_times_stride():
+    taken = []
+    frames = (taken.append(n) or (n, PICTURE) for n in range(500))
+    most = 0
+    for n, _, _ in detect_strided(frames, lambda each: [people()] * len(each), 25, 8):
+        most = max(most, len(taken) - n)
+    assert most <= 51

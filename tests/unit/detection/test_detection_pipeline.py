@@ -6,8 +6,9 @@ from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import People
-from worldpose.detection.pipeline import PeopleFinder, Place, on_pitch
+from worldpose.detection.pipeline import PeopleFinder, Place, detect_people, on_pitch
 from worldpose.detection.settings import DetectionSettings
+from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
 
 SIZE = (1920, 1080)
@@ -123,3 +124,42 @@ def test_a_clip_without_people_has_a_true_reason(camera):
     )
     weak = Knowing([on_pitch], [np.array([0.3, 0.3])])  # below the score that begins a track
     assert "of 40 boxes of the detector 0 lie outside" in reason(weak)
+
+
+IMAGE = np.zeros((48, 64, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        [IMAGE.astype(np.float32)],
+        [IMAGE.astype(np.uint16)],
+        [IMAGE[..., 0]],
+        [np.dstack([IMAGE, IMAGE[..., :1]])],
+        [IMAGE, IMAGE[:40]],
+    ],
+    ids=["float", "16 bits", "grey", "rgba", "sizes"],
+)
+def test_images_that_no_net_takes_are_refused(images):
+    with pytest.raises(InputError, match=f"image {len(images) - 1}.*uint8 RGB.* 64 x 48 px"):
+        detect_people(images, detectors=[Knowing([], [])])
+
+
+def test_images_are_of_the_camera_s_size_and_may_be_views(camera):
+    nobody = Knowing([np.empty((0, 4))], [np.empty(0)])
+    with pytest.raises(InputError, match="1920 x 1080 px"):
+        detect_people([IMAGE], detectors=[nobody], camera=camera)
+    nobody.detect = lambda images: [
+        People(np.empty((0, 4)), np.empty(0)) for each in images if each.flags.c_contiguous
+    ]
+    assert detect_people([IMAGE[..., ::-1]], detectors=[nobody]).frame.tolist() == [0]
+
+
+def test_given_boxes_beyond_the_limit_stay_and_detected_ones_are_counted():
+    x = 24.0 * np.arange(70)
+    boxes = np.stack([x, np.full(70, 10.0), x + 20.0, np.full(70, 40.0)], axis=1)
+    one, image = Knowing([boxes], [np.full(70, 0.9)]), np.zeros((48, 1920, 3), np.uint8)
+    finder = PeopleFinder([one], one, DetectionSettings(max_people=60))
+    for given, count in (({0: People(boxes, np.ones(70))}, 70), (None, 60)):
+        (found,) = finder.find([(0, image)], None, given)
+        assert (np.isfinite(found.score).sum(), finder.report.cut) == (count, 70 - count)

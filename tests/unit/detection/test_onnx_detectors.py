@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from worldpose.detection.models import load_detectors
-from worldpose.detection.onnx_detectors import FORMS, _class_names, _person_classes, recognize_form
+from worldpose.detection.onnx_detectors import (
+    FORMS,
+    _class_names,
+    find_person_classes,
+    recognize_form,
+)
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 
@@ -98,7 +103,8 @@ OUTPUTS = {
 def test_a_form_is_recognized_and_its_person_decoded(form):
     outputs, score = OUTPUTS[form]
     assert recognize_form("net.onnx", outputs, SIZE) == form
-    people = _person_classes("net.onnx", FORMS[form], outputs, {}, None)
+    count = FORMS[form].classes and FORMS[form].classes(outputs)
+    people = find_person_classes("net.onnx", count, {}, None)
     found = FORMS[form].decode(outputs, SIZE, people)
     np.testing.assert_allclose(found.boxes, [BOX], atol=1e-9)
     np.testing.assert_allclose(found.scores, [score])
@@ -122,10 +128,9 @@ def test_unknown_outputs_are_refused_with_all_forms(outputs):
 
 def test_classes_of_people_are_named_numbered_or_asked_for():
     football = {0: "ball", 1: "goalkeeper", 2: "player", 3: "Referee"}
-    outputs = [np.zeros((8, CELLS))]
 
     def classes(names, asked=None):
-        return _person_classes("net.onnx", FORMS["yolov8"], outputs, names, asked)
+        return find_person_classes("net.onnx", 4, names, asked)
 
     assert classes(football) == (1, 2, 3)
     assert classes(football, [2]) == (2,)
@@ -137,8 +142,14 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     with pytest.raises(InputError, match="below 4"):
         classes({}, [4])
     assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
+    assert _class_names({"names": "['ball']"}) == _class_names({"names": "{'ball': 0}"})
     assert _class_names({"names": "['ball']"}) == {0: "ball"}
-    assert _class_names({"names": "__import__('os')"}) == _class_names({}) == {}
+    assert (
+        _class_names({"names": "{'a': 'b'}"})
+        == _class_names({"names": "f()"})
+        == _class_names({})
+        == {}
+    )
 
 
 def test_nets_take_channels_and_grey_levels_as_in_their_training():
