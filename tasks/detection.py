@@ -79,7 +79,7 @@ class _Found:
     images: dict[str, Singles]
     unreadable: list[list[int]]
     figures: dict[str, float]
-    warnings: tuple[str, ...]
+    warnings: list[str]
 
 
 def _longest_gap(unreadable: list[list[int]]) -> dict[str, float]:
@@ -115,7 +115,7 @@ def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
     stored, manifest = published
     detections = KeypointDetections.from_arrays(stored)
     images = {array.name: stored[array.name].values for array in IMAGE_ARRAYS}
-    return _Found(detections, images, stored.attrs["unreadable"], dict(manifest.figures), ())
+    return _Found(detections, images, stored.attrs["unreadable"], dict(manifest.figures), [])
 
 
 def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
@@ -137,11 +137,11 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
     inputs.require_registered("video")
     report = finder.report
     unreadable = report.unreadable
-    told = (reason,) if (reason := report.why_no_person()) else ()
+    told = [reason] if (reason := report.why_no_person()) else []
     if report.cut:
-        told += (f"{report.cut} people beyond detection.max_people of a frame were left out",)
+        told.append(f"{report.cut} people beyond detection.max_people of a frame were left out")
     if len(unreadable) == report.frames and not _has_images(inputs):
-        unreadable, told = [], ("the camera does not film this clip",)
+        unreadable, told = [], ["the camera does not film this clip"]
     elif len(unreadable) == report.frames:
         raise InputError(
             str(inputs.file("video")),

@@ -241,7 +241,8 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
         InputError: an unknown kind, or missing weights.
     """
     names: list[tuple[str, Task]] = [(name, "detector") for name in settings.detector]
-    names += [(settings.pose, "pose"), *([("embedded", "pose")] if settings.landmarks else [])]
+    names += [(settings.pose, "pose")]
+    names += [("embedded", "pose")] if settings.landmarks else []
     found: dict[str, str | None] = {}
     for name, task in names:
         kind, path = _split_name(name, task)

@@ -421,7 +421,7 @@ def _require_rgb(
             yield number, None
             continue
         size, given = size or image.shape[1::-1], (image.dtype, image.shape)
-        if given != (np.uint8, (*size[::-1], 3)):
+        if given != (np.dtype(np.uint8), (*size[::-1], 3)):
             raise InputError(
                 f"image {number}",
                 expected="uint8 RGB (height, width, 3) of {} x {} px, as the camera or the first "
