@@ -86,18 +86,7 @@ def finetune(
             todo="Train in a local project: settings name weights by file.",
         )
     kinds = tuple(_kind(name, "--net") for name in nets or NETS)
-    begin: dict[NetKind, Path] = {}
-    for start in starts or []:
-        name, file = _split_assignment(start)
-        kind = _kind(name, "--start")
-        if kind in begin or kind not in kinds:
-            raise UsageError(
-                f"--start {start}",
-                expected=f"initial weights of each trained net once: {', '.join(kinds)}",
-                found="the second of this net" if kind in begin else "a net that is not trained",
-                todo="Leave it out, or name the net with --net.",
-            )
-        begin[kind] = Path(file)
+    begin = _initial_weights(starts or [], kinds)
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
@@ -140,6 +129,23 @@ def _kind(name: str, where: str) -> NetKind:
         if name == kind:
             return kind
     raise unknown_name(f"{where} {name}", name, NETS)
+
+
+def _initial_weights(starts: list[str], kinds: tuple[NetKind, ...]) -> dict[NetKind, Path]:
+    """Return the files of `--start`, each of another trained net."""
+    begin: dict[NetKind, Path] = {}
+    for start in starts:
+        name, file = _split_assignment(start)
+        kind = _kind(name, "--start")
+        if kind in begin or kind not in kinds:
+            raise UsageError(
+                f"--start {start}",
+                expected=f"initial weights of each trained net once: {', '.join(kinds)}",
+                found="the second of this net" if kind in begin else "a net that is not trained",
+                todo="Leave it out, or name the net with --net.",
+            )
+        begin[kind] = Path(file)
+    return begin
 
 
 def _split_assignment(assignment: str) -> tuple[str, str]:
