@@ -23,13 +23,14 @@ from flows.cli.console import (
     print_table,
 )
 from flows.cli.options import FpsOption
+from flows.layers import known_pitch
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
-from worldpose.ingest.match_folder import unclicked_clips
+from worldpose.ingest.match_folder import read_spec, unclicked_clips
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
@@ -58,6 +59,7 @@ def import_command(
     template: TemplateName | None = None,
     unit: str | None = None,
     up: str | None = None,
+    project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
@@ -142,7 +144,7 @@ def import_command(
     elif kind == "--lens" and lens is not None:
         _import_lenses(lens, out, camera, as_json=as_json)
     elif kind == "--clicks" and clicks is not None:
-        _import_clicks(clicks, out, camera, as_json=as_json)
+        _import_clicks(clicks, out, camera, Store.open_or_new(project), as_json=as_json)
     elif kind == "--camera-data" and camera_data is not None:
         target, data = import_camera_data(
             camera_data, out, camera, first=first_frame, number=freed_camera, zoom_table=zoom_table
@@ -272,9 +274,11 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json:
         )
 
 
-def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) -> None:
+def _import_clicks(
+    file: Path, out: Path, camera: str | None, store: Store, *, as_json: bool
+) -> None:
     """Write clicks and own points into a match folder, and print what was read."""
-    found = import_clicks(file, out, camera)
+    found = import_clicks(file, out, camera, known_pitch(store, out, read_spec(out)))
     questions = []
     if found.repeated:
         from flows.review.repeated_clicks import explain_repeated  # late: it loads the estimators
