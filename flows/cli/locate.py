@@ -20,6 +20,7 @@ from flows.results.outputs import require_new
 from flows.running import RunRequest
 from flows.stage import Match
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.lens_files import square_focal
 from worldpose.store.store import Store
 
 if TYPE_CHECKING:
@@ -120,7 +121,9 @@ def _lens(match: Match, camera: str) -> LensCalibration:
         return folder.lenses[camera]
     if camera in folder.calibrations:
         given = folder.calibrations[camera]
-        focal = float(np.mean(given.focal_px))
+        focal, differ = square_focal(
+            given.focal_px, f"{folder.folder / 'calibration.toml'}: {camera}"
+        )
         return LensCalibration(
             id=camera,
             image_size=given.image_size,
@@ -128,7 +131,7 @@ def _lens(match: Match, camera: str) -> LensCalibration:
             principal_point_px=given.principal_point_px,
             distortion=given.distortion,
             lens_model=given.lens_model,
-            focal_std_px=GIVEN_FOCAL * focal,
+            focal_std_px=max(GIVEN_FOCAL * focal, differ),
             principal_point_std_px=GIVEN_CENTER_PX,
             distortion_std=0.005,
         )

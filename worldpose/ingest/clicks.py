@@ -369,9 +369,7 @@ def _label_frame(
         raise InputError(f"{file}: labels with places", expected, told, todo)
     side = -1.0 if signs[0] > 0 else 1.0  # of y, -1 = mirrored
     half = np.array([0.5 * pitch.length, 0.5 * pitch.width])
-    frames = [
-        np.array([[1.0, 0.0, -x], [0.0, side, -side * y]]) for x, y in (half, np.zeros(2))
-    ]
+    frames = [np.array([[1.0, 0.0, -x], [0.0, side, -side * y]]) for x, y in (half, np.zeros(2))]
     places = np.unique(places, axis=0)
     apart = [
         np.linalg.norm((places @ each[:, :2].T + each[:, 2])[:, None] - known, axis=-1)

@@ -167,9 +167,7 @@ def _read_spec(folder: Path) -> MatchSpec:
     return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
-def _read_match(
-    folder: Path, known: Container[str], clicked_on: PitchSpec | None
-) -> MatchFolder:
+def _read_match(folder: Path, known: Container[str], clicked_on: PitchSpec | None) -> MatchFolder:
     spec = read_spec(folder)
     if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
