@@ -20,7 +20,7 @@ from typing import Any, Final
 import yaml
 from pydantic import JsonValue
 
-from data_contracts.match import MatchSpec, Registration
+from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.settings import RunSettings
 from worldpose.body.body_file import given_body_folder

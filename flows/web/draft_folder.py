@@ -20,9 +20,9 @@ import yaml
 from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
+from flows.layers import pitch_of
 from flows.method import METHOD
 from flows.registering import register_next
-from flows.layers import pitch_of
 from flows.review.corrections import corrected_match
 from flows.run_record import expected_work, latest_run
 from flows.run_status import plan_as_latest

@@ -299,7 +299,7 @@ def test_places_depend_on_the_pitch_of_the_venue_and_names_do_not(tmp_path):
     with (folder / "match.yaml").open("a") as file:
         file.write("venue: parken\n")
     size = PitchSpec(length=101.0, width=66.0)
-    labels = ["({:g},{:g})".format(x + 50.5, y + 33.0) for x, y in QUADRANT]
+    labels = [f"({x + 50.5:g},{y + 33.0:g})" for x, y in QUADRANT]
     pixels = [*map(tuple, seen(QUADRANT))]
     twice = [*CLICKS.items(), ("halfway_far", (960.0, 301.0))]
     for clicks in ([*zip(labels, pixels, strict=True)], twice):
