@@ -140,8 +140,8 @@ def _require_markings(
     drawn = [
         (f"{dot}drawn[{n}]", marking.name, marking.xy) for n, marking in enumerate(clicked.drawn)
     ]
-    _require_known(file, points, "a point", template and template.points)
-    _require_known(file, drawn, "a marking", template and template.marking_names)
+    _require_known(file, points, "a point", None if template is None else template.points)
+    _require_known(file, drawn, "a marking", None if template is None else template.marking_names)
     for place, _, (pixel,) in points:
         _require_inside(f"{file}: {place}.xy", pixel, camera)
     for place, _, along in drawn:
