@@ -486,5 +486,5 @@ def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
         shutil.copy(source, given / name)
     before = {file: file.read_bytes() for file in folder.glob("*.toml")}
     with pytest.raises(InputError, match=expected):
-        take_given(given, folder, {})
+        take_given(Store.open_or_new(tmp_path / "store"), given, folder, {})
     assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before
