@@ -130,6 +130,12 @@ def test_arrays_that_do_not_fit_are_refused():
         fit_bodies(
             MODEL, ClipEvidence(np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0), SETTINGS
         )
+    joints, bias = np.zeros((1, 1, 17, 3)), np.full(17, 0.03)
+    alone = 0.01**2 * np.broadcast_to(np.eye(3), (1, 1, 17, 3, 3))
+    whole = alone + np.float32(0.03**2 - 0.01**2) * np.eye(3)  # nothing else, rounded
+    ClipEvidence(joints, (whole - alone).astype(np.float32), 50.0, bias)
+    with pytest.raises(InputError, match="common_bias.*covariance of 17 joints"):
+        ClipEvidence(joints, alone, 50.0, bias)
 
 
 def test_offsets_are_far_beyond_the_chance_of_all_joints_together():

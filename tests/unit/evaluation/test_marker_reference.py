@@ -111,6 +111,9 @@ def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers
     (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
     with pytest.raises(InputError, match="that rise"):
         read_markers(tmp_path / "a.trc")
+    (tmp_path / "a.trc").write_text("\n".join(text[:6]) + "\n")
+    with pytest.raises(InputError, match="samples of markers, found none"):
+        read_markers(tmp_path / "a.trc")
 
 
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):

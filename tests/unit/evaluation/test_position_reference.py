@@ -58,6 +58,15 @@ def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
     assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
 
 
+def test_people_of_one_name_are_told_apart_and_pieces_of_a_track_are_not(tmp_path):
+    people = [(0, 7, "Ann"), (0, 9, "Ann"), (0, 4, "Eve"), (1, 7, "Ann"), (1, 12, "Eve")]
+    lines = [f"{frame},{who},{name},{who},2" for frame, who, name in people]
+    (tmp_path / "a.csv").write_text("\n".join(["frame_id,player_id,name,x,y", *lines]))
+    _, names, places, _ = read_positions(tmp_path / "a.csv")
+    assert names == ("Ann 7", "Ann 9", "Eve")
+    np.testing.assert_array_equal(places[..., 0], [[7.0, 9.0, 4.0], [7.0, np.nan, 12.0]])
+
+
 @pytest.mark.parametrize("timed", [True, False])
 def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
     mine, places = tracks()
