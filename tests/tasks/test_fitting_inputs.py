@@ -8,11 +8,15 @@ import xarray as xr
 from camera_builders import look_at_camera
 
 from tasks import refitting
+from worldpose.body.body_file import find_body
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.clock import ImageClock
+
+
+MODEL = find_body()
 
 
 def beside(frames):
@@ -61,6 +65,32 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_of
     assert (pictures.clock.late + pictures.late).tolist() == [late] * 3
     assert pictures.clock.number.tolist() == [104, 105, 106]
     assert np.isfinite(pictures.camera.focal).all(axis=-1).tolist() == [True, False, True]
+
+
+def test_names_give_a_shape_only_to_people_who_can_be_the_same(monkeypatch):
+    monkeypatch.setattr(refitting, "find_same_body", lambda before: MODEL)
+    count = MODEL.shapes
+
+    def bodies(*first):
+        betas = np.zeros((len(first), count))
+        betas[:, 0] = first
+        covariance = np.tile(0.2 * np.eye(count), (len(first), 1, 1))
+        return xr.Dataset(
+            {"betas": (("person", "beta"), betas), "betas_covariance": (("person", "a", "b"), covariance)},
+            {"person": np.arange(len(first))},
+        )
+
+    fitted = {"body_fitting/a": bodies(0.0, 1.0, 2.0), "body_fitting/b": bodies(1.1, -4.0)}
+    names = {"a": {"1": "kane", "2": "rice", "99": "saka"}, "b": {"0": "kane", "1": "rice"}}
+    inputs = SimpleNamespace(unit="a", sources={"people": names}, open=fitted.__getitem__)
+    before = SimpleNamespace(settings=lambda kind: SimpleNamespace(shape_weight=1.0))
+    result = SimpleNamespace(warnings=[])
+    known = refitting._known_shapes(inputs, before, fitted["body_fitting/a"], result)
+    assert list(known) == [1]
+    assert known[1].betas[0] == pytest.approx(1.1)
+    differ, missing = result.warnings
+    assert "person 2 of clip a and person 1 of clip b are both named rice and differ" in differ
+    assert missing.startswith("clip a has no fitted person 99, named saka; its people are 0, 1, 2.")
 
 
 @pytest.mark.parametrize("late", [1.0, -2.0])

@@ -5,7 +5,7 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.bones import Shape, pool_shapes
+from worldpose.body_fitting.bones import Shape, agree, pool_shapes
 from worldpose.body_fitting.evidence import Contacts, PersonEvidence
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
 from worldpose.body_fitting.residuals import PersonObjective, Pose
@@ -60,3 +60,7 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
     # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
     np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
+    # One in a thousand pairs of clips of one person is farther apart, 13.8 of two betas.
+    limit = np.sqrt(13.8 * 0.4)
+    for apart, said in ((limit, True), (limit + 0.01, False)):
+        assert agree(clips[0], Shape(clips[0].betas + [apart, 0.0], covariance)) == said
