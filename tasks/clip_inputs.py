@@ -313,9 +313,7 @@ def open_tracked_clip(
     )
     tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
     people = clip.detections.assign_people(tracks["detection_index"].values)
-    return replace(
-        clip, detections=_on_match_clock(inputs, people), person=tracks["person"].values
-    )
+    return replace(clip, detections=_on_match_clock(inputs, people), person=tracks["person"].values)
 
 
 def _on_match_clock(

@@ -28,6 +28,7 @@ from flows.registering import find_match
 from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
 from flows.review.corrections import objections_of
+from flows.review.identities import lost_names
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
 from flows.run_record import alone_with
@@ -111,7 +112,7 @@ def run(
     seconds = time.monotonic() - started
     warned = [
         *record.warnings,
-        *objections_of(Run(store, record)).values(),
+        *(objections_of(run := Run(store, record)) | lost_names(run)).values(),
         *clock_advice(record.figures, opened.folder.spec),
         *click_advice(record.figures, record.settings),
     ]

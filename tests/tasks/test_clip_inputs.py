@@ -151,13 +151,13 @@ def test_every_iteration_is_judged_on_keypoints_at_match_time(late_clips, monkey
     late_clips.sources["seen"] = ["s/a"]
     compared = []
     monkeypatch.setattr(
-        filtering, "measure_held_out", lambda cameras, used, keypoints, _: compared.append(keypoints)
+        filtering,
+        "measure_held_out",
+        lambda cameras, used, keypoints, _: compared.append(keypoints),
     )
     suspects = SimpleNamespace(detections=clip_inputs.open_tracked_clip(late_clips).detections[:])
     for first in (True, False):
-        case = SimpleNamespace(
-            first=first, clip=SimpleNamespace(cameras=None), triangulation=None
-        )
+        case = SimpleNamespace(first=first, clip=SimpleNamespace(cameras=None), triangulation=None)
         filtering._held_out(late_clips, case, np.arange(10), suspects)
     np.testing.assert_array_equal(*compared)
     np.testing.assert_allclose(compared[1][:, 0, 0, 0, 0], 8.0 * np.arange(10))

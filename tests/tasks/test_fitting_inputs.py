@@ -15,7 +15,6 @@ from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.clock import ImageClock
 
-
 MODEL = find_body()
 
 
@@ -76,7 +75,10 @@ def test_names_give_a_shape_only_to_people_who_can_be_the_same(monkeypatch):
         betas[:, 0] = first
         covariance = np.tile(0.2 * np.eye(count), (len(first), 1, 1))
         return xr.Dataset(
-            {"betas": (("person", "beta"), betas), "betas_covariance": (("person", "a", "b"), covariance)},
+            {
+                "betas": (("person", "beta"), betas),
+                "betas_covariance": (("person", "a", "b"), covariance),
+            },
             {"person": np.arange(len(first))},
         )
 

@@ -94,7 +94,7 @@ class ClipEvidence:
             raise InputError(
                 "body fitting: common_bias",
                 expected="an error [m] whose square is part of the covariance of each joint",
-                found=f"up to {self.bias.max():g}, more than the covariance of {short.sum()} joints",
+                found=f"{self.bias.max():g}, more than the covariance of {short.sum()} joints",
                 todo="Add its square to the diagonal of covariance, or give no common_bias.",
             )
 

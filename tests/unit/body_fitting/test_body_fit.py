@@ -134,7 +134,7 @@ def test_arrays_that_do_not_fit_are_refused():
     alone = 0.01**2 * np.broadcast_to(np.eye(3), (1, 1, 17, 3, 3))
     whole = alone + np.float32(0.03**2 - 0.01**2) * np.eye(3)  # nothing else, rounded
     ClipEvidence(joints, (whole - alone).astype(np.float32), 50.0, bias)
-    with pytest.raises(InputError, match="common_bias.*covariance of 17 joints"):
+    with pytest.raises(InputError, match=r"common_bias.*covariance of 17 joints"):
         ClipEvidence(joints, alone, 50.0, bias)
 
 
