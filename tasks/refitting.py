@@ -201,13 +201,13 @@ def _known_shapes(
                     continue
                 if person not in own or agree(own[person], shape):
                     shapes.append(shape)
-                    continue
-                result.warnings.append(
-                    f"person {person} of clip {inputs.unit} and person {other} of clip {clip} are "
-                    f"both named {name} and differ: their bodies are {stature(own[person])} and "
-                    f"{stature(shape)} tall. Neither gets the other's shape: correct `people` in "
-                    "match.yaml."
-                )
+                elif inputs.unit < clip:  # once for both
+                    result.warnings.append(
+                        f"person {person} of clip {inputs.unit} and person {other} of clip {clip} "
+                        f"are both named {name} and differ: their bodies are "
+                        f"{stature(own[person])} and {stature(shape)} tall. Neither gets the "
+                        "other's shape: correct `people` in match.yaml."
+                    )
         if shapes:
             known[ids.index(int(person))] = pool_shapes(shapes, weight)
     return known
