@@ -124,7 +124,7 @@ def _open_clip(inputs: UnitInputs, people: _People, opened: ClipInputs) -> Clip:
         covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
         clicks=tuple(_clicks(camera, pitch) for camera in known),
         fps=people.fps,
-        detections=opened.detections.assign_people(people.detection_index),
+        detections=opened.detections[:].assign_people(people.detection_index),
         joints=people.joints,
         views=people.views,
         triangulation=triangulation_settings(inputs, next(iter(people.clip_frames))),

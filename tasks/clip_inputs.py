@@ -392,13 +392,11 @@ def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> 
         bare = replace(found, points=(), extra_keypoints=None, extra_confidence=None)
         parts.append(bare[np.searchsorted(read, frame)].arrays())
     most = max(part["score"].shape[2] for part in parts)
-    detections = KeypointDetections(
-        **{
-            name: np.concatenate([_pad_detections(part[name], most) for part in parts])
-            for name in parts[0]
-        },
-        frame=np.concatenate(list(frames.values())),
-    )
+    arrays: dict[str, Any] = {
+        name: np.concatenate([_pad_detections(part[name], most) for part in parts])
+        for name in parts[0]
+    }
+    detections = KeypointDetections(**arrays, frame=np.concatenate(list(frames.values())))
     return _open_inputs(inputs, detections)
 
 

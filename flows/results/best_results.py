@@ -26,7 +26,7 @@ from flows.results.run_cameras import (
     clip_of,
     static_cameras,
 )
-from flows.review.identities import PLANE, names_of
+from flows.review.identities import names_of
 from flows.stage import Match
 from worldpose.body.body_file import find_body, is_open_body
 from worldpose.body.model import BodyModel, BodyParameters
@@ -50,6 +50,8 @@ JointDefinition = Literal["body", "detector"]
 LIMB_ENDS = [9, 10, 15, 16]
 """Wrists and ankles in COCO-17, whose offset from body to detector nothing separates from the
 length of the limb."""
+PLANE = "broadcast_tracking"
+"""Stage that places people on the pitch in clips without static cameras."""
 MID_HIP = [11, 12]  # of COCO-17
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
 
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
@@ -27,9 +26,6 @@ from worldpose.review.identities import (
 )
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Run, Store
-
-PLANE: Final = "broadcast_tracking"
-"""Stage that places people on the pitch in clips without static cameras."""
 
 
 def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
@@ -78,7 +74,9 @@ def lost_names(run: Run) -> dict[str, str]:
     lost: dict[str, str] = {}
     for unit, key in run.record.results.items():
         stage, _, clip = unit.partition("/")
-        if stage in ("tracking", PLANE) and run.store.has(run.record.match_id, stage, clip, key):
+        if stage in ("tracking", "broadcast_tracking") and run.store.has(
+            run.record.match_id, stage, clip, key
+        ):
             lost |= _replay_names(run, clip)[0]
     return lost
 
@@ -88,7 +86,7 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     match_id, unit = run.record.match_id, f"tracking/{clip}"
     journal, stated = read_journal(run.store, match_id), _stated_names(run.store, match_id, clip)
     if unit not in run:
-        plane = f"{PLANE}/{clip}"
+        plane = f"broadcast_tracking/{clip}"
         ids = run[plane]["person"].values.tolist() if plane in run else [*stated]
         names = {person: name for person, name in stated.items() if person in ids}
         return _lost_stated(clip, stated, ids, names), names

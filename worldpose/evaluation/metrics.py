@@ -294,12 +294,12 @@ def evaluate_joints(
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
-    sides = [each.frames for each in (prediction, reference)]
-    if all(map(len, sides)) and not np.isin(*sides).any():
-        own, true = (f"{frames.min()} to {frames.max()}" for frames in sides)
+    sides = prediction.frames, reference.frames
+    if all(map(len, sides)) and not np.isin(sides[0], sides[1]).any():
+        own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
         raise InputError(
             "frames of the prediction",
-            expected=f"match frames of the reference, which has some of {true}",
+            expected=f"match frames of the reference, which has some of {wanted}",
             found=f"{own}, none in common",
             todo="Name the prediction of the same clip, or number both sides by match frames.",
         )
