@@ -290,8 +290,7 @@ def _held_out(
         frames: the frames to measure in.
         suspects: their detections.
     """
-    used = suspects.detections
-    keypoints = used.keypoints
+    used, keypoints = suspects.detections, suspects.detections.keypoints
     if not case.first:
         used = open_tracked_clip(inputs).detections[frames]
         whole = open_tracked_clip(inputs, filtered=False, redetected=False)
@@ -440,25 +439,25 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
     require_weights(settings, case.detection.sources["weights"])
     shown = _pictures(inputs, case, np.unique(sought.frame))
     boxes: AnyFloats = case.detected.boxes
-    turn = QuarterTurn.of(case.camera)
-    if turn is not None:  # as in `detection`
+    # As in `detection`.
+    quarters = round(inputs.manifest(f"detection/{inputs.unit}").figures["turned_deg"] / 90.0)
+    width, height = case.camera.image_size.tolist()
+    turn = QuarterTurn(quarters, (width, height)) if quarters else None
+    if turn is not None:
         shown = ((place, turn.image(image)) for place, image in shown)
         sought, boxes = replace(sought, boxes=turn.boxes(sought.boxes)), turn.boxes(boxes)
     pose, least = load_pose(settings), settings.min_keypoint_confidence
     found = search_missing_people(shown, sought, pose, least, boxes)
     found = found if turn is None else turn.turn_back(found)
     case.detection.require_registered("video")
-    score_map = load_score_map(settings)
+    score_map = None if "boxes" in case.detection.sources else load_score_map(settings)
     return found if score_map is None else replace(found, score=score_map.probability(found.score))
 
 
 def _pictures(
     inputs: UnitInputs, case: _CameraCase, places: NDArray[np.int64]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield the images of some frame indices, as the video has them, without those it lacks.
-
-    Decoding skips images without a search.
-    """
+    """Yield the images of some frame indices, as the video has them, without those it lacks."""
     footage = inputs.open(f"ingest/{inputs.sources['camera']}")
     numbers = footage["picture_of_frame"].sel(frame=case.detected.frame[places]).values
     there = numbers >= 0
