@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import page_client
 import pytest
+from run_records import calibration
 
-from data_contracts.cameras import CameraCalibration
 from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
 from flows.service.layout import served_state
@@ -481,17 +481,8 @@ def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
     for name in names:
         source = tiny / "detections" / "cam00.npz"
         if name.endswith(".toml"):
-            camera = CameraCalibration(
-                id="cam00",
-                image_size=(1920, 1080),
-                focal_px=(1500.0, 1500.0),
-                principal_point_px=(960.0, 540.0),
-                distortion=(0.0,) * 5,
-                rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-                translation=(0.0, 10.0, 50.0),
-            )
             source = folder / name
-            write_calibration_toml(source, {"cam00": camera})
+            write_calibration_toml(source, {"cam00": calibration("cam00")})
         shutil.copy(source, given / name)
     before = {file: file.read_bytes() for file in folder.glob("*.toml")}
     with pytest.raises(InputError, match=expected):

@@ -194,11 +194,7 @@ def test_each_value_is_from_the_last_layer_that_states_it(store, tiny):
 @pytest.mark.parametrize(
     ("text", "key", "found"),
     [
-        (
-            "detection.strid: 2",
-            "detection.strid",
-            "Did you mean 'detection.stride'.*settings --list",
-        ),
+        ("detection.strid: 2", "detection.strid", "Did you mean 'detection.stride'.*settings"),
         ("detection.stride: none", "detection.stride", "'none'"),
         ("tracking.gate_m: -1", "tracking.gate_m", "-1"),
         ("iterations: many", "iterations", "many"),

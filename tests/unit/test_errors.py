@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 import run
 from registry import REGISTRY
+from run_records import match_spec
 
 import worldpose.compiled
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.method import METHOD
 from worldpose import pipeline
 from worldpose.cache_folder import own_temporary_folder
@@ -103,13 +103,8 @@ def test_people_of_a_video_are_placed_on_match_frames(monkeypatch, fps, images):
         frame = np.arange(len(shown))
         return KeypointDetections.from_keypoints(points, points[..., 0] > 0, frame=frame)
 
-    size = {"width": 64, "height": 48}
-    spec = MatchSpec(
-        match_id="m",
-        fps=25.0,
-        cameras=[CameraSpec(id="a", **size), CameraSpec(id="b", fps=fps, **size)],
-        clips=[ClipSpec(id="c", first_frame=900, frame_count=20)],
-    )
+    clips = {"c": {"first_frame": 900, "frame_count": 20}}
+    spec = match_spec({"a": {}, "b": {"fps": fps}}, clips, (64, 48))
     given = find(range(900, 920))
     monkeypatch.setattr(pipeline, "open_video", lambda _: Video())
     monkeypatch.setattr(pipeline, "pictures_at", read)

@@ -352,10 +352,7 @@ LEFT_OUT = {
     [
         ("cvat.xml", "lines: 1 box of b, 1 ellipse of center_circle, 1 polygon of adboard"),
         ("studio.json", "lines: 1 brushlabels of halfway_line"),
-        (
-            "coco.json",
-            "lines: 1 annotation of an image not listed, 1 annotation without keypoints of half",
-        ),
+        ("coco.json", "lines: 1 annotation of an image not listed, 1 annotation without"),
     ],
 )
 def test_shapes_that_are_not_read_are_counted(tmp_path, name, said):

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from run_records import match_spec
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import TEMPLATES, ArcSpec, LineSpec, PitchSpec
 from worldpose.errors import InputError
 from worldpose.ingest.pitch_file import read_pitch
@@ -189,12 +189,7 @@ def test_derivatives_of_samples_are_those_of_their_heights():
     assert there - here == pytest.approx(pitch.samples_by_surface(1.0) @ change, abs=1e-12)
 
 
-MATCH = MatchSpec(
-    match_id="m",
-    fps=25,
-    cameras=(CameraSpec(id="cam", width=1920, height=1080),),
-    clips=(ClipSpec(id="clip", frame_count=1),),
-)
+MATCH = match_spec(["cam"])
 
 
 def pitch(template, **dimensions):
