@@ -89,7 +89,7 @@ class DrawnFiles:
             run,
             f"{clip}.mp4",
             lambda file: write_clip_video(store, run, match, clip, file),
-            names_said(match.journal),
+            names_said(match),
         )
         return FileResponse(file, media_type="video/mp4")
 
@@ -115,7 +115,7 @@ class _Clips:
 
 def _people_said(match: Match) -> str:
     """Return a text that changes with a match's id, roster and names of people."""
-    return f"{match.registration.model_dump_json()} {names_said(match.journal)}"
+    return f"{match.registration.model_dump_json()} {names_said(match)}"
 
 
 def _player_names(match: Match, run: Run) -> dict[str, str]:
