@@ -21,6 +21,7 @@ from run_records import match_spec
 
 import worldpose.compiled
 from data_contracts.keypoints import KeypointDetections
+from data_contracts.match import CameraSpec
 from flows.method import METHOD
 from worldpose import pipeline
 from worldpose.cache_folder import own_temporary_folder
