@@ -37,6 +37,7 @@ from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
+from flows.web.images import file_mark
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
 from worldpose.store.store import Run, Store
@@ -82,12 +83,19 @@ class DrawnFiles:
         return file
 
     def clip_video(self, store: Store, run: Run, match: Match, clip: str) -> FileResponse:
-        """Return the response with the overlay video of a clip."""
+        """Return the response with the overlay video of a clip.
+
+        Raises:
+            HTTPException: 404, no video of the clip is at hand.
+        """
+        match = match.at_hand()
+        if clip_view(run, match, clip) is None:
+            raise HTTPException(404, "no video of this clip is at hand")
         file = self.get(
             run,
             f"{clip}.mp4",
             lambda file: write_clip_video(store, run, match, clip, file),
-            names_said(match.journal),
+            f"{names_said(match.journal)} {footage_mark(match)}",
         )
         return FileResponse(file, media_type="video/mp4")
 
@@ -101,7 +109,8 @@ class _Clips:
         self._clip: ViewerClip | None = None
 
     def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
-        key = (run.record.run_id, clip, _people_said(match))
+        match = match.at_hand()
+        key = (run.record.run_id, clip, f"{_people_said(match)} {[*match.folder.videos]}")
         with self._lock:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)
@@ -114,6 +123,13 @@ class _Clips:
 def _people_said(match: Match) -> str:
     """Return a text that changes with a match's id, roster and names of people."""
     return f"{match.registration.model_dump_json()} {names_said(match.journal)}"
+
+
+def footage_mark(match: Match) -> str:
+    """Return a text that changes with the videos and stills of a match that are at hand."""
+    folder = match.at_hand().folder  # nothing while the folder is away
+    files = (*folder.videos.values(), *folder.stills.values())
+    return str([file_mark(file) for file in files if file.exists()])
 
 
 def _player_names(match: Match, run: Run) -> dict[str, str]:
@@ -183,9 +199,8 @@ def routes(context: PageContext) -> APIRouter:
             run_id = run.record.run_id
             write_report(context.store, match, file, run_id=run_id, videos=False)
 
-        there = match.at_hand().folder  # nothing while the folder is away
-        seen = [*there.videos, *there.stills, *there.clicked, *there.calibrations]
-        shows = f"{_people_said(match)} {match.journal.tip} {seen}"
+        given = [*match.folder.clicked, *match.folder.calibrations]
+        shows = f"{_people_said(match)} {match.journal.tip} {given} {footage_mark(match)}"
         return FileResponse(
             files.get(run, "report.html", draw, shows),
             media_type="text/html; charset=utf-8",
@@ -195,8 +210,8 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/videos/{clip}")
     def video(match_id: str, clip: str) -> FileResponse:
         match, run = open_latest(match_id)
-        if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
-            raise HTTPException(404, "no camera of such a clip has a video")
+        if clip not in clips_of(run.record):
+            raise HTTPException(404, "the run has no such clip")
         return files.clip_video(context.store, run, match, clip)
 
     @router.get("/health/{clip}")
@@ -231,7 +246,7 @@ def routes(context: PageContext) -> APIRouter:
 
 def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
     """Return clips and export formats of a run, and what came after it."""
-    record = run.record
+    record, there = run.record, match.at_hand()
     clips = find_clips(record)
     lacking = {clip: why_without_joints(run, clip) for clip in clips}
     is_3d = not clips or None in lacking.values()
@@ -247,7 +262,7 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
         "formats": list(formats),
         "purposes": EXPORT_PURPOSES,
         "clips": [
-            {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
+            {"id": clip, "video": clip_view(run, there, clip), "without_joints": lacking[clip]}
             for clip in clips
         ],
     }
