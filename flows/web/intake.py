@@ -39,7 +39,7 @@ CHUNK_SUFFIX: Final = "/bytes"
 """Suffix of the paths that take chunks; all others take JSON."""
 FRAME_PX: Final = 960
 """Maximum width of the frames that a page compares, unless it looks at one close up [px]."""
-OVERTAKEN: Final = "another page saved this form first: load it again"
+OVERTAKEN: Final = "another page saved this form meanwhile: look at it as it is now"
 
 
 @dataclass(frozen=True)
