@@ -120,13 +120,25 @@ for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
   await shoot(page, `ready_${width}`);
 }
 // Another page saves the form: this one says so, and shows that form.
-const other = await page.context().newPage();
-await other.goto(seen.link);
-await other.fill('[data-field="match_id"]', "cup_other");
-await other.waitForSelector('[data-saving="saved"]');
-await page.fill('[data-field="fps"]', "26");
-await page.click("[data-again]");
+async function takeOther(fps) {
+  await page.evaluate(async ([path, fps]) => {
+    const [{ form_secret }, { revision, content }] = await Promise.all(["/api/session", path].map(async (each) => (await fetch(each)).json()));
+    [content.match_id, content.cameras[1].fps] = ["cup_other", fps];
+    const headers = { "content-type": "application/json", "x-form-secret": form_secret };
+    await fetch(`${path}/form`, { method: "POST", headers, body: JSON.stringify({ revision, content }) });
+  }, [`/api/drafts/${seen.link.split("/").at(-1)}`, fps]);
+  await page.fill('[data-field="fps"]', "26");
+  await page.click("[data-again]");
+}
+await takeOther(50);
 seen.again = [await page.inputValue('[data-field="match_id"]'), await page.inputValue('[data-field="fps"]')];
+// On a clock of twice the rate, the moment of frame 5 is frame 10, and 6 later with an offset of 6.
+await page.click("[data-offsets]");
+await frames.nth(0).fill("5");
+await frames.nth(1).fill("16");
+seen.offset = await page.locator("dialog figcaption").nth(1).innerText();
+await page.click("dialog >> text=Cancel");
+await takeOther();
 // The form is left while the server is away: it is saved when the server is back.
 await page.route("**/api/drafts/**", (route) => route.abort());
 await page.fill('[data-field="match_id"]', "cup_final");
