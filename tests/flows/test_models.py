@@ -121,8 +121,7 @@ def test_a_checkpoint_is_pulled_once_and_found_by_its_name(hub, tmp_path, monkey
     assert (place / "files" / "config.json").read_bytes() == CONFIG
     assert [path.name for path in tmp_path.iterdir()] == ["toy"]
     asked = len(hub.asked)
-    assert pull(checkpoint(), tmp_path, quiet) == place
-    assert len(hub.asked) == asked
+    assert (pull(checkpoint(), tmp_path, quiet), len(hub.asked)) == (place, asked)
     monkeypatch.setenv("WORLDPOSE_MODEL_FOLDER", str(tmp_path))
     before = weights_of(DetectionSettings(detector="model:toy"))
     assert len(before["model:toy"]) == 64

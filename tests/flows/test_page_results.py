@@ -8,7 +8,6 @@ import numpy as np
 import page_client
 from command_line import TINY, worldpose
 from page_client import MATCH
-from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
@@ -87,25 +86,12 @@ def test_the_page_gets_the_bodies_of_the_store(reader, tiny_run):
     assert {person["kind"] for person in header["people"]} == {"triangulated"}
     assert header["notes"]["units"] == "metres, seconds"
     found = [decode_bodies(scene, each) for each in ranges]
-    rotations, placed = (np.concatenate(each) for each in zip(*found, strict=True))
+    placed = np.concatenate([joints for _, joints in found])
     joints = model.joints(poses).swapaxes(0, 1)
     known = np.isfinite(joints).all(axis=(-1, -2))
     assert np.array_equal(known, np.isfinite(placed).all(axis=(-1, -2)))
     assert known.sum() > 10
     assert np.linalg.norm(placed - joints, axis=-1)[known].max() < 1e-4
-    truth = model.articulate(poses).rotations.swapaxes(0, 1)[known].reshape(-1, 3, 3)
-    turned = Rotation.from_matrix(rotations[known].reshape(-1, 3, 3))
-    apart = turned * Rotation.from_matrix(truth).inv()
-    assert np.degrees(apart.magnitude()).max() < 0.01
-
-
-def test_metrics_are_per_camera_and_player(reader):
-    found = reader.get(f"{MATCH}/results/metrics").json()
-    assert (found["before"], found["changes"], found["problem"]) == (None, [], "")
-    kinds = {each["kind"] for each in found["metrics"]}
-    assert kinds == {"match", "clip", "camera", "player"}
-    (player, *_) = (each for each in found["metrics"] if each["kind"] == "player")
-    assert any(name.endswith(" residual_m") for name in player["values"])
 
 
 def test_a_command_writes_one_file(tiny_run, tmp_path):

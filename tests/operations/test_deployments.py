@@ -172,8 +172,7 @@ def test_a_schedule_of_serve_is_made_changed_by_the_option_alone_and_never_remov
     assert (own["schedule"]["cron"], own["schedule"]["timezone"]) == ("30 7 * * 1", "Asia/Tokyo")
     # Removed by a person, it comes back with another option only.
     prefect.ask(f"{place}/{made['id']}", method="DELETE")
-    assert len(start(morning)) == 1
-    assert len(start(night)) == 2
+    assert (len(start(morning)), len(start(night))) == (1, 2)
     for flow in ("ingest", "reprocess"):
         found = prefect.deployment(deployment_name("ops", flow))
         prefect.ask(f"/deployments/{found['id']}", method="DELETE")
@@ -372,8 +371,7 @@ def test_killed_runs_begin_again_and_no_others(lonely, monkeypatch):
     assert states == {**asked, "waits": "waiting", "done": "complete", "off": "cancelled"}
     # The end of the worker is not the run's fault; a crash is.
     assert (again["begun"].service_deaths, again["begun"].kills) == (1, 0)
-    assert again["crashed"].kills == 1
-    assert recover(plan) == []
+    assert (again["crashed"].kills, recover(plan)) == (1, [])
     monkeypatch.setattr(recovery, "STARTING", recovery.STARTING * 0)
     assert [name.partition(",")[0] for name in recover(plan)] == ["starting"]
 

@@ -1,11 +1,15 @@
-"""Forms of ONNX detectors: recognized by outputs of their kind, decoded to hand-made boxes."""
+"""Nets of others: forms of ONNX outputs, and crops for pose nets."""
 
 import numpy as np
 import pytest
 
-from worldpose.detection.models import load_detectors
+from data_contracts.conventions import COCO17_FLIP
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.crops import crops_around, cut_crop, frame_from_crop
+from worldpose.detection.models import load_detectors, weights_of
 from worldpose.detection.onnx_detectors import FORMS, _class_names, _person_classes, recognize_form
 from worldpose.detection.settings import DetectionSettings
+from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
 
 SIZE = (96, 64)
@@ -127,8 +131,7 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     def classes(names, asked=None):
         return _person_classes("net.onnx", FORMS["yolov8"], outputs, names, asked)
 
-    assert classes(football) == (1, 2, 3)
-    assert classes(football, [2]) == (2,)
+    assert (classes(football), classes(football, [2])) == ((1, 2, 3), (2,))
     assert classes({}, [1, 2]) == (1, 2)
     with pytest.raises(InputError, match="4 classes without names"):
         classes({})
@@ -162,3 +165,73 @@ def test_an_unknown_form_is_refused_with_the_known_ones(tmp_path):
     file.write_bytes(b"none")
     with pytest.raises(InputError, match=r"one of yolox: .*rtmdet: "):
         load_detectors(DetectionSettings(detector=f"onnx-yolo99:{file}"))
+
+
+def test_a_crop_shows_the_box_and_its_points_come_back():
+    picture = np.zeros((400, 600, 3), dtype=np.uint8)
+    rng = np.random.default_rng(2)
+    for size in (20, 90, 300):  # enlarged, reduced a little and much
+        x, y = rng.uniform([200, 180], [260, 200])
+        column, row = int(x + 0.5 * size * 0.4), int(y)
+        picture[:] = 0
+        picture[row - 6 : row + 7, column - 6 : column + 7] = 255  # a square around the point
+        box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
+        mapping = frame_from_crop(crops_around(box, (48, 64))[0], (48, 64))
+        crop = cut_crop(picture, mapping, (48, 64), 0)[..., 0].astype(float)
+        middle = np.array(
+            [
+                np.average(np.arange(48), weights=crop.sum(0)),
+                np.average(np.arange(64), weights=crop.sum(1)),
+            ]
+        )
+        back = mapping[:, :2] @ middle + mapping[:, 2]
+        if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
+            continue  # the square reaches over the crop: its middle is another
+        # A fifth of a crop's pixel: the square's hard edges are sampled twice.
+        np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, mapping[0, 0]))
+
+
+class Leaning:
+    """Sees joint j at column 10 j of the box, `late` px too far right; no wrists to the left."""
+
+    def estimate(self, picture, boxes):
+        columns = np.where(
+            picture[0, 0, 0] == 1, 10.0 * np.arange(17), 10.0 * np.array(COCO17_FLIP)
+        )
+        sign = 1.0 if picture[0, 0, 0] == 1 else -1.0  # the first column is marked
+        start = boxes[:, 0] if sign > 0 else boxes[:, 2]
+        x = start[:, None] + sign * columns + 2.0
+        confidence = np.full(x.shape, 0.8 if sign > 0 else 0.4)
+        confidence[:, 9] = np.nan
+        keypoints = np.stack([x, np.repeat(boxes[:, 1:2], 17, axis=1)], axis=2)
+        keypoints[:, 9] = np.nan
+        return KeypointDetections.from_keypoints(keypoints, confidence)
+
+
+def test_what_leans_to_one_side_is_set_right_by_the_mirror():
+    picture = np.zeros((50, 300, 3), dtype=np.uint8)
+    picture[0, 0] = 1
+    boxes = np.array([[20.0, 5.0, 100.0, 45.0]])
+    poses = FlipTest(Leaning()).estimate(picture, boxes)
+    expected = 20.0 + 10.0 * np.arange(17) + (0.8 * 2.0 - 0.4 * 2.0) / 1.2
+    expected[9] = 20.0 + 90.0 - 2.0  # seen in the mirror alone, and the other in the image
+    expected[10] = 20.0 + 100.0 + 2.0
+    np.testing.assert_allclose(poses.keypoints[0, :, 0], expected)
+    np.testing.assert_allclose(poses.keypoints[0, :, 1], 5.0)
+    assert poses.confidence[0, [0, 9, 10]].tolist() == pytest.approx([0.6, 0.4, 0.8])
+
+
+@pytest.mark.parametrize("name", ["yolo", "onnx:", "transformers"])
+def test_an_unknown_name_of_a_net_is_refused(name):
+    with pytest.raises(InputError, match="onnx:FILE"):
+        weights_of(DetectionSettings(detector=name))
+
+
+def test_a_file_that_is_no_net_is_refused(tmp_path):
+    pytest.importorskip("onnxruntime")
+    file = tmp_path / "net.onnx"
+    file.write_bytes(b"none")
+    with pytest.raises(InputError, match="ONNX file"):
+        load_detectors(DetectionSettings(detector=f"onnx:{file}"))
+    with pytest.raises(InputError, match="nothing"):
+        weights_of(DetectionSettings(detector=f"onnx:{tmp_path / 'other.onnx'}"))
