@@ -88,7 +88,6 @@ class DrawnFiles:
         Raises:
             HTTPException: 404, no video of the clip is at hand.
         """
-        match = match.at_hand()
         if clip_view(run, match, clip) is None:
             raise HTTPException(404, "no video of this clip is at hand")
         file = self.get(
@@ -109,8 +108,8 @@ class _Clips:
         self._clip: ViewerClip | None = None
 
     def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
-        match = match.at_hand()
-        key = (run.record.run_id, clip, f"{_people_said(match)} {[*match.folder.videos]}")
+        there = [*match.at_hand().folder.videos]
+        key = (run.record.run_id, clip, f"{_people_said(match)} {there}")
         with self._lock:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)
@@ -246,7 +245,7 @@ def routes(context: PageContext) -> APIRouter:
 
 def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
     """Return clips and export formats of a run, and what came after it."""
-    record, there = run.record, match.at_hand()
+    record = run.record
     clips = find_clips(record)
     lacking = {clip: why_without_joints(run, clip) for clip in clips}
     is_3d = not clips or None in lacking.values()
@@ -262,7 +261,7 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
         "formats": list(formats),
         "purposes": EXPORT_PURPOSES,
         "clips": [
-            {"id": clip, "video": clip_view(run, there, clip), "without_joints": lacking[clip]}
+            {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
             for clip in clips
         ],
     }
