@@ -11,7 +11,7 @@ from pydantic import JsonValue, ValidationError
 
 from data_contracts.finetune import NetKind, NetVersion
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
+from flows.cli.options import DEFAULT_PROJECT
 from flows.settings import parse_value
 from worldpose.errors import UsageError, unknown_name
 
@@ -32,11 +32,10 @@ class _Lines(logging.Handler):
 
 def label(
     videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...")],
-    out: Annotated[Path, typer.Option()],
+    out: Path,
     every: Annotated[int, typer.Option(min=1)] = 50,
     detectors: Annotated[list[str] | None, typer.Option("--detector")] = None,
     pose: str = "embedded",
-    as_json: JsonOption = False,
 ) -> None:
     """Propose labels for evenly spaced frames, for people to correct.
 
@@ -55,7 +54,7 @@ def label(
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
     frames = propose_labels(videos, every, out, settings)
     told = f"proposed labels of {frames} frames: correct {out / 'labels.json'}"
-    console.answer(as_json, {"frames": frames, "labels": str(out / "labels.json")}, told)
+    console.answer({"frames": frames, "labels": str(out / "labels.json")}, told)
 
 
 def finetune(
@@ -64,8 +63,7 @@ def finetune(
     nets: Annotated[list[str] | None, typer.Option("--net")] = None,
     starts: Annotated[list[str] | None, typer.Option("--start", metavar="NET=FILE")] = None,
     assignments: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Train nets on labels; adopt a version only if it is better on held-out frames.
 
@@ -97,7 +95,7 @@ def finetune(
     shown = _Lines()
     logger.addHandler(shown)
     try:
-        with prefect_server(project) as wait_until_ready:
+        with prefect_server() as wait_until_ready:
             from prefect.logging.handlers import APILogHandler
 
             from flows.finetune import FOLDER, fine_tune_nets
@@ -112,26 +110,17 @@ def finetune(
     finally:
         logger.removeHandler(shown)
     folder = Path(project) / FOLDER
-    if as_json:
-        console.print_json({"versions": [version.model_dump(mode="json") for version in versions]})
-    else:
-        _print(versions, folder)
+    console.print_json({"versions": [version.model_dump(mode="json") for version in versions]})
+    _print(versions, folder)
 
 
 def _print(versions: list[NetVersion], folder: Path) -> None:
-    rows = [
-        (
-            v.net,
-            v.figure,
-            f"{v.before:.3f}",
-            f"{v.after:.3f}",
-            str(len(v.held_out)),
-            "adopted" if v.adopted else "not better: the old version stays",
-        )
+    rows = (
+        f"{v.net}\t{v.figure}\t{v.before:.3f}\t{v.after:.3f}\t{len(v.held_out)}\t"
+        + ("adopted" if v.adopted else "not better: the old version stays")
         for v in versions
-    ]
-    columns = ("net", "metric", ">before", ">after", ">held-out images", "")
-    console.print_table("fine-tuning", columns, rows)
+    )
+    console.print_table("fine-tuning", "net\tmetric\t>before\t>after\t>held-out images\t", rows)
     chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
     if chosen:
         console.line(f"use it with: worldpose run MATCH {' '.join(chosen)}")

@@ -11,29 +11,15 @@ from typing import Annotated, Literal
 import typer
 
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    RunOption,
-    StageOption,
-    answer,
-    errors,
-    line,
-)
+from flows.cli.console import answer, errors, line
 from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Store
 
-OverwriteOption = Annotated[
-    bool,
-    typer.Option("--overwrite", help="Also replace files of another match, or of unknown origin."),
-]
-
 
 def export(
-    match: MatchArgument,
+    store: Store,
+    match: str,
     forms: Annotated[
         list[str],
         typer.Option(
@@ -43,18 +29,16 @@ def export(
             "(docs/reference/formats.md); more than one may be given.",
         ),
     ],
-    out: Annotated[Path, typer.Option()],
-    run: RunOption = "latest",
-    stage: StageOption = None,
+    out: Path,
+    run: str = "latest",
+    stage: str | None = None,
     definition: Literal["body", "detector"] | None = None,
-    release: Annotated[str | None, typer.Option("--release", metavar="NAME")] = None,
+    release: Annotated[str | None, typer.Option(metavar="NAME")] = None,
     licence: Path | None = None,
-    filled: Annotated[bool, typer.Option("--filled")] = False,
-    surface: Annotated[bool, typer.Option("--surface")] = False,
-    video: Annotated[bool, typer.Option("--video")] = False,
-    overwrite: OverwriteOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    filled: bool = False,
+    surface: bool = False,
+    video: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write a run's results as files that other tools read.
 
@@ -94,7 +78,6 @@ def export(
             found=f"--format {' --format '.join(forms)}",
             todo="Add --format viewer, or leave out --video.",
         )
-    store = Store.open(project)
     registration = find_registration(store, match)
     name = registration.spec.match_id
     opened = open_results(store, name, run)
@@ -125,7 +108,7 @@ def export(
         off = max(each["max_error_px"] for each in json.loads(path.read_text()).values())
         sizes[path] = f": lenses in cameras/ differ from those used by up to {off:.2g} px"
     told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
-    answer(as_json, {"match": name, "files": [str(path) for path in written]}, *told)
+    answer({"match": name, "files": [str(path) for path in written]}, *told)
 
 
 def read_licence(file: Path) -> str:
@@ -153,16 +136,15 @@ export.__doc__ = f"{_ABOUT}\n\n\b\nFormats:\n{_LISTED}\n\nOptions:{_OPTIONS}"
 
 
 def report(
-    match: MatchArgument,
+    store: Store,
+    match: str,
     out: Path = Path("report.html"),
     reference: str | None = None,
-    videos: Annotated[bool, typer.Option("--videos/--no-videos")] = True,
+    videos: bool = True,
     camera: str | None = None,
-    figures: Annotated[Path | None, typer.Option("--figures", metavar="FOLDER")] = None,
-    run: RunOption = "latest",
-    overwrite: OverwriteOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    figures: Annotated[Path | None, typer.Option(metavar="FOLDER")] = None,
+    run: str = "latest",
+    overwrite: bool = False,
 ) -> None:
     """Write one HTML page about a run, with its settings, metrics and images.
 
@@ -180,7 +162,6 @@ def report(
     from flows.results.best_results import describe_age, open_results
     from flows.results.outputs import record_owner, require_own
 
-    store = Store.open(project)
     try:
         known = find_match(store, match, unfinished=True)
     except InputError as error:
@@ -222,7 +203,6 @@ def report(
     written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
     folder = {} if figures is None else {"figures": str(figures.resolve())}
     answer(
-        as_json,
         {"match": known.match_id, **written, **folder},
         f"report:  {out.resolve()}",
         *(f"video:   {film.resolve()}" for film in films),

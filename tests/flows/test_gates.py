@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from data_contracts.review import MovedPoint, ReviewDecision
 from flows.cli.app import app
-from flows.cli.synchronize import compute_poses
+from flows.cli.locate import compute_poses
 from flows.gates import GATES, Gatekeeper
 from flows.match import IncompleteRunError
 from flows.method import METHOD

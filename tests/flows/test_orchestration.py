@@ -24,7 +24,7 @@ from starlette.testclient import TestClient
 
 from flows.match import on_workers_with, task_count
 from flows.orchestration import local_cluster
-from flows.orchestration.cluster_errors import LostWorkersError, require_workers
+from flows.orchestration.local_cluster import LostWorkersError, require_workers
 from flows.orchestration.prefect_environment import (
     CLIENT_LOGIN,
     authorization,

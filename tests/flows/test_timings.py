@@ -8,9 +8,9 @@ import pytest
 from command_line import TINY, succeed
 
 from flows.method import METHOD
-from flows.orchestration.time_limits import DEFAULT_MINUTES, parse_time_limits, seconds_of
 from flows.results import timings
-from flows.service.schedules import parse_schedules
+from flows.service.plan import parse_schedules
+from flows.settings import DEFAULT_MINUTES, parse_time_limits, seconds_of
 from tasks import tracing
 from worldpose.errors import UsageError
 from worldpose.store.store import Store

@@ -29,10 +29,9 @@ from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, install
 from flows.service.layout import is_alive
 from flows.service.match_runs import MatchRuns
-from flows.service.plan import FLOWS, ServePlan, deployment_name
+from flows.service.plan import FLOWS, ServePlan, deployment_name, parse_schedules
 from flows.service.recovery import adopt_due, recover
 from flows.service.run_queue import beating, queued_run
-from flows.service.schedules import parse_schedules
 from flows.service.worker import RefusedRunError, ServedWorker, require_installed
 from flows.web import app_context
 from flows.web.app_context import Continuing
