@@ -255,8 +255,8 @@ def _against_truth(
     try:
         truth = load_reference(source)
         if len(clips) == 1:
-            found = score(match.match_id, source, store.url, run_id=run.record.run_id)
-            return found.evaluation, truth, ""
+            scores = score(match.match_id, source, store.url, run_id=run.record.run_id)
+            return scores.evaluation, truth, ""
     except WorldposeError as error:
         if reference is not None:
             raise
