@@ -217,12 +217,14 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
 def test_a_reference_that_is_not_scored_is_said(tiny, project_copy, tmp_path, monkeypatch):
     page, own = tmp_path / "report.html", shutil.copytree(tiny, tmp_path / "match") / "reference"
     (own / "joints.npz").write_bytes(b"PK")
-    given = ("report", own.parent, "--project", project_copy, "--no-videos", "--out", page)
+    store = Store.open(str(project_copy))
+    there = {"folder": str(own.parent)}
+    store.register(store.registration(TINY).model_copy(update=there))
+    given = ("report", TINY, "--project", project_copy, "--no-videos", "--out", page)
     answer = worldpose(*given)  # nobody asked for it
     assert (answer.code, "warning: The results are not scored" in answer.err) == (0, True)
     assert "Against the truth" in page.read_text()
     assert worldpose(*given, "--reference", own).code == 1
-    store = Store.open(str(project_copy))
     monkeypatch.setattr(report, "find_clips", lambda record: ("first", "second"))
     match, run = open_match(store, TINY), open_run(str(project_copy), TINY)
     *_, said = report._against_truth(store, run, match, str(tiny / "reference"))
