@@ -143,6 +143,21 @@ def test_results_stay_reachable_when_a_later_run_has_none(ada, project_copy, tmp
     assert score(TINY, str(tmp_path / "out"), str(project_copy)).age == later
 
 
+def test_an_open_page_gets_the_run_that_it_shows_until_it_shows_the_next(ada, project_copy):
+    asked = ("scenes/clip?", "scenes/clip/frames?first=0&count=2&", "metrics?", "exports/joints?")
+
+    def answers(run):
+        return [ada.get(f"{MATCH}/results/{each}{run}").content for each in asked]
+
+    before = answers("")
+    stages = ("ingest", "static", "camera", "detection", "tracking", "triangulation")
+    add_run(project_copy, "complete", stages)  # without bodies
+    assert all(new != old for new, old in zip(answers(""), before, strict=True))
+    assert answers("run_id=0001") == before
+    assert "no such run" in ada.get(f"{MATCH}/results/metrics?run_id=0009").json()["error"]
+    assert ada.get(f"{MATCH}/results/metrics?run_id=../x").status_code == 422
+
+
 def test_results_say_which_change_made_them_old(ada, project_copy, tmp_path):
     store = Store.open(str(project_copy))
     edits = {"split": SplitTrack(clip="clip", person=0, first_frame_of_new=12)}

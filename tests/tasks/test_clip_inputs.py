@@ -1,6 +1,7 @@
 """What stages get of a clip: corrections applied, errors taken off, times as measured."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,11 +9,14 @@ import pytest
 import xarray as xr
 from camera_builders import look_at_camera
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
 from tasks import clip_inputs, filtering, refitting
 from tasks.clip_inputs import PAGE, StoredFeedback, open_detections
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
+from worldpose.detection.interfaces import ScoreMap
+from worldpose.filtering.redetection import MissingPeople
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.clock import ImageClock, camera_frames
@@ -130,6 +134,44 @@ def test_two_frames_that_show_one_image_are_both_searched(monkeypatch):
     monkeypatch.setattr(filtering, "some_pictures", lambda _, some: zip(some, some, strict=True))
     shown = dict(filtering._pictures(Results({"ingest/cam": footage}), case, frame))
     assert shown == dict(enumerate(numbers.tolist()))
+
+
+@pytest.mark.parametrize(("given", "turned_deg"), [(True, 0.0), (False, 90.0)])
+def test_a_search_has_the_turn_and_the_scores_of_detection(monkeypatch, given, turned_deg):
+    shapes = []
+
+    def estimate(image, boxes):
+        shapes.append(image.shape)
+        found = KeypointDetections.from_keypoints(
+            np.repeat(boxes[:, None, :2], 17, axis=1), np.full((len(boxes), 17), 0.9)
+        )
+        return replace(found, boxes=boxes, score=np.full(len(boxes), 0.7))
+
+    image = np.zeros((60, 40, 3), np.uint8)
+    monkeypatch.setattr(filtering, "require_weights", lambda *_: None)
+    monkeypatch.setattr(filtering, "_pictures", lambda *_: iter([(0, image)]))
+    monkeypatch.setattr(filtering, "load_pose", lambda _: SimpleNamespace(estimate=estimate))
+    monkeypatch.setattr(filtering, "load_score_map", lambda _: ScoreMap(1.0, 1.0))
+    inputs = SimpleNamespace(
+        unit="cam.clip",
+        manifest=lambda _: SimpleNamespace(figures={"turned_deg": turned_deg}),
+    )
+    case = SimpleNamespace(
+        camera=look_at_camera((0.0, -20.0, 5.0), (0.0, 0.0, 0.0), 50.0, (40, 60)),
+        detected=SimpleNamespace(boxes=np.empty((1, 0, 4))),
+        detection=SimpleNamespace(
+            settings=lambda kind: kind(),
+            sources={"weights": {}, **({"boxes": "b.txt"} if given else {})},
+            require_registered=lambda _: None,
+        ),
+    )
+    box = np.array([[5.0, 10.0, 15.0, 30.0]])
+    sought = MissingPeople(np.array([0]), np.array([0]), box, 0)
+    found = filtering._search(inputs, case, sought)
+    assert shapes == [(60, 40, 3) if given else (40, 60, 3)]
+    np.testing.assert_allclose(found.boxes, box)
+    raw = np.cbrt([0.7 * 0.9])
+    np.testing.assert_allclose(found.score, raw if given else ScoreMap(1.0, 1.0).probability(raw))
 
 
 def beside(frames):
