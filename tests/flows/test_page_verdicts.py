@@ -139,6 +139,10 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
         return match
 
     monkeypatch.setattr(PageContext, "match", with_video)
+    away = frames.rename(tmp_path / "away")
+    evidence = ada.get(f"{path}/evidence").json()
+    assert (evidence["video"], evidence["tables"][-1]["rows"]) == (None, [["cam02"]])
+    away.rename(frames)  # what was drawn without the images is not kept
     evidence = ada.get(f"{path}/evidence").json()
     assert evidence["video"] == "cam02"
     assert evidence["pictures"] and evidence["tables"]

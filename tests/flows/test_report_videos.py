@@ -17,5 +17,6 @@ def test_a_camera_without_a_video_of_its_own_is_refused_before_anything_is_writt
     folder = SimpleNamespace(spec=spec, videos={"north": "a.mp4", "clip": "b.mp4"})
     page = tmp_path / "report.html"
     with pytest.raises(UsageError, match=rf"--camera {asked}: .*these have one: north\."):
-        write_report(None, SimpleNamespace(folder=folder), page, camera=asked)
+        there = SimpleNamespace(folder=folder)
+        write_report(None, SimpleNamespace(at_hand=lambda: there), page, camera=asked)
     assert not page.exists()
