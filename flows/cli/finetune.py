@@ -79,9 +79,7 @@ def finetune(
             todo="Train in a local project: settings name weights by file.",
         )
     kinds = tuple(_kind(name, "--net") for name in nets or NETS)
-    begin = {
-        _kind(name, "--start"): Path(file) for name, file in map(_split_assignment, starts or [])
-    }
+    begin = _initial_weights(starts or [], kinds)
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
@@ -126,6 +124,23 @@ def _kind(name: str, where: str) -> NetKind:
     raise unknown_name(f"{where} {name}", name, NETS)
 
 
+def _initial_weights(starts: list[str], kinds: tuple[NetKind, ...]) -> dict[NetKind, Path]:
+    """Return the files of `--start`, each of another trained net."""
+    begin: dict[NetKind, Path] = {}
+    for start in starts:
+        name, file = _split_assignment(start)
+        kind = _kind(name, "--start")
+        if kind in begin or kind not in kinds:
+            raise UsageError(
+                f"--start {start}",
+                expected=f"initial weights of each trained net once: {', '.join(kinds)}",
+                found="the second of this net" if kind in begin else "a net that is not trained",
+                todo="Leave it out, or name the net with --net.",
+            )
+        begin[kind] = Path(file)
+    return begin
+
+
 def _split_assignment(assignment: str) -> tuple[str, str]:
     name, equals, value = assignment.partition("=")
     if not equals:
@@ -144,7 +159,11 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
         name, text = _split_assignment(assignment)
         group, _, field = name.rpartition(".")
         groups.setdefault(group, {})[field] = parse_value(text)
-    given = {**groups.pop(""), **groups}
+    given = groups.pop("")
+    for group, fields in groups.items():
+        whole = given.get(group, {})
+        # The contract refuses what is no mapping.
+        given[group] = {**whole, **fields} if isinstance(whole, dict) else whole
     try:
         return FineTuningSettings.model_validate(given)
     except ValidationError as error:

@@ -126,6 +126,8 @@ def test_a_checkpoint_is_pulled_once_and_found_by_its_name(hub, tmp_path, monkey
     before = weights_of(DetectionSettings(detector="model:toy"))
     assert len(before["model:toy"]) == 64
     assert "transformers" in before
+    with pytest.raises(InputError, match="expected a checkpoint of task pose, found detector"):
+        weights_of(DetectionSettings(pose="model:toy"))
     (place / "files" / "config.json").write_bytes(b"{}")
     assert weights_of(DetectionSettings(detector="model:toy")) != before
 

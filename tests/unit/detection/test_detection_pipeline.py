@@ -8,11 +8,12 @@ from camera_builders import look_at_camera
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, BoxTracker, detect_strided
 from worldpose.detection.interfaces import People
-from worldpose.detection.pipeline import PeopleFinder, Place, on_pitch
+from worldpose.detection.pipeline import PeopleFinder, Place, detect_people, on_pitch
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import suppress
 from worldpose.detection.turning import QuarterTurn
 from worldpose.detection.views import TiledDetector
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 
@@ -131,6 +132,45 @@ def test_a_clip_without_people_has_a_true_reason(camera):
     assert "of 40 boxes of the detector 0 lie outside" in reason(weak)
 
 
+IMAGE = np.zeros((48, 64, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        [IMAGE.astype(np.float32)],
+        [IMAGE.astype(np.uint16)],
+        [IMAGE[..., 0]],
+        [np.dstack([IMAGE, IMAGE[..., :1]])],
+        [IMAGE, IMAGE[:40]],
+    ],
+    ids=["float", "16 bits", "grey", "rgba", "sizes"],
+)
+def test_images_that_no_net_takes_are_refused(images):
+    with pytest.raises(InputError, match=f"image {len(images) - 1}.*uint8 RGB.* 64 x 48 px"):
+        detect_people(images, detectors=[Knowing([], [])])
+
+
+def test_images_are_of_the_camera_s_size_and_may_be_views(camera):
+    nobody = Knowing([np.empty((0, 4))], [np.empty(0)])
+    with pytest.raises(InputError, match="1920 x 1080 px"):
+        detect_people([IMAGE], detectors=[nobody], camera=camera)
+    nobody.detect = lambda images: [
+        People(np.empty((0, 4)), np.empty(0)) for each in images if each.flags.c_contiguous
+    ]
+    assert detect_people([IMAGE[..., ::-1]], detectors=[nobody]).frame.tolist() == [0]
+
+
+def test_given_boxes_beyond_the_limit_stay_and_detected_ones_are_counted():
+    x = 24.0 * np.arange(70)
+    boxes = np.stack([x, np.full(70, 10.0), x + 20.0, np.full(70, 40.0)], axis=1)
+    one, image = Knowing([boxes], [np.full(70, 0.9)]), np.zeros((48, 1920, 3), np.uint8)
+    finder = PeopleFinder([one], one, DetectionSettings(max_people=60))
+    for given, count in (({0: People(boxes, np.ones(70))}, 70), (None, 60)):
+        (found,) = finder.find([(0, image)], None, given)
+        assert (np.isfinite(found.score).sum(), finder.report.cut) == (count, 70 - count)
+
+
 PICTURE = np.zeros((4, 4, 3), dtype=np.uint8)
 
 
@@ -192,15 +232,8 @@ def test_looks_at_every_third_frame_give_boxes_in_all_of_them():
             np.testing.assert_allclose(one.boxes, [walker(number)], atol=1e-9)
 
 
-def boxed_people(*rows):
-    rows = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    return People(rows[:, :4], rows[:, 4])
-
-
 def test_the_best_of_two_boxes_of_a_person_stays():
-    found = suppress(
-        boxed_people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6
-    )
+    found = suppress(people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6)
     assert found.scores.tolist() == [0.9, 0.2]
 
 
@@ -210,8 +243,6 @@ class Blobs:
     view_size = (64, 48)
 
     def detect(self, pictures):
-        import cv2
-
         found = []
         for picture in pictures:
             assert picture.shape == (48, 64, 3)
@@ -219,9 +250,7 @@ class Blobs:
                 (picture[..., 0] > 200).astype(np.uint8)
             )
             found.append(
-                boxed_people(
-                    *[(x, y, x + w - 1, y + h - 1, 0.9) for x, y, w, h, _ in stats[1:] if w > 2]
-                )
+                people(*[(x, y, x + w - 1, y + h - 1, 0.9) for x, y, w, h, _ in stats[1:] if w > 2])
             )
         return found
 
@@ -319,3 +348,33 @@ def test_people_of_a_camera_on_its_side_are_found_where_they_are(quarters, is_gi
     (found,) = finder.find(frames, Place(rolled(quarters), None), given)
     assert finder.report.quarters == turned
     np.testing.assert_allclose(found.keypoints[:, 0, 0], np.tile([30.0, 20.0], (20, 1)), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("lost", "begin", "settings"),
+    [
+        ({50}, 0, {"stride": 10}),
+        ({50, 51, 52}, 0, {"stride": 10}),
+        (set(), 30, {"stride": 10, "min_hits": 3}),
+        (set(), 30, {"min_hits": 12}),
+    ],
+)
+def test_no_frame_of_a_true_track_is_lost(lost, begin, settings):
+    def look(pictures):
+        numbers = [int(picture[0, 0, 0]) for picture in pictures]
+        return [people(*[[*walker(n, speed=0.1), 0.9]] * (n >= begin)) for n in numbers]
+
+    asked = DetectionSettings(**settings)
+    frames = ((n, None if n in lost else np.full((4, 4, 3), n, np.uint8)) for n in range(100))
+    found = BoxCleaner(asked).clean(detect_strided(frames, look, asked.stride, asked.batch))
+    shown = {number for number, _, one in found if len(one.scores)}
+    assert shown == set(range(begin, 100)) - lost
+
+
+def test_frames_in_memory_do_not_grow_with_batch_times_stride():
+    taken = []
+    frames = (taken.append(n) or (n, PICTURE) for n in range(500))
+    most = 0
+    for n, _, _ in detect_strided(frames, lambda each: [people()] * len(each), 25, 8):
+        most = max(most, len(taken) - n)
+    assert most <= 51

@@ -10,7 +10,7 @@ import pytest
 from worldpose.errors import InputError
 from worldpose.ingest.footage import write_still
 from worldpose.video.files import VideoReader, index_frames, write_video
-from worldpose.video.folder import index_video, open_video
+from worldpose.video.folder import index_video, open_video, pictures_at
 from worldpose.video.pictures import FrameIndex
 
 SIZE = (48, 64)
@@ -26,6 +26,13 @@ def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
     assert write_video(path, numbered(55), 25.0, quality=5) == 55
     return path
+
+
+def test_each_number_has_its_frame_also_where_numbers_repeat_and_go_back(clip):
+    numbers = np.array([-1, 10, 10, 11, 12, -1, 8, 9, 9, 30])
+    with VideoReader(clip) as video:
+        shown = list(pictures_at(video, numbers))
+    assert [-1 if one is None else round((one.mean() - 10) / 4) for one in shown] == list(numbers)
 
 
 def test_frames_beyond_the_end_are_refused(clip):
