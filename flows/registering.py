@@ -225,12 +225,9 @@ def _read_new_files(
     def is_new(path: Path) -> bool:
         return registration.digest_of(path.relative_to(match.folder).as_posix()) not in known
 
-    def check_detections(unit: str) -> None:
-        read_unit(match, unit)
-
     with ThreadPoolExecutor(READERS) as threads:
         new = [unit for unit, path in match.detections.items() if is_new(path)]
-        for _ in threads.map(check_detections, new):
+        for _ in threads.map(lambda unit: read_unit(match, unit), new):
             pass  # an error is raised here, that of the first file
     boxes = {unit for unit, path in match.boxes.items() if is_new(path)}
     videos = {unit for unit, path in match.videos.items() if is_new(path)}
