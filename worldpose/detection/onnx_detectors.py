@@ -225,8 +225,8 @@ def find_person_classes(
         return tuple(asked)
     if people := select_named_people(names):
         return people
-    if count == 1:  # whatever its name
-        return (0,)
+    if (count or len(names)) == 1:  # whatever its name
+        return (0,) if count else tuple(names)
     # Class of people by number of classes: COCO's 80, its 91 numbered ones, and these with a last
     # class for no object.
     coco_person = {80: 0, 91: 1, 92: 1}

@@ -150,7 +150,8 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     with pytest.raises(InputError, match="below 4"):
         classes({}, [4])
     assert classes({0: "ball", 1: "People", 2: "players", 3: "human"}) == (1, 2, 3)
-    assert find_person_classes("net.onnx", 1, {0: "footballer"}, None) == (0,)
+    for count in (1, None):
+        assert find_person_classes("net.onnx", count, {0: "footballer"}, None) == (0,)
     assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
     assert _class_names({"names": "['ball']"}) == _class_names({"names": "{'ball': 0}"})
     assert _class_names({"names": "['ball']"}) == {0: "ball"}
