@@ -167,16 +167,24 @@ def add_venue(folder: MatchFolder, layers: Iterable[Layer]) -> MatchFolder:
 
 def pitch_of(store: Store, folder: Path, spec: MatchSpec) -> PitchSpec | None:
     """Return the pitch of a match's folder or else of its layers; None for `pitch: none`."""
+    return pitch_in_words(store, folder, spec)[0]
+
+
+def pitch_in_words(store: Store, folder: Path, spec: MatchSpec) -> tuple[PitchSpec | None, str]:
+    """Return the pitch as `pitch_of`, and in words for messages on names that it lacks."""
     if spec.pitch is None and not pitch_file(folder, spec):
-        found = merge_general(read_layers(store, spec)).pitch
+        layers = read_layers(store, spec)
+        found = merge_general(layers).pitch
         if found is not None:
-            return found
-    return read_pitch(folder, spec)
+            origin = [each.origin for each in layers if each.values.get("pitch") is not None][-1]
+            return found, f"the {found.template} pitch in the settings of the {origin}"
+    return read_pitch(folder, spec), "the pitch"
 
 
 def known_pitch(store: Store, folder: Path, spec: MatchSpec) -> PitchSpec | None:
     """Return the pitch of a match as `pitch_of`; None if the project lacks its venue."""
-    is_known = spec.venue is None or spec.venue in list_venues(store)
+    stated = merge_general(read_layers(store, spec))
+    is_known = stated.pitch is not None or stated.venue in (None, *list_venues(store))
     return pitch_of(store, folder, spec) if is_known else None
 
 

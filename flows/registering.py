@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
-from flows.layers import pitch_of, pitch_of_run, read_layers
+from flows.layers import pitch_in_words, pitch_of_run, read_layers
 from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
@@ -45,7 +45,7 @@ def register(
     with reachable(folder):
         at_home = previous is not None and previous.folder == str(folder.resolve())
     known = [file.path for file in previous.files] if previous is not None and at_home else ()
-    match_folder = read_match(folder, known, pitch_of(store, folder, spec))
+    match_folder = read_match(folder, known, *pitch_in_words(store, folder, spec))
     is_next = previous is not None and previous.folder == replaces
     if replaces is not None and not is_next and not at_home:
         raise InputError(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from data_contracts.match import MatchSpec
 from flows.cli.console import answer, line, print_json
 from flows.cli.options import DEFAULT_PROJECT
 from flows.layers import (
@@ -18,10 +20,12 @@ from flows.layers import (
     match_layer,
     project_layers,
     read_layer,
+    read_layers,
 )
-from flows.registering import find_match
+from flows.registering import find_match, find_registration
 from flows.settings import as_text, known_settings, parse_value, require_known, resolve, save_layer
 from worldpose.errors import UsageError, unknown_name
+from worldpose.ingest.match_folder import read_spec
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
@@ -89,12 +93,24 @@ def _read(
             todo="Give a match its venue: worldpose settings MATCH --set venue=NAME.",
         )
     if match is not None:
-        opened = find_match(store, match, unfinished=True)
-        return match_layer(opened.match_id), opened.layers
+        spec = _spec_of(store, match)
+        return match_layer(spec.match_id), read_layers(store, spec)
     if venue is None:
         return PROJECT, project_layers(store)
     name = f"{VENUES}/{venue}"
     return name, (*project_layers(store), read_layer(store, name))
+
+
+def _spec_of(store: Store, match: str) -> MatchSpec:
+    """Return match.yaml of a match, which need not fit its settings; a new folder is registered."""
+    folder = Path(match)
+    if not (folder / "match.yaml").is_file():
+        return find_registration(store, match).spec
+    spec = read_spec(folder)
+    known = store.registration(spec.match_id)
+    if known is None or known.folder != str(folder.resolve()):
+        find_match(store, match, unfinished=True)
+    return spec
 
 
 def print_known() -> None:

@@ -192,7 +192,7 @@ def _write_clip(
 
 def _write_footage(origin: Origin, view: str, out: Path, form: FootageForm) -> StoredFile:
     folder = Path(origin.registration.folder)
-    video = read_match(folder).videos.get(view)
+    video = read_match(folder, whose=None).videos.get(view)
     source = "" if video is None else video.relative_to(folder).as_posix()
     digest = origin.registration.digest_of(source)
     if video is None or digest is None:

@@ -20,7 +20,7 @@ import yaml
 from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
-from flows.layers import pitch_of
+from flows.layers import pitch_in_words
 from flows.method import METHOD
 from flows.registering import register_next
 from flows.review.corrections import corrected_match
@@ -152,7 +152,7 @@ def build(
         taken = take_given(store, given, folder, indexes) if given.is_dir() else []
         # No paths of this machine, no options of commands.
         notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
-        match = read_match(folder, pitch=pitch_of(store, folder, read_spec(folder)))
+        match = read_match(folder, (), *pitch_in_words(store, folder, read_spec(folder)))
     except InputError as error:
         return [describe(error, folder, given)], notes
     owners = {*(each.id for each in match.spec.cameras), *match.spec.broadcast_views}
@@ -189,7 +189,7 @@ def registered_as(store: Store, match: MatchFolder) -> str | None:
 
 def _is_sound(folder: Path) -> bool:
     with suppress(InputError, OSError):
-        read_match(folder)
+        read_match(folder, whose=None)
         return True
     return False
 

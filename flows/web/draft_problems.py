@@ -54,6 +54,11 @@ GIVEN_ENDINGS: Final = tuple(
 
 MATCH_FILES: Final = frozenset({"calibration.toml", "lenses.toml", "pitch.json"})
 """Files that a person can add to videos and stills."""
+_ON_PAGES: Final = {
+    "--camera": "Rename the file, so that it begins with its camera's name, and add it again.",
+    "--project": "Add the venue and its pitch to the settings, or add pitch.json.",
+}
+"""What to do on the pages, by the option that a command asks for."""
 
 
 class DraftFile(Record):
@@ -227,11 +232,9 @@ def take_given(
             try:
                 found = import_clicks(file, folder, owner, known_pitch(store, folder, spec))
             except InputError as error:
-                if "--camera" not in error.todo:  # the images are named after no cameras
+                todo = next((it for asks, it in _ON_PAGES.items() if asks in error.todo), None)
+                if todo is None:
                     raise
-                todo = (
-                    "Rename the file, so that it begins with its camera's name, and add it again."
-                )
                 raise InputError(error.where, error.expected, error.found, todo) from error
             notes += [f"{file.name}: {n} clicks in {name}" for name, n in found.clicks.items()]
             notes += found.notes

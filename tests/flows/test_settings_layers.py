@@ -18,7 +18,7 @@ from flows import layers, reprocess
 from flows.cli import run as run_command
 from flows.cli import settings as cli_settings
 from flows.cli.app import app as worldpose
-from flows.layers import project_layers, read_layer, write_layer
+from flows.layers import known_pitch, project_layers, read_layer, write_layer
 from flows.progress import reporting_to
 from flows.registering import open_match, register
 from flows.reports.match_pictures import shown_pitch
@@ -249,7 +249,8 @@ def test_clicks_have_the_names_of_the_venues_game(store, tiny, tmp_path):
     assert read_match(folder).clicked.keys() == {camera}  # the venue is not known here
     for template in ("futsal", "basketball"):
         write_layer(store, "venues/hall", {"pitch": {"template": template}})
-        with nullcontext() if template == "basketball" else pytest.raises(InputError, match="name"):
+        wrong = "a point of the futsal pitch in the settings of the venue hall"
+        with nullcontext() if template == "basketball" else pytest.raises(InputError, match=wrong):
             register(store, folder, unfinished=True)
     again = (folder / "again.json", tmp_path / "copy")
     shutil.copytree(folder, again[1])
@@ -265,6 +266,39 @@ def test_clicks_have_the_names_of_the_venues_game(store, tiny, tmp_path):
     command(*given, store.url)
     found = json.loads((again[1] / "pitch.json").read_text())
     assert found["template"] == "basketball" and [*found["points"]] == [f"{places[0]}.again"]
+
+
+def test_a_venue_that_the_clicks_do_not_fit_can_be_taken_back(store, tiny, tmp_path, ada):
+    folder = shutil.copytree(tiny, tmp_path / "m")
+    (folder / "pitch.json").unlink()
+    text = (folder / "match.yaml").read_text().replace(TINY, "other")
+    (folder / "match.yaml").write_text(text)
+    write_layer(store, "venues/hall", {"pitch": {"template": "futsal"}})
+    for match in (folder, "other"):
+        given = ("settings", match, "--project", store.url)
+        command(*given, "--set", "venue=hall")
+        assert shown(store, match)["pitch"][1] == "venue hall"
+        with pytest.raises(InputError, match="the settings of the venue hall"):
+            register(store, folder, unfinished=True)
+        command(*given, "--unset", "venue")
+        register(store, folder, unfinished=True)
+    write_layer(store, "matches/other", {"venue": "hall"})
+    *_, own = ada.get("/api/settings?match=other").json()["layers"]
+    sent = {"layer": own["layer"], "values": {}, "revision": own["revision"]}
+    assert ada.post("/api/settings?match=other", json=sent).status_code == 200
+    register(store, folder, unfinished=True)
+
+
+def test_the_pitch_of_labels_is_that_of_the_venue_in_the_matchs_own_layer(store, tiny, tmp_path):
+    spec = read_match(tiny).spec.model_copy(update={"venue": "elsewhere"})
+    assert known_pitch(store, tmp_path, spec) is None
+    own, size = f"matches/{TINY}", {"pitch": {"length": 101.0}}
+    write_layer(store, "venues/parken", size)
+    for values in ({"venue": "parken"}, size):
+        write_layer(store, own, values)
+        assert known_pitch(store, tmp_path, spec).length == 101.0
+    write_layer(store, own, {"venue": "gone"})
+    assert known_pitch(store, tmp_path, spec) is None
 
 
 def test_the_list_has_one_short_line_per_setting_and_the_rest_by_name():

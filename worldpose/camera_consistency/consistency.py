@@ -100,18 +100,20 @@ def _judge_most(
     if len(judged) < 3 or 2 * len(weak) <= len(judged):
         return found
     rays = usable_rays(cameras, detections, MIN_JOINTS)
-    agree = np.zeros(len(seen), dtype=np.bool_)
+    answers: list[set[bool | None]] = [set() for _ in seen]
     for pair in itertools.combinations(judged.tolist(), 2):
-        agree[list(pair)] |= not _is_by_chance(cameras, rays, pair)
-    alone = tuple(judged[~agree[judged]].tolist())
+        answer = _do_agree(cameras, rays, pair)
+        for c in pair:
+            answers[c].add(answer)
+    alone = tuple(c for c in judged.tolist() if False in answers[c] and True not in answers[c])
     every = tuple(range(len(seen)))
     return Consistency(
         (), (), every, found.agreement, alone if 2 * len(alone) > len(judged) else ()
     )
 
 
-def _is_by_chance(cameras: Camera, rays: Floats, pair: tuple[int, int]) -> bool:
-    """Return whether the people of two cameras clearly meet no more often than by chance.
+def _do_agree(cameras: Camera, rays: Floats, pair: tuple[int, int]) -> bool | None:
+    """Return whether people of two cameras meet more often than by chance; None if none can tell.
 
     By chance they meet at other moments of the clip too. Cameras share a part of their views, so
     that few can meet at all. From low cameras, or where people stand still, chance is high and
@@ -123,7 +125,9 @@ def _is_by_chance(cameras: Camera, rays: Floats, pair: tuple[int, int]) -> bool:
     shifts = (len(rays) * np.array([-3, -2, -1, 1, 2, 3])) // 6
     chance = [match_pair(cameras, rays, pair, s, MIN_JOINTS).share for s in shifts.tolist()]
     above = now.share - np.mean(chance) > max(least, 3.0 * float(np.std(chance)))
-    return not (now.agrees or (above and now.count >= 4) or np.mean(chance) > tells)
+    if now.agrees or (above and now.count >= 4):
+        return True
+    return None if np.mean(chance) > tells else False
 
 
 def select_busiest_frames(confidence: ClipArray, longest: int) -> slice:

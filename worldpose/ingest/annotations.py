@@ -37,7 +37,7 @@ def key_frames_file(clip_id: str) -> str:
 
 
 def read_clicked(
-    folder: Path, spec: MatchSpec, pitch: PitchSpec | None, *, named: bool = True
+    folder: Path, spec: MatchSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras of a match folder, in their order.
 
@@ -45,7 +45,7 @@ def read_clicked(
         folder: the match folder.
         spec: its match.yaml.
         pitch: its pitch; None without a pitch.
-        named: whether the names must be the pitch's; False while that of the venue is unknown.
+        whose: the pitch in words, for messages; None = names are not checked.
 
     Raises:
         InputError: a file belongs to no static camera, or is invalid.
@@ -55,12 +55,12 @@ def read_clicked(
     of_cameras = "<camera>.json of a static camera"
     files = files_by_unit(folder, CLICKED_FOLDER, (".json",), static, of_cameras, alone=True)
     for name, file in files.items():
-        clicked[name] = read_clicked_markings(file, static[name], pitch, named=named)
+        clicked[name] = read_clicked_markings(file, static[name], pitch, whose)
     return {name: clicked[name] for name in static if name in clicked}
 
 
 def read_clicked_markings(
-    file: Path, camera: CameraSpec, pitch: PitchSpec | None, *, named: bool = True
+    file: Path, camera: CameraSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> ClickedMarkings:
     """Return the clicks in one camera's image.
 
@@ -68,21 +68,21 @@ def read_clicked_markings(
         file: JSON, a `ClickedMarkings`.
         camera: the camera; all clicks must be inside its image.
         pitch: the match's pitch; its template defines the names.
-        named: as in `read_clicked`.
+        whose: as in `read_clicked`.
 
     Raises:
         InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
             a pixel outside the image, or no clicks, or the match has no pitch; the error names file
             and entry.
     """
-    template = _template(file, pitch, named)
+    template = _template(file, pitch, whose)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))
-    _require_markings(str(file), "", clicked, camera, template)
+    _require_markings(str(file), "", clicked, camera, template, whose)
     return clicked
 
 
 def read_key_frames(
-    folder: Path, spec: MatchSpec, pitch: PitchSpec | None, *, named: bool = True
+    folder: Path, spec: MatchSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> dict[str, KeyFrames]:
     """Return the clicked key frames by broadcast view, in the order of the clips.
 
@@ -90,7 +90,7 @@ def read_key_frames(
         folder: the match folder.
         spec: its match.yaml.
         pitch: its pitch; None without a pitch.
-        named: as in `read_clicked`.
+        whose: as in `read_clicked`.
 
     Raises:
         InputError: a file belongs to no clip with a broadcast camera, or is invalid.
@@ -100,7 +100,7 @@ def read_key_frames(
     files = files_by_unit(folder, KEY_FRAMES_FOLDER, (".json",), views, of_clips, alone=True)
     for name, file in files.items():
         camera = views[name].camera
-        template = _template(file, pitch, named)
+        template = _template(file, pitch, whose)
         key_frames = validate_record(KeyFrames, read_json(file), str(file))
         numbers = [key_frame.frame for key_frame in key_frames.key_frames]
         if numbers != sorted(set(numbers)):
@@ -109,17 +109,17 @@ def read_key_frames(
             raise InputError(f"{file}: key_frames", expected, f"{numbers}", todo)
         for n, key_frame in enumerate(key_frames.key_frames):
             inside = f"key_frames[{n}].markings"
-            _require_markings(str(file), inside, key_frame.markings, camera, template)
+            _require_markings(str(file), inside, key_frame.markings, camera, template, whose)
         picked[name] = key_frames
     return {name: picked[name] for name in views if name in picked}
 
 
-def _template(file: Path, pitch: PitchSpec | None, named: bool) -> PitchTemplate | None:
+def _template(file: Path, pitch: PitchSpec | None, whose: str | None) -> PitchTemplate | None:
     if pitch is None:
         expected = "no clicked markings where match.yaml says `pitch: none`"
         todo = "Remove it, or take `pitch: none` out of match.yaml."
         raise InputError(str(file), expected, "a file of them", todo)
-    return PitchTemplate.from_spec(pitch) if named else None
+    return PitchTemplate.from_spec(pitch) if whose else None
 
 
 def _require_markings(
@@ -128,6 +128,7 @@ def _require_markings(
     clicked: ClickedMarkings,
     camera: CameraSpec,
     template: PitchTemplate | None,
+    whose: str | None,
 ) -> None:
     """Raise InputError for unknown markings, and for pixels outside the image."""
     if not (clicked.points or clicked.drawn):
@@ -140,8 +141,11 @@ def _require_markings(
     drawn = [
         (f"{dot}drawn[{n}]", marking.name, marking.xy) for n, marking in enumerate(clicked.drawn)
     ]
-    _require_known(file, points, "a point", None if template is None else template.points)
-    _require_known(file, drawn, "a marking", None if template is None else template.marking_names)
+    _require_known(
+        file, points, f"a point of {whose}", None if template is None else template.points
+    )
+    names = None if template is None else template.marking_names
+    _require_known(file, drawn, f"a marking of {whose}", names)
     for place, _, (pixel,) in points:
         _require_inside(f"{file}: {place}.xy", pixel, camera)
     for place, _, along in drawn:
@@ -160,7 +164,7 @@ def _require_known(
     for place, name, _ in entries:
         if known is not None and name not in known:
             close = get_close_matches(name, known, n=1)
-            expected = f"the name of {kind} of the pitch"
+            expected = f"the name of {kind}"
             todo = f"Did you mean {close[0]!r}?" if close else f"Known: {', '.join(known)}."
             raise InputError(f"{file}: {place}.name", expected, repr(name), todo)
         if name in places:

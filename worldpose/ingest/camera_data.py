@@ -50,7 +50,7 @@ def import_camera_data(
         InputError: a file is invalid or has no frame of the view, or the view has camera data
             already.
     """
-    match = read_match(folder)
+    match = read_match(folder, whose=None)
     views = match.spec.broadcast_views
     if view is None and len(views) == 1:
         (view,) = views

@@ -376,7 +376,7 @@ def _label_frame(
         for each in frames
     ]
     corner, center = (int((each.min(axis=1) < SNAP_M).sum()) for each in apart)
-    if from_corner and center < corner + 2:
+    if from_corner and (center < corner + 2 or 2 * center <= len(places)):
         return frames[0]
     if from_corner:
         notes.append(

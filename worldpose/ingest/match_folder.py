@@ -126,7 +126,10 @@ class MatchFolder:
 
 
 def read_match(
-    folder: str | os.PathLike[str], known: Container[str] = (), pitch: PitchSpec | None = None
+    folder: str | os.PathLike[str],
+    known: Container[str] = (),
+    pitch: PitchSpec | None = None,
+    whose: str | None = "the pitch",
 ) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
@@ -135,6 +138,7 @@ def read_match(
         known: paths in the folder of videos that may be gone, as their results are at hand.
         pitch: that of the settings, whose names clicks have; None = the folder's or the standard
             one. Of a venue of match.yaml without pitch.json, names are checked with `pitch` alone.
+        whose: that pitch in words, for messages; None = the names of clicks are not checked.
 
     Raises:
         InputError: the folder is unreadable (its disk is not mounted, or this user has no
@@ -143,7 +147,7 @@ def read_match(
     """
     folder = Path(folder)
     with reachable(folder):
-        return _read_match(folder, known, pitch)
+        return _read_match(folder, known, pitch, whose)
 
 
 def read_spec(folder: Path) -> MatchSpec:
@@ -167,7 +171,9 @@ def _read_spec(folder: Path) -> MatchSpec:
     return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
-def _read_match(folder: Path, known: Container[str], clicked_on: PitchSpec | None) -> MatchFolder:
+def _read_match(
+    folder: Path, known: Container[str], clicked_on: PitchSpec | None, whose: str | None
+) -> MatchFolder:
     spec = read_spec(folder)
     if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
@@ -181,7 +187,8 @@ def _read_match(folder: Path, known: Container[str], clicked_on: PitchSpec | Non
     _require_one_view(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
-    named = clicked_on is not None or spec.venue is None or pitch_file(folder, spec) is not None
+    if clicked_on is None and spec.venue is not None and pitch_file(folder, spec) is None:
+        whose = None
     clicked_on = clicked_on or pitch
     calibrations = _calibrations(folder, spec)
     return MatchFolder(
@@ -191,9 +198,9 @@ def _read_match(folder: Path, known: Container[str], clicked_on: PitchSpec | Non
         detections=detections,
         pitch=pitch,
         videos=videos,
-        clicked=read_clicked(folder, spec, clicked_on, named=named),
+        clicked=read_clicked(folder, spec, clicked_on, whose),
         stills=_stills(folder, spec),
-        key_frames=read_key_frames(folder, spec, clicked_on, named=named),
+        key_frames=read_key_frames(folder, spec, clicked_on, whose),
         lenses=_lenses(folder, spec, calibrations),
         estimates=_estimates(folder, spec, ".npz"),
         boxes=_boxes(folder, spec, videos, detections),

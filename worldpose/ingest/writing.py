@@ -239,7 +239,7 @@ def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> d
         InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
             nothing is written then.
     """
-    match = read_match(folder)
+    match = read_match(folder, whose=None)
     open_to = {name for name in match.videos if name not in match.detections}
     known = sorted({file.stem for file in _box_files(boxes)} & match.boxes.keys())
     if known:

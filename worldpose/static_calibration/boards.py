@@ -254,16 +254,18 @@ def calibrate_lens(
     )
     count = len(kept)
     spread = (count - 1) / count * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
-    std = np.sqrt(spread)
-    if std[0] > max_focal_std * numbers[0]:
+    bend, bent = _fit_bend(kept, size, model)
+    spread += (bent - numbers) ** 2
+    if np.sqrt(spread[0]) > max_focal_std * numbers[0]:
+        tilt = "Add images in which the board is tilted by 30 to 45 degrees about both axes."
+        bent_m = float(np.abs(bend).max())
+        flatten = f"The board is bent by about {1000.0 * bent_m:.0f} mm: fix it to a flat plate."
         raise InputError(
             f"{camera}: board images",
             expected=f"boards that determine the focal length within {100 * max_focal_std:g} %",
-            found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
-            todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
+            found=f"{numbers[0]:.0f} px with a standard deviation of {np.sqrt(spread[0]):.0f} px",
+            todo=f"{flatten} {tilt}" if bent_m else tilt,
         )
-    bend, bent = _fit_bend(kept, size, model)
-    spread += (bent - numbers) ** 2
     corner = np.array([_corner_factor(each, size, model) for each in left_out])
     corner_std = np.hypot(
         np.sqrt((count - 1) / count * ((corner - corner.mean()) ** 2).sum()),

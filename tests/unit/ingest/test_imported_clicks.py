@@ -294,6 +294,17 @@ def test_places_of_one_quadrant_are_from_where_they_are_points_of_the_pitch(tmp_
     assert [note[: len(said[0])] for note in report.notes] == ([] if any(shift) else said)
 
 
+def test_two_points_by_chance_do_not_make_places_those_from_the_centre_spot(tmp_path):
+    folder = match(tmp_path / "m")
+    # From the centre spot, the first two would be the two penalty marks of one half.
+    labels = np.array([(14.0, 0.0), (10.0, 0.0), (3.0, 4.0), (9.0, 7.0), (16.0, 3.0)])
+    world = labels - [20.0, 10.0]
+    clicks = zip(("({:g},{:g})".format(*at) for at in labels), map(tuple, seen(world)), strict=True)
+    file = cvat(tmp_path / "c.xml", clicks)
+    report = import_clicks(file, folder, pitch=PitchSpec(template="futsal"))
+    assert [at[:2] for at in report.own_points.values()] == [tuple(at) for at in world.tolist()]
+
+
 def test_places_depend_on_the_pitch_of_the_venue_and_names_do_not(tmp_path):
     folder = match(tmp_path / "m")
     with (folder / "match.yaml").open("a") as file:
@@ -452,15 +463,21 @@ def folder(tmp_path):
 
 
 def test_camera_data_are_written_for_the_frames_of_the_video(folder, tmp_path):
+    clicks = folder / "annotations/broadcast_calibration/shot.json"
+    clicks.parent.mkdir(parents=True)
+    marked = {"frame": 1, "markings": {"points": [{"name": "mast", "xy": [5, 6]}]}}
+    clicks.write_text(json.dumps({"contract": 1, "key_frames": [marked]}))
     table = tmp_path / "viz.csv"
     table.write_text("pan,tilt,fov,x_mm,y,z\n1,-9,90,500,-70,15\n2,-9,90,500,-70,15\n")
     target, data = import_camera_data(table, folder, "goal", first=11)
     assert data.frame.tolist() == [11, 12]
     assert "1 of 3 images of goal have no camera data" in data.notes
     assert target == folder / "estimates" / "goal.csv"
-    match = read_match(folder)
+    with pytest.raises(InputError, match="the name of a point of the pitch, found 'mast'"):
+        read_match(folder)  # a venue of the project's settings can have it
+    match = read_match(folder, pitch=PitchSpec(points={"mast": (0.0, 40.0, 10.0)}))
     assert match.camera_data == {"goal": target}
-    assert match.calibrated_views == ("goal",)
+    assert match.calibrated_views == ("goal", "shot")
     again = read_given_camera(match, "goal", target)
     assert again.frame.tolist() == [11, 12]
     assert again.values[0, :7].tolist() == [1, -9, pytest.approx(float("nan"), nan_ok=True)] + [

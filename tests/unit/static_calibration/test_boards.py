@@ -58,6 +58,9 @@ def test_too_few_boards_and_boards_that_face_the_camera_are_refused():
         InputError, match=r"determine the focal length .* tilted by 30 to 45 degrees"
     ):
         calibrate_lens("cam", [view(rng, tilt=0.01, noise=0.5) for _ in range(6)], SIZE)
+    bent = np.random.default_rng(1)
+    with pytest.raises(InputError, match=r"788 px .* of 113 px.*bent by about 10 mm"):
+        calibrate_lens("cam", [view(bent, bend=0.01) for _ in range(12)], SIZE)
 
 
 def drawn(board_image, rng):

@@ -55,7 +55,7 @@ def test_lines_off_their_places_ask_for_the_size_of_an_unmeasured_pitch(stated):
     pitch = PitchTemplate.from_spec(stated or PitchSpec())
     drawn = render_pitch(view, true, None, 1)
     report = calibrate_camera(pitch, people.points(seen), (960, 540), picture=drawn).report
-    told = [each for each in report.decisions if "measure length and width" in each]
+    told = [each for each in report.decisions if "survey its corners" in each]
     assert [each[:34] for each in told] == (
         [] if stated else ["the painted lines lie 2.2 cm off t"]
     )
