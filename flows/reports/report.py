@@ -261,9 +261,11 @@ def _against_truth(
         if reference is not None:
             raise
         return None, truth, f"The results are not scored against {source}: {error}"
+    if not clips and reference is None:
+        return None, truth, ""
     found = f"the run has {len(clips)} clips with people, and a reference is of one"
-    todo = "Export the match, and evaluate clip by clip."
-    return None, truth, f"The results are not scored against {source}: {found}. {todo}"
+    todo = " Export the match, and evaluate clip by clip." if clips else ""
+    return None, truth, f"The results are not scored against {source}: {found}.{todo}"
 
 
 def extent_of(run: Run, match: Match) -> DataSetStatistics:

@@ -84,9 +84,8 @@ class Pictures:
         Raises:
             HTTPException: 404, there is none.
         """
-        still = match.folder.stills.get(owner)
-        if frame is None and still is not None:
-            return Path(still).read_bytes()
+        if frame is None and owner in match.folder.stills:
+            return _find_picture(match, owner, frame).read_bytes()
         return encode_image(self.decode_image(match, owner, frame), "png")
 
     def decode_image(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
@@ -95,10 +94,7 @@ class Pictures:
         Raises:
             HTTPException: 404, there is none.
         """
-        stills, videos = match.folder.stills, match.folder.videos
-        file = (stills if frame is None and owner in stills else videos).get(owner)
-        if file is None:
-            raise HTTPException(404, "there is no picture")
+        file = _find_picture(match, owner, frame)
         name = (match.match_id, owner, frame, file_mark(file))
         with self._lock:
             if name not in self._decoded:
@@ -248,6 +244,17 @@ def warm_up(context: PageContext) -> None:
             continue  # the queue shows its error
     gc.collect()
     gc.freeze()  # collecting long journals as garbage would delay requests
+
+
+def _find_picture(match: Match, owner: str, frame: int | None) -> Path:
+    """Return the still or the video that has an image; 404 without one, or if it is gone."""
+    stills, videos = match.folder.stills, match.folder.videos
+    kind, files = ("still", stills) if frame is None and owner in stills else ("video", videos)
+    file = files.get(owner)
+    if file is None or not file.exists():
+        said = "there is no picture" if file is None else f"the {kind} is not at hand"
+        raise HTTPException(404, said)
+    return file
 
 
 def _read(match: Match, owner: str, frame: int | None, file: Path) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from fastapi.responses import Response
@@ -10,9 +11,16 @@ from data_contracts.arrays import Image
 
 
 def file_mark(file: Path) -> tuple[str, int, int]:
-    """Return a file's path, size [byte] and time of its last change [ns]; of another, others."""
-    status = file.stat()
-    return str(file), status.st_size, status.st_mtime_ns
+    """Return a path, its size [byte] and the time of its last change [ns].
+
+    Of a folder, also those of its files: writing one anew does not change the folder's own.
+    """
+    states = [file.stat()]
+    if file.is_dir():
+        with os.scandir(file) as entries:
+            states += [entry.stat() for entry in entries if entry.is_file()]
+    size, changed = zip(*((each.st_size, each.st_mtime_ns) for each in states), strict=True)
+    return str(file), sum(size), max(changed)
 
 
 def encode_image(image: Image, kind: str) -> bytes:

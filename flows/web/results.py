@@ -202,7 +202,8 @@ def routes(context: PageContext) -> APIRouter:
             run_id = run.record.run_id
             write_report(context.store, match, file, run_id=run_id, videos=False)
 
-        given = [*match.folder.clicked, *match.folder.calibrations]
+        truth = map(file_mark, sorted((match.folder.folder / "reference").glob("*")))
+        given = [*match.folder.clicked, *match.folder.calibrations, *truth]
         shows = f"{_people_said(match)} {match.journal.tip} {given} {footage_mark(match)}"
         return FileResponse(
             files.get(run, "report.html", draw, shows),

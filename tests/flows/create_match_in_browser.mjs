@@ -120,38 +120,73 @@ for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
   await shoot(page, `ready_${width}`);
 }
 // Another page saves the form: this one says so, and shows that form.
-async function takeOther(fps) {
-  await page.evaluate(async ([path, fps]) => {
+const saveElsewhere = (fps) =>
+  page.evaluate(async ([path, fps]) => {
     const [{ form_secret }, { revision, content }] = await Promise.all(["/api/session", path].map(async (each) => (await fetch(each)).json()));
     [content.match_id, content.cameras[1].fps] = ["cup_other", fps];
     const headers = { "content-type": "application/json", "x-form-secret": form_secret };
     await fetch(`${path}/form`, { method: "POST", headers, body: JSON.stringify({ revision, content }) });
   }, [`/api/drafts/${seen.link.split("/").at(-1)}`, fps]);
+async function takeOther(fps) {
+  await saveElsewhere(24);
   await page.fill('[data-field="fps"]', "26");
+  await page.waitForSelector("[data-again]");
+  await saveElsewhere(fps); // and once more
   await page.click("[data-again]");
+  await page.waitForSelector("[data-again]", { state: "detached" });
 }
-await takeOther(50);
+await takeOther(30);
 seen.again = [await page.inputValue('[data-field="match_id"]'), await page.inputValue('[data-field="fps"]')];
-// On a clock of twice the rate, the moment of frame 5 is frame 10, and 6 later with an offset of 6.
+// On a clock of 1.2 times the rate, the moment of frame 5 is frame 6, and 4 later with an offset of 4. All videos move
+// together by 6 frames of that clock with 5 of the other one, and past the first frame and back.
 await page.click("[data-offsets]");
 await frames.nth(0).fill("5");
-await frames.nth(1).fill("16");
+await frames.nth(1).fill("10");
+for (const [word, times] of [["all videos ▶", 5], ["◀ all videos", 12], ["all videos ▶", 12]])
+  for (let k = 0; k < times; k++) await page.click(`dialog >> text=${word}`);
+seen.together = [await frames.nth(0).inputValue(), await frames.nth(1).inputValue()];
 seen.offset = await page.locator("dialog figcaption").nth(1).innerText();
 await page.click("dialog >> text=Cancel");
 await takeOther();
-// The form is left while the server is away: it is saved when the server is back.
-await page.route("**/api/drafts/**", (route) => route.abort());
-await page.fill('[data-field="match_id"]', "cup_final");
+// The form is left while the server is away: it is saved when the server is back. The answer to a save broke off before.
+let cut = 0;
+await page.route("**/api/drafts/**", async (route) => {
+  if (cut++) return route.abort();
+  await route.fetch();
+  return route.fulfill({ status: 200, contentType: "application/json", body: "{" });
+});
+await page.fill('[data-field="match_id"]', "cup_half");
 await page.waitForSelector('[data-saving="not saved"]');
+const again = page.waitForEvent("requestfailed", (request) => request.postData()?.includes("cup_final"));
+await page.fill('[data-field="match_id"]', "cup_final");
+await again;
 await page.click("a.home");
 const saved = page.waitForResponse((answer) => answer.url().endsWith("/form") && answer.ok());
 await page.unroute("**/api/drafts/**");
 await saved;
 await page.goto(seen.link);
 await page.waitForSelector("text=Nothing is missing");
+// What changes while it is being finished is not saved: nothing is left to save it to.
+await page.route("**/finish", async (route) => {
+  const response = await route.fetch();
+  await page.fill('[data-field="fps"]', "27");
+  await route.fulfill({ response });
+});
+const isUnsaved = () => page.evaluate(() => !dispatchEvent(new Event("beforeunload", { cancelable: true })));
 await page.click("[data-finish]");
 await page.waitForSelector("text=cup_final");
 await shoot(page, "arrived");
+seen.unsaved = [await isUnsaved()];
+// Nor is a form whose match is discarded on another page.
+await page.click("[data-create]");
+await page.waitForSelector("[data-missing]");
+await page.evaluate(async (path) => {
+  const { form_secret } = await (await fetch("/api/session")).json();
+  await fetch(`${path}/removal`, { method: "POST", headers: { "content-type": "application/json", "x-form-secret": form_secret }, body: "{}" });
+}, `/api/drafts/${page.url().split("/").at(-1)}`);
+await page.fill('[data-field="fps"]', "27");
+await page.waitForSelector("text=finished or discarded");
+seen.unsaved.push(await isUnsaved());
 // The restart was meant: while the server was away, the browser said so in its console.
-seen.errors = seen.errors.filter((text) => !/ERR_CONNECTION|ERR_EMPTY|ERR_FAILED|409|Failed to fetch/.test(text));
+seen.errors = seen.errors.filter((text) => !/ERR_CONNECTION|ERR_EMPTY|ERR_FAILED|409|422|Failed to fetch/.test(text));
 await tell(seen);

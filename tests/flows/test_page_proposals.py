@@ -11,10 +11,12 @@ import yaml
 from camera_builders import plain_camera
 from chromium import IN_BROWSER, drive
 from command_line import TINY, succeed, worldpose
+from fastapi import HTTPException
 from page_client import MATCH
 
 from flows.registering import open_match
 from flows.web.calibration import Pictures
+from flows.web.images import file_mark
 from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate
@@ -67,6 +69,19 @@ def test_lines_are_sought_in_the_still_that_took_the_place_of_another(tmp_path):
         match = SimpleNamespace(match_id="final", folder=known)
         shown.append(pictures.decode_image(match, "cam01", None).mean())
     assert shown == [40, 200]
+    still.unlink()
+    for look in (pictures.decode_image, pictures.png):
+        with pytest.raises(HTTPException, match="the still is not at hand"):
+            look(match, "cam01", None)
+
+
+def test_an_image_that_is_written_anew_in_its_folder_gives_another_mark(tmp_path):
+    image = tmp_path / "000.png"
+    image.write_bytes(b"dark")
+    (tmp_path / "left_out").symlink_to("nowhere")
+    mark = file_mark(tmp_path)
+    image.write_bytes(b"bright")
+    assert file_mark(tmp_path) != mark == (mark[0], tmp_path.stat().st_size + 4, mark[2])
 
 
 @pytest.fixture

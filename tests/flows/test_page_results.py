@@ -236,3 +236,8 @@ def test_the_report_is_drawn_again_with_the_journal_and_while_its_folder_is_away
     for folder, said in ((str(tmp_path / "away"), "report 3"), (here.folder, "report 2")):
         store.register(here.model_copy(update={"folder": folder}))
         assert ada.get(f"{MATCH}/results/report").text == said
+    copy = shutil.copytree(here.folder, tmp_path / "copy")
+    store.register(here.model_copy(update={"folder": str(copy)}))
+    assert ada.get(f"{MATCH}/results/report").text == "report 4"
+    (copy / "reference" / "joints.npz").write_bytes(b"PK")
+    assert ada.get(f"{MATCH}/results/report").text == "report 5"

@@ -229,3 +229,8 @@ def test_a_reference_that_is_not_scored_is_said(tiny, project_copy, tmp_path, mo
     match, run = open_match(store, TINY), open_run(str(project_copy), TINY)
     *_, said = report._against_truth(store, run, match, str(tiny / "reference"))
     assert "the run has 2 clips" in said
+    monkeypatch.setattr(report, "find_clips", lambda record: ())
+    *_, said = report._against_truth(store, run, match, str(tiny / "reference"))
+    assert "the run has 0 clips" in said and "clip by clip" not in said
+    shutil.copy(tiny / "reference" / "joints.npz", own)
+    assert report._against_truth(store, run, match, None)[2] == ""  # nobody asked for it

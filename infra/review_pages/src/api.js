@@ -60,9 +60,10 @@ async function ask(method, path, body) {
     location.assign("/login");
     throw new Refusal(401, { error: "log in first" });
   }
-  const content = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw new Refusal(answer.status, content);
-  return content;
+  if (!answer.ok) throw new Refusal(answer.status, await answer.json().catch(() => ({})));
+  return answer.json().catch(() => {
+    throw new Error("The answer of the server broke off. Try again.");
+  });
 }
 
 export async function getBytes(path) {

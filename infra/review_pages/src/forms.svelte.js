@@ -25,7 +25,7 @@ class Form {
   lost = $state("");
   isOvertaken = $state(false); // another page saved the form, and what changed here is not in it
   revision = 0; // of the saved form that `content` began with
-  #sent = ""; // content of the last save
+  #sent = new Set(); // contents whose saves had no answer: the server may have any of them
   #isSending = false;
   #timer = null;
   #last = Promise.resolve();
@@ -49,7 +49,7 @@ class Form {
     if (!this.draft || found.revision >= this.draft.revision) this.draft = found; // else asked for before the last save
     if (this.content === null) this.take();
     if (this.#isSending || this.draft.revision === this.revision) return;
-    if (JSON.stringify(this.draft.content) === this.#sent) this.revision = this.draft.revision; // the answer was lost
+    if (this.#sent.has(JSON.stringify(this.draft.content))) this.revision = this.draft.revision; // the answer was lost
     else if (this.saving === "saved") this.take();
     else [this.isOvertaken, this.saving] = [true, "not saved"];
   }
@@ -59,6 +59,7 @@ class Form {
     this.content = { cameras: [], clips: [], ...$state.snapshot(this.draft.content) };
     this.revision = this.draft.revision;
     this.isOvertaken = false;
+    this.#sent.clear();
     this.settle();
   }
 
@@ -83,19 +84,22 @@ class Form {
   async #send() {
     if (this.isOvertaken || this.saving === "saved") return;
     const content = filled($state.snapshot(this.content));
-    this.#sent = JSON.stringify(content);
+    const sent = JSON.stringify(content);
+    this.#sent.add(sent);
     this.#isSending = true;
     const answer = await post(`${this.path}/form`, { revision: this.revision, content }).catch((error) => ({ error }));
     this.#isSending = false;
     if (!answer.error) {
       this.revision = answer.revision;
       this.lost = "";
-      if (JSON.stringify(filled($state.snapshot(this.content))) === this.#sent) this.settle();
+      this.#sent.clear();
+      if (JSON.stringify(filled($state.snapshot(this.content))) === sent) this.settle();
       this.show(answer);
     } else if (unsaved.has(this.id)) this.#explain(answer.error);
   }
 
   async #explain(error) {
+    if (error.body?.where === "draft") this.settle(); // it is finished or discarded
     this.saving = "not saved";
     if (error.status === 409) {
       await this.load(); // it is overtaken, or the answer to a save was lost
