@@ -7,6 +7,7 @@ import sqlite3
 import ssl
 import subprocess
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -88,6 +89,21 @@ def require_answers_for_its_run_alone():
     assert ask(**right, Host="evil.example") == 421
     assert ask(**right, Origin="http://evil.example") == 403
     return login
+
+
+def test_a_killed_run_leaves_no_folder_of_its_server(kept):
+    run = "import os, time; from flows.orchestration.prefect_environment import prefect_server as s"
+    run += "\nwith s() as wait:\n wait()\n print(os.environ['PREFECT_HOME'], flush=True)"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{run}\n time.sleep(600)"], stdout=subprocess.PIPE, text=True
+    ) as killed:
+        home = Path(killed.stdout.readline().strip())
+        assert (home / DATABASE_FILE).is_file()
+        killed.kill()
+    deadline = time.monotonic() + 60
+    while home.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not home.exists()
 
 
 def test_a_prefect_server_without_a_login_does_not_start():
