@@ -199,12 +199,15 @@ async function refuse() {
 // Arrow keys in a camera whose clips are not in rising order; the other cameras cannot be asked.
 async function step() {
   let [run, saving, early] = ["0001", 0, 0];
-  await at_server("match/final", (path, search) => {
+  await at_server("match/final", async (path, search) => {
     if (path === "/api/session") return session;
     if (path === "/api/matches/final") return matchOf(run, []);
     if (path.endsWith("/results")) return { ...resultsOf(run), clips: [] };
-    if (path.endsWith("/corrections")) await wait((saving += 1) && 5);
-    if (path.endsWith("/corrections")) saving -= 1;
+    if (path.endsWith("/corrections")) {
+      saving = 1;
+      await wait(5);
+      saving = 0;
+    }
     if (path.endsWith("/runs")) return [];
     if (path.endsWith("/queue")) return { left: 0, people: 1, next: [] };
     if (path.endsWith("/views")) return [422, { error: "no calibration of south" }];
