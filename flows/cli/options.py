@@ -112,7 +112,8 @@ SHARED: Final = _described(_shared, {})
 def command_of(function: Callable[..., None]) -> Callable[..., None]:
     """Return a command for Typer, from a function that says only what is its own.
 
-    A parameter `store` becomes `--project`, whose store must exist. Every command has `--json`.
+    A parameter `store` becomes `--project`, whose store is opened at its first use: a command
+    checks its own options before. Every command has `--json`.
     """
     if hasattr(function, "__signature__"):  # it is one
         return function
@@ -131,9 +132,9 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
 
         console.output.quiet = as_json
         if takes_store:
-            from worldpose.store.store import Store
+            from worldpose.store.store import LateStore
 
-            given["store"] = Store.open(given.pop("project"))
+            given["store"] = LateStore(given.pop("project"))
         function(**given)
 
     about = (inspect.getdoc(function) or "").partition("\n\nOptions:\n")[0]

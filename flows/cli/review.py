@@ -336,7 +336,7 @@ def import_annotations(
     match: MatchId,
     file: Annotated[Path, typer.Argument(metavar="FILE")],
     exported: Path,
-    who: str,
+    who: Annotated[str, typer.Option(envvar="WORLDPOSE_REVIEWER")],
     form: AnyFormatOption = None,
 ) -> None:
     """Import an annotator's changes as corrections, found by comparison with the export.
@@ -346,6 +346,7 @@ def import_annotations(
     Options:
         file: File of the annotation tool.
         exported: The file exported.json of the export.
+        who: Name of the annotator.
     """
     changes, kept = import_people(
         store, lambda: open_match(store, match), file, exported, form, who=who

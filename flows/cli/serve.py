@@ -134,25 +134,25 @@ def serve(
     access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
     secrets = secrets_of(plan, access.token)
     # A token that the operator chose is not printed: the output can go to a log.
-    login = "/login" if token or users else f"/login#token={access.token}"
+    pages = f"{plan.pages}/login{'' if token or users else f'#token={access.token}'}"
     token_at = "the file --users" if users else PAGES_TOKEN if token else "this address"
-    pages = f"{plan.pages}{login}  open it in a browser; the token is in {token_at}"
     serve_all(
         plan,
         secrets,
-        lambda: _print_addresses(plan, pages, asks_for_login=secrets.prefect is not None),
+        lambda: _print_addresses(plan, pages, token_at, asks_for_login=secrets.prefect is not None),
         lambda text: line(text, to=errors),
     )
 
 
-def _print_addresses(plan: ServePlan, pages: str, *, asks_for_login: bool) -> None:
+def _print_addresses(
+    plan: ServePlan, pages: str, pages_token_at: str, *, asks_for_login: bool
+) -> None:
     """Print the addresses, and where secrets are instead of the secrets."""
     variable = SERVER_LOGIN if plan.owns_prefect else CLIENT_LOGIN
     is_kept = plan.owns_prefect and variable not in os.environ
     login_at = plan.state_folder.prefect_login if is_kept else variable
     is_given = METRICS_TOKEN in os.environ
     token_at = METRICS_TOKEN if is_given else plan.state_folder.metrics_token
-    metrics = f"http://{plan.host}:{plan.metrics_port}/metrics"
     login = f"its login is in {login_at}"
     if not asks_for_login:
         login = "which asks for no login: others may use it"
@@ -160,12 +160,18 @@ def _print_addresses(plan: ServePlan, pages: str, *, asks_for_login: bool) -> No
         "pages": pages,
         "status page": f"{plan.pages}/status",
         "inbox": f"{plan.inbox}",
-        "Prefect": f"{plan.dashboard}  {login}",
-        "metrics": f"{metrics}  its token is in {token_at}",
+        "Prefect": plan.dashboard,
+        "metrics": f"http://{plan.host}:{plan.metrics_port}/metrics",
     }
-    lines = (f"{name:<15}{text}" for name, text in told.items())
+    remarks = {
+        "pages": f"open it in a browser; the token is in {pages_token_at}",
+        "Prefect": login,
+        "metrics": f"its token is in {token_at}",
+    }
+    lines = (f"{name:<15}{at}  {remarks.get(name, '')}".rstrip() for name, at in told.items())
     end = "Ctrl-C ends it; the next start resumes"
-    answer({"project": plan.project, **told}, f"serving {plan.project}", *lines, end)
+    found = {"project": plan.project, **told, "remarks": remarks}
+    answer(found, f"serving {plan.project}", *lines, end)
 
 
 def _test_alerts(folder: StateFolder) -> None:

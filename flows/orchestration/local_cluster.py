@@ -9,7 +9,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flows.method import task_modules
@@ -135,23 +134,22 @@ class LostWorkersError(WorldposeError):
 def require_room(failure: BaseException, project: str) -> None:
     """Raise StoreError if a failure of Prefect was caused by a full disk; else return.
 
-    Prefect reports database failures only as `500`. Its database is in the project, or in a
-    temporary folder.
+    Prefect reports database failures only as `500`. Its database is in a temporary folder.
 
     Raises:
         StoreError: the disk of the store or of Prefect's database is full.
     """
     if isinstance(failure, StoreError):
         return
-    folders = [Path(tempfile.gettempdir())]
+    folders = {tempfile.gettempdir(): "Prefect keeps its database"}
     if "://" not in project:
-        folders.insert(0, Path(project))
-    for folder in folders:
+        folders = {project: "results are written", **folders}
+    for folder, use in folders.items():
         free = shutil.disk_usage(folder).free
         if free < LITTLE_BYTES:
             raise StoreError(
-                f"{folder}: No space left on device ({free} bytes are free), where Prefect keeps "
-                "its database. Free space there and run again; published results are untouched."
+                f"{folder}: No space left on device ({free} bytes are free), where {use}. "
+                "Free space there and run again; published results are untouched."
             ) from failure
 
 

@@ -34,6 +34,8 @@ from worldpose.errors import InputError, WorldposeError
 
 DATABASE_FILE = "prefect.db"
 """Name of the database file in PREFECT_HOME."""
+RUN_HOME = "worldpose-prefect-"
+"""Begin of the name of PREFECT_HOME of a server that lasts as long as its run."""
 START_SECONDS = 120.0
 """The very first start creates Prefect's database, which took 15 s on two busy cores."""
 
@@ -215,7 +217,7 @@ def prefect_server(*, is_local: bool = False) -> Iterator[Callable[[], None]]:
             yield lambda: None
             return
         with (
-            tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as home,
+            tempfile.TemporaryDirectory(prefix=RUN_HOME) as home,
             _environment({"PREFECT_HOME": home}),
             _environment(one_authority(Path(home)) if is_local else {}),
             _environment({CLIENT_LOGIN: new_login()}),

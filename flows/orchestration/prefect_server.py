@@ -17,11 +17,12 @@ import socket
 import sys
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from flows.orchestration.prefect_environment import SERVER_LOGIN
+from flows.orchestration.prefect_environment import RUN_HOME, SERVER_LOGIN
 from flows.web.host_guard import SAFE_METHODS, HostGuard
 from flows.web.http_server import serve_http
 from worldpose.errors import UsageError
@@ -177,7 +178,12 @@ def main() -> None:
 
 
 def _end_with_parent() -> None:
+    """End when standard input closes, and remove the folder that a killed run leaves behind."""
     sys.stdin.buffer.read()
+    home = os.environ.get("PREFECT_HOME", "")
+    if Path(home).name.startswith(RUN_HOME):
+        with suppress(OSError):  # there is no such program
+            os.execvp("rm", ("rm", "-rf", home))  # ends all threads, which would write on
     os._exit(0)
 
 

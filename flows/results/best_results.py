@@ -121,10 +121,17 @@ def open_results(store: Store, match_id: str, run_id: str = LATEST) -> Run:
 
 def describe_age(store: Store, record: RunRecord) -> str:
     """Return a sentence about a later run, or about why the latest is out of date; or nothing."""
+    if later := describe_later(store, record):
+        return later
+    now = read_summary(store, record.match_id)
+    return f"These results are {now.words}. {now.todo}" if now.kind == "outdated" else ""
+
+
+def describe_later(store: Store, record: RunRecord) -> str:
+    """Return a sentence about a later run; or nothing."""
     latest = store.run(record.match_id)
     if latest.run_id == record.run_id:
-        now = read_summary(store, record.match_id)
-        return f"These results are {now.words}. {now.todo}" if now.kind == "outdated" else ""
+        return ""
     lacks = "" if find_clips(latest) else " and has no people"
     return (
         f"These are results of run {record.run_id}. The later run {latest.run_id} "

@@ -78,7 +78,8 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/evidence")
     def evidence(match_id: str, request: str) -> dict[str, Any]:
         found = evidence_of(match_id, request)
-        every = max((-(-len(curve.values) // CURVE_VALUES) for curve in found.curves), default=1)
+        count = max((len(curve.values) for curve in found.curves), default=1)
+        every = max(1, -(-count // CURVE_VALUES))
         return {
             "pictures": [picture.caption for picture in found.pictures],
             "tables": [
@@ -91,6 +92,7 @@ def routes(context: PageContext) -> APIRouter:
             ],
             "frames_per_value": every,
             "first_frame": found.first_frame,
+            "last_frame": found.first_frame + count - 1,
             "video": found.video,
             "clicked": found.clicked,
         }
@@ -120,7 +122,10 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def thin_curve(values: NDArray[np.float64], every: int) -> NDArray[np.float64]:
-    """Thin values (n,) to the least and largest of each 2 * `every`, in order; NaN without any."""
+    """Thin values (n,) to the least and largest of each 2 * `every`, in order; NaN without any.
+
+    A gap that covers no such stretch is not in the curve: it is narrower than a pixel of its plot.
+    """
     if every <= 1:
         return values
     padded = np.pad(values, (0, -len(values) % (2 * every)), constant_values=np.nan)

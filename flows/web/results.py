@@ -24,7 +24,7 @@ from flows.reports.viewer import describe_video, viewer_clip
 from flows.results.best_results import (
     Origin,
     clips_of,
-    describe_age,
+    describe_later,
     find_clips,
     joint_tracks,
     open_results,
@@ -262,7 +262,7 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     return {
         "run": record.run_id,
         "state": record.state,
-        "later": describe_age(context.store, record),
+        "later": describe_later(context.store, record),
         "formats": list(formats),
         "purposes": EXPORT_PURPOSES,
         "clips": [

@@ -86,8 +86,11 @@ def test_what_prefect_raises_is_the_disk_only_where_that_is_full(tmp_path, monke
     require_room(failure, "s3://bucket/project")
     usage = shutil.disk_usage(tmp_path)._replace(free=4096)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(StoreError, match=r"No space left on device \(4096 bytes are free\)"):
+    said = r"No space left on device \(4096 bytes are free\), where "
+    with pytest.raises(StoreError, match=f"{said}results are written"):
         require_room(failure, str(tmp_path))
+    with pytest.raises(StoreError, match=f"{said}Prefect keeps its database"):
+        require_room(failure, "s3://bucket/project")
 
 
 @pytest.mark.parametrize(

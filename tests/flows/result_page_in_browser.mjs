@@ -22,6 +22,11 @@ await page.keyboard.press("ArrowRight");
 await page.click("[data-play]");
 await page.waitForFunction((first) => Number(document.querySelector("[data-scene]").dataset.frame) !== first + 8, seen.first);
 await page.click("[data-play]");
+await page.locator("[data-scrub]").focus();
+for (let k = 0; k < 4; k++) await page.keyboard.down("Space"); // held, it counts once
+seen.held = await page.getAttribute("[data-play]", "aria-pressed");
+await page.keyboard.up("Space");
+await page.keyboard.press("Space");
 await page.selectOption("[aria-label=Camera]", "cam00");
 await page.waitForTimeout(500);
 await shoot(page, "through_cam00");
@@ -29,7 +34,7 @@ await page.click(".people button >> nth=0");
 await page.waitForTimeout(500);
 await shoot(page, "follow");
 // A download that cannot be written says why on this page.
-await page.route("**/exports/usd", (route) => route.fulfill({ status: 422, json: { error: "needs the extra usd" } }));
+await page.route("**/exports/usd?*", (route) => route.fulfill({ status: 422, json: { error: "needs the extra usd" } }));
 await page.click("[data-downloads] a >> text=/^usd$/");
 seen.refused = await page.locator("[role=alert] >> text=needs the extra").innerText();
 seen.pages = page.context().pages().length;

@@ -51,7 +51,7 @@ const trackOf = (id, name) => ({ id, name, seen: { north: 1 }, segments: [[100, 
 // A new run while the page is open; two names at once; two downloads at once.
 async function showNewRun() {
   let [run, slow] = ["0001", 0];
-  const [asked, names, sent, written] = [[], {}, [], []];
+  const [asked, names, sent, written, crops] = [[], {}, [], [], []];
   await at_server("match/final", async (path, search, body) => {
     if (path.includes("/scenes/")) asked.push(search);
     if (path.includes("/scenes/")) return [500, { error: "stub" }];
@@ -68,9 +68,10 @@ async function showNewRun() {
       sent.push(edit.name);
       names[edit.person] = edit.name;
     }
-    if (!path.includes("/identities/")) return null;
+    if (path.endsWith("/crop")) crops.push(new URLSearchParams(search).get("run_id"));
+    if (!path.includes("/identities/") || path.endsWith("/crop")) return null;
     await wait(slow);
-    return { clip: "half", fps: 25, first_frame: 100, frame_count: 200, step: 1, pitch: null, roster: [], events: [], has_video: false, joins: [], people: [7, 8].map((id) => trackOf(id, names[id] ?? null)) };
+    return { clip: "half", fps: 25, first_frame: 100, frame_count: 200, step: 1, pitch: null, roster: [], events: [], has_video: true, joins: [], people: [7, 8].map((id) => trackOf(id, names[id] ?? null)) };
   });
   await page.click("summary >> text=Metrics per camera");
   await page.click("summary >> text=Clocks of the cameras");
@@ -95,8 +96,12 @@ async function showNewRun() {
     await page.fill('input[aria-label="Name"]', name);
     await page.keyboard.press("Enter");
   }
+  await page.dblclick('[data-person="7"]'); // its name waits, and is neither lost nor sent again
+  seen.begun = await page.inputValue('input[aria-label="Name"]');
+  await page.keyboard.press("Enter");
   await wait(4);
   seen.names = sent;
+  seen.crops = [...new Set(crops)];
 }
 
 const held = async (key, count) => {
@@ -122,7 +127,7 @@ async function ask() {
     if (path.endsWith("/evidence") && !isThere) return [500, { error: "no memory" }];
     if (path.endsWith("/evidence")) {
       const curves = [{ title: "error", values: Array(135000).fill(0.5) }];
-      return { pictures: [], tables: [{ title: "Joins", columns: ["a"], rows: [["one"]] }], curves, first_frame: 0, frames_per_value: 1, video: "north", clicked: [] };
+      return { pictures: [], tables: [{ title: "Joins", columns: ["a"], rows: [["one"]] }], curves, first_frame: 0, last_frame: 200000, frames_per_value: 2, video: "north", clicked: [] };
     }
     if (path.endsWith("/corrections")) removed.push(body.edits[0].edit.frame);
     if (path.endsWith("/decisions")) {
@@ -137,6 +142,9 @@ async function ask() {
   await evidence.locator("button >> text=Try again").click();
   await evidence.locator("[data-outlier]").first().waitFor();
   seen.curves = await evidence.locator("polyline").count();
+  const box = await evidence.locator("[data-curve] svg").boundingBox();
+  await page.mouse.move(box.x + box.width - 1, box.y + 5);
+  seen.near = await evidence.locator("h3 .soft").innerText();
   await page.click("article.open .question");
   await page.keyboard.press("v");
   await evidence.locator(".note >> text=the video is damaged").waitFor();
@@ -190,14 +198,21 @@ async function refuse() {
 
 // Arrow keys in a camera whose clips are not in rising order; the other cameras cannot be asked.
 async function step() {
-  await at_server("match/final", (path, search) => {
+  let [run, saving, early] = ["0001", 0, 0];
+  await at_server("match/final", async (path, search) => {
     if (path === "/api/session") return session;
-    if (path === "/api/matches/final") return matchOf("0001", []);
-    if (path.endsWith("/results")) return { ...resultsOf("0001"), clips: [] };
+    if (path === "/api/matches/final") return matchOf(run, []);
+    if (path.endsWith("/results")) return { ...resultsOf(run), clips: [] };
+    if (path.endsWith("/corrections")) {
+      saving = 1;
+      await wait(5);
+      saving = 0;
+    }
     if (path.endsWith("/runs")) return [];
     if (path.endsWith("/queue")) return { left: 0, people: 1, next: [] };
     if (path.endsWith("/views")) return [422, { error: "no calibration of south" }];
     if (!path.endsWith("/detections/north")) return [404, {}];
+    early += saving;
     const frame = Number(new URLSearchParams(search).get("frame") ?? 150);
     const people = [{ detection: 0, box: [10, 10, 50, 90], score: 1, keypoints: [[30, 30]], confidence: [1] }];
     return { frame, frames: [[200, 299], [100, 199]], size: [100, 100], has_picture: false, joints: ["nose"], bones: [], free: 1, note: "", cameras: ["north"], people };
@@ -210,6 +225,10 @@ async function step() {
   await page.locator("aside > table tbody tr").click();
   await page.locator("aside [role=alert]").waitFor({ timeout: 3000 }).catch(() => {});
   seen.views = await page.locator("aside [role=alert]").allInnerTexts();
+  await page.keyboard.press("x");
+  run = "0002"; // its people are shown when the correction is saved, and none is chosen
+  await wait(7);
+  seen.renewed = [early, await page.locator("aside > table tbody tr").count(), await page.locator("tr.chosen").count()];
 }
 
 await showNewRun();

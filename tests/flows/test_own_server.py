@@ -2,11 +2,13 @@
 
 import dataclasses
 import http.client
+import json
 import os
 import sqlite3
 import ssl
 import subprocess
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -15,6 +17,8 @@ import psutil
 import pytest
 from distributed import Client, Security
 
+from flows.cli import console
+from flows.cli.serve import _print_addresses
 from flows.orchestration import prefect_environment
 from flows.orchestration.prefect_environment import (
     AUTHORITIES,
@@ -90,6 +94,21 @@ def require_answers_for_its_run_alone():
     return login
 
 
+def test_a_killed_run_leaves_no_folder_of_its_server(kept):
+    run = "import os, time; from flows.orchestration.prefect_environment import prefect_server as s"
+    run += "\nwith s() as wait:\n wait()\n print(os.environ['PREFECT_HOME'], flush=True)"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{run}\n time.sleep(600)"], stdout=subprocess.PIPE, text=True
+    ) as killed:
+        home = Path(killed.stdout.readline().strip())
+        assert (home / DATABASE_FILE).is_file()
+        killed.kill()
+    deadline = time.monotonic() + 60
+    while home.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not home.exists()
+
+
 def test_a_prefect_server_without_a_login_does_not_start():
     server = [sys.executable, "-m", "flows.orchestration.prefect_server", "--host", "0.0.0.0"]
     environment = without_secrets(os.environ)
@@ -97,6 +116,17 @@ def test_a_prefect_server_without_a_login_does_not_start():
     assert said.returncode != 0
     assert SERVER_LOGIN in said.stderr
     assert "openssl" in said.stderr
+
+
+def test_addresses_and_remarks_of_a_service_are_apart_in_its_json(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(console.output, "quiet", True)
+    plan = ServePlan(
+        project=str(tmp_path), inbox=tmp_path, state=tmp_path / "state", prefect="http://x:1/api"
+    )
+    _print_addresses(plan, "http://x:2/login", "this address", asks_for_login=True)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["pages"], told["Prefect"]) == ("http://x:2/login", plan.dashboard)
+    assert told["remarks"]["pages"] == "open it in a browser; the token is in this address"
 
 
 def test_a_server_that_asks_for_another_login_is_named(server, monkeypatch):

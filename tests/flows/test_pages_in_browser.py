@@ -156,12 +156,15 @@ def test_pages_lose_and_repeat_nothing_at_a_slow_or_refusing_server(tmp_path):
     assert seen["after"] == ["north\t2", f"{plot}0002", 0]
     assert seen["scenes"] == ["?run_id=0001", "?run_id=0002"]
     # What is asked for while something is saved or written waits for its turn.
-    assert seen["names"] == ["kane", "rice"]
+    assert (seen["begun"], seen["names"]) == ("kane", ["kane", "rice"])
+    assert seen["crops"] == ["0001", "0002"]
     assert seen["written"] == ["usd?run_id=0002", "c3d?run_id=0002"]
     # A held key counts once, but moves on.
     assert (seen["removed"], seen["row"], seen["decided"]) == ([1], "4", ["q1"])
     assert (seen["curves"], seen["tables"]) == (1, 1)
+    assert seen["near"] == "near frame 200000"
     assert (seen["drawn"], seen["same"], seen["other"], seen["kept"]) == (0, "saved", "refused", 1)
     assert seen["refused"] == "north.png: expected a PNG image, found damaged bytes"
     assert seen["frame"] == "north, frame 151"
     assert seen["views"] == ["no calibration of south"]
+    assert seen["renewed"] == [0, 1, 0]

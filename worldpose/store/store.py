@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,12 +21,7 @@ from data_contracts.run import (
     RunRecord,
 )
 from data_contracts.work import Work
-from worldpose.errors import (
-    CorruptionError,
-    InputError,
-    NondeterminismError,
-    StoreError,
-)
+from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
 from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point
 from worldpose.store.documents import seal, unseal, verify_published
 from worldpose.store.paths import (
@@ -339,6 +335,18 @@ class Store:
                 "must give the same bytes. The published result stays. Report the stage."
             )
         return theirs
+
+
+class LateStore(Store):
+    """The store of the project at `url`, which is opened at its first use."""
+
+    def __init__(self, url: str) -> None:
+        self._given = url
+
+    @cached_property
+    def blobs(self) -> Blobs:  # type: ignore[override]
+        """Files of the project."""
+        return Store.open(self._given).blobs
 
 
 def open_blobs(url: str) -> Blobs:

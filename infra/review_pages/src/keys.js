@@ -7,8 +7,8 @@ export function isTyping(event) {
   return event.defaultPrevented || event.isComposing || Boolean(event.target.closest?.(FIELDS)) || document.querySelector("dialog[open]") !== null;
 }
 
-// Whether a held key repeats what its first press did: only moving on may be repeated.
-export const isHeld = (event) => event.repeat && !/^(Arrow\w+|[jk])$/.test(event.key);
+// Whether a held key repeats what its first press did: only moving on may be repeated, as by `more` keys of a part.
+export const isHeld = (event, more = "") => event.repeat && !/^(Arrow\w+|Tab|[-+=jk])$/.test(event.key) && !more.includes(event.key);
 
 // The part of a page that was used last has the shortcuts; a page with one part has no areas.
 let area = "";

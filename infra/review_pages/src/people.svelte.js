@@ -104,6 +104,14 @@ export class People {
     return this.#last;
   }
 
+  // Another run numbers detections anew; what was corrected before is of the one before.
+  renew() {
+    return this.#inTurn(async () => {
+      this.choose(null);
+      await this.load();
+    });
+  }
+
   // The edit is of the frame that is shown now, whichever is shown in its turn.
   #correct(edit) {
     const id = newId(edit.kind);
