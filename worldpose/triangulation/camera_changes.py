@@ -122,12 +122,18 @@ def _fit_clip(
     The views of a `free` camera count for nothing.
     """
     parts = [Part(c, "constant", 0, (0.0,)) for c in range(sums.cameras)]
+    tried = [[part.name for part in parts]]
     for _ in range(12):
         sums = sums if free is None else sums.without_camera(free)
         add_up = partial(sum_clip, cameras, people, fps, rows)
         placed = place_steps(parts, len(rows), fps, partial(add_up, parts))
         fitted = on_common_clock(fit_parts(sums, placed, len(rows), kinds))
-        is_done, parts = is_settled(parts, fitted), fitted
+        names = [part.name for part in fitted]
+        # What comes and goes is hardly clear.
+        returns = names != tried[-1] and names in tried
+        is_done = returns or is_settled(parts, fitted)
+        parts = [part for part in fitted if not returns or part.name in tried[-1]]
+        tried.append(names)
         if is_done:
             break
         sums = add_up(parts)

@@ -49,11 +49,12 @@ MIN_SIZE: Final = {
 }
 """Least size of a part: of a clock [frame], as a recorder loses whole frames, and the errors that
 views share differ between the ends of a clip; of a view [rad], where 0.001 is 1 to 3 pixels."""
-MIN_GAIN: Final = 30.0
-"""Least decrease of the sum of squares by a drift or a step, in variances of the noise [1]."""
-MIN_JUMP: Final = 15.0
-"""Least T of a step in the seconds around it, in variances of the noise [1]: people who walk to
-another place meet other errors of the calibration, a slow change."""
+MAX_VIEW: Final = np.array([0.2, 0.2, 0.2, 0.1])
+"""Most that a view moves: rotation [rad] and growth [1]. People who agree nowhere show more."""
+MIN_GAIN: Final[dict[Kind, float]] = {"clock": 30.0, "view": 60.0}
+"""Least decrease of the sum of squares by a drift or a step, in variances of the noise [1]; half of
+it in the seconds around a step. People who walk to another place meet other errors of the
+calibration, a slow change."""
 MAX_FURTHER: Final = 4
 """Most parts that one fit adds."""
 MIN_SHARE: Final = 0.2
@@ -85,19 +86,24 @@ class Part:
         return self.camera, self.kind, self.shape, self.row
 
     @property
+    def name(self) -> tuple[int, Kind, str]:
+        """All but the size and the row."""
+        return self.place[:3]
+
+    @property
     def unknowns(self) -> Integers:
         """The unknowns that change."""
         return WIDTH * self.camera + UNKNOWNS[self.kind]
 
     @property
-    def is_small(self) -> bool:
-        """Whether the size is too small to matter."""
+    def is_usual(self) -> bool:
+        """Whether the size is large enough to matter, and a camera can change so."""
         least = MIN_SIZE.get((self.kind, self.shape), 0.0)
+        if self.kind == "clock":
+            return abs(self.size[0]) >= least
         # Roll and growth move what is seen 0.3 rad from the axis, the usual place.
-        return (
-            float(np.linalg.norm(self.size * np.array([1.0, 1.0, 0.3, 0.3])[: len(self.size)]))
-            < least
-        )
+        size = np.linalg.norm(self.size * np.array([1.0, 1.0, 0.3, 0.3]))
+        return bool(size >= least and (np.abs(self.size) < MAX_VIEW).all())
 
     def share(self, rows: Floats | Integers, frames: int) -> Floats:
         """Return the share (n,) at rows of a clip of some frames."""
@@ -477,10 +483,15 @@ class _Fit:
         part = self.sized()[k]
         if part.shape == "constant":
             return np.inf
-        if part.is_small:
+        if not part.is_usual:
             return 0.0
         usual = noise[part.kind, part.shape == "drift"][part.camera]
-        clear = self.gain_of(k) / (MIN_GAIN * usual)
+        own = self.sizes_of(k)
+        spread = MIN_GAIN[part.kind] * usual * self.covariance[own, own]
+        if part.kind == "view" and part.shape == "drift":
+            # People who walk through the view meet its constant errors one after the other.
+            spread = spread + np.diag(4.0 / np.array(PRIOR))
+        clear = float(self.sizes[own] @ np.linalg.solve(spread, self.sizes[own]))
         if part.shape == "drift":
             return clear
         late = self.columns[:, :, self.sizes_of(k)] @ np.array(part.size)
@@ -488,7 +499,7 @@ class _Fit:
         jumps = replace(self.sums, score=alone).steps(part.camera, part.kind)
         after = min(int(np.searchsorted(self.sums.rows, part.row)), len(jumps) - 1)
         jump = float(np.nan_to_num(jumps[after]))
-        return min(clear, jump / (MIN_JUMP * usual))
+        return min(clear, jump / (0.5 * MIN_GAIN[part.kind] * usual))
 
     def find_part(self, kinds: Sequence[Kind]) -> Part | None:
         """Return the part that lowers the sum of squares most, in variances of the usual noise."""
@@ -496,7 +507,7 @@ class _Fit:
         for c, kind in product(range(self.sums.cameras), kinds):
             for part, gain in self._candidates(c, kind):
                 clear = gain / float(np.median(noise[kind, part.shape == "drift"]))
-                if clear > most and gain > MIN_GAIN:
+                if clear > most and gain > MIN_GAIN[kind]:
                     best, most = part, clear
         return best
 
@@ -505,7 +516,7 @@ class _Fit:
         rows, own = self.sums.rows, Part(camera, "step", 0, (0.0,) * len(UNKNOWNS[kind]))
         length = np.diff(rows).min() if len(rows) > 1 else 1.0
         jumps = replace(self.sums, score=self.left).steps(camera, kind)
-        others = [part.row for part in self.parts if part.place[:3] == own.place[:3]]
+        others = [part.row for part in self.parts if part.name == own.name]
         far = np.abs(rows[:, None] - np.array([*others, np.inf])).min(axis=1) > self.sums.fps
         inner = np.flatnonzero(np.isfinite(jumps) & far)
         starts = np.ceil(rows[inner] - 0.5 * length).astype(int)
