@@ -483,7 +483,7 @@ class _Fit:
         part = self.sized()[k]
         if part.shape == "constant":
             return np.inf
-        if not part.is_usual:
+        if not part.is_usual or self._returns(part):
             return 0.0
         usual = noise[part.kind, part.shape == "drift"][part.camera]
         own = self.sizes_of(k)
@@ -500,6 +500,14 @@ class _Fit:
         after = min(int(np.searchsorted(self.sums.rows, part.row)), len(jumps) - 1)
         jump = float(np.nan_to_num(jumps[after]))
         return min(clear, jump / (0.5 * MIN_GAIN[part.kind] * usual))
+
+    def _returns(self, part: Part) -> bool:
+        """Return whether another step takes a view back: it was a person who came and went."""
+        if (part.kind, part.shape) != ("view", "step"):
+            return False
+        others = [each.size for each in self.sized() if each.name == part.name]
+        rest = np.linalg.norm(np.array(others) + part.size, axis=1)
+        return bool(rest.min() < 0.5 * np.linalg.norm(part.size))
 
     def find_part(self, kinds: Sequence[Kind]) -> Part | None:
         """Return the part that lowers the sum of squares most, in variances of the usual noise."""
