@@ -33,14 +33,12 @@ from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.camera_changes import (
     MeasuredChange,
     change_record,
-    choose_bins,
     describe_change,
     find_changes,
     is_by_chance,
     is_same_change,
-    sum_joints,
 )
-from worldpose.triangulation.change_parts import ChangeSums, Kind
+from worldpose.triangulation.change_sums import ChangeSums, Kind, choose_bins, sum_joints
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.person_offsets import stated_errors
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +18,11 @@ from scipy.spatial.transform import Rotation
 from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
-from worldpose.camera_consistency.health import LIMBS
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.triangulation.change_parts import (
-    WIDTH,
-    ChangeSums,
-    Kind,
     Part,
+    expected_step,
     find_sway,
     fit_parts,
     fit_sizes,
@@ -34,17 +30,22 @@ from worldpose.triangulation.change_parts import (
     on_common_clock,
     spreads,
 )
+from worldpose.triangulation.change_sums import (
+    LOOSE,
+    WIDTH,
+    ChangeSums,
+    Kind,
+    choose_bins,
+    choose_rows,
+    half_window,
+    sum_joints,
+)
 from worldpose.triangulation.clocks import (
-    MovingJoints,
     shift_in_time,
-    sum_equations,
     triangulate_views,
 )
 from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
-
-LOOSE: Final = TriangulationSettings(max_deviation=30.0)
-"""Deviations accepted while views may be displaced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +185,7 @@ def sum_clip(
         near: the rows that count.
         bins: as of `choose_bins`; None = its own choice.
     """
-    frames, half = len(rows), _half(fps)
+    frames, half = len(rows), half_window(fps)
     length, every = bins or choose_bins(frames * people.detection_index[0].size, fps)
     rig, late = Rig.from_cameras(cameras), np.zeros((len(cameras.focal), frames))
     for part in parts:
@@ -200,7 +201,7 @@ def sum_clip(
         # Those beyond the chunk have no neighbours in time, or belong to the next.
         inner = slice(max(0, start - half) - begun, min(end, start + step + half) - begun)
         seen, begun = seen[inner], begun + inner.start
-        at = _chosen_rows(len(seen.detection_index), begun, fps, every)
+        at = choose_rows(len(seen.detection_index), begun, fps, every)
         if not len(at):
             continue
         used = np.unique(at[:, None] + np.array([-half, 0, half]))
@@ -208,58 +209,6 @@ def sum_clip(
         joints[used] = triangulate_views(rig, seen[used], settings)
         sums.append(sum_joints(cameras, seen, joints, begun, fps, (length, every), settings))
     return ChangeSums.join(sums, len(cameras.focal), fps)
-
-
-def sum_joints(
-    cameras: Camera,
-    seen: KeypointDetections,
-    joints: Floats,
-    start: int,
-    fps: float,
-    bins: tuple[int, int],
-    settings: TriangulationSettings = LOOSE,
-) -> ChangeSums:
-    """Return the equations of a chunk of a clip; its first and last rows give velocities only.
-
-    Args:
-        cameras: batch (cameras,).
-        seen: detections of tracked people, (frames, cameras, detections).
-        joints: (frames, persons, 17, 3) triangulated [m], world.
-        start: row of the first of these frames in the clip.
-        fps: rows per second [1/s].
-        bins: as of `choose_bins`.
-        settings: accepted deviations.
-    """
-    (length, every), limbs = bins, np.full_like(joints, np.nan)
-    limbs[:, :, LIMBS] = joints[:, :, LIMBS]
-    rows = _chosen_rows(len(joints), start, fps, every)
-    people = shift_in_time(seen[rows], np.zeros(1))
-    rig = Rig.from_cameras(cameras)
-    moving = MovingJoints.at_rows(rig, people, limbs, rows, _half(fps), settings)
-    if not len(moving.at):
-        return ChangeSums.join([], len(cameras.focal), fps)
-    number = (start + moving.frame) // length
-    added = sum_equations(replace(moving, person=number), with_cameras=True)
-    middles = np.unique(number) * length + 0.5 * (length - 1)
-    return ChangeSums(added.information, added.score, middles, fps)
-
-
-def _half(fps: float) -> int:
-    """Return half the rows over which velocity is computed: 0.06 s."""
-    return max(1, round(0.06 * fps))
-
-
-def _chosen_rows(count: int, start: int, fps: float, every: int) -> Integers:
-    """Return the rows of a chunk that are used."""
-    rows = np.arange(_half(fps), count - _half(fps))
-    return rows[(start + rows) % every == every // 2]
-
-
-def choose_bins(terms: int, fps: float) -> tuple[int, int]:
-    """Return the rows of a bin of 0.2 s, and every how many rows one is used."""
-    length = max(1, round(0.2 * fps))
-    # More rows cost time and tell little more.
-    return length, length if terms > 50_000 else 1
 
 
 def place_steps(
@@ -278,7 +227,7 @@ def place_steps(
             continue
         around = slice(max(0, part.row - near), part.row + near)
         sums = add_up(near=around, bins=(1, 1))
-        placed[number] = replace(part, row=sums.expected_step(part, frames))
+        placed[number] = replace(part, row=expected_step(sums, part, frames))
     return placed
 
 

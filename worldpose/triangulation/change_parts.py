@@ -11,14 +11,6 @@ with the present sizes x_0. A further part with columns a_b lowers the sum by g^
     g = sum_b a_b^T r_b,  K = sum_b a_b^T M_b a_b - P^T N^-1 P,  P = sum_b A_b^T M_b a_b,
 
 with what is left, r_b, and the normal matrix N of all other parts.
-
-Errors of detectors and calibrations last, and views share them. So the noise is measured: a camera
-with the estimates d_1, d_2 in the w seconds before and after a moment, of covariances C_1, C_2, has
-
-    T = (d_2 - d_1)^T (C_1 + C_2)^-1 (d_2 - d_1).
-
-The median of T over all moments, over that of chi-square, is the variance of its noise. A step is
-one at which T is far larger; for drifts, T compares long blocks with the mean of their neighbours.
 """
 
 from __future__ import annotations
@@ -29,18 +21,17 @@ from itertools import product
 from typing import Final, Literal, Self
 
 import numpy as np
-from scipy.ndimage import convolve1d
-from scipy.stats import chi2
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.geometry.cameras import Camera
+from worldpose.triangulation.change_sums import (
+    UNKNOWNS,
+    WIDTH,
+    ChangeSums,
+    Kind,
+    Noise,
+)
 from worldpose.triangulation.synchronization import PRIOR
 
-Kind = Literal["clock", "view"]
-UNKNOWNS: Final[dict[Kind, Integers]] = {"clock": np.arange(1), "view": np.arange(1, 5)}
-"""Of a camera, as of `sum_equations`."""
-WIDTH: Final = 5
-"""Number of unknowns of a camera."""
 MIN_SIZE: Final = {
     ("clock", "drift"): 0.4,
     ("clock", "step"): 0.6,
@@ -59,8 +50,6 @@ MAX_FURTHER: Final = 4
 """Most parts that one fit adds."""
 MIN_SHARE: Final = 0.2
 """Least gain of a further part, over that of the largest one [1]."""
-Noise = dict[tuple[Kind, bool], Floats]
-"""Variance of the noise of each camera (cameras,) [1], by kind and whether for drifts."""
 
 
 @dataclass(frozen=True)
@@ -118,173 +107,6 @@ class Part:
         return (0, self.row - 1, self.row) if self.shape == "step" else (0,)
 
 
-@dataclass(frozen=True, eq=False)
-class ChangeSums:
-    """Normal equations of all cameras in bins of frames; unknowns as of `sum_equations`.
-
-    Attributes:
-        matrix: (bins, unknowns, unknowns).
-        score: (bins, unknowns).
-        rows: (bins,) middle of each bin [frame].
-        fps: [1/s].
-    """
-
-    matrix: Floats
-    score: Floats
-    rows: Floats
-    fps: float
-
-    @classmethod
-    def join(cls, parts: Sequence[ChangeSums], cameras: int, fps: float) -> Self:
-        """Return the equations of several stretches of a clip."""
-        size = WIDTH * cameras
-        empty = cls(np.zeros((0, size, size)), np.zeros((0, size)), np.zeros(0), fps)
-        each = [empty, *parts]
-        return cls(
-            np.concatenate([one.matrix for one in each]),
-            np.concatenate([one.score for one in each]),
-            np.concatenate([one.rows for one in each]),
-            fps,
-        )
-
-    @property
-    def cameras(self) -> int:
-        """Number of cameras."""
-        return self.score.shape[1] // WIDTH
-
-    def select(self, chosen: Flags) -> ChangeSums:
-        """Return the equations of some bins."""
-        matrix, score = self.matrix[chosen], self.score[chosen]
-        return replace(self, matrix=matrix, score=score, rows=self.rows[chosen])
-
-    def of_camera(self, camera: int, kind: Kind) -> tuple[Floats, Floats]:
-        """Return the equations (bins, k, k), (bins, k) of one camera, the others as they are."""
-        own = WIDTH * camera + UNKNOWNS[kind]
-        return self.matrix[:, own[:, None], own], self.score[:, own]
-
-    def without_camera(self, camera: int) -> ChangeSums:
-        """Return the equations of a camera that may be anywhere in each bin."""
-        own = WIDTH * camera + np.arange(WIDTH)
-        held = self.matrix[:, own[:, None], own] + np.diag(1e-9 * _INFORMATION)
-        follow = self.matrix[:, :, own] @ np.linalg.inv(held)
-        matrix = self.matrix - follow @ self.matrix[:, own]
-        score = self.score - (follow @ self.score[:, own, None])[..., 0]
-        matrix[:, own], matrix[:, :, own], score[:, own] = 0.0, 0.0, 0.0
-        return replace(self, matrix=matrix, score=score)
-
-    def steps(self, camera: int, kind: Kind) -> Floats:
-        """Return T (bins,) of a step before each bin; NaN where a side is short."""
-        matrix, score = self.of_camera(camera, kind)
-        prior = np.diag(_INFORMATION[UNKNOWNS[kind]])
-        near = min(3.0 * self.fps, 0.2 * (np.ptp(self.rows) + 1.0))
-        inner = (self.rows - self.rows[0] >= 0.5 * near) & (self.rows[-1] - self.rows >= 0.5 * near)
-        first, last = np.searchsorted(self.rows, [self.rows - near, self.rows + near])
-        here = np.arange(len(self.rows))
-        sides = (
-            _solve_blocks(matrix, score, *each, prior) for each in ((first, here), (here, last))
-        )
-        (before, one), (after, other) = sides
-        off = after - before
-        values = (off * np.linalg.solve(one + other, off[..., None])[..., 0]).sum(axis=1)
-        return np.where(inner, values, np.nan)
-
-    def bends(self, camera: int, kind: Kind) -> Floats:
-        """Return T (n,) of long blocks and the mean of their neighbours."""
-        matrix, score = self.of_camera(camera, kind)
-        ends = np.linspace(0, len(self.rows), 7).astype(int)
-        prior = np.diag(_INFORMATION[UNKNOWNS[kind]])
-        values, covariance = _solve_blocks(matrix, score, ends[:-1], ends[1:], prior)
-        off = values[1:-1] - 0.5 * (values[:-2] + values[2:])
-        spread = covariance[1:-1] + 0.25 * (covariance[:-2] + covariance[2:])
-        return np.asarray((off * np.linalg.solve(spread, off[..., None])[..., 0]).sum(axis=1))
-
-    def departures(self, cameras: Camera, bins: int, length: int) -> Floats:
-        """Return the shift of each view [px] and its clock offset [frame], (bins, cameras, 2).
-
-        They are those of the second around each bin of `length` rows, as the people whom the other
-        cameras place show them. Where people tell nothing, they are 0.
-        """
-        number = (self.rows // length).astype(int)
-        matrix = np.zeros((bins, self.cameras, WIDTH, WIDTH))
-        blocks = self.matrix.reshape(-1, *(self.cameras, WIDTH) * 2)
-        matrix[number] = np.einsum("bcicj->bcij", blocks)
-        score = np.zeros((bins, self.cameras, WIDTH))
-        score[number] = self.score.reshape(-1, self.cameras, WIDTH)
-        matrix, score = (
-            convolve1d(each, np.ones(5), axis=0, mode="constant") for each in (matrix, score)
-        )
-        off = np.linalg.solve(matrix + np.diag(_INFORMATION), score[..., None])[..., 0]
-        shift = cameras.focal.mean(axis=-1) * np.hypot(off[..., 1], off[..., 2])
-        return np.stack([shift, off[..., 0]], axis=-1)
-
-    def sway(self, camera: int) -> tuple[float, float]:
-        """Return the usual size of a view's change in a second [rad], and its gain [1]."""
-        own = WIDTH * camera + np.arange(WIDTH)
-        matrix, score = self.matrix[:, own[:, None], own], self.score[:, own]
-        second = np.flatnonzero(np.diff(self.rows // max(1.0, round(self.fps)), prepend=-1.0))
-        ends = np.append(second, len(self.rows))
-        prior = np.diag(_INFORMATION)
-        late, covariance = _solve_blocks(matrix, score, ends[:-1], ends[1:], prior)
-        late, covariance = late[:, 1:], covariance[:, 1:, 1:]
-        late -= np.median(late, axis=0)
-        gain = (late * np.linalg.solve(covariance, late[..., None])[..., 0]).sum(axis=1)
-        return float(np.median(np.linalg.norm(late, axis=1))), float(np.median(gain)) / WIDTH
-
-    def expected_step(self, part: Part, frames: int) -> int:
-        """Return the row of a step that single rows, with the step taken back, show."""
-        own, size = part.unknowns, np.array(part.size)
-        held = np.einsum("i,bij,j->b", size, self.matrix[:, own[:, None], own], size)
-        if not (held > 0.0).any():
-            return part.row
-        share = self.score[:, own] @ size / np.maximum(held, 1e-12)
-        share += part.share(self.rows, frames)
-        off = share - (self.rows >= self.rows[:, None])
-        off -= (off @ held)[:, None] / held.sum()
-        cost = off**2 @ held
-        noise = max(1.0, float(cost.min()) / max(1, len(held) - 2))
-        chance = np.exp(-0.5 * (cost - cost.min()) / noise)
-        chance /= chance.sum()
-        row = float(chance @ self.rows)
-        std = float(np.sqrt(chance @ (self.rows - row) ** 2))
-        lost = max(0.0, part.size[0]) if part.kind == "clock" else 0.0
-        # Lost frames have no image: any row among them is as good.
-        return part.row if abs(row - part.row) <= max(1.0 + lost, std) else round(row)
-
-    def noise(self) -> Noise:
-        """Return the noise by kind, and whether for drifts."""
-        noise: Noise = {}
-        for kind, unknowns in UNKNOWNS.items():
-            usual = float(chi2.median(len(unknowns)))
-            steps = [_median(self.steps(c, kind)) for c in range(self.cameras)]
-            bends = [_median(self.bends(c, kind)) for c in range(self.cameras)]
-            own = np.maximum(1.0, np.array(steps) / usual)
-            noise[kind, False] = np.maximum(own, np.median(own))
-            # A clip has few long blocks: those of all cameras tell together.
-            noise[kind, True] = np.maximum(noise[kind, False], np.median(bends) / usual)
-        return noise
-
-
-_INFORMATION: Final = 1e-2 * np.array([1e-2, *PRIOR])
-"""Weak information on the unknowns of a camera in a block of bins."""
-
-
-def _median(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
-
-
-def _solve_blocks(
-    matrix: Floats, score: Floats, first: Integers, last: Integers, prior: Floats
-) -> tuple[Floats, Floats]:
-    """Return solutions (n, k) of blocks of bins from a first to before a last, and covariances."""
-    held, pull = (
-        np.concatenate([np.zeros_like(each[:1]), np.cumsum(each, axis=0)])
-        for each in (matrix, score)
-    )
-    covariance = np.linalg.inv(held[last] - held[first] + prior)
-    return (covariance @ (pull[last] - pull[first])[..., None])[..., 0], covariance
-
-
 def fit_parts(
     sums: ChangeSums, parts: Sequence[Part], frames: int, kinds: Sequence[Kind]
 ) -> list[Part]:
@@ -313,6 +135,15 @@ def fit_parts(
         for part, gain in zip(grown.sized(), gains, strict=True)
         if part.place in known or gain > MIN_SHARE * max(gains)
     ]
+    # Where several views jump at once, it was a person whom the tracker took for another.
+    steps = [(p.camera, p.row) for p in kept if p.name[1:] == ("view", "step")]
+    kept = [
+        p
+        for p in kept
+        if p.place in known
+        or p.name[1:] != ("view", "step")
+        or not any(c != p.camera and abs(row - p.row) < 0.5 * sums.fps for c, row in steps)
+    ]
     return _prune(_Fit.of(sums, kept, frames)).sized()
 
 
@@ -327,6 +158,27 @@ def _prune(fit: _Fit) -> _Fit:
         parts = fit.sized()
         parts.pop(weakest)
         fit = _Fit.of(fit.sums, parts, fit.frames)
+
+
+def expected_step(sums: ChangeSums, part: Part, frames: int) -> int:
+    """Return the row of a step that single rows, with the step taken back, show."""
+    own, size = part.unknowns, np.array(part.size)
+    held = np.einsum("i,bij,j->b", size, sums.matrix[:, own[:, None], own], size)
+    if not (held > 0.0).any():
+        return part.row
+    share = sums.score[:, own] @ size / np.maximum(held, 1e-12)
+    share += part.share(sums.rows, frames)
+    off = share - (sums.rows >= sums.rows[:, None])
+    off -= (off @ held)[:, None] / held.sum()
+    cost = off**2 @ held
+    noise = max(1.0, float(cost.min()) / max(1, len(held) - 2))
+    chance = np.exp(-0.5 * (cost - cost.min()) / noise)
+    chance /= chance.sum()
+    row = float(chance @ sums.rows)
+    std = float(np.sqrt(chance @ (sums.rows - row) ** 2))
+    lost = max(0.0, part.size[0]) if part.kind == "clock" else 0.0
+    # Lost frames have no image: any row among them is as good.
+    return part.row if abs(row - part.row) <= max(1.0 + lost, std) else round(row)
 
 
 def fit_sizes(sums: ChangeSums, parts: Sequence[Part], frames: int) -> list[Part]:
@@ -491,7 +343,8 @@ class _Fit:
         if part.kind == "view" and part.shape == "drift":
             # People who walk through the view meet its constant errors one after the other.
             spread = spread + np.diag(4.0 / np.array(PRIOR))
-        clear = float(self.sizes[own] @ np.linalg.solve(spread, self.sizes[own]))
+        size = self.sizes[own]
+        clear = float(size @ np.linalg.solve(spread, size))
         if part.shape == "drift":
             return clear
         late = self.columns[:, :, self.sizes_of(k)] @ np.array(part.size)
@@ -499,7 +352,7 @@ class _Fit:
         jumps = replace(self.sums, score=alone).steps(part.camera, part.kind)
         after = min(int(np.searchsorted(self.sums.rows, part.row)), len(jumps) - 1)
         jump = float(np.nan_to_num(jumps[after]))
-        return min(clear, jump / (0.5 * MIN_GAIN[part.kind] * usual))
+        return float(min(clear, jump / (0.5 * MIN_GAIN[part.kind] * usual)))
 
     def _returns(self, part: Part) -> bool:
         """Return whether another step takes a view back: it was a person who came and went."""
@@ -507,7 +360,7 @@ class _Fit:
             return False
         others = [each.size for each in self.sized() if each.name == part.name]
         rest = np.linalg.norm(np.array(others) + part.size, axis=1)
-        return bool(rest.min() < 0.5 * np.linalg.norm(part.size))
+        return float(rest.min()) < 0.5 * float(np.linalg.norm(part.size))
 
     def find_part(self, kinds: Sequence[Kind]) -> Part | None:
         """Return the part that lowers the sum of squares most, in variances of the usual noise."""

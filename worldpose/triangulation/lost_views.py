@@ -21,7 +21,7 @@ from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import MeasuredChange
-from worldpose.triangulation.change_parts import WIDTH, Kind
+from worldpose.triangulation.change_sums import WIDTH, Kind
 
 
 def find_lost_views(

@@ -13,7 +13,8 @@ from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import correct_views, find_changes, sum_clip
-from worldpose.triangulation.change_parts import ChangeSums, Part, fit_parts
+from worldpose.triangulation.change_parts import Part, fit_parts
+from worldpose.triangulation.change_sums import ChangeSums
 from worldpose.triangulation.clock_courses import (
     add_slow_drifts,
     shift_by_courses,
