@@ -27,7 +27,7 @@ from worldpose.detection.models import (
 )
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import fuse
-from worldpose.detection.views import TiledDetector
+from worldpose.detection.views import as_frame_detector
 from worldpose.training.fine_tuning import split
 from worldpose.training.labels import (
     LabelledPicture,
@@ -140,12 +140,7 @@ def fetch_stills(data: Path) -> None:
 
 def detect(stills: Sequence[LabelledPicture], settings: DetectionSettings) -> list[People]:
     """Return the people that the detectors see in each still, as the stage asks them."""
-    detectors = [
-        each
-        if each.view_size is None
-        else TiledDetector(each, settings.zooms, settings.view_overlap, settings.nms_iou)
-        for each in load_detectors(settings)
-    ]
+    detectors = [as_frame_detector(each, settings) for each in load_detectors(settings)]
     cache = PictureCache(1 << 28)
     return [
         fuse([each.detect([cache[still.path]])[0] for each in detectors], settings.nms_iou)
@@ -251,7 +246,7 @@ def load_stills(folder: Path, count: int | None = None, part: str = "all") -> li
 
 def detect_people(stills: Sequence[LabelledPicture], settings: DetectionSettings) -> list[People]:
     """Return the boxes of all detectors in each still."""
-    detectors = load_detectors(settings)
+    detectors = [as_frame_detector(each, settings) for each in load_detectors(settings)]
     found = []
     for still in stills:
         image = read_picture(still.path)

@@ -22,15 +22,13 @@ from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Work
-from flows.orchestration.cluster_errors import require_workers
-from flows.orchestration.local_cluster import short_seconds
-from flows.orchestration.time_limits import TimeLimits, seconds_of
+from flows.orchestration.local_cluster import require_workers, short_seconds
 from flows.overview import make_summary
 from flows.progress import reporter
 from flows.registering import open_for_review, open_match
 from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog, describe_end
-from flows.settings import selected_stages
+from flows.settings import TimeLimits, seconds_of, selected_stages
 from flows.stage import Stage
 from worldpose.errors import WorldposeError
 from worldpose.store.store import Store

@@ -6,6 +6,7 @@ from collections.abc import Container
 from concurrent.futures import ThreadPoolExecutor
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
 from flows.layers import pitch_of_run, read_layers
@@ -20,6 +21,9 @@ from worldpose.ingest.validation import reachable
 from worldpose.review.journal import read_journal
 from worldpose.store.paths import is_name
 from worldpose.store.store import Run, Store
+
+if TYPE_CHECKING:
+    from worldpose.video.pictures import FrameIndex
 
 
 def register(
@@ -227,13 +231,11 @@ def _read_new_files(
         new = [unit for unit, path in match.detections.items() if is_new(path)]
         for _ in threads.map(check_detections, new):
             pass  # an error is raised here, that of the first file
-    _read_videos(match, [unit for unit, path in match.videos.items() if is_new(path)])
-    for unit, path in match.boxes.items():
-        if is_new(path):
-            from worldpose.video.folder import index_video  # late: few matches have such files
-
-            index = index_video(match.videos[unit])
-            read_boxes(path, index.size, len(index))
+    boxes = {unit for unit, path in match.boxes.items() if is_new(path)}
+    videos = {unit for unit, path in match.videos.items() if is_new(path)}
+    for unit, index in _read_videos(match, videos | boxes).items():
+        if unit in match.boxes:
+            read_boxes(match.boxes[unit], index.size, len(index))
     for unit, path in match.camera_data.items():
         if is_new(path):
             from worldpose.ingest.camera_data import read_given_camera  # late: as below
@@ -251,26 +253,31 @@ def _read_new_files(
             read_still(path, (camera.width, camera.height))
 
 
-def _read_videos(match: MatchFolder, new: Container[str]) -> None:
-    """Refuse videos that contradict match.yaml, and broken ones unless two cameras remain.
+def _read_videos(match: MatchFolder, new: Container[str]) -> dict[str, FrameIndex]:
+    """Return the indices of videos that are not broken, of those that are new, by unit.
 
-    Stage `ingest` leaves out the static cameras of broken videos.
+    It refuses videos that contradict match.yaml, and broken ones unless two cameras remain. Stage
+    `ingest` leaves out the static cameras of broken videos.
     """
     from worldpose.video.folder import index_video  # late: few matches have new videos
 
     static = {camera.id for camera in match.spec.static_cameras}
     broken: dict[str, InputError] = {}
+    indices: dict[str, FrameIndex] = {}
     unseen: dict[str, list[InputError]] = {}
     for unit, path in match.videos.items():
         whole = unit in match.calibrated_views
-        if (unit in match.detections and not whole) or not (path.is_dir() or unit in new):
+        unused = unit in match.detections and not whole
+        if (unused and unit not in match.boxes) or not (path.is_dir() or unit in new):
             continue
         try:
-            index = index_video(path)
+            index = indices[unit] = index_video(path)
         except InputError as error:
             if unit not in static:
                 raise
             broken[unit] = error
+            continue
+        if unused:
             continue
         for clip, refusal in require_footage(match.spec, unit, path, index, whole=whole).items():
             unseen.setdefault(clip, []).append(refusal)
@@ -279,6 +286,7 @@ def _read_videos(match: MatchFolder, new: Container[str]) -> None:
             raise errors[0]
     if broken and len(static) - len(broken) < 2:
         raise next(iter(broken.values()))
+    return indices
 
 
 def _of_footage(spec: MatchSpec) -> MatchSpec:

@@ -27,15 +27,15 @@ from flows.layers import (
     write_layer,
 )
 from flows.method import METHOD, task_modules
-from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
     keep_workers,
+    require_room,
+    require_workers,
     start_cluster,
     wait_for_worker,
     workers_for,
 )
 from flows.orchestration.prefect_environment import has_server, prefect_server
-from flows.orchestration.time_limits import TimeLimits
 from flows.overview import make_summary
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
@@ -44,6 +44,7 @@ from flows.run_status import last_stage
 from flows.settings import (
     Overrides,
     ResolvedSettings,
+    TimeLimits,
     as_text,
     flatten,
     resolve,
@@ -341,7 +342,7 @@ def _machines(
     is_watched = has_server()
     if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
-    server = prefect_server(store.url, is_local=request.dask is None)
+    server = prefect_server(is_local=request.dask is None)
     with end_at_once(), server as wait_until_ready, ExitStack() as stack:
         cluster: PrivateCluster | None = None
         ask_for: Callable[[int], None] = _no_more

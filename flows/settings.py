@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
+from typing import Final
 
 from pydantic import JsonValue, ValidationError
 
@@ -179,6 +181,12 @@ def by_stage(values: Mapping[str, JsonValue]) -> dict[str, dict[str, JsonValue]]
     return found
 
 
+DEFAULT_MINUTES: Final = 360.0
+"""Default limit of a stage [min]; the longest unit so far took a tenth of it."""
+
+TimeLimits = Mapping[str, float]
+"""Stage to the time limit of each of its units [min]."""
+
 LIST = "List all settings: worldpose settings --list."
 
 
@@ -298,3 +306,33 @@ def _place(where: str, name: str, names: list[str]) -> int:
     if name not in names:
         raise unknown_name(where, name, names)
     return names.index(name)
+
+
+def seconds_of(stage: str, limits: TimeLimits) -> float:
+    """Return the time limit of the stage's units [s]."""
+    return 60.0 * limits.get(stage, DEFAULT_MINUTES)
+
+
+def parse_time_limits(given: Sequence[str]) -> TimeLimits:
+    """Parse limits given as minutes for every stage, or as `stage=minutes`; later ones win.
+
+    Raises:
+        UsageError: an unknown stage, or not a number of minutes.
+    """
+    limits: dict[str, float] = {}
+    names = [stage.name for stage in METHOD]
+    for text in given:
+        stage, equals, number = text.rpartition("=")
+        try:
+            minutes = float(number)
+        except ValueError:
+            minutes = math.nan
+        if not 0.0 < minutes < math.inf or (equals and stage not in names):
+            raise UsageError(
+                f"--time-limit {text}",
+                expected=f"minutes, or stage=minutes with one of {', '.join(names)}",
+                found=repr(text),
+                todo="Write it as in: --time-limit detection=120.",
+            )
+        limits |= dict.fromkeys([stage] if equals else names, minutes)
+    return limits

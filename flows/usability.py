@@ -55,126 +55,79 @@ class _Rule:
     metric: str
     limit: str
     says: str
-    is_required: bool = False
+    is_required: bool
+
+    @classmethod
+    def parse(cls, text: str) -> Iterator[_Rule]:
+        """Yield a rule for each stage that its first line names."""
+        head, _, says = text.partition("\n")
+        stages, metric, limit, required, *_ = *head.split(), "", ""
+        for stage in stages.split(","):
+            yield cls(stage, metric, limit, " ".join(says.split()), required == "required")
 
 
-_RULES: Final = (
-    _Rule(
-        "static_calibration",
-        "clicks_wrong",
-        "",
-        "clicks of {unit} contradict the others and are not used: {value}. Correct or remove them.",
-    ),
-    _Rule(
-        "detection",
-        "unreadable_share",
-        "max_unreadable_share",
-        "the video of {unit} has no image, or none that can be decoded, for {value} of the frames"
-        "{when}. Check the video and its offset, or convert it with any video tool.",
-    ),
-    _Rule(
-        "tracking",
-        "absent_share",
-        "max_absent_share",
-        "people are missing in {unit} for {value} of the time{when}. Look at the videos there.",
-    ),
-    _Rule(
-        "tracking",
-        "unmatched_share",
-        "max_unmatched_share",
-        "no track follows {value} of the people found in the images of {unit}. Look for people "
-        "beside the pitch, or for a camera whose clock or calibration is wrong.",
-        is_required=True,
-    ),
-    _Rule(
-        "tracking",
-        "mean_ray_distance_m",
-        "max_ray_distance_m",
-        "cameras disagree by {value} about where people are in {unit}. Check the calibration and "
-        "the clocks of the cameras.",
-    ),
-    _Rule(
-        "triangulation",
-        "standard_deviation_m",
-        "max_standard_deviation_m",
-        "joints in {unit} are uncertain by {value}. More cameras, or better calibrated ones, have "
-        "to see the people.",
-        is_required=True,
-    ),
-    _Rule(
-        "triangulation",
-        "filled_share",
-        "max_filled_share",
-        "no camera sees {value} of the joints in {unit}: motion alone places them. Add cameras, or "
-        "check their 2D poses.",
-    ),
-    _Rule(
-        "triangulation",
-        "unhealthy_s",
-        "max_unhealthy_s",
-        "the keypoints of {part} depart from the people in {unit}, or its images are bad, for "
-        "{value} at a time{when}. Look at the video there.",
-    ),
-    _Rule(
-        "triangulation",
-        "misplacement_m",
-        "max_misplacement_m",
-        "the calibration of {part} displaces people in {unit} by {value}. Click more markings, "
-        "where there are none.",
-    ),
-    _Rule(
-        "bundle_adjustment",
-        "moved_deviations",
-        "max_moved_deviations",
-        "the people contradict the calibration of {part}: the adjustment moves it by {value} "
-        "standard deviations. Check its clicks, and calibrate its lens.",
-    ),
-    _Rule(
-        "body_fitting",
-        "held_out_certain_excess_m",
-        "max_body_excess_m",
-        "bodies in {unit} are farther from the images than triangulated joints are ({part}), by "
-        "{value}. Compare both with the images, or export --stage retriangulation.",
-    ),
-    _Rule(
-        "body_fitting",
-        "offset_rms_m",
-        "max_body_offset_m",
-        "bodies in {unit} lie {value} off the joints that cameras show. Compare both with the "
-        "images, or export --stage retriangulation.",
-        is_required=True,
-    ),
-    _Rule(
-        "broadcast_calibration",
-        "expected_error_median_px",
-        "max_broadcast_error_px",
-        "the broadcast camera of {unit} is uncertain by {value}. Click more key frames.",
-        is_required=True,
-    ),
-    _Rule(
-        "broadcast_tracking",
-        "unmatched_share",
-        "max_unmatched_share",
-        "no track follows {value} of the people found by the broadcast camera in {unit}. Look for "
-        "people beside the pitch, or for wrong key frames.",
-    ),
-    _Rule(
-        "broadcast_tracking",
-        "plane_std_m",
-        "max_plane_std_m",
-        "places of people in {unit} are uncertain by {value}. Click more key frames.",
-    ),
-    *(
-        _Rule(
-            stage,
-            "corrections_refused",
-            "",
-            "{value} corrections of {unit} do not fit its results and are not applied. Correct "
-            "them on the page of the match, or withdraw them, and run again.",
-        )
-        for stage in ("ingest", "detection", "tracking")
-    ),
-)
+_STATED: Final = """\
+static_calibration clicks_wrong
+clicks of {unit} contradict the others and are not used: {value}. Correct or remove them.
+
+detection unreadable_share max_unreadable_share
+the video of {unit} has no image, or none that can be decoded, for {value} of the frames{when}.
+Check the video and its offset, or convert it with any video tool.
+
+tracking absent_share max_absent_share
+people are missing in {unit} for {value} of the time{when}. Look at the videos there.
+
+tracking unmatched_share max_unmatched_share required
+no track follows {value} of the people found in the images of {unit}. Look for people beside the
+pitch, or for a camera whose clock or calibration is wrong.
+
+tracking mean_ray_distance_m max_ray_distance_m
+cameras disagree by {value} about where people are in {unit}. Check the calibration and the clocks
+of the cameras.
+
+triangulation standard_deviation_m max_standard_deviation_m required
+joints in {unit} are uncertain by {value}. More cameras, or better calibrated ones, have to see the
+people.
+
+triangulation filled_share max_filled_share
+no camera sees {value} of the joints in {unit}: motion alone places them. Add cameras, or check
+their 2D poses.
+
+triangulation unhealthy_s max_unhealthy_s
+the keypoints of {part} depart from the people in {unit}, or its images are bad, for {value} at a
+time{when}. Look at the video there.
+
+triangulation misplacement_m max_misplacement_m
+the calibration of {part} displaces people in {unit} by {value}. Click more markings, where there
+are none.
+
+bundle_adjustment moved_deviations max_moved_deviations
+the people contradict the calibration of {part}: the adjustment moves it by {value} standard
+deviations. Check its clicks, and calibrate its lens.
+
+body_fitting held_out_certain_excess_m max_body_excess_m
+bodies in {unit} are farther from the images than triangulated joints are ({part}), by {value}.
+Compare both with the images, or export --stage retriangulation.
+
+body_fitting offset_rms_m max_body_offset_m required
+bodies in {unit} lie {value} off the joints that cameras show. Compare both with the images, or
+export --stage retriangulation.
+
+broadcast_calibration expected_error_median_px max_broadcast_error_px required
+the broadcast camera of {unit} is uncertain by {value}. Click more key frames.
+
+broadcast_tracking unmatched_share max_unmatched_share
+no track follows {value} of the people found by the broadcast camera in {unit}. Look for people
+beside the pitch, or for wrong key frames.
+
+broadcast_tracking plane_std_m max_plane_std_m
+places of people in {unit} are uncertain by {value}. Click more key frames.
+
+ingest,detection,tracking corrections_refused
+{value} corrections of {unit} do not fit its results and are not applied. Correct them on the page
+of the match, or withdraw them, and run again."""
+"""Paragraphs: stages, metric, limit, and `required`; below them what is said."""
+_RULES: Final = tuple(rule for text in _STATED.split("\n\n") for rule in _Rule.parse(text))
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from worldpose.ingest.footage import stretches
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.store.writer import ResultWriter
-from worldpose.video.folder import open_video
+from worldpose.video.folder import open_video, readable_at
 from worldpose.video.pictures import FrameIndex
 
 
@@ -43,7 +43,8 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
         found = found or _detect_people(inputs, spool)
         result.figures |= found.figures | _longest_gap(found.unreadable)
         settings = inputs.settings(DetectionSettings)
-        warnings = [*found.warnings, *_warn_of_size(found, settings)]
+        is_given = "boxes" in inputs.sources
+        warnings = [*found.warnings, *([] if is_given else _warn_of_size(found, settings))]
         result.warnings += [f"{inputs.recipe.name}: {each}." for each in warnings]
         detections = found.detections
         if edits:
@@ -78,7 +79,7 @@ class _Found:
     images: dict[str, Singles]
     unreadable: list[list[int]]
     figures: dict[str, float]
-    warnings: tuple[str, ...]
+    warnings: list[str]
 
 
 def _longest_gap(unreadable: list[list[int]]) -> dict[str, float]:
@@ -114,7 +115,7 @@ def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
     stored, manifest = published
     detections = KeypointDetections.from_arrays(stored)
     images = {array.name: stored[array.name].values for array in IMAGE_ARRAYS}
-    return _Found(detections, images, stored.attrs["unreadable"], dict(manifest.figures), ())
+    return _Found(detections, images, stored.attrs["unreadable"], dict(manifest.figures), [])
 
 
 def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
@@ -136,9 +137,11 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
     inputs.require_registered("video")
     report = finder.report
     unreadable = report.unreadable
-    told = (reason,) if (reason := report.why_no_person()) else ()
+    told = [reason] if (reason := report.why_no_person()) else []
+    if report.cut:
+        told.append(f"{report.cut} people beyond detection.max_people of a frame were left out")
     if len(unreadable) == report.frames and not _has_images(inputs):
-        unreadable, told = [], ("the camera does not film this clip",)
+        unreadable, told = [], ["the camera does not film this clip"]
     elif len(unreadable) == report.frames:
         raise InputError(
             str(inputs.file("video")),
@@ -207,21 +210,15 @@ def _given_people(inputs: UnitInputs) -> dict[int, People]:
 def _read_frames(
     inputs: UnitInputs, quality: list[tuple[float, float]]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield every match frame of the clip with its image, decoded once and in order.
+    """Yield every match frame of the clip with its image.
 
     Brightness and sharpness of each are added to `quality`.
     """
     footage, frames = inputs.open(f"ingest/{inputs.sources['camera']}"), inputs.frames
     numbers = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
-    there = numbers[numbers >= 0]
     with open_video(inputs.file("video"), footage_index(footage)) as video:
-        shown = video.readable(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
-        for frame, number in zip(frames.tolist(), numbers, strict=True):
-            picture = None
-            while number >= 0:  # skip images that no match frame uses
-                at, picture = next(shown)
-                if at == number:
-                    break
+        shown = readable_at(video, numbers)
+        for frame, picture in zip(frames.tolist(), shown, strict=True):
             quality.append(measure_image(picture))
             yield frame, picture
 

@@ -436,15 +436,18 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
     require_weights(settings, case.detection.sources["weights"])
     shown = _pictures(inputs, case, np.unique(sought.frame))
     boxes: AnyFloats = case.detected.boxes
-    turn = QuarterTurn.of(case.camera)
-    if turn is not None:  # as in `detection`
+    # As in `detection`.
+    quarters = round(inputs.manifest(f"detection/{inputs.unit}").figures["turned_deg"] / 90.0)
+    width, height = case.camera.image_size.tolist()
+    turn = QuarterTurn(quarters, (width, height)) if quarters else None
+    if turn is not None:
         shown = ((place, turn.image(image)) for place, image in shown)
         sought, boxes = replace(sought, boxes=turn.boxes(sought.boxes)), turn.boxes(boxes)
     pose, least = load_pose(settings), settings.min_keypoint_confidence
     found = search_missing_people(shown, sought, pose, least, boxes)
     found = found if turn is None else turn.turn_back(found)
     case.detection.require_registered("video")
-    score_map = load_score_map(settings)
+    score_map = None if "boxes" in case.detection.sources else load_score_map(settings)
     return found if score_map is None else replace(found, score=score_map.probability(found.score))
 
 

@@ -152,10 +152,13 @@ class UnitInputs:
 
     def made_from(self, name: str) -> UnitInputs:
         """Return what the input `stage/unit` was computed from."""
+        work = self.work.model_copy(update={"recipe": self.manifest(name).recipe})
+        return UnitInputs(self.store, work)
+
+    def manifest(self, name: str) -> ResultManifest:
+        """Return the manifest of the input `stage/unit`."""
         stage, _, unit = name.partition("/")
-        key = self.recipe.inputs[name]
-        recipe = self.store.manifest(self.recipe.match_id, stage, unit, key).recipe
-        return UnitInputs(self.store, self.work.model_copy(update={"recipe": recipe}))
+        return self.store.manifest(self.recipe.match_id, stage, unit, self.recipe.inputs[name])
 
     def settings(self, kind: type[Settings]) -> Settings:
         """Return the settings that it is computed with."""

@@ -29,7 +29,7 @@ settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")
-def server(tmp_path_factory):
+def server():
     """The address of one Prefect API for all tests that do not test starting one.
 
     Their runs compute on one standing Dask worker.
@@ -37,12 +37,11 @@ def server(tmp_path_factory):
     from distributed import LocalCluster  # late: many test runs need no cluster
 
     before = dict(os.environ)
-    home = str(tmp_path_factory.mktemp("prefect"))
     options = {**local_cluster_options(1), "host": "127.0.0.1"}
     stages = [f"tasks.{name}" for name in STAGES]
     options["preload"] = ["tasks.preload", "prefect_dask", *stages, "flows.match"]
     with (
-        prefect_server(home, is_local=True) as wait_until_ready,
+        prefect_server(is_local=True) as wait_until_ready,
         LocalCluster(**options) as cluster,
     ):
         # Before the scheduler, a thread of this process, would do it while it receives the first

@@ -1,9 +1,6 @@
 """Inputs of a pose challenge, and their truth, from a simulated match."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -36,7 +33,7 @@ TRUTH: Final = "true.zip"
 """The true submission, beside the kit's folders."""
 
 
-def lay_out_kit(match: Path, kit: Path, name: str, *, all_poses: bool = False) -> None:
+def lay_out_kit(match, kit, name, *, all_poses=False):
     """Add a sequence to a kit: what participants get, and the true submission as `true.zip`.
 
     Boxes are those of the true bodies. 2D skeletons are the simulated detector's, and 3D skeletons

@@ -1,13 +1,9 @@
 """Comparison of two projects: whether their computations give the same results."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 
-from data_contracts.records import Record
 from worldpose.store.documents import digest
-from worldpose.store.store import Store
 
 _TRANSIENT_FIELDS = {
     "manifest": {"created_at", "seconds", "run_id", "checksum"},
@@ -17,7 +13,7 @@ _TRANSIENT_FIELDS = {
 """Allowed differences between two valid runs: times, numbers, places, and reused units."""
 
 
-def compare_stores(ours: Store, theirs: Store) -> list[str]:
+def compare_stores(ours, theirs):
     """Return one line per difference; empty if the projects are equal, byte for byte.
 
     Compared are the registered matches, every result's files and manifest, and the latest run of
@@ -32,7 +28,7 @@ def compare_stores(ours: Store, theirs: Store) -> list[str]:
     ]
 
 
-def _describe(store: Store) -> dict[str, Any]:
+def _describe(store):
     """Return the content of a project by path or name; that of files as their digests."""
     found: dict[str, Any] = {}
     for match_id in store.matches():
@@ -52,6 +48,6 @@ def _describe(store: Store) -> dict[str, Any]:
     return found
 
 
-def _fields(where: str, record: Record, kind: str) -> dict[str, str]:
+def _fields(where, record, kind):
     fields = record.model_dump(mode="json", exclude=_TRANSIENT_FIELDS[kind])
     return {f"{where}: {name}": json.dumps(value)[:500] for name, value in fields.items()}

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import ast
-import inspect
 import os
-import re
-from collections.abc import Callable
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
 
+from flows.cli.options import command_of
 from worldpose.cache_folder import find_cache_folder
 
 if TYPE_CHECKING:
@@ -33,12 +31,12 @@ GROUPS: Final = {
         "ingest": "matches:ingest",
         "calibrate": "calibrate:calibrate",
         "locate-cameras": "locate:locate_cameras",
-        "synchronize": "synchronize:synchronize",
+        "synchronize": "locate:synchronize",
     },
     "Process matches": {
         "run": "run:run",
         "settings": "settings:settings",
-        "reprocess": "reprocess:reprocess",
+        "reprocess": "run:reprocess",
         "serve": "serve:serve",
         "review": "review",
     },
@@ -85,10 +83,10 @@ class Commands(TyperGroup):
         parent = typer.Typer(add_completion=False, rich_markup_mode=None)
         if not function:  # inside another group, a group of one command stays a group
             for each in loaded.commands.registered_commands:
-                describe_options(each.callback)
+                each.callback = command_of(each.callback)
             parent.add_typer(loaded.commands, name=cmd_name)
             return typer.main.get_group(parent).commands[cmd_name]
-        parent.command(cmd_name)(describe_options(getattr(loaded, function)))
+        parent.command(cmd_name)(command_of(getattr(loaded, function)))
         return typer.main.get_command(parent)
 
     def list_commands(self, ctx: Context) -> list[str]:
@@ -120,22 +118,6 @@ class Commands(TyperGroup):
         options = super(TyperGroup, self).shell_complete(ctx, incomplete)
         names = (name for name in COMMANDS if name.startswith(incomplete))
         return [*(CompletionItem(name, help=summary(name)) for name in names), *options]
-
-
-def describe_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Give the parameters of a command the help of `Options:` in its docstring, and remove that."""
-    about, _, listed = (inspect.getdoc(function) or "").partition("\n\nOptions:\n")
-    hints = get_type_hints(function, include_extras=True)
-    for entry in re.split(r"\n(?=    \S)", listed) if listed else ():
-        name, _, text = entry.strip().partition(": ")
-        kind, *given = (
-            get_args(hints[name]) if get_origin(hints[name]) is Annotated else [hints[name]]
-        )
-        option = given[0] if given else typer.Option()
-        option.help = " ".join(text.split())
-        hints[name] = Annotated[kind, option]
-    function.__annotations__, function.__doc__ = hints, about
-    return function
 
 
 def summary(command: str) -> str:

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.console import JsonOption, answer
-from flows.cli.options import BodyFolderOption
+from flows.cli.console import answer
 from worldpose.body.body_file import body_path, install_body
 
 commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
@@ -18,8 +17,7 @@ commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_mar
 def install(
     file: Annotated[Path, typer.Argument(metavar="FILE")],
     name: str | None = None,
-    body_folder: BodyFolderOption = None,
-    as_json: JsonOption = False,
+    body_folder: Path | None = None,
 ) -> None:
     """Convert your licensed SMPL file once to a safe one; nothing in it is run.
 
@@ -32,4 +30,4 @@ def install(
     model = install_body(file, body_folder, name)
     path = body_path(model.name, body_folder)
     told = f"installed body model {model.name} as {path}"
-    answer(as_json, {"body_model": model.name, "file": str(path)}, told)
+    answer({"body_model": model.name, "file": str(path)}, told)

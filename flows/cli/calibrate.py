@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from data_contracts.arrays import Image
-from flows.cli.console import JsonOption, errors, line, print_json, print_table
+from flows.cli.console import errors, line, print_json, print_table
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.video.names import is_video
 
@@ -25,13 +25,12 @@ def calibrate(
     columns: Annotated[int, typer.Option(min=2, max=100)],
     rows: Annotated[int, typer.Option(min=2, max=100)],
     square: Annotated[float, typer.Option(min=0.0001, max=10.0)],
-    out: Annotated[Path, typer.Option()],
+    out: Path,
     camera: str | None = None,
     charuco: Annotated[str | None, typer.Option(metavar="DICTIONARY")] = None,
     marker: float | None = None,
     every: Annotated[float, typer.Option(min=0.01, max=60.0)] = 0.5,
     plot: Path | None = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Compute the lenses of cameras from images or videos of a checkerboard or ChArUco board.
 
@@ -82,9 +81,7 @@ def calibrate(
         write_lens_toml(draft, {name: fit.lens for name, fit in fits.items()})
     if plot is not None:
         draw_lens_fits(fits, plot)
-    if as_json:
-        print_json({"lenses": str(out), "cameras": {n: _as_json(f) for n, f in fits.items()}})
-        return
+    print_json({"lenses": str(out), "cameras": {n: _as_json(f) for n, f in fits.items()}})
     _print(fits, files)
     line(f"wrote {out}; worldpose import --lens {out} --out MATCH adds it to a match")
 
@@ -209,24 +206,17 @@ def _print(fits: dict[str, LensFit], files: dict[str, list[str]]) -> None:
     """Print a table of the lenses, and what is to know about the images."""
     rows = []
     for name, fit in fits.items():
-        lens = fit.lens
-        x, y = lens.principal_point_px
+        lens, (x, y) = fit.lens, fit.lens.principal_point_px
+        kind = "fisheye " if lens.lens_model == "fisheye" else ""
         rows.append(
-            (
-                name,
-                f"{fit.used.sum()} of {len(fit.used)}",
-                f"{fit.rms_px:.2f}",
-                f"{lens.focal_px:.1f} +- {lens.focal_std_px:.1f}",
-                f"{x:.1f}, {y:.1f} +- {lens.principal_point_std_px:.1f}",
-                ("fisheye " if lens.lens_model == "fisheye" else "")
-                + " ".join(f"{one:.4f}" for one in lens.distortion[:4]),
-                f"{100 * fit.coverage:.0f}",
-            )
+            f"{name}\t{fit.used.sum()} of {len(fit.used)}\t{fit.rms_px:.2f}\t"
+            f"{lens.focal_px:.1f} +- {lens.focal_std_px:.1f}\t"
+            f"{x:.1f}, {y:.1f} +- {lens.principal_point_std_px:.1f}\t"
+            f"{kind}{' '.join(f'{one:.4f}' for one in lens.distortion[:4])}\t"
+            f"{100 * fit.coverage:.0f}"
         )
-    head = (
-        *("camera", ">images", ">residual px", ">focal length px", ">principal point px"),
-        *("k1 k2 p1 p2, fisheye k1 to k4", ">coverage %"),
-    )
+    head = "camera\t>images\t>residual px\t>focal length px\t>principal point px\t"
+    head += "k1 k2 p1 p2, fisheye k1 to k4\t>coverage %"
     print_table("lenses", head, rows)
     for name, fit in fits.items():
         for file, reason in zip(files[name], fit.reasons, strict=True):

@@ -1,4 +1,4 @@
-"""Shared parts of all commands: the project and JSON options, output, progress."""
+"""Output of all commands: lines and tables for people, or one JSON object; progress."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
@@ -21,29 +20,9 @@ from flows.progress import Reporter, reporting_to
 from flows.review.metric_words import all_reasons, in_short
 
 output = Console(soft_wrap=True)
+"""Standard output for people; quiet with --json."""
 errors = Console(stderr=True, soft_wrap=True)
 
-ProjectOption = Annotated[
-    str,
-    typer.Option(
-        "--project", envvar="WORLDPOSE_PROJECT", help="Folder or s3:// URL that holds all results."
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-VerboseOption = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Print the metrics of each result too.")
-]
-MatchArgument = Annotated[
-    str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
-]
-RunOption = Annotated[
-    str, typer.Option("--run", help="A run's number or name; by default the latest, with results.")
-]
-StageOption = Annotated[
-    str | None, typer.Option("--stage", help="Stage of the joints; the last by default.")
-]
-
-DEFAULT_PROJECT = "worldpose-data"
 ERASE_SPINNER = "\r\x1b[2K\x1b[?25h"
 """Control codes of a terminal: erase the current line and show the cursor."""
 NO_WIDTH = 100_000
@@ -51,8 +30,9 @@ NO_WIDTH = 100_000
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object on standard output."""
-    print(json.dumps(value, indent=2, default=str))  # noqa: T201
+    """Print one JSON object on standard output if the command is asked for it."""
+    if output.quiet:
+        print(json.dumps(value, indent=2, default=str), flush=True)  # noqa: T201
 
 
 def line(text: str, *, to: Console = output) -> None:
@@ -60,29 +40,34 @@ def line(text: str, *, to: Console = output) -> None:
     to.print(text, markup=False, highlight=False)
 
 
-def answer(as_json: bool, value: Mapping[str, Any], *lines: str) -> None:
+def answer(value: Mapping[str, Any], *lines: str) -> None:
     """Print what a command did: one JSON object, or lines for people."""
-    if as_json:
-        print_json(value)
-    else:
-        for text in lines:
-            line(text)
+    print_json(value)
+    for text in lines:
+        line(text)
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def print_table(
+    title: str, columns: str | Sequence[str], rows: Iterable[str | Sequence[str]]
+) -> None:
     """Print a plain table; columns that start with ">" are right-aligned.
 
-    Nothing is truncated: a cell too wide for the terminal wraps, and a file or pipe, which people
-    search, gets whole lines.
+    Cells that are numbers and names can be given as one text with tabs between them. Nothing is
+    truncated: a cell too wide for the terminal wraps, and a file or pipe, which people search, gets
+    whole lines.
     """
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
-    for column in columns:
+    for column in _cells(columns):
         justify: Literal["left", "right"] = "right" if column.startswith(">") else "left"
         table.add_column(column.lstrip(">"), justify=justify, overflow="fold")
     for row in rows:
-        table.add_row(*map(Text, row))
-    to = output if output.is_terminal else Console(width=NO_WIDTH)
+        table.add_row(*map(Text, _cells(row)))
+    to = output if output.is_terminal else Console(width=NO_WIDTH, quiet=output.quiet)
     to.print(table, soft_wrap=False)
+
+
+def _cells(row: str | Sequence[str]) -> Sequence[str]:
+    return row.split("\t") if isinstance(row, str) else row
 
 
 UNIT_WIDTH = 25

@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    errors,
-    line,
-    print_json,
-    print_table,
-)
-from flows.cli.options import FpsOption
+from flows.cli.console import errors, line, print_json, print_table
+from flows.cli.options import DEFAULT_PROJECT
 from worldpose.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
@@ -27,8 +19,7 @@ def statistics(
     folders: Annotated[list[Path], typer.Argument(metavar="DIR...")],
     picture: Path | None = None,
     page: Path | None = None,
-    fps: FpsOption = None,
-    as_json: JsonOption = False,
+    fps: float | None = None,
 ) -> None:
     """Count a data set as the paper does: clips, frames, poses, people, distances.
 
@@ -65,23 +56,13 @@ def statistics(
         title = ", ".join(folder.resolve().name for folder in folders)
         with whole_file(page) as draft:
             draft.write_text(data_set_page(title, found, checks), encoding="utf-8")
-    if as_json:
-        print_json(found.model_dump(mode="json"))
-        return
-    rows = [
-        (
-            name,
-            clip.camera or "-",
-            f"{clip.frames}",
-            f"{clip.seconds:.1f}",
-            f"{clip.persons}",
-            f"{clip.poses}",
-            f"{sum(clip.trajectories_m):.0f}",
-        )
+    print_json(found.model_dump(mode="json"))
+    rows = (
+        f"{name}\t{clip.camera or '-'}\t{clip.frames}\t{clip.seconds:.1f}\t{clip.persons}\t"
+        f"{clip.poses}\t{sum(clip.trajectories_m):.0f}"
         for name, clip in found.clips.items()
-    ]
-    titles = ("frames", "s", "people", "poses", "distance m")
-    print_table("", ("clip", "camera", *(f">{title}" for title in titles)), rows)
+    )
+    print_table("", "clip\tcamera\t>frames\t>s\t>people\t>poses\t>distance m", rows)
     line(
         f"{len(found.clips)} clips, {found.minutes:.1f} min, {found.frames} frames, "
         f"{found.poses} poses, {found.distance_km:.2f} km, camera {found.camera or '-'}"
@@ -102,10 +83,9 @@ FAULTY = 1
 
 def check(
     folder: Annotated[Path, typer.Argument(metavar="DIR")],
-    fps: FpsOption = None,
+    fps: float | None = None,
     body: str | None = None,
-    pitch: Annotated[bool, typer.Option("--pitch/--no-pitch")] = True,
-    as_json: JsonOption = False,
+    pitch: bool = True,
 ) -> None:
     """Check whether a data set is consistent, and which convention it violates if not.
 
@@ -119,34 +99,25 @@ def check(
     from flows.results.dataset import check as check_data_set
 
     tell_unstated_rate(folder, fps)
-    _print_check(check_data_set(folder, fps=fps, body=body, pitch=pitch), as_json=as_json)
+    _print_check(check_data_set(folder, fps=fps, body=body, pitch=pitch))
 
 
-def _print_check(report: CheckReport, *, as_json: bool) -> None:
+def _print_check(report: CheckReport) -> None:
     """Print the outcome of a check, and end the command with an exit code if there are findings."""
     for note in report.notes:
         line(note, to=errors)
-    if as_json:
-        print_json({**report.model_dump(mode="json"), "passed": not report.findings})
-    else:
-        rows = [
-            (
-                name,
-                f"{figures.frames}",
-                f"{figures.persons}",
-                f"{figures.cameras}",
-                f"{figures.compared}",
-                _format_value(figures.reprojection_median_px),
-                _format_value(figures.plausible_share),
-            )
-            for name, figures in report.clips.items()
-        ]
-        titles = ("frames", "people", "cameras", "compared", "reprojection px", "plausible")
-        print_table("", ("clip", *(f">{title}" for title in titles)), rows)
-        for finding in report.findings:
-            figures = ", ".join(f"{name} {value:.4g}" for name, value in finding.figures.items())
-            line(f"{finding.fault}: {finding.says} [{', '.join(finding.where)}] {figures}".rstrip())
-        line(f"{len(report.findings)} findings" if report.findings else "no findings")
+    print_json({**report.model_dump(mode="json"), "passed": not report.findings})
+    rows = (
+        f"{name}\t{it.frames}\t{it.persons}\t{it.cameras}\t{it.compared}\t"
+        f"{_format_value(it.reprojection_median_px)}\t{_format_value(it.plausible_share)}"
+        for name, it in report.clips.items()
+    )
+    heads = "clip\t>frames\t>people\t>cameras\t>compared\t>reprojection px\t>plausible"
+    print_table("", heads, rows)
+    for finding in report.findings:
+        figures = ", ".join(f"{name} {value:.4g}" for name, value in finding.figures.items())
+        line(f"{finding.fault}: {finding.says} [{', '.join(finding.where)}] {figures}".rstrip())
+    line(f"{len(report.findings)} findings" if report.findings else "no findings")
     if report.findings:
         raise typer.Exit(FAULTY)
 
@@ -177,8 +148,7 @@ def release(
     footage: Literal["none", "digest", "copy"] = "none",
     subjects: Path | None = None,
     check: Annotated[Path | None, typer.Option(metavar="FOLDER")] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Write one data set from runs of several matches, or check one.
 
@@ -200,7 +170,7 @@ def release(
     from flows.results.data_set_release import ASSETS, check_data_set, write_data_set
 
     if check is not None:
-        _print_check(check_data_set(check, hidden), as_json=as_json)
+        _print_check(check_data_set(check, hidden))
         return
     runs: dict[str, str] = {}
     for item in matches or ():
@@ -218,7 +188,7 @@ def release(
         )
     from flows.cli.results import read_licence
     from flows.registering import find_registration
-    from flows.results.best_results import Origin, describe_later_run, open_results
+    from flows.results.best_results import Origin, describe_age, open_results
     from worldpose.store.store import Store
 
     licences: dict[str, str] = {}
@@ -231,7 +201,7 @@ def release(
     for match, run in runs.items():
         registration = find_registration(store, match)
         opened = open_results(store, registration.spec.match_id, run)
-        if run == "latest" and (later := describe_later_run(store, opened.record)):
+        if run == "latest" and (later := describe_age(store, opened.record)):
             line(later, to=errors)
         origin = Origin(opened, registration)
         if absent := sorted({clip.id for clip in registration.spec.clips} - {*origin.clips}):
@@ -242,9 +212,7 @@ def release(
         *(store, origins, out, name, licences), hidden=hidden, footage=footage, subjects=subjects
     )
     found = manifest.statistics
-    if as_json:
-        print_json({"out": str(out), "statistics": found.model_dump(mode="json")})
-        return
+    print_json({"out": str(out), "statistics": found.model_dump(mode="json")})
     line(
         f"wrote {out}: {len(manifest.clips)} clips; without those of the test part "
         f"{found.subjects} subjects, {found.frames} frames, {found.poses} poses, "

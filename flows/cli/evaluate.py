@@ -12,17 +12,8 @@ import numpy as np
 import typer
 
 from data_contracts.evaluation import MethodScore
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    RunOption,
-    StageOption,
-    errors,
-    line,
-    print_json,
-    print_table,
-)
+from flows.cli.console import errors, line, print_json, print_table
+from flows.cli.options import DEFAULT_PROJECT, given_options
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,26 +24,21 @@ TableForm = Literal["text", "csv", "latex"]
 
 
 def evaluate(
-    prediction: Annotated[
-        list[str] | None, typer.Option("--prediction", metavar="[NAME=]PATH")
-    ] = None,
+    prediction: Annotated[list[str] | None, typer.Option(metavar="[NAME=]PATH")] = None,
     reference: str | None = None,
-    run: RunOption = "latest",
-    stage: StageOption = None,
-    match_in: Annotated[str | None, typer.Option("--match-in", metavar="CAMERA")] = None,
-    fps: Annotated[float | None, typer.Option("--fps", min=0.001)] = None,
-    ablation: Annotated[int, typer.Option("--ablation", metavar="SEEDS", min=0)] = 0,
-    method: Annotated[list[str] | None, typer.Option("--method", metavar="NAME=PATH")] = None,
+    run: str = "latest",
+    stage: str | None = None,
+    match_in: Annotated[str | None, typer.Option(metavar="CAMERA")] = None,
+    fps: Annotated[float | None, typer.Option(min=0.001)] = None,
+    ablation: Annotated[int, typer.Option(metavar="SEEDS", min=0)] = 0,
+    method: Annotated[list[str] | None, typer.Option(metavar="NAME=PATH")] = None,
     body: str | None = None,
     markers: Path | None = None,
     first_frame: int | None = None,
-    method_fps: Annotated[
-        list[str] | None, typer.Option("--method-fps", metavar="NAME=FPS")
-    ] = None,
+    method_fps: Annotated[list[str] | None, typer.Option(metavar="NAME=FPS")] = None,
     table: TableForm = "text",
     picture: Path | None = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Score joints and cameras against a reference; definitions in docs/reference/metrics.md.
 
@@ -80,16 +66,11 @@ def evaluate(
         table: Table of methods: text, csv or latex.
         picture: With a data set, a PNG of each method's people in the camera and from the side.
     """
-    given = {
-        **{"--run": run != "latest", "--stage": stage, "--match-in": match_in, "--fps": fps},
-        **{"--body": body, "--markers": markers, "--first-frame": first_frame is not None},
-        **{"--method-fps": method_fps, "--table": table != "text", "--picture": picture},
-    }
+    given = given_options(evaluate, locals())
     allowed: tuple[str, ...]
     if ablation:
-        named = {"--prediction": prediction, "--reference": reference, "--method": method}
-        _require_effect("--ablation", {**given, **named}, ())
-        print_ablation(ablation, as_json=as_json)
+        _require_effect("--ablation", given, ())
+        print_ablation(ablation)
         return
     if reference is not None and prediction and not method:
         from worldpose.dataset.benchmark import is_data_set, score_folders
@@ -109,7 +90,7 @@ def evaluate(
                     draft.write_bytes(plot_methods(sample))
             for place, note in (each for score in results for each in score.notes.items()):
                 line(f"{place}: {note}", to=errors)
-            print_methods(results, table, as_json=as_json)
+            print_methods(results, table)
             return
     if method and reference is not None and not prediction and picture is None:
         from flows.results.baselines import score_methods
@@ -125,7 +106,7 @@ def evaluate(
             fps=fps,
             seen_fps=named_rates(method_fps or ()),
         )
-        print_methods(found, table, as_json=as_json)
+        print_methods(found, table)
         return
     if not prediction or reference is None or picture is not None or method:
         raise UsageError(
@@ -138,7 +119,7 @@ def evaluate(
 
     if is_submission(Path(prediction[0])) and is_submission(Path(reference)):
         _require_effect("submissions", given, ())
-        _print_challenge(Path(prediction[0]), Path(reference), as_json=as_json)
+        _print_challenge(Path(prediction[0]), Path(reference))
         return
     from flows.results.evaluation import Reading, is_of_files, score
 
@@ -156,14 +137,17 @@ def evaluate(
         match_in=match_in,
         reading=Reading(markers, first_frame),
     )
-    if scores.later_run:
-        line(scores.later_run, to=errors)
-    _print_scores(scores, as_json=as_json)
+    if scores.age:
+        line(scores.age, to=errors)
+    _print_scores(scores)
 
 
-def _require_effect(kind: str, given: Mapping[str, object], allowed: Sequence[str]) -> None:
+def _require_effect(kind: str, given: Sequence[str], allowed: Sequence[str]) -> None:
     """Raise UsageError if an option is given that has no effect."""
-    idle = [name for name, value in given.items() if value and name not in allowed]
+    always = ["--project", "--ablation"]
+    if kind != "--ablation":
+        always = ["--project", "--prediction", "--reference", "--method"]
+    idle = [name for name in given if name not in (*allowed, *always)]
     if idle:
         raise UsageError(
             f"worldpose evaluate {' '.join(idle)}",
@@ -189,33 +173,29 @@ def named_folders(given: Sequence[str]) -> dict[str, Path]:
     return folders
 
 
-def _print_challenge(prediction: Path, reference: Path, *, as_json: bool) -> None:
+def _print_challenge(prediction: Path, reference: Path) -> None:
     from worldpose.evaluation.challenge import ALL, score_submission
     from worldpose.formats.challenge import submission_clips
 
     found = {name: each.row() for name, each in score_submission(prediction, reference).items()}
     if unknown := [clip for clip in submission_clips(prediction) if clip not in found]:
         line(f"not scored, as the reference lacks them: {', '.join(unknown)}", to=errors)
-    if as_json:
-        print_json({**found.pop(ALL), "clips": found})
-        return
+    print_json({**found[ALL], "clips": {name: each for name, each in found.items() if name != ALL}})
     rows = [(name, *(f"{value:.4g}" for value in row.values())) for name, row in found.items()]
     print_table("", ("clip", *(f">{name}" for name in found[ALL])), rows)
 
 
-def _print_scores(scores: Scores, *, as_json: bool) -> None:
+def _print_scores(scores: Scores) -> None:
     from worldpose.reports.run_report import score_rows
 
     alignment = scores.alignment
-    if as_json:
-        metrics = scores.evaluation.model_dump(exclude_none=True)
-        if alignment is not None:
-            metrics["reference_offset_s"] = alignment.offset
-            metrics["reference_residual_m"] = alignment.residual
-        if scores.notes:
-            metrics["notes"] = scores.notes
-        print_json(metrics)
-        return
+    metrics = scores.evaluation.model_dump(exclude_none=True)
+    if alignment is not None:
+        metrics["reference_offset_s"] = alignment.offset
+        metrics["reference_residual_m"] = alignment.residual
+    if scores.notes:
+        metrics["notes"] = scores.notes
+    print_json(metrics)
     if alignment is not None:
         line(
             f"the reference's clock is {alignment.offset:.4f} s at match frame 0; after a rigid "
@@ -266,7 +246,7 @@ def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object
     print_table("", (kind, *(f">{title}" for title in columns.values())), shown)
 
 
-def print_ablation(seeds: int, *, as_json: bool) -> None:
+def print_ablation(seeds: int) -> None:
     """Simulate trials and print every row's mean and standard deviation over them.
 
     Seeds count from 0; JSON has every trial's metrics.
@@ -277,17 +257,15 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
     )
     names = [field.name for field in fields(Score)]
-    if as_json:
-        print_json(
-            {
-                clicks: {
-                    row: {name: [getattr(trial[row], name) for trial in found] for name in names}
-                    for row in found[0]
-                }
-                for clicks, found in trials.items()
+    print_json(
+        {
+            clicks: {
+                row: {name: [getattr(trial[row], name) for trial in found] for name in names}
+                for row in found[0]
             }
-        )
-        return
+            for clicks, found in trials.items()
+        }
+    )
     columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px")
     for clicks, found in trials.items():
         for how in (*TRIANGULATIONS, BY_PAPER):
@@ -307,22 +285,14 @@ def _is_of(row: str, how: str) -> bool:
     return max(ends, key=len) == how
 
 
-def _row(name: str, scores: list[Score]) -> tuple[str, str, str, str, str]:
-    def values(figure: str) -> list[float]:
-        return [getattr(score, figure) for score in scores]
-
-    def mean(figure: str, digits: int) -> str:
-        return f"{np.mean(values(figure)):.{digits}f}"
-
-    def mean_and_deviation(metric: str) -> str:
-        return f"{mean(metric, 1)} ± {np.std(values(metric)):.1f}"
-
+def _row(name: str, scores: list[Score]) -> str:
+    g, pa, ground, marking = (
+        np.array([getattr(score, figure) for score in scores])
+        for figure in ("g_mpjpe_mm", "pa_mpjpe_mm", "ground_error_m", "marking_error_px")
+    )
     return (
-        name,
-        mean_and_deviation("g_mpjpe_mm"),
-        mean_and_deviation("pa_mpjpe_mm"),
-        mean("ground_error_m", 3),
-        mean("marking_error_px", 2),
+        f"{name}\t{g.mean():.1f} ± {g.std():.1f}\t{pa.mean():.1f} ± {pa.std():.1f}\t"
+        f"{ground.mean():.3f}\t{marking.mean():.2f}"
     )
 
 
@@ -349,14 +319,13 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
     return rates
 
 
-def print_methods(scores: Sequence[MethodScore], form: TableForm, *, as_json: bool) -> None:
+def print_methods(scores: Sequence[MethodScore], form: TableForm) -> None:
     """Print scores of methods as text, CSV or LaTeX, or in full as JSON."""
     from flows.results import baselines
 
-    if as_json:
-        rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
-        print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
-    elif form == "text":
+    rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
+    print_json({"methods": rows, "table": [list(row) for row in baselines.table_rows(scores)]})
+    if form == "text":
         # Brackets would be parsed as markup.
         titles = (
             f">{title.replace('[', '').replace(']', '')}" for title in baselines.COLUMNS.values()

@@ -11,7 +11,7 @@ from pydantic import JsonValue, ValidationError
 
 from data_contracts.finetune import NetKind, NetVersion
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
+from flows.cli.options import DEFAULT_PROJECT
 from flows.settings import parse_value
 from worldpose.errors import UsageError, unknown_name
 
@@ -32,11 +32,10 @@ class _Lines(logging.Handler):
 
 def label(
     videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...")],
-    out: Annotated[Path, typer.Option()],
+    out: Path,
     every: Annotated[int, typer.Option(min=1)] = 50,
     detectors: Annotated[list[str] | None, typer.Option("--detector")] = None,
     pose: str = "embedded",
-    as_json: JsonOption = False,
 ) -> None:
     """Propose labels for evenly spaced frames, for people to correct.
 
@@ -55,7 +54,7 @@ def label(
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
     frames = propose_labels(videos, every, out, settings)
     told = f"proposed labels of {frames} frames: correct {out / 'labels.json'}"
-    console.answer(as_json, {"frames": frames, "labels": str(out / "labels.json")}, told)
+    console.answer({"frames": frames, "labels": str(out / "labels.json")}, told)
 
 
 def finetune(
@@ -64,8 +63,7 @@ def finetune(
     nets: Annotated[list[str] | None, typer.Option("--net")] = None,
     starts: Annotated[list[str] | None, typer.Option("--start", metavar="NET=FILE")] = None,
     assignments: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Train nets on labels; adopt a version only if it is better on held-out frames.
 
@@ -88,16 +86,14 @@ def finetune(
             todo="Train in a local project: settings name weights by file.",
         )
     kinds = tuple(_kind(name, "--net") for name in nets or NETS)
-    begin = {
-        _kind(name, "--start"): Path(file) for name, file in map(_split_assignment, starts or [])
-    }
+    begin = _initial_weights(starts or [], kinds)
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
     shown = _Lines()
     logger.addHandler(shown)
     try:
-        with prefect_server(project) as wait_until_ready:
+        with prefect_server() as wait_until_ready:
             from prefect.logging.handlers import APILogHandler
 
             from flows.finetune import FOLDER, fine_tune_nets
@@ -112,26 +108,17 @@ def finetune(
     finally:
         logger.removeHandler(shown)
     folder = Path(project) / FOLDER
-    if as_json:
-        console.print_json({"versions": [version.model_dump(mode="json") for version in versions]})
-    else:
-        _print(versions, folder)
+    console.print_json({"versions": [version.model_dump(mode="json") for version in versions]})
+    _print(versions, folder)
 
 
 def _print(versions: list[NetVersion], folder: Path) -> None:
-    rows = [
-        (
-            v.net,
-            v.figure,
-            f"{v.before:.3f}",
-            f"{v.after:.3f}",
-            str(len(v.held_out)),
-            "adopted" if v.adopted else "not better: the old version stays",
-        )
+    rows = (
+        f"{v.net}\t{v.figure}\t{v.before:.3f}\t{v.after:.3f}\t{len(v.held_out)}\t"
+        + ("adopted" if v.adopted else "not better: the old version stays")
         for v in versions
-    ]
-    columns = ("net", "metric", ">before", ">after", ">held-out images", "")
-    console.print_table("fine-tuning", columns, rows)
+    )
+    console.print_table("fine-tuning", "net\tmetric\t>before\t>after\t>held-out images\t", rows)
     chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
     if chosen:
         console.line(f"use it with: worldpose run MATCH {' '.join(chosen)}")
@@ -142,6 +129,23 @@ def _kind(name: str, where: str) -> NetKind:
         if name == kind:
             return kind
     raise unknown_name(f"{where} {name}", name, NETS)
+
+
+def _initial_weights(starts: list[str], kinds: tuple[NetKind, ...]) -> dict[NetKind, Path]:
+    """Return the files of `--start`, each of another trained net."""
+    begin: dict[NetKind, Path] = {}
+    for start in starts:
+        name, file = _split_assignment(start)
+        kind = _kind(name, "--start")
+        if kind in begin or kind not in kinds:
+            raise UsageError(
+                f"--start {start}",
+                expected=f"initial weights of each trained net once: {', '.join(kinds)}",
+                found="the second of this net" if kind in begin else "a net that is not trained",
+                todo="Leave it out, or name the net with --net.",
+            )
+        begin[kind] = Path(file)
+    return begin
 
 
 def _split_assignment(assignment: str) -> tuple[str, str]:
@@ -162,7 +166,11 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
         name, text = _split_assignment(assignment)
         group, _, field = name.rpartition(".")
         groups.setdefault(group, {})[field] = parse_value(text)
-    given = {**groups.pop(""), **groups}
+    given = groups.pop("")
+    for group, fields in groups.items():
+        whole = given.get(group, {})
+        # The contract refuses what is no mapping.
+        given[group] = {**whole, **fields} if isinstance(whole, dict) else whole
     try:
         return FineTuningSettings.model_validate(given)
     except ValidationError as error:

@@ -8,8 +8,6 @@ from typing import Annotated
 import typer
 
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption, RunOption
-from flows.cli.options import MoreSettingsOption
 from flows.registering import find_registration
 from flows.results.comparison import (
     KINDS,
@@ -25,10 +23,9 @@ from worldpose.store.store import Store
 
 
 def diff(
+    store: Store,
     run_a: Annotated[str, typer.Argument(metavar="A")],
     run_b: Annotated[str, typer.Argument(metavar="B")],
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Show what changed between two runs: keys, reasons and metrics, and which parts improved.
 
@@ -43,20 +40,17 @@ def diff(
         run_a: A run, as MATCH/NUMBER.
         run_b: Another run, as MATCH/NUMBER.
     """
-    store = Store.open(project)
     a, b = find_run(store, run_a), find_run(store, run_b)
     changes = run_difference(store, a, b)
     is_one_match = a.match_id == b.match_id
     compared = compare_runs(store, a, b) if is_one_match else []
     pictures = largest_pose_changes(store, a, b) if is_one_match else []
-    if as_json:
-        found = {
-            "units": [asdict(each) for each in changes],
-            "compared": [asdict(each) for each in compared],
-            "moved": [asdict(each) for each in pictures],
-        }
-        console.print_json({"a": run_a, "b": run_b, **found})
-        return
+    found = {
+        "units": [asdict(each) for each in changes],
+        "compared": [asdict(each) for each in compared],
+        "moved": [asdict(each) for each in pictures],
+    }
+    console.print_json({"a": run_a, "b": run_b, **found})
     rows = [
         (
             change.unit,
@@ -69,14 +63,12 @@ def diff(
     console.print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "metrics"), rows)
     _print_compared(compared)
     if pictures:
-        console.print_table(
-            "images with the largest changes of people",
-            ("clip", "camera", ">frame", ">person", ">px"),
-            [
-                (each.clip, each.camera, str(each.frame), str(each.person), f"{each.moved_px:.2f}")
-                for each in pictures
-            ],
+        shown = (
+            f"{each.clip}\t{each.camera}\t{each.frame}\t{each.person}\t{each.moved_px:.2f}"
+            for each in pictures
         )
+        title = "images with the largest changes of people"
+        console.print_table(title, "clip\tcamera\t>frame\t>person\t>px", shown)
 
 
 def _print_compared(compared: list[SubjectChange]) -> None:
@@ -105,10 +97,9 @@ def _print_compared(compared: list[SubjectChange]) -> None:
 
 
 def why(
+    store: Store,
     unit: Annotated[str, typer.Argument(metavar="UNIT")],
-    assignments: MoreSettingsOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    more_settings: list[str] | None = None,
 ) -> None:
     """Show whether a unit's result is current, and if not, what made it stale.
 
@@ -121,41 +112,27 @@ def why(
     Options:
         unit: A unit, as MATCH/STAGE/UNIT.
     """
-    found = explain_unit(Store.open(project), unit, parse_overrides(assignments or []))
+    found = explain_unit(store, unit, parse_overrides(more_settings or []))
     reasons = (f"  {reason}" for reason in found.reasons)
-    console.answer(as_json, asdict(found), f"{found.unit}: {found.state}", *reasons)
+    console.answer(asdict(found), f"{found.unit}: {found.state}", *reasons)
 
 
-def timings(
-    match: MatchArgument,
-    run: RunOption = "latest",
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
-) -> None:
+def timings(store: Store, match: str, run: str = "latest") -> None:
     """Print the time of each stage of a run, the idle time, core hours and bytes.
 
     Example: worldpose timings matches/tiny
     """
-    store = Store.open(project)
     found = run_time(store, find_registration(store, match).spec.match_id, run)
-    if as_json:
-        console.print_json(asdict(found))
-        return
-    columns = ("stage", ">units", ">elapsed s", ">of the run %", ">work s", ">longest unit s")
-    whole = max(found.seconds, 1e-9)
+    console.print_json(asdict(found))
+    columns = "stage\t>units\t>elapsed s\t>of the run %\t>work s\t>longest unit s"
+    percent = 100.0 / max(found.seconds, 1e-9)
     rows = [
-        (
-            each.stage,
-            str(each.units),
-            f"{each.elapsed:.2f}",
-            f"{100.0 * each.elapsed / whole:.1f}",
-            f"{each.work:.2f}",
-            f"{each.longest:.2f}",
-        )
+        f"{each.stage}\t{each.units}\t{each.elapsed:.2f}\t{percent * each.elapsed:.1f}\t"
+        f"{each.work:.2f}\t{each.longest:.2f}"
         for each in found.stages
     ]
     for name, seconds in (("start", found.start), ("between units", found.between)):
-        rows.append((name, "", f"{seconds:.2f}", f"{100.0 * seconds / whole:.1f}", "", ""))
+        rows.append(f"{name}\t\t{seconds:.2f}\t{percent * seconds:.1f}\t\t")
     console.print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
     console.line(f"all its results, also those of earlier runs: {found.cost}")
     if not found.stages:

@@ -1,29 +1,36 @@
-"""Command locate-cameras: find the poses of static cameras from the people who walk past them."""
+"""Commands locate-cameras and synchronize: poses and clocks of cameras, from people in them."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
 
 from data_contracts.cameras import CameraCalibration, LensCalibration
+from data_contracts.match import ClockOffset
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, MatchArgument, ProjectOption
-from flows.cli.options import WorkersOption
-from flows.cli.synchronize import compute_poses
+from flows.cli.options import DEFAULT_PROJECT
 from flows.registering import find_match
-from flows.results.clock_offsets import choose_clip, load_detections
-from flows.results.outputs import require_new
-from flows.running import RunRequest
+from flows.results.clock_offsets import (
+    ClockOffsets,
+    choose_clip,
+    find_offsets,
+    load_detections,
+)
+from flows.results.outputs import claim_file, require_new
+from flows.run_record import alone_with
+from flows.running import RunRequest, run_match
 from flows.stage import Match
+from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength
+from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimate
 from worldpose.errors import InputError, UsageError
-from worldpose.store.store import Store
-
-if TYPE_CHECKING:
-    from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.formats.files import whole_file
+from worldpose.ingest.match_folder import LENS_FILE
+from worldpose.store.store import Run, Store
 
 UNKNOWN_FOCAL: Final = 0.3
 """Relative deviation of a focal length that nothing is known of [1]."""
@@ -38,17 +45,16 @@ STATURE_STD_M: Final = 0.01
 
 
 def locate_cameras(
-    match: MatchArgument,
+    match: str,
     stature: Annotated[float | None, typer.Option(min=0.5, max=2.5)] = None,
     distance: Annotated[
         tuple[str, str, float] | None, typer.Option(metavar="CAMERA CAMERA METRES")
     ] = None,
     clip: str | None = None,
     out: Path | None = None,
-    apply: Annotated[bool, typer.Option("--apply")] = False,
-    workers: WorkersOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    apply: bool = False,
+    workers: int | None = None,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Find the poses of static cameras from people who walk through their views, without a pitch.
 
@@ -65,9 +71,6 @@ def locate_cameras(
         out: Calibration (TOML) to write.
         apply: Write calibration.toml into the match folder.
     """
-    from worldpose.bundle_adjustment.people_cameras import KnownLength
-    from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimate
-
     if (stature is None) == (distance is None):
         raise UsageError(
             "--stature",
@@ -107,9 +110,7 @@ def locate_cameras(
     found = estimate(lenses, detections, folder.spec.fps, known)
     calibrations = {name: found.cameras[c].to_calibration(name) for c, name in enumerate(names)}
     written = _write(calibrations, folder.folder if apply else None, out)
-    if as_json:
-        console.print_json({"clip": chosen, "written": written, **_as_json(found, names)})
-        return
+    console.print_json({"clip": chosen, "written": written, **_as_json(found, names)})
     _print(found, names, written, known)
 
 
@@ -147,8 +148,6 @@ def _lens(match: Match, camera: str) -> LensCalibration:
 
 def _distance(given: tuple[str, str, float], names: list[str]) -> KnownLength:
     """Return the measured distance of two cameras."""
-    from worldpose.bundle_adjustment.people_cameras import KnownLength
-
     one, other, metres = given
     if one not in names or other not in names or one == other or not metres > 0.0:
         raise UsageError(
@@ -164,10 +163,6 @@ def _write(
     calibrations: dict[str, CameraCalibration], folder: Path | None, out: Path | None
 ) -> list[str]:
     """Write the calibration to a file, and into a match folder in place of its lenses."""
-    from worldpose.formats.calibration_writer import write_calibration_toml
-    from worldpose.formats.files import whole_file
-    from worldpose.ingest.match_folder import LENS_FILE
-
     places = [] if out is None else [out]
     if folder is not None:
         places.append(folder / "calibration.toml")
@@ -218,21 +213,14 @@ def _print(
         x, y, z = found.cameras.center[c]
         held = found.held_out_px[c]
         rows.append(
-            (
-                name,
-                f"{x:.2f}, {y:.2f}, {z:.2f} +- {found.std[c, 0]:.2f}",
-                f"{np.degrees(found.std[c, 1]):.2f}",
-                f"{found.cameras.focal[c, 0]:.0f} +- {100 * found.std[c, 2]:.1f} %",
-                str(found.keypoints[c]),
-                f"{found.residual_px[c]:.1f}",
-                "-" if np.isnan(held) else f"{held:.1f}",
-                f"{100 * found.coverage[c]:.0f}",
-            )
+            f"{name}\t{x:.2f}, {y:.2f}, {z:.2f} +- {found.std[c, 0]:.2f}\t"
+            f"{np.degrees(found.std[c, 1]):.2f}\t"
+            f"{found.cameras.focal[c, 0]:.0f} +- {100 * found.std[c, 2]:.1f} %\t"
+            f"{found.keypoints[c]}\t{found.residual_px[c]:.1f}\t"
+            f"{'-' if np.isnan(held) else f'{held:.1f}'}\t{100 * found.coverage[c]:.0f}"
         )
-    head = (
-        *("camera", ">position m", ">rotation +- deg", ">focal length px", ">keypoints"),
-        *(">residual px", ">held out px", ">coverage %"),
-    )
+    head = "camera\t>position m\t>rotation +- deg\t>focal length px\t>keypoints\t"
+    head += ">residual px\t>held out px\t>coverage %"
     console.print_table("cameras by the people", head, rows)
     by = "standing feet" if found.on_feet else "upright bodies"
     console.line(
@@ -245,3 +233,115 @@ def _print(
         console.line(f"wrote {place}")
     if not written:
         console.line("Add --apply to write calibration.toml into the match folder, or --out FILE.")
+
+
+def synchronize(
+    match: str,
+    clip: str | None = None,
+    max_offset: Annotated[float, typer.Option(min=0.1, max=60.0)] = 2.0,
+    plot: Path | None = None,
+    apply: bool = False,
+    workers: int | None = None,
+    project: str = DEFAULT_PROJECT,
+) -> None:
+    """Find the clock offsets of the static cameras from moving people, and propose offset_frames.
+
+    The cameras must be calibrated, and nothing must be known of their clocks. The command computes
+    the match up to the 2D poses first. The offset of the first camera that it can tell stays, and
+    --apply writes the others. A clock that drifts or steps has pairs [match frame, offset].
+
+    Example: worldpose synchronize matches/lab --plot clocks.svg --apply
+
+    Options:
+        clip: Clip whose people are compared; the longest by default.
+        max_offset: Largest offset between two cameras [s].
+        plot: Plot of the matches by offset to write: .svg, .pdf or .png.
+        apply: Write the proposed offset_frames into match.yaml.
+    """
+    from worldpose.reports.drawing import draw_synchronization, require_plot
+
+    if plot is not None:
+        require_plot(plot)
+    store = Store.open_or_new(project)
+    with console.progress(verbose=False):
+        opened = find_match(store, match)
+        spec = opened.folder.spec
+        chosen_clip = choose_clip(spec, clip)
+        claim_file(plot, opened.match_id)
+        run = compute_poses(store, opened, workers, RunRequest({}, until_stage="detection"))
+    offsets = find_offsets(run, opened, chosen_clip, max_offset)
+    found, rows, changed = offsets.found, offsets.rows, offsets.changed
+    if plot is not None:
+        draw_synchronization(found, offsets.names, plot)
+    if apply and changed:
+        from worldpose.ingest.writing import write_offsets
+
+        write_offsets(opened.folder.folder, changed)
+    console.print_json(
+        {
+            "clip": chosen_clip,
+            "cameras": [row._asdict() for row in rows],
+            "applied": changed if apply else {},
+        }
+    )
+    _print_offsets(offsets, plot, applied=apply)
+    if offsets.warning:
+        console.line(f"warning: {offsets.warning}", to=console.errors)
+    is_known = np.isfinite(found.late).all() and not offsets.warning
+    raise typer.Exit(0 if is_known else 4)
+
+
+def compute_poses(store: Store, match: Match, workers: int | None, *parts: RunRequest) -> Run:
+    """Compute parts of the method, up to the 2D poses, with the gates of the match's other runs.
+
+    Raises:
+        InputError: another process runs the match, or results must be reviewed first.
+    """
+    with alone_with(store, match.match_id):
+        for part in parts:
+            record = run_match(store, match, replace(part, workers=workers))
+    if record.waiting and any(name.startswith("detection/") for name in record.blocked):
+        raise InputError(
+            f"{match.match_id}: 2D poses",
+            expected="all results that they need",
+            found=f"{len(record.waiting)} that wait for review",
+            todo=f"Decide them first: worldpose review list {match.match_id}.",
+        )
+    return Run(store, record)
+
+
+def _offset_text(offset: ClockOffset) -> str:
+    """Return an offset as in match.yaml."""
+    pairs = [list(pair) for pair in offset] if isinstance(offset, tuple) else offset
+    return str(pairs)
+
+
+def _print_offsets(offsets: ClockOffsets, plot: Path | None, *, applied: bool) -> None:
+    """Print a table of the offsets, and what to do with them."""
+    changed = offsets.changed
+    shown = [
+        (
+            row.camera,
+            _offset_text(row.stated),
+            "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
+            "-" if row.std is None else f"{row.std:.2f}",
+            "-" if row.found is None else _offset_text(row.proposed),
+            row.reason if row.relative_to is None else f"relative to {row.relative_to}",
+        )
+        for row in offsets.rows
+    ]
+    head = ("camera", ">offset_frames", ">by the people", ">standard deviation", ">proposed", "")
+    console.print_table("clock offsets of the cameras", head, shown)
+    if plot is not None:
+        console.line(f"wrote {plot}")
+    if not changed:
+        console.line("match.yaml needs no change.")
+    elif applied:
+        console.line(f"wrote offset_frames of {', '.join(changed)} into match.yaml")
+    else:
+        console.line("Add --apply to write the proposed offsets into match.yaml.")
+    if offsets.has_rest:
+        console.line(
+            "The fraction of a frame remains; worldpose run --set "
+            "triangulation.correct_clocks=true corrects it."
+        )

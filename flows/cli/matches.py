@@ -12,17 +12,8 @@ import typer
 from data_contracts.cameras import COEFFICIENTS
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    ProjectOption,
-    answer,
-    errors,
-    line,
-    print_json,
-    print_table,
-)
-from flows.cli.options import FpsOption
+from flows.cli.console import answer, errors, line, print_json, print_table
+from flows.cli.options import DEFAULT_PROJECT, given_options
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
@@ -36,29 +27,28 @@ from worldpose.store.store import Store
 
 
 def import_command(
-    out: Annotated[Path, typer.Option()],
+    out: Path,
     calibration: Path | None = None,
     detections: Path | None = None,
     videos: Path | None = None,
     boxes: Path | None = None,
-    join: Annotated[bool, typer.Option("--join")] = False,
+    join: bool = False,
     pose2sim: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     challenge: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
-    fps: FpsOption = None,
+    fps: float | None = None,
     match_id: str | None = None,
     pitch: Path | None = None,
     clicks: Path | None = None,
     camera: str | None = None,
     lens: list[Path] | None = None,
-    camera_data: Annotated[Path | None, typer.Option("--camera-data")] = None,
-    first_frame: Annotated[int | None, typer.Option("--first-frame", min=0)] = None,
-    freed_camera: Annotated[int | None, typer.Option("--freed-camera", min=0, max=255)] = None,
-    zoom_table: Annotated[Path | None, typer.Option("--zoom-table")] = None,
-    left_handed: Annotated[bool, typer.Option("--left-handed")] = False,
+    camera_data: Path | None = None,
+    first_frame: Annotated[int | None, typer.Option(min=0)] = None,
+    freed_camera: Annotated[int | None, typer.Option(min=0, max=255)] = None,
+    zoom_table: Path | None = None,
+    left_handed: bool = False,
     template: TemplateName | None = None,
     unit: str | None = None,
     up: str | None = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
 
@@ -101,30 +91,9 @@ def import_command(
         up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
             By default people who stand tell it.
     """
-    options = {
-        "--calibration": calibration,
-        "--detections": detections,
-        "--videos": videos,
-        "--boxes": None if videos else boxes,  # with videos, they are a part of the match
-        "--pose2sim": pose2sim,
-        "--challenge": challenge,
-        "--fps": fps,
-        "--match-id": match_id,
-        "--pitch": pitch,
-        "--clicks": clicks,
-        "--camera": camera,
-        "--lens": lens,
-        "--camera-data": camera_data,
-        "--first-frame": first_frame is not None,
-        "--freed-camera": freed_camera is not None,
-        "--zoom-table": zoom_table,
-        "--left-handed": left_handed,
-        "--template": template,
-        "--unit": unit,
-        "--up": up,
-        "--join": join and not videos,
-    }
-    given = {name for name, value in options.items() if value}
+    given = set(given_options(import_command, locals()))
+    if videos is not None:  # then they are a part of the match
+        given -= {"--boxes", "--join"}
     kind = next((name for name in ALONE if name in given), None)
     if kind is not None:
         _require_alone(kind, given)
@@ -138,24 +107,24 @@ def import_command(
         counts = import_boxes(boxes, out, changes)
         lines = (f"wrote {out / 'boxes' / name}.txt: {n} boxes" for name, n in counts.items())
         told = {"notes": changes} if changes else {}
-        answer(as_json, {"folder": str(out), "boxes": counts, **told}, *lines, *changes)
+        answer({"folder": str(out), "boxes": counts, **told}, *lines, *changes)
     elif kind == "--lens" and lens is not None:
-        _import_lenses(lens, out, camera, as_json=as_json)
+        _import_lenses(lens, out, camera)
     elif kind == "--clicks" and clicks is not None:
-        _import_clicks(clicks, out, camera, as_json=as_json)
+        _import_clicks(clicks, out, camera)
     elif kind == "--camera-data" and camera_data is not None:
         target, data = import_camera_data(
             camera_data, out, camera, first=first_frame, number=freed_camera, zoom_table=zoom_table
         )
         about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
-        answer(as_json, about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
+        answer(about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
-        import_pitch(pitch, template, out, left_handed=left_handed, as_json=as_json)
+        import_pitch(pitch, template, out, left_handed=left_handed)
     elif challenge is not None:
-        _import_challenge(challenge, out, fps, as_json=as_json)
+        _import_challenge(challenge, out, fps)
     elif pose2sim is not None:
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
-        _print_match(spec, out, notes, as_json=as_json)
+        _print_match(spec, out, notes)
     elif videos is not None and detections is None:
         spec, notes = import_videos(
             calibration,
@@ -167,7 +136,7 @@ def import_command(
             place=place,
             join=join,
         )
-        _print_match(spec, out, notes, as_json=as_json)
+        _print_match(spec, out, notes)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",
@@ -179,7 +148,7 @@ def import_command(
         spec, notes = import_match(
             calibration, detections, fps, out, match_id=match_id, place=place
         )
-        _print_match(spec, out, notes, as_json=as_json)
+        _print_match(spec, out, notes)
 
 
 ALONE: Final = {
@@ -221,7 +190,7 @@ def _require_alone(kind: str, given: set[str]) -> None:
         )
 
 
-def _import_challenge(kit: Path, out: Path, fps: float | None, *, as_json: bool) -> None:
+def _import_challenge(kit: Path, out: Path, fps: float | None) -> None:
     """Write a match for each sequence of a challenge, and print what was read."""
     from worldpose.body_fitting.skeletons import pose_skeletons  # late: it loads the body
     from worldpose.ingest.challenge_kit import import_challenge
@@ -230,15 +199,13 @@ def _import_challenge(kit: Path, out: Path, fps: float | None, *, as_json: bool)
     lines = [note for _, notes in made.values() for note in notes]
     folders = {name: str(out / name) for name in made}
     following = [f"next: worldpose run {folder}" for folder in folders.values()]
-    answer(as_json, {"folders": folders, "notes": lines}, *lines, *following)
+    answer({"folders": folders, "notes": lines}, *lines, *following)
 
 
-def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:
+def _print_match(spec: MatchSpec, out: Path, notes: list[str]) -> None:
     """Print a match that was made, and sentences about what was found."""
-    if as_json:
-        about = {"notes": notes} if notes else {}
-        print_json({"match": spec.match_id, "folder": str(out), **about})
-        return
+    about = {"notes": notes} if notes else {}
+    print_json({"match": spec.match_id, "folder": str(out), **about})
     clip = spec.clips[0]
     for note in notes:
         line(note)
@@ -253,13 +220,11 @@ def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool)
     line(f"next: worldpose {'run' if is_calibrated else 'ingest'} {out}")
 
 
-def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json: bool) -> None:
+def _import_lenses(files: list[Path], out: Path, camera: str | None) -> None:
     """Write lenses without a pose into a match folder, and print them with their deviations."""
     lenses = import_lenses(files, out, camera)
-    if as_json:
-        cameras = {name: lens.model_dump(mode="json") for name, lens in lenses.items()}
-        print_json({"folder": str(out), "lenses": cameras})
-        return
+    cameras = {name: lens.model_dump(mode="json") for name, lens in lenses.items()}
+    print_json({"folder": str(out), "lenses": cameras})
     line(f"wrote {out / 'lenses.toml'}; the deviations can be edited there")
     for name, lens in lenses.items():
         x, y = lens.principal_point_px
@@ -272,7 +237,7 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json:
         )
 
 
-def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) -> None:
+def _import_clicks(file: Path, out: Path, camera: str | None) -> None:
     """Write clicks and own points into a match folder, and print what was read."""
     found = import_clicks(file, out, camera)
     questions = []
@@ -280,9 +245,7 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
         from flows.review.repeated_clicks import explain_repeated  # late: it loads the estimators
 
         questions = explain_repeated(out, file, found.repeated)
-    if as_json:
-        print_json({"folder": str(out), **asdict(found), "questions": questions})
-        return
+    print_json({"folder": str(out), **asdict(found), "questions": questions})
     for name in found.files:
         line(f"wrote {out / name}")
     for owner, count in found.clicks.items():
@@ -299,7 +262,7 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
 
 
 def import_pitch(
-    survey: Path, template: TemplateName | None, out: Path, *, left_handed: bool, as_json: bool
+    survey: Path, template: TemplateName | None, out: Path, *, left_handed: bool
 ) -> None:
     """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats.files import whole_file
@@ -325,20 +288,18 @@ def import_pitch(
         key=lambda row: -row[1],
     )
     size = {name: getattr(fit.pitch, name) for name in ("length", "width", "crown")}
-    if as_json:
-        heights = {name: None if isnan(height) else height for name, _, height in rows}
-        print_json(
-            {
-                "pitch": str(file),
-                **size,
-                "measured": fit.measured,
-                "scale": fit.scale,
-                "slope": fit.slope,
-                "offset_plan_m": {name: plan for name, plan, _ in rows},
-                "offset_height_m": heights,
-            }
-        )
-        return
+    heights = {name: None if isnan(height) else height for name, _, height in rows}
+    print_json(
+        {
+            "pitch": str(file),
+            **size,
+            "measured": fit.measured,
+            "scale": fit.scale,
+            "slope": fit.slope,
+            "offset_plan_m": {name: plan for name, plan, _ in rows},
+            "offset_height_m": heights,
+        }
+    )
     line(f"wrote {file}")
     for name, value in size.items():
         line(f"{name}: {value:.3f} m{'' if name in fit.measured else ' (the survey cannot tell)'}")
@@ -353,8 +314,7 @@ def import_pitch(
 
 def ingest(
     folders: Annotated[list[Path], typer.Argument(metavar="MATCH...")],
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Validate match folders and register them in the project; repeating it is harmless.
 
@@ -374,12 +334,10 @@ def ingest(
             line(f"error: {failure}", to=errors)
             continue
         rows.append({"match": match.match_id, "folder": str(folder), "changed": changed})
-        if not as_json:
-            known = "registered" if changed else "already registered, unchanged:"
-            line(f"{known} {match.match_id}")
-            _tell_unclicked(match)
-    if as_json:
-        print_json({"matches": rows, "refused": refused})
+        known = "registered" if changed else "already registered, unchanged:"
+        line(f"{known} {match.match_id}")
+        _tell_unclicked(match)
+    print_json({"matches": rows, "refused": refused})
     if refused:
         raise typer.Exit(4 if rows else 1)
 

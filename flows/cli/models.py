@@ -11,34 +11,17 @@ from rich.progress import BarColumn, DownloadColumn, Progress
 
 from data_contracts.checkpoint import Checkpoint
 from flows.checkpoint_downloads import find_damage, pull, read_catalog
-from flows.cli.console import JsonOption, answer, errors, print_json, print_table
+from flows.cli.console import answer, errors, print_json, print_table
 from worldpose.detection.models import model_folder, read_pulled
 from worldpose.errors import WorldposeError, unknown_name
 
 commands = typer.Typer(name="models", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
-CatalogOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--catalog",
-        envvar="WORLDPOSE_MODEL_CATALOG",
-        help="YAML file with checkpoints of your own: name, address, digest.",
-    ),
-]
-FolderOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--folder",
-        help="Folder of pulled checkpoints; by default WORLDPOSE_MODEL_FOLDER, or the cache.",
-    ),
-]
 SETTING = {"detector": "detection.detector", "pose": "detection.pose"}
 
 
 @commands.command(name="list")
-def list_models(
-    catalog: CatalogOption = None, folder: FolderOption = None, as_json: JsonOption = False
-) -> None:
+def list_models(catalog: Path | None = None, folder: Path | None = None) -> None:
     """List the checkpoints that can be pulled, and those that are there.
 
     Example: worldpose models list
@@ -48,10 +31,8 @@ def list_models(
     there = _read_all_pulled(place)
     for name, pulled in there.items():
         known.setdefault(name, pulled)
-    if as_json:
-        rows = [_describe(each, each.name in there) for each in known.values()]
-        print_json({"folder": str(place), "models": rows})
-        return
+    rows = [_describe(each, each.name in there) for each in known.values()]
+    print_json({"folder": str(place), "models": rows})
     columns = ("name", "setting", ">MB", "licence", "pulled", "what it is")
     print_table(
         f"checkpoints; pulled ones lie in {place}",
@@ -102,9 +83,8 @@ def _describe(checkpoint: Checkpoint, is_pulled: bool) -> dict[str, object]:
 @commands.command(name="pull")
 def pull_model(
     name: Annotated[str, typer.Argument(metavar="NAME")],
-    catalog: CatalogOption = None,
-    folder: FolderOption = None,
-    as_json: JsonOption = False,
+    catalog: Path | None = None,
+    folder: Path | None = None,
 ) -> None:
     """Download a checkpoint, check its SHA-256, and keep it in the cache.
 
@@ -133,14 +113,13 @@ def pull_model(
         path = pull(checkpoint, place, advance)
     setting = _setting_for(checkpoint)
     told = f"pulled {name} into {path} ({checkpoint.licence}); use it: --set {setting}"
-    answer(as_json, {"name": name, "folder": str(path), "setting": setting}, told)
+    answer({"name": name, "folder": str(path), "setting": setting}, told)
 
 
 @commands.command(name="verify")
 def verify_models(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...")] = None,
-    folder: FolderOption = None,
-    as_json: JsonOption = False,
+    folder: Path | None = None,
 ) -> None:
     """Compare pulled checkpoints with their digests, and remove damaged ones.
 
@@ -157,7 +136,6 @@ def verify_models(
     for name in wrong:
         shutil.rmtree(place / name)
     answer(
-        as_json,
         {"folder": str(place), "right": sorted(set(checked) - set(wrong)), "removed": wrong},
         *(f"{name}: {'removed' if name in wrong else 'all digests are right'}" for name in checked),
     )

@@ -10,8 +10,13 @@ import typer
 from rich.progress import Progress
 
 from data_contracts.arrays import Image
-from flows.cli.console import JsonOption, answer, errors, line, print_json, print_table
+from flows.cli.console import answer, errors, line, print_json, print_table
+from flows.results.outputs import claim_file
+from worldpose.broadcast_calibration.shots import find_shots
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.files import whole_file
+from worldpose.video.files import VideoReader, index_frames
+from worldpose.video.recordings import cut_video
 
 ANALYSED_WIDTH = 320
 """Width of the analysed images [px]."""
@@ -20,9 +25,8 @@ ANALYSED_WIDTH = 320
 def clips(
     programme: Annotated[Path, typer.Argument(metavar="VIDEO")],
     sheet: Path | None = None,
-    take: Annotated[str | None, typer.Option("--take", metavar="FIRST:STOP")] = None,
+    take: Annotated[str | None, typer.Option(metavar="FIRST:STOP")] = None,
     out: Path | None = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Propose clips of a programme: shots of the main camera without a cut and with a pan.
 
@@ -44,12 +48,8 @@ def clips(
             todo="Read the help: worldpose clips --help.",
         )
     if take is not None and out is not None:
-        _take(programme, take, out, as_json=as_json)
+        _take(programme, take, out)
         return
-    from flows.results.outputs import claim_file
-    from worldpose.broadcast_calibration.shots import find_shots
-    from worldpose.video.files import index_frames
-
     claim_file(sheet, str(programme.resolve()))
 
     index = index_frames(programme)
@@ -70,41 +70,34 @@ def clips(
         )
     proposed = [shot for shot in shots if not shot.unfit]
     if sheet is not None:
-        from worldpose.formats.files import whole_file
         from worldpose.reports.broadcast import programme_sheet
 
         with whole_file(sheet) as draft:
             draft.write_bytes(programme_sheet(proposed))
-    if as_json:
-        print_json(
-            {
-                "pictures": len(index),
-                "shots": [
-                    {
-                        "first": shot.first,
-                        "stop": shot.first + shot.count,
-                        "seconds": shot.seconds,
-                        "pan_widths": shot.pan,
-                        "grass": shot.grass,
-                        "tallest": shot.tallest,
-                        "unfit": shot.unfit,
-                    }
-                    for shot in shots
-                ],
-            }
-        )
-        return
-    columns = ("take", ">begins at", ">seconds", ">pan in widths", ">% grass")
-    rows = [
-        (
-            f"{shot.first}:{shot.first + shot.count}",
-            "{:.0f}:{:04.1f}".format(*divmod(shot.first / index.fps, 60.0)),
-            f"{shot.seconds:.1f}",
-            f"{shot.pan:.2f}",
-            f"{100.0 * shot.grass:.0f}",
-        )
+    print_json(
+        {
+            "pictures": len(index),
+            "shots": [
+                {
+                    "first": shot.first,
+                    "stop": shot.first + shot.count,
+                    "seconds": shot.seconds,
+                    "pan_widths": shot.pan,
+                    "grass": shot.grass,
+                    "tallest": shot.tallest,
+                    "unfit": shot.unfit,
+                }
+                for shot in shots
+            ],
+        }
+    )
+    rows = (
+        f"{shot.first}:{shot.first + shot.count}\t"
+        + "{:.0f}:{:04.1f}".format(*divmod(shot.first / index.fps, 60.0))
+        + f"\t{shot.seconds:.1f}\t{shot.pan:.2f}\t{100.0 * shot.grass:.0f}"
         for shot in proposed
-    ]
+    )
+    columns = "take\t>begins at\t>seconds\t>pan in widths\t>% grass"
     print_table("proposed clips", columns, rows)
     reasons = sorted({reason for shot in shots for reason in shot.unfit})
     for reason in reasons:
@@ -113,8 +106,6 @@ def clips(
 
 def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, Image | None]]:
     """Yield all images, downscaled, with progress on a terminal; add undecodable ones to `lost`."""
-    from worldpose.video.files import VideoReader
-
     with (
         VideoReader(programme) as video,
         Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars,
@@ -127,11 +118,8 @@ def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, Image | N
             bars.update(bar, completed=number + 1)
 
 
-def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
+def _take(programme: Path, take: str, out: Path) -> None:
     """Cut a range of images out, and print the entry for match.yaml."""
-    from worldpose.formats.files import whole_file
-    from worldpose.video.recordings import cut_video
-
     first, _, stop = take.partition(":")
     if not (first.isdecimal() and stop.isdecimal()):
         raise UsageError(
@@ -156,7 +144,6 @@ def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     }
     said = ", ".join(f"{key}: {value}" for key, value in entry.items())
     answer(
-        as_json,
         {"video": str(out), "clip": {**entry, "first_frame": None}},
         f"wrote {out}; for match.yaml, first_frame being its match frame:",
         f"  - {{{said}}}",

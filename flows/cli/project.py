@@ -10,7 +10,6 @@ import typer
 
 from data_contracts.pin import Pin
 from flows.cli import console
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
 from flows.match_state import UNREADABLE
 from flows.overview import PAGE, read_summary
 from flows.registering import find_registration
@@ -24,9 +23,7 @@ from worldpose.store.runs import list_pins, pin_run, unpin_run
 from worldpose.store.store import Store
 
 
-def init(
-    folder: Annotated[str, typer.Argument(metavar="DIR")], as_json: JsonOption = False
-) -> None:
+def init(folder: Annotated[str, typer.Argument(metavar="DIR")]) -> None:
     """Create a project: the folder of registered matches and their results.
 
     Example: worldpose init worldpose-data
@@ -35,13 +32,11 @@ def init(
         folder: Folder or s3:// URL to create.
     """
     store = Store.create(folder)
-    console.answer(as_json, {"project": store.url}, f"created project {store.url}")
+    console.answer({"project": store.url}, f"created project {store.url}")
 
 
 def status(
-    match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    store: Store, match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None
 ) -> None:
     """Show which results of each match are current, stale or missing.
 
@@ -50,9 +45,8 @@ def status(
     Options:
         match: Match id.
     """
-    store = Store.open(project)
     wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
-    if as_json:
+    if console.output.quiet:
         console.print_json({"matches": [_match_status(store, match_id) for match_id in wanted]})
         return
     if not wanted:
@@ -146,11 +140,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     }
 
 
-def verify(
-    mend: Annotated[bool, typer.Option("--repair")] = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
-) -> None:
+def verify(store: Store, mend: Annotated[bool, typer.Option("--repair")] = False) -> None:
     """Check every stored byte against its checksum; exit code 1 if any differs.
 
     Example: worldpose verify
@@ -159,18 +149,16 @@ def verify(
         mend: Withdraw damaged results, which a new run computes, and set damaged records aside
             as *.damaged.
     """
-    store = Store.open(project)
     with console.progress() as reporter:
         findings = verify_store(store, progress=reporter.bytes_read)
     withdrawn, set_aside = repair(store, findings) if mend else ((), ())
-    if as_json:
-        console.print_json(
-            {
-                "findings": [{"path": each.path, "problem": each.problem} for each in findings],
-                "withdrawn": [each.path for each in withdrawn],
-                "set_aside": list(set_aside),
-            }
-        )
+    console.print_json(
+        {
+            "findings": [{"path": each.path, "problem": each.problem} for each in findings],
+            "withdrawn": [each.path for each in withdrawn],
+            "set_aside": list(set_aside),
+        }
+    )
     for finding in findings:
         console.line(f"damaged: {finding.path}: {finding.problem}", to=console.errors)
     for result in withdrawn:
@@ -184,17 +172,15 @@ def verify(
         )
     if findings:
         raise typer.Exit(1)
-    if not as_json:
-        console.line("Every stored byte is as it was published.")
+    console.line("Every stored byte is as it was published.")
 
 
 def gc(
-    delete: Annotated[bool, typer.Option("--delete")] = False,
+    store: Store,
+    delete: bool = False,
     keep_last: Annotated[int | None, typer.Option(min=1)] = None,
     forget: Annotated[list[str] | None, typer.Option(metavar="MATCH/RUN")] = None,
     older_than: Annotated[float, typer.Option(min=0)] = 24.0,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """List or remove (--delete) data that no run uses; pinned runs are always kept.
 
@@ -206,7 +192,6 @@ def gc(
         forget: Also forget this run.
         older_than: Keep items younger than this [h].
     """
-    store = Store.open(project)
     plan = plan_gc(
         store, keep_last=keep_last, forget=forget or [], older_than=timedelta(hours=older_than)
     )
@@ -214,7 +199,6 @@ def gc(
     rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
     verb = "removed" if delete else "no run reaches"
     console.answer(
-        as_json,
         {"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed},
         *(f"{garbage.path}  {garbage.reason}" for garbage in plan.garbage),
         *plan.held,
@@ -223,12 +207,11 @@ def gc(
 
 
 def pin(
+    store: Store,
     run: Annotated[str, typer.Argument(metavar="RUN")],
     name: Annotated[str, typer.Argument(metavar="NAME")],
-    who: Annotated[str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER")],
+    who: str,
     why: str = "",
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Name a run and keep it: gc never forgets a named run, and --run accepts the name.
 
@@ -237,10 +220,8 @@ def pin(
     Options:
         run: MATCH/NUMBER, or MATCH: its latest.
         name: Name of the pin, such as v1.
-        who: Your name; it is recorded.
         why: Reason for the pin; it is recorded.
     """
-    store = Store.open(project)
     record = find_run(store, run)
     kept = pin_run(
         store.blobs,
@@ -253,14 +234,10 @@ def pin(
             pinned_at=datetime.now(UTC),
         ),
     )
-    _say_pin(kept, "pinned", as_json)
+    _say_pin(kept, "pinned")
 
 
-def unpin(
-    named: Annotated[str, typer.Argument(metavar="MATCH/NAME")],
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
-) -> None:
+def unpin(store: Store, named: Annotated[str, typer.Argument(metavar="MATCH/NAME")]) -> None:
     """Remove the name of a run; gc may then forget the run like any other.
 
     Example: worldpose unpin tiny-1/paper
@@ -276,9 +253,9 @@ def unpin(
             found=repr(named),
             todo="List the names: worldpose status.",
         )
-    _say_pin(unpin_run(Store.open(project).blobs, match_id, name), "unpinned", as_json)
+    _say_pin(unpin_run(store.blobs, match_id, name), "unpinned")
 
 
-def _say_pin(kept: Pin, verb: str, as_json: bool) -> None:
+def _say_pin(kept: Pin, verb: str) -> None:
     told = f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}"
-    console.answer(as_json, kept.model_dump(mode="json"), told)
+    console.answer(kept.model_dump(mode="json"), told)

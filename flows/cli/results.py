@@ -11,29 +11,15 @@ from typing import Annotated, Literal
 import typer
 
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    RunOption,
-    StageOption,
-    answer,
-    errors,
-    line,
-)
+from flows.cli.console import answer, errors, line
 from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Store
 
-OverwriteOption = Annotated[
-    bool,
-    typer.Option("--overwrite", help="Also replace files of another match, or of unknown origin."),
-]
-
 
 def export(
-    match: MatchArgument,
+    store: Store,
+    match: str,
     forms: Annotated[
         list[str],
         typer.Option(
@@ -43,18 +29,16 @@ def export(
             "(docs/reference/formats.md); more than one may be given.",
         ),
     ],
-    out: Annotated[Path, typer.Option()],
-    run: RunOption = "latest",
-    stage: StageOption = None,
+    out: Path,
+    run: str = "latest",
+    stage: str | None = None,
     definition: Literal["body", "detector"] | None = None,
-    release: Annotated[str | None, typer.Option("--release", metavar="NAME")] = None,
+    release: Annotated[str | None, typer.Option(metavar="NAME")] = None,
     licence: Path | None = None,
-    filled: Annotated[bool, typer.Option("--filled")] = False,
-    surface: Annotated[bool, typer.Option("--surface")] = False,
-    video: Annotated[bool, typer.Option("--video")] = False,
-    overwrite: OverwriteOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    filled: bool = False,
+    surface: bool = False,
+    video: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write a run's results as files that other tools read.
 
@@ -73,7 +57,7 @@ def export(
         video: With viewer, also embed the clip's overlay video.
     """
     from flows.registering import find_registration, open_match
-    from flows.results.best_results import Footage, Origin, describe_later_run, open_results
+    from flows.results.best_results import Footage, Origin, describe_age, open_results
     from flows.results.export import LENS_ERRORS
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
@@ -94,11 +78,10 @@ def export(
             found=f"--format {' --format '.join(forms)}",
             todo="Add --format viewer, or leave out --video.",
         )
-    store = Store.open(project)
     registration = find_registration(store, match)
     name = registration.spec.match_id
     opened = open_results(store, name, run)
-    if run == LATEST and (later := describe_later_run(store, opened.record)):
+    if run == LATEST and (later := describe_age(store, opened.record)):
         line(later, to=errors)
     for text in opened.record.usability.reservations:
         line(f"reservation: {text}", to=errors)
@@ -125,7 +108,7 @@ def export(
         off = max(each["max_error_px"] for each in json.loads(path.read_text()).values())
         sizes[path] = f": lenses in cameras/ differ from those used by up to {off:.2g} px"
     told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
-    answer(as_json, {"match": name, "files": [str(path) for path in written]}, *told)
+    answer({"match": name, "files": [str(path) for path in written]}, *told)
 
 
 def read_licence(file: Path) -> str:
@@ -153,16 +136,15 @@ export.__doc__ = f"{_ABOUT}\n\n\b\nFormats:\n{_LISTED}\n\nOptions:{_OPTIONS}"
 
 
 def report(
-    match: MatchArgument,
+    store: Store,
+    match: str,
     out: Path = Path("report.html"),
     reference: str | None = None,
-    videos: Annotated[bool, typer.Option("--videos/--no-videos")] = True,
+    videos: bool = True,
     camera: str | None = None,
-    figures: Annotated[Path | None, typer.Option("--figures", metavar="FOLDER")] = None,
-    run: RunOption = "latest",
-    overwrite: OverwriteOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    figures: Annotated[Path | None, typer.Option(metavar="FOLDER")] = None,
+    run: str = "latest",
+    overwrite: bool = False,
 ) -> None:
     """Write one HTML page about a run, with its settings, metrics and images.
 
@@ -177,10 +159,9 @@ def report(
     """
     from flows.registering import find_match, open_stored
     from flows.reports.report import write_report
-    from flows.results.best_results import describe_later_run, open_results
+    from flows.results.best_results import describe_age, open_results
     from flows.results.outputs import record_owner, require_own
 
-    store = Store.open(project)
     try:
         known = find_match(store, match, unfinished=True)
     except InputError as error:
@@ -200,7 +181,7 @@ def report(
         names = {file.name: None for file in files}
         require_own(place, names, (known.match_id,), overwrite=overwrite)
     opened = open_results(store, known.match_id, run).record
-    if run == LATEST and (later := describe_later_run(store, opened)):
+    if run == LATEST and (later := describe_age(store, opened)):
         line(later, to=errors)
     films = write_report(
         store,
@@ -220,7 +201,6 @@ def report(
     written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
     folder = {} if figures is None else {"figures": str(figures.resolve())}
     answer(
-        as_json,
         {"match": known.match_id, **written, **folder},
         f"report:  {out.resolve()}",
         *(f"video:   {film.resolve()}" for film in films),

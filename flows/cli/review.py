@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,18 +11,20 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.review import Edit
-from flows.cli import console, options, review_exchange
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption
+from flows.cli import console, options
+from flows.cli.options import DEFAULT_PROJECT
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
+from flows.review.annotation_exchange import export_people, import_people
 from flows.review.corrections import objections_of
 from flows.review.descriptions import describe_corrections, in_words, review_json, when
 from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
-from worldpose.errors import InputError, WorldposeError
+from worldpose.errors import InputError, UsageError, WorldposeError, unknown_name
+from worldpose.formats.annotations import Format, read_annotations, write_annotations
 from worldpose.store.store import Run, Store
 
 commands = typer.Typer(name="review", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
@@ -31,19 +34,19 @@ Requests = Annotated[
     list[str] | None,
     typer.Argument(metavar="[REVIEW...]", help="Ids from `list`; all pending ones by default."),
 ]
-Who = Annotated[
-    str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; it is recorded.")
-]
 Why = Annotated[str, typer.Option("--why", help="Your reason; it is recorded.")]
+FormatOption = Annotated[Format, typer.Option("--format", help="Format of the annotation tool.")]
+AnyFormatOption = Annotated[
+    Format | None, typer.Option("--format", help="Format of the file; detected by default.")
+]
 _EDITS = typer.Option("--edits", help="JSON list of corrections; see docs/how-to/review.md.")
 
 
 @commands.command("list")
 def list_reviews(
+    store: Store,
     match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None,
     everything: Annotated[bool, typer.Option("--all")] = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """List pending reviews of one match or of all; an unreadable match does not hide the others.
 
@@ -52,7 +55,6 @@ def list_reviews(
     Options:
         everything: Also list decided and superseded reviews.
     """
-    store = Store.open(project)
     names = [find_registration(store, match).spec.match_id] if match else store.matches()
     found: list[Review] = []
     problems: dict[str, str] = {}
@@ -66,9 +68,8 @@ def list_reviews(
         else:
             _tell_damage(opened)
     shown = [each for each in found if everything or each.state == "waits"]
-    if as_json:
-        console.print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
-    elif shown or not problems:
+    console.print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
+    if shown or not problems:
         _print_list(shown)
     if match and problems:
         raise typer.Exit(1)
@@ -76,16 +77,14 @@ def list_reviews(
 
 @commands.command()
 def show(
+    store: Store,
     match: MatchId,
     request: Annotated[str | None, typer.Argument(metavar="[REVIEW]")] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Show one review with its metrics, or a match's corrections and the origins of its results.
 
     Example: worldpose review show tiny-1 static_calibration.cam03.1f2e3d4c5b6a
     """
-    store = Store.open(project)
     opened = open_match(store, match)
     _tell_damage(opened)
     latest = latest_run(store, match)
@@ -98,7 +97,7 @@ def show(
                 found="no such review",
                 todo=f"List them: worldpose review list {match} --all.",
             )
-        _print_review(known[request], as_json)
+        _print_review(known[request])
         return
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
     refused = objections_of(Run(store, latest)) if latest else {}
@@ -109,19 +108,17 @@ def show(
     gone = ((each, refused[each.id]) for each in opened.corrections if each.id in refused)
     stale = [*opened.stale, *gone]
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
-    if as_json:
-        console.print_json(
-            {
-                "match": match,
-                "corrections": [
-                    each.model_dump(mode="json") | {"state": states[each.id]} for each in applied
-                ],
-                "stale": [each.model_dump(mode="json") | {"reason": why} for each, why in stale],
-                "origins": origins,
-                "damage": list(opened.journal.damage),
-            }
-        )
-        return
+    console.print_json(
+        {
+            "match": match,
+            "corrections": [
+                each.model_dump(mode="json") | {"state": states[each.id]} for each in applied
+            ],
+            "stale": [each.model_dump(mode="json") | {"reason": why} for each, why in stale],
+            "origins": origins,
+            "damage": list(opened.journal.damage),
+        }
+    )
     told = [
         *((it, states[it.id]) for it in applied),
         *((it, f"does not apply: {why}") for it, why in stale),
@@ -138,64 +135,55 @@ def show(
 
 @commands.command()
 def approve(
+    store: Store,
     match: MatchId,
-    who: Who,
+    who: str,
     requests: Requests = None,
     why: Why = "",
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Approve results; the verdict applies to their bytes, also in later runs.
 
     Example: worldpose review approve tiny-1 --who Ada --why "checked every overlay"
     """
-    _decide("approve", match, requests, who, why, None, project, as_json)
+    _decide(store, "approve", match, requests, who, why)
 
 
 @commands.command()
 def reject(
+    store: Store,
     match: MatchId,
-    who: Who,
+    who: str,
     why: Why,
     requests: Requests = None,
     edits: Annotated[Path | None, _EDITS] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Reject results, optionally with corrections; no later stage uses rejected results.
 
     Example: worldpose review reject tiny-1 --who Ada --why "wrong corner" --edits edits.json
     """
-    _decide("reject", match, requests, who, why, edits, project, as_json)
+    _decide(store, "reject", match, requests, who, why, edits)
 
 
 @commands.command()
 def correct(
-    match: MatchId,
-    who: Who,
-    edits: Annotated[Path, _EDITS],
-    why: Why = "",
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    store: Store, match: MatchId, who: str, edits: Annotated[Path, _EDITS], why: Why = ""
 ) -> None:
     """Correct clicks, detections or identities; the next run recomputes only what depends on them.
 
     Example: worldpose review correct tiny-1 --who Ada --edits edits.json
     """
-    store = Store.open(project)
     said = verdicts.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
     found = {"corrections": [each.model_dump(mode="json") for each in said]}
-    console.answer(as_json, found, *describe_corrections(said), _next_command(match))
+    console.answer(found, *describe_corrections(said), _next_command(match))
 
 
 @commands.command()
 def withdraw(
+    store: Store,
     match: MatchId,
     correction: Annotated[str, typer.Argument(metavar="CORRECTION")],
-    who: Who,
+    who: str,
     why: Why = "",
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
 ) -> None:
     """Withdraw a correction; the journal keeps both records.
 
@@ -204,36 +192,32 @@ def withdraw(
     Options:
         correction: Id of the correction, from `show`.
     """
-    store = Store.open(project)
     verdicts.withdraw(store, open_match(store, match), [correction], who=who, why=why)
     told = f"withdrawn: {correction}"
-    console.answer(as_json, {"withdrawn": correction}, told, _next_command(match))
+    console.answer({"withdrawn": correction}, told, _next_command(match))
 
 
 @commands.command()
-def resume(
-    match: MatchId, project: ProjectOption = DEFAULT_PROJECT, as_json: JsonOption = False
-) -> None:
+def resume(store: Store, match: MatchId) -> None:
     """Resume the suspended runs of a deployment after all reviews are decided.
 
     Example: worldpose review resume tiny-1
     """
-    store = Store.open(project)
     resumed = verdicts.resume(store, open_match(store, match))
     told = f"resumed {len(resumed)} runs of {match}; a serving process takes them up"
-    console.answer(as_json, {"resumed": resumed}, told)
+    console.answer({"resumed": resumed}, told)
 
 
 @commands.command()
 def serve(
-    port: options.PortOption = options.PAGES_PORT,
-    host: options.HostOption = "127.0.0.1",
-    names: options.NamesOption = None,
-    certificate: options.CertificateOption = None,
-    key: options.KeyOption = None,
-    token: options.TokenOption = None,
-    users: options.UsersOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
+    port: int = options.PAGES_PORT,
+    host: str = "127.0.0.1",
+    names: list[str] | None = None,
+    certificate: Path | None = None,
+    key: Path | None = None,
+    token: str | None = None,
+    users: Path | None = None,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Serve the review pages to browsers until interrupted.
 
@@ -254,20 +238,19 @@ def serve(
     is_shown = token is None and users is None
     shown = where if is_shown else where.partition("#")[0]
     told = f"review pages of {Store.open(project).url}: {shown}"
-    serve_pages(project, access, host=host, port=port, tls=tls, announce=lambda: console.line(told))
+    say = partial(console.answer, {"pages": shown}, told)
+    serve_pages(project, access, host=host, port=port, tls=tls, announce=say)
 
 
 def _decide(
+    store: Store,
     verdict: Literal["approve", "reject"],
     match: str,
     requests: list[str] | None,
     who: str,
     why: str,
-    edits: Path | None,
-    project: str,
-    as_json: bool,
+    edits: Path | None = None,
 ) -> None:
-    store = Store.open(project)
     ids, corrections = verdicts.decide(
         store,
         open_match(store, match),
@@ -279,7 +262,6 @@ def _decide(
     )
     said = [each.model_dump(mode="json") for each in corrections]
     console.answer(
-        as_json,
         {"verdict": verdict, "reviews": ids, "corrections": said},
         *(f"{verdict}: {name}" for name in ids),
         *describe_corrections(corrections),
@@ -311,7 +293,126 @@ def _tell_damage(match: Match) -> None:
         console.line(f"warning: {text}", to=console.errors)
 
 
-review_exchange.add_to(commands)
+@commands.command("export")
+def export_annotations(
+    store: Store,
+    match: MatchId,
+    out: Path,
+    form: FormatOption = "coco",
+    cameras: Annotated[list[str] | None, typer.Option("--camera")] = None,
+    frames: Annotated[list[int] | None, typer.Option("--frame")] = None,
+    every: Annotated[int, typer.Option(min=1)] = 50,
+) -> None:
+    """Write detections and images in the format of an annotation tool.
+
+    Example: worldpose review export tiny-1 --format cvat --camera cam03 --out to_annotate
+
+    Options:
+        out: Output folder; absent or empty.
+        cameras: A static camera, or a clip; all static ones by default.
+        frames: A match frame; repeatable.
+        every: Step between frames if no --frame is given.
+    """
+    opened = open_match(store, match)
+    places = _places(opened, cameras, frames, every)
+    written = export_people(store, opened, places, out, form)
+    unseen = f"{written.unseen} pictures have no file: there is no video of them"
+    console.answer(
+        {
+            "annotations": str(written.annotations),
+            "pictures": written.pictures,
+            "people": written.people,
+            "without_picture": written.unseen,
+        },
+        f"{written.annotations}: {written.people} people in {written.pictures} pictures",
+        *([unseen] if written.unseen else []),
+        f"next: worldpose review import {match} FILE --exported {out / 'exported.json'} --who YOU",
+    )
+
+
+@commands.command("import")
+def import_annotations(
+    store: Store,
+    match: MatchId,
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    exported: Path,
+    who: str,
+    form: AnyFormatOption = None,
+) -> None:
+    """Import an annotator's changes as corrections, found by comparison with the export.
+
+    Example: worldpose review import tiny-1 out.xml --exported to_annotate/exported.json --who Ada
+
+    Options:
+        file: File of the annotation tool.
+        exported: The file exported.json of the export.
+    """
+    changes, kept = import_people(
+        store, lambda: open_match(store, match), file, exported, form, who=who
+    )
+    passed_over = f"passed over: {changes.boxes} boxes of people who were there; keypoints decide"
+    console.answer(
+        {
+            "pictures": changes.pictures,
+            "boxes_passed_over": changes.boxes,
+            "corrections": [each.model_dump(mode="json") for each in kept],
+        },
+        *describe_corrections(kept),
+        f"{len(kept)} corrections from {changes.pictures} pictures",
+        *([passed_over] if changes.boxes else []),
+        f"next: worldpose run {match}",
+    )
+
+
+@commands.command("convert")
+def convert_annotations(
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    out: Path,
+    form: FormatOption = "coco",
+) -> None:
+    """Convert annotations to another format, for example COCO labels to CVAT, or CVAT to COCO.
+
+    Example: worldpose review convert annotations.xml --out labels.json
+
+    Options:
+        file: COCO, CVAT or Label Studio file.
+        out: Output file; it must not exist.
+    """
+    if out.exists():
+        raise UsageError(str(out), "a new file", "a file", "Choose another name.")
+    pictures = read_annotations(file)
+    write_annotations(out, pictures, form)
+    people = sum(len(picture.people) for picture in pictures)
+    told = f"{out}: {people} people in {len(pictures)} pictures"
+    console.answer({"annotations": str(out), "pictures": len(pictures), "people": people}, told)
+
+
+def _places(
+    match: Match, cameras: list[str] | None, frames: list[int] | None, every: int
+) -> list[tuple[str, int]]:
+    """Return camera and frame of each image: of a clip's own camera, in that clip alone."""
+    spec = match.folder.spec
+    static = [camera.id for camera in spec.static_cameras]
+    moving = [*spec.broadcast_views]
+    chosen = cameras or static
+    for camera in chosen:
+        if camera not in (*static, *moving):
+            raise unknown_name(f"--camera {camera}", camera, (*static, *moving))
+    places = [
+        (camera, frame)
+        for camera in chosen
+        for clip in spec.clips_of(camera)
+        for frame in range(clip.first_frame, clip.first_frame + clip.frame_count)
+        if (frame in frames if frames else (frame - clip.first_frame) % every == 0)
+    ]
+    if not places:
+        raise UsageError(
+            "--frame",
+            expected="frames of a clip",
+            found=", ".join(map(str, frames or [])),
+            todo="Choose match frames within a clip of match.yaml.",
+        )
+    return places
 
 
 def _print_list(shown: list[Review]) -> None:
@@ -325,11 +426,9 @@ def _print_list(shown: list[Review]) -> None:
             console.line(f"  {reason_words(reason)}")
 
 
-def _print_review(shown: Review, as_json: bool) -> None:
+def _print_review(shown: Review) -> None:
     """Print one review request, its verdict, and all metrics."""
-    if as_json:
-        console.print_json(review_json(shown))
-        return
+    console.print_json(review_json(shown))
     request, decision = shown.request, shown.decision
     console.line(f"{request.id}: {shown.state}")
     console.line(f"  {shown.question}")

@@ -1,38 +1,33 @@
-"""Command run: make a match's results current."""
+"""Commands run and reprocess: make the results of one match, or of all, current."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 from pydantic import JsonValue
 
 from data_contracts.run import EXIT_CODES, GatePolicy, RunRecord
-from flows.cli import console, options
-from flows.cli.console import (
-    DEFAULT_PROJECT,
-    JsonOption,
-    MatchArgument,
-    ProjectOption,
-    VerboseOption,
-)
+from flows.cli import console
+from flows.cli.options import DEFAULT_PROJECT
 from flows.cli.settings import print_known
 from flows.iterate import Iteration, Iterations, iterate_match
-from flows.orchestration.time_limits import parse_time_limits
-from flows.registering import find_match
+from flows.registering import find_match, find_registration
+from flows.reprocess import Reprocessed, State, reprocess_matches
 from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
 from flows.review.corrections import objections_of
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
 from flows.run_record import alone_with
+from flows.run_status import RunStatus
 from flows.running import RunRequest, run_match, settle
-from flows.settings import parse_overrides, selected_stages
+from flows.settings import parse_overrides, parse_time_limits, selected_stages
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.store import Run, Store
@@ -40,27 +35,31 @@ from worldpose.store.store import Run, Store
 if TYPE_CHECKING:
     from flows.results.comparison import Mark
 
+Marks = list[dict[str, str]]
+MAX_REASONS: Final = 3
+"""Printed reasons per unit; --json has them all."""
+JSON_STATES: Final = {"current": "untouched", "stale": "touched"}
+"""Words of --json for states that have no run of their own, as programs know them."""
 MAX_LISTED = 5
 """Number of waiting units listed by name."""
 
 
 def run(
-    match: MatchArgument,
+    match: str,
     from_stage: Annotated[str | None, typer.Option("--from")] = None,
     until_stage: Annotated[str | None, typer.Option("--until")] = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="STAGE.NAME=VALUE")
     ] = None,
-    default_settings: Annotated[bool, typer.Option("--default-settings")] = False,
-    dask: options.DaskOption = None,
-    workers: options.WorkersOption = None,
-    time_limits: options.TimeLimitOption = None,
+    default_settings: bool = False,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: list[str] | None = None,
     gates: Annotated[GatePolicy | None, typer.Option(metavar="POLICY")] = None,
     iterations: Annotated[str | None, typer.Option(metavar="N")] = None,
-    body_folder: options.BodyFolderOption = None,
-    verbose: VerboseOption = False,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    body_folder: Path | None = None,
+    verbose: bool = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Compute a match's missing and stale results, and nothing else.
 
@@ -82,7 +81,7 @@ def run(
     """
     started = time.monotonic()
     if assignments == ["list"]:
-        print_known(as_json=as_json)
+        print_known()
         return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
@@ -115,32 +114,31 @@ def run(
         *clock_advice(record.figures, opened.folder.spec),
         *click_advice(record.figures, record.settings),
     ]
-    if as_json:
-        console.print_json(
-            {
-                "run": record.run_id,
-                "executed": len(record.executed),
-                "reused": len(record.reused),
-                "failed": len(record.failed),
-                "waiting": len(record.waiting),
-                "seconds": round(seconds, 3),
-                "blocked": len(record.blocked),
-                "failures": [failure.model_dump() for failure in record.failed],
-                "gates": record.gates,
-                "reviews": [unit.model_dump() for unit in record.waiting],
-                "left_out": record.left_out,
-                "warnings": warned,
-                "usability": record.usability.model_dump(mode="json"),
-                **({"exports": [str(path) for path in exported]} if exported else {}),
-                **({} if passes is None else _iterations_json(store, passes)),
-            }
-        )
-    else:
-        if passes is not None:
-            print_iterations(store, passes)
-        _print(record, store.url, seconds)
-        for path in exported:
-            console.line(f"exported {path}")
+    marks = [] if passes is None else marks_of(store, passes)
+    console.print_json(
+        {
+            "run": record.run_id,
+            "executed": len(record.executed),
+            "reused": len(record.reused),
+            "failed": len(record.failed),
+            "waiting": len(record.waiting),
+            "seconds": round(seconds, 3),
+            "blocked": len(record.blocked),
+            "failures": [failure.model_dump() for failure in record.failed],
+            "gates": record.gates,
+            "reviews": [unit.model_dump() for unit in record.waiting],
+            "left_out": record.left_out,
+            "warnings": warned,
+            "usability": record.usability.model_dump(mode="json"),
+            **({"exports": [str(path) for path in exported]} if exported else {}),
+            **({} if passes is None else _iterations_json(passes, marks)),
+        }
+    )
+    if passes is not None:
+        print_iterations(passes, marks)
+    _print(record, store.url, seconds)
+    for path in exported:
+        console.line(f"exported {path}")
     reservations = record.usability.reservations
     for text in dict.fromkeys((*reservations, *warned)):
         kind = "reservation" if text in reservations else "warning"
@@ -248,12 +246,12 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
     }
 
 
-def marks_of(store: Store, found: Iterations) -> list[dict[str, str]]:
+def marks_of(store: Store, found: Iterations) -> Marks:
     """Compare cameras, clips and players of each iteration with the iteration before."""
     # Imported here: it takes 0.7 s, before Prefect and Dask can start, and few runs iterate.
     from flows.results.comparison import KINDS, compare_runs, count_marks
 
-    marks: list[dict[str, str]] = [{}]
+    marks: Marks = [{}]
     for before, after in pairwise(found.passes):
         changes = compare_runs(store, before.record, after.record)
         marks.append({kind: _in_short(count_marks(changes, kind)) for kind in KINDS})
@@ -265,7 +263,7 @@ def _in_short(marks: Mapping[Mark, int]) -> str:
     return " / ".join(str(marks.get(mark, 0)) for mark in shown)
 
 
-def _iterations_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
+def _iterations_json(found: Iterations, marks: Marks) -> dict[str, JsonValue]:
     """Return all iterations with their metrics, and the kept one."""
     return {
         "iterations": [
@@ -273,23 +271,22 @@ def _iterations_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
                 "iteration": each.number,
                 "run": each.record.run_id,
                 **figures_of(each),
-                "better_worse_mixed_unchanged": dict(marks),
+                "better_worse_mixed_unchanged": dict(changes),
             }
-            for each, marks in zip(found.passes, marks_of(store, found), strict=True)
+            for each, changes in zip(found.passes, marks, strict=True)
         ],
         "kept": found.kept.number,
         "ended": found.ended,
     }
 
 
-def print_iterations(store: Store, found: Iterations) -> None:
+def print_iterations(found: Iterations, marks: Marks) -> None:
     """Print one column per iteration, and the kept one."""
     columns = [figures_of(each) for each in found.passes]
     rows = [
         (name, *("" if column[name] is None else f"{column[name]:.4g}" for column in columns))
         for name in columns[0]
     ]
-    marks = marks_of(store, found)
     kinds = dict.fromkeys(kind for each in marks for kind in each)
     rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in kinds]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
@@ -320,3 +317,111 @@ def _last_bodies(record: RunRecord) -> dict[str, float]:
                 clip = unit.partition("/")[2]
                 found |= {f"{clip}.{name}": value for name, value in figures.items()}
     return found
+
+
+def reprocess(
+    store: Store,
+    matches: Annotated[list[str] | None, typer.Argument(metavar="[MATCH]...")] = None,
+    dry_run: bool = False,
+    retry: bool = False,
+    more_settings: list[str] | None = None,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: list[str] | None = None,
+    verbose: bool = False,
+) -> None:
+    """Recompute results that an edit, a setting, a detector or new code made stale.
+
+    Each match is run as worldpose settings MATCH says, up to the last stage of its latest run. Exit
+    code 0: all matches are current or at work; 1: none could be run; 3: some wait for review; 4:
+    some failed.
+
+    Example: worldpose reprocess --dry-run
+
+    Options:
+        matches: Ids or folders; all matches by default.
+        dry_run: Only list the units to compute, with reasons.
+        retry: Retry failed units, even without an edit.
+    """
+    overrides = parse_overrides(more_settings or [])
+    wanted = [find_registration(store, name).spec.match_id for name in matches or ()]
+    limits = parse_time_limits(time_limits or ())
+    request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
+    with console.progress(verbose=verbose):
+        states, told = set(), []
+        for each in reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run):
+            states.add(each.state)
+            told.append(_outcome_json(each))
+            _print_outcome(each)
+    console.print_json({"matches": told})
+    if not states:
+        console.line("No match is registered. Register one: worldpose ingest FOLDER.")
+    raise typer.Exit(exit_code(states))
+
+
+def exit_code(states: Set[State]) -> int:
+    """Return the exit code of the command for the states of the matches."""
+    if states & {"failed", "partial"}:
+        return 1 if states == {"failed"} else 4
+    return 3 if "waiting" in states else 0
+
+
+def _print_outcome(each: Reprocessed) -> None:
+    if each.state in ("never run", "current", "at work"):
+        console.line(f"{each.match_id}: {_nothing_to_do(each)}")
+        return
+    count = 0 if each.status is None else len(each.status.to_compute)
+    run = "" if each.record is None else f", run {each.record.run_id}"
+    console.line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
+    if each.status is not None:
+        _print_units(each.status)
+    if each.problem is not None:
+        console.line(f"error: {each.problem}", to=console.errors)
+
+
+def _nothing_to_do(each: Reprocessed) -> str:
+    record = each.record
+    if each.state == "at work":
+        return f"at work. {each.problem}"
+    if record is None:
+        return f"no run yet; start one: worldpose run {each.match_id}"
+    if record.state in ("failed", "partial"):
+        return (
+            f"nothing was edited since run {record.run_id}, which is {record.state}; "
+            "--retry repeats its failed units"
+        )
+    return "every result is current"
+
+
+def _print_units(status: RunStatus) -> None:
+    rows = []
+    for unit in status.units:
+        name = unit.unit if status.latest.iteration == 1 else f"{unit.iteration}: {unit.unit}"
+        own = [str(reason) for reason in unit.own_reasons]
+        more = [f"and {len(own) - MAX_REASONS} more"] * (len(own) > MAX_REASONS)
+        inputs = [f"changed inputs: {', '.join(unit.changed_inputs)}"] * bool(unit.changed_inputs)
+        rows.append((name, unit.state.value, "\n".join([*own[:MAX_REASONS], *more, *inputs])))
+    console.print_table(f"since run {status.latest.run_id}", ("unit", "state", "why"), rows)
+
+
+def _outcome_json(each: Reprocessed) -> dict[str, JsonValue]:
+    status = each.status
+    ran = None if each.state in JSON_STATES else each.record
+    return {
+        "match": each.match_id,
+        "state": JSON_STATES.get(each.state, each.state),
+        "run": None if each.record is None else each.record.run_id,
+        "executed": [] if ran is None else list(ran.executed),
+        "problem": each.problem,
+        "to_compute": 0 if status is None else len(status.to_compute),
+        "units": [
+            {
+                "unit": unit.unit,
+                "iteration": unit.iteration,
+                "state": unit.state.value,
+                "edited": bool(unit.own_reasons),
+                "reasons": list(unit.describe()),
+            }
+            for unit in (() if status is None else status.units)
+        ],
+    }

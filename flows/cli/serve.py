@@ -4,38 +4,43 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from flows.cli import options
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, answer, errors, line
-from flows.orchestration.time_limits import parse_time_limits
+from flows.cli.console import answer, errors, line
+from flows.cli.options import DEFAULT_PROJECT
+from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
+from flows.service.channels import channels_of, send_test
+from flows.service.health import check as check_service
+from flows.service.layout import StateFolder, state_folder
+from flows.service.plan import METRICS_TOKEN, PAGES_TOKEN, ServePlan, parse_schedules, secrets_of
+from flows.service.serving import serve as serve_all
+from flows.settings import parse_time_limits
+from flows.web.access import access_for
 from worldpose.errors import UsageError
-
-if TYPE_CHECKING:
-    from flows.service.layout import StateFolder
-    from flows.service.plan import ServePlan
+from worldpose.store.store import open_blobs
 
 
 def serve(
     inbox: Path | None = None,
     videos: Annotated[list[Path] | None, typer.Option(exists=True, file_okay=False)] = None,
     bucket: str | None = None,
-    check: Annotated[bool, typer.Option("--check")] = False,
-    test_alerts: Annotated[bool, typer.Option("--test-alerts")] = False,
+    check: bool = False,
+    test_alerts: bool = False,
     max_concurrent: Annotated[int, typer.Option(min=1)] = 1,
-    dask: options.DaskOption = None,
-    workers: options.WorkersOption = None,
-    time_limits: options.TimeLimitOption = None,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: list[str] | None = None,
     name: str = "worldpose",
-    port: options.PortOption = options.PAGES_PORT,
+    port: int = options.PAGES_PORT,
     prefect_port: Annotated[int, typer.Option(min=1, max=65535)] = 4200,
     metrics_port: Annotated[int, typer.Option(min=1, max=65535)] = 8573,
-    host: options.HostOption = "127.0.0.1",
-    names: options.NamesOption = None,
-    certificate: options.CertificateOption = None,
-    key: options.KeyOption = None,
+    host: str = "127.0.0.1",
+    names: list[str] | None = None,
+    certificate: Path | None = None,
+    key: Path | None = None,
     settle_time: Annotated[float, typer.Option(min=0)] = 30.0,
     poll_interval: Annotated[float, typer.Option(min=0.1)] = 15.0,
     schedule: Annotated[list[str] | None, typer.Option(metavar="FLOW=CRON")] = None,
@@ -44,10 +49,9 @@ def serve(
     stall_minutes: Annotated[float, typer.Option(min=0.5)] = 10.0,
     history_days: Annotated[float, typer.Option(min=1)] = 30.0,
     state: Path | None = None,
-    token: options.TokenOption = None,
-    users: options.UsersOption = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    token: str | None = None,
+    users: Path | None = None,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Serve a project until interrupted: pages, runs, inbox, dashboard, metrics, alerts.
 
@@ -80,26 +84,15 @@ def serve(
         history_days: Age at which Prefect forgets ended runs [d].
         state: Folder of logs and Prefect's database; PROJECT/operations by default.
     """
-    # Imported here: no other command needs them.
-    from flows.service.layout import state_folder
-    from flows.service.plan import ServePlan
-    from worldpose.store.store import open_blobs
-
     url = open_blobs(project).url
     folder = state_folder(url, state)
     if check:
-        _check(folder, as_json=as_json)
+        _check(folder)
         return
     if test_alerts:
-        _test_alerts(folder, as_json=as_json)
+        _test_alerts(folder)
         return
     line(f"starting Prefect, the worker and the pages for {url}", to=errors)
-    from flows.service.channels import channels_of
-    from flows.service.schedules import parse_schedules
-    from flows.service.service_secrets import PAGES_TOKEN, secrets_of
-    from flows.service.serving import serve as serve_all
-    from flows.web.access import access_for
-
     channels_of(os.environ, folder.alert_settings)  # refused here, not in an unread log
     tls = options.certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
@@ -154,30 +147,28 @@ def serve(
 
 def _print_addresses(plan: ServePlan, pages: str, *, asks_for_login: bool) -> None:
     """Print the addresses, and where secrets are instead of the secrets."""
-    from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
-    from flows.service.service_secrets import METRICS_TOKEN
-
     variable = SERVER_LOGIN if plan.owns_prefect else CLIENT_LOGIN
     is_kept = plan.owns_prefect and variable not in os.environ
     login_at = plan.state_folder.prefect_login if is_kept else variable
     is_given = METRICS_TOKEN in os.environ
     token_at = METRICS_TOKEN if is_given else plan.state_folder.metrics_token
-    line(f"serving {plan.project}")
-    line(f"pages          {pages}")
-    line(f"status page    {plan.pages}/status")
-    line(f"inbox          {plan.inbox}")
-    if asks_for_login:
-        line(f"Prefect        {plan.dashboard}  its login is in {login_at}")
-    else:
-        line(f"Prefect        {plan.dashboard}  which asks for no login: others may use it")
     metrics = f"http://{plan.host}:{plan.metrics_port}/metrics"
-    line(f"metrics        {metrics}  its token is in {token_at}")
-    line("Ctrl-C ends it; the next start resumes")
+    login = f"its login is in {login_at}"
+    if not asks_for_login:
+        login = "which asks for no login: others may use it"
+    told = {
+        "pages": pages,
+        "status page": f"{plan.pages}/status",
+        "inbox": f"{plan.inbox}",
+        "Prefect": f"{plan.dashboard}  {login}",
+        "metrics": f"{metrics}  its token is in {token_at}",
+    }
+    lines = (f"{name:<15}{text}" for name, text in told.items())
+    end = "Ctrl-C ends it; the next start resumes"
+    answer({"project": plan.project, **told}, f"serving {plan.project}", *lines, end)
 
 
-def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:
-    from flows.service.channels import channels_of, send_test
-
+def _test_alerts(folder: StateFolder) -> None:
     channels = channels_of(os.environ, folder.alert_settings)
     if not channels:
         raise UsageError(
@@ -190,15 +181,13 @@ def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:
     said = {
         name: f"failed: {it}" if it else "accepted a test alert" for name, it in problems.items()
     }
-    answer(as_json, {"channels": problems}, *(f"{name}: {text}" for name, text in said.items()))
+    answer({"channels": problems}, *(f"{name}: {text}" for name, text in said.items()))
     if any(problems.values()):
         raise typer.Exit(1)
 
 
-def _check(folder: StateFolder, *, as_json: bool) -> None:
-    from flows.service.health import check
-
-    findings = check(folder)
+def _check(folder: StateFolder) -> None:
+    findings = check_service(folder)
     is_healthy = all(finding.is_well for finding in findings)
     lines = []
     for it in findings:
@@ -208,5 +197,5 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
         {"part": it.part, "well": it.is_well, "state": it.state, "mend": it.remedy}
         for it in findings
     ]
-    answer(as_json, {"healthy": is_healthy, "findings": rows}, *lines)
+    answer({"healthy": is_healthy, "findings": rows}, *lines)
     raise typer.Exit(0 if is_healthy else 1)

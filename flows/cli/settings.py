@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, answer, line, print_json
+from flows.cli.console import answer, line, print_json
+from flows.cli.options import DEFAULT_PROJECT
 from flows.layers import (
     PROJECT,
     SETTINGS_LOCK,
@@ -33,11 +34,10 @@ def settings(
     venue: str | None = None,
     assignments: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None,
     removed: Annotated[list[str] | None, typer.Option("--unset", metavar="NAME")] = None,
-    add: Annotated[bool, typer.Option("--add")] = False,
+    add: bool = False,
     list_all: Annotated[bool, typer.Option("--list")] = False,
     described: Annotated[str | None, typer.Option("--describe", metavar="NAME")] = None,
-    project: ProjectOption = DEFAULT_PROJECT,
-    as_json: JsonOption = False,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Show or change the settings of a project, a venue or a match, and where each is from.
 
@@ -57,13 +57,13 @@ def settings(
         described: Describe one setting, as in --describe triangulation.min_views.
     """
     if list_all:
-        print_known(as_json=as_json)
+        print_known()
         return
     if described is not None:
         require_known(described, f"--describe {described}")
         it = known_settings()[described]
         about = f"{described} = {as_text(it['default'])}, built in", str(it["about"])
-        answer(as_json, {described: it}, *about)
+        answer({described: it}, *about)
         return
     store = Store.open(project)
     name, layers = _read(store, match, venue, is_new=add)
@@ -74,7 +74,7 @@ def settings(
     if match is None and venue is None:
         venues = {each: read_layer(store, f"{VENUES}/{each}") for each in list_venues(store)}
         told["venues"] = {each: dict(layer.values) for each, layer in venues.items()}
-    answer(as_json, told, *_lines(told))
+    answer(told, *_lines(told))
 
 
 def _read(
@@ -97,12 +97,10 @@ def _read(
     return name, (*project_layers(store), read_layer(store, name))
 
 
-def print_known(*, as_json: bool) -> None:
+def print_known() -> None:
     """Print all settings, one short line each, by stages."""
     known = known_settings()
-    if as_json:
-        print_json(known)
-        return
+    print_json(known)
     shown = None
     for name, it in known.items():
         stage, _, short = name.rpartition(".")

@@ -10,26 +10,25 @@ from typing import Annotated
 import typer
 from rich.progress import Progress, TaskID
 
-from flows.cli.console import JsonOption, answer, errors, line, print_json, print_table
+from flows.cli.console import answer, errors, line, print_json, print_table
 from worldpose.errors import UsageError, unknown_name
 
 
 def simulate(
-    scenario: Annotated[str, typer.Option()],
+    scenario: str,
     out: Path | None = None,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
     duration: Annotated[float | None, typer.Option(min=0.2)] = None,
     cameras: Annotated[int | None, typer.Option(min=1)] = None,
     players: Annotated[int | None, typer.Option(min=0)] = None,
     trajectories: Path | None = None,
     mocap: Path | None = None,
-    calibrated: Annotated[bool, typer.Option("--calibrated")] = False,
+    calibrated: bool = False,
     stills: bool = True,
     video: bool = True,
-    render: Annotated[bool, typer.Option("--render")] = False,
-    masks: Annotated[bool, typer.Option("--masks")] = False,
+    render: bool = False,
+    masks: bool = False,
     recordings: Path | None = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
 
@@ -58,9 +57,7 @@ def simulate(
 
     about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
     if scenario == "list":
-        if as_json:
-            print_json({"scenarios": about})
-            return
+        print_json({"scenarios": about})
         print_table("scenarios", ("name", "what happens"), list(about.items()))
         return
     if scenario not in about:
@@ -94,7 +91,7 @@ def simulate(
             recordings=recordings,
             calibrated=calibrated,
         )
-        _report_match(spec.match_id, out, as_json)
+        _report_match(spec.match_id, out)
         return
     _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
     with _show_rendering() as advance:
@@ -116,7 +113,7 @@ def simulate(
             ),
             advance=advance,
         )
-    _report_match(spec.match_id, out, as_json)
+    _report_match(spec.match_id, out)
 
 
 def _refuse_options(what: str, options: dict[str, bool]) -> None:
@@ -131,10 +128,10 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
             )
 
 
-def _report_match(match_id: str, out: Path, as_json: bool) -> None:
+def _report_match(match_id: str, out: Path) -> None:
     """Print the id of the created match."""
     about = {"match": match_id, "folder": str(out)}
-    answer(as_json, about, f"made match {match_id} in {out}")
+    answer(about, f"made match {match_id} in {out}")
 
 
 @contextmanager

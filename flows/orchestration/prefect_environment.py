@@ -1,4 +1,4 @@
-"""Prefect's environment for this project: no telemetry, its database with the project.
+"""Prefect's environment for this project: no telemetry, and a server of each run's own.
 
 With PREFECT_API_URL set, runs use that server and appear in its dashboard. Otherwise a run starts
 its own server on loopback for its duration. Only this module reads and sets the environment; it
@@ -8,11 +8,12 @@ must be called before Prefect is imported.
 from __future__ import annotations
 
 import base64
-import fcntl
 import os
 import re
 import secrets
+import shutil
 import socket
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -20,16 +21,19 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import certifi
 
-from flows.orchestration.prefect_database import begin_database, keep_database
+from worldpose.cache_folder import user_cache
 from worldpose.errors import InputError, WorldposeError
 
+DATABASE_FILE = "prefect.db"
+"""Name of the database file in PREFECT_HOME."""
 START_SECONDS = 120.0
 """The very first start creates Prefect's database, which took 15 s on two busy cores."""
 
@@ -193,12 +197,12 @@ def has_server() -> bool:
 
 
 @contextmanager
-def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable[[], None]]:
+def prefect_server(*, is_local: bool = False) -> Iterator[Callable[[], None]]:
     """Set up environment and server for Prefect; yield a function that waits for its API.
 
     Prefect, which takes seconds to import, can then be imported while its server starts. The
-    function raises WorldposeError if our own server does not answer. A local project also holds
-    Prefect's database; `is_local` says that all its clients see this machine's files.
+    function raises WorldposeError if our own server does not answer. Its database lasts as long as
+    it does. `is_local` says that all its clients see this machine's files.
 
     Raises:
         InputError: a given server does not answer.
@@ -211,39 +215,14 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
             yield lambda: None
             return
         with (
-            tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch,
-            _home(project, Path(scratch)) as home,
-            _environment({"PREFECT_HOME": str(home)}),
-            _environment(one_authority(Path(scratch)) if is_local else {}),
+            tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as home,
+            _environment({"PREFECT_HOME": home}),
+            _environment(one_authority(Path(home)) if is_local else {}),
             _environment({CLIENT_LOGIN: new_login()}),
-            _embedded_server(home, Path(scratch) / "server.log") as (address, wait_until_ready),
+            _embedded_server(Path(home)) as (address, wait_until_ready),
             _environment({"PREFECT_API_URL": address}),
         ):
             yield wait_until_ready
-
-
-@contextmanager
-def _home(project: str, scratch: Path) -> Iterator[Path]:
-    """Return the folder of Prefect's database: a local project's, which saves its creation.
-
-    While another run of the project uses that folder, or on object storage, it is a temporary one:
-    two servers that create one database at once destroy it.
-    """
-    from worldpose.store.blobs import storage_errors  # the server's process needs none
-
-    if "://" in project:
-        yield scratch
-        return
-    home = Path(project).resolve() / "prefect"
-    with storage_errors(str(home)):
-        home.mkdir(parents=True, exist_ok=True)
-        lock = (home / "in-use").open("w")
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            home = scratch
-        yield home
 
 
 @contextmanager
@@ -261,8 +240,8 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
-    is_first = begin_database(home)
+def _embedded_server(home: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+    is_first, log = begin_database(home), home / "server.log"
     with socket.create_server(("127.0.0.1", 0)) as listening, log.open("wb") as output:
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/api"
         # The server ends when its standard input closes, so a killed run leaves none behind. It
@@ -361,3 +340,62 @@ def problem_at(address: str) -> str:
         return f"{address} answers {error.code}"
     except (OSError, ValueError) as error:
         return f"{address} does not answer: {getattr(error, 'reason', error)}"
+
+
+def begin_database(home: Path) -> bool:
+    """Copy an empty database to `home`, PREFECT_HOME of a server that will be started.
+
+    Prefect creates one with a hundred migrations, which takes as long as the rest of its start. The
+    first one of a version is kept in the user's cache. Its files are for this account alone: SQLite
+    gives the rights of the database to its log.
+
+    Returns:
+        Whether the server must create the first one of its version there, to be kept then.
+
+    Raises:
+        StoreError: `home` is not writable.
+    """
+    # Imported here and below: with them, the server's process would import numba and scipy.
+    from worldpose.formats.files import whole_file
+    from worldpose.store.blobs import storage_errors
+
+    kept, database = kept_database(), home / DATABASE_FILE
+    if database.exists() and database.stat().st_size:
+        for file in home.glob(f"{DATABASE_FILE}*"):
+            file.chmod(0o600)
+        return False
+    with storage_errors(str(database)):
+        home.mkdir(parents=True, exist_ok=True)
+        if kept is None or not os.access(kept, os.R_OK):
+            database.touch(0o600)
+            return True
+        with whole_file(database) as draft:
+            draft.touch(0o600)
+            try:
+                shutil.copyfile(kept, draft)
+            except OSError as error:  # a copy error names the source file first, whichever failed
+                raise OSError(error.errno, error.strerror) from error
+    return False
+
+
+def keep_database(home: Path) -> None:
+    """Keep a copy of the unused database that a server has created in `home`."""
+    from worldpose.formats.files import whole_file
+
+    kept, database = kept_database(), home / DATABASE_FILE
+    if kept is None or not database.exists() or not database.stat().st_size:
+        return  # no home, or the environment names another database
+    # If the cache is not writable, every project creates its own.
+    with (
+        suppress(OSError, sqlite3.Error),
+        whole_file(kept) as draft,
+        closing(sqlite3.connect(database)) as made,
+        closing(sqlite3.connect(draft)) as copy,
+    ):
+        made.backup(copy)
+
+
+def kept_database() -> Path | None:
+    """Return the path of the kept empty database of this Prefect version; None without a home."""
+    cache = user_cache()
+    return None if cache is None else cache / "worldpose" / f"prefect-{version('prefect')}.db"

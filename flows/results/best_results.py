@@ -17,6 +17,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Join, Track
 from flows.layers import pitch_of, pitch_of_run
+from flows.overview import read_summary
 from flows.results.run_cameras import (
     BROADCAST,
     broadcast_unit,
@@ -118,11 +119,12 @@ def open_results(store: Store, match_id: str, run_id: str = LATEST) -> Run:
     return open_run(store.url, match_id, fallback or run_id)
 
 
-def describe_later_run(store: Store, record: RunRecord) -> str:
-    """Return a sentence about a match's latest run if it is later than `record`, else nothing."""
+def describe_age(store: Store, record: RunRecord) -> str:
+    """Return a sentence about a later run, or about why the latest is out of date; or nothing."""
     latest = store.run(record.match_id)
     if latest.run_id == record.run_id:
-        return ""
+        now = read_summary(store, record.match_id)
+        return f"These results are {now.words}. {now.todo}" if now.kind == "outdated" else ""
     lacks = "" if find_clips(latest) else " and has no people"
     return (
         f"These are results of run {record.run_id}. The later run {latest.run_id} "

@@ -10,7 +10,7 @@ from data_contracts.evaluation import Evaluation
 from data_contracts.match import MatchSpec
 from data_contracts.run import JOINT_STAGES
 from flows.registering import find_match
-from flows.results.best_results import clips_of, describe_later_run, joint_tracks, open_results
+from flows.results.best_results import clips_of, describe_age, joint_tracks, open_results
 from flows.results.run_cameras import broadcast_cameras, static_cameras
 from worldpose.dataset.benchmark import require_one_rate
 from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
@@ -45,8 +45,8 @@ class Scores:
     cameras: tuple[CameraScore, ...]
     alignment: ReferenceAlignment | None = None
     """Alignment of markers to the prediction, if markers are the ground truth."""
-    later_run: str = ""
-    """A sentence about a later run than that of the prediction, if there is one."""
+    age: str = ""
+    """A sentence about a later run than that of the prediction, or about what made it old."""
     notes: tuple[str, ...] = ()
     """Sentences about how the reference was read."""
 
@@ -70,8 +70,8 @@ class Side:
     """By static camera, or by broadcast view."""
     match: MatchFolder | None = None
     """The match it belongs to, if known."""
-    later_run: str = ""
-    """A sentence about a later run of the match, if there is one."""
+    age: str = ""
+    """A sentence about a later run of the match, or about what made this one old."""
     fps: float | None = None
     """Frames per second; None if nothing states them."""
 
@@ -157,7 +157,7 @@ def score(
     if cameras and match is None:
         notes.append("no match states the pitch: ground errors are those of one of 105 x 68 m")
     evaluation = evaluation.model_copy(update={"cameras": errors})
-    return Scores(evaluation, people, cameras, alignment, estimate.later_run, tuple(notes))
+    return Scores(evaluation, people, cameras, alignment, estimate.age, tuple(notes))
 
 
 def _align_markers(
@@ -226,11 +226,11 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
     store = Store.open(project)
     match = find_match(store, name, unfinished=True)
     run = open_results(store, match.match_id, run_id)
-    later = describe_later_run(store, run.record) if run_id == LATEST else ""
+    age = describe_age(store, run.record) if run_id == LATEST else ""
     spec = match.folder.spec
     placed = any(unit.partition("/")[0] in JOINT_STAGES for unit in run)
     if not placed and truth.cameras and (cameras := static_cameras(run, spec)):
-        return Side(None, cameras, match.folder, later, spec.fps)
+        return Side(None, cameras, match.folder, age, spec.fps)
     clips = clips_of(run.record)
     if len(clips) > 1:
         raise UsageError(
@@ -240,7 +240,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             todo="Export the match and score clip by clip.",
         )
     cameras = static_cameras(run, spec, stage) | broadcast_cameras(run) if truth.cameras else {}
-    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder, later, spec.fps)
+    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder, age, spec.fps)
 
 
 def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:

@@ -16,7 +16,6 @@ from flows.service.layout import PRIORITIES
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import Schedule, ServePlan, deployment_name
 from flows.service.recovery import adopt_due
-from flows.service.schedules import set_schedule
 from flows.service.worker import JOB_TEMPLATE, Installed, ServedWorker
 from worldpose.errors import InputError
 
@@ -68,6 +67,8 @@ DEPLOYED: Final = (
 """Their names are also in `flows.service.plan.FLOWS`."""
 DEFAULT_QUEUE: Final = "default"
 """Queue that each of Prefect's pools has."""
+SLUG: Final = "serve-schedule"
+"""Slug of the schedule of `--schedule` at its deployment."""
 POLL: Final = "poll-interval"
 """Slug of our schedule; all others are the operator's."""
 
@@ -137,9 +138,29 @@ def _deploy(
         _update(prefect, plan, deployed, there, wanted)
     known = (before.get("schedules") or {}).get(deployed.flow)
     schedule = None if known is None else Schedule.model_validate(known)
-    set_schedule(prefect, there, plan.schedules.get(deployed.flow), schedule)
+    _set_schedule(prefect, there, plan.schedules.get(deployed.flow), schedule)
     fixed = {name: parameters[name] for name in deployed.fixed}
     return there["id"], Installed(flow, fixed)
+
+
+def _set_schedule(
+    prefect: PrefectApi,
+    deployment: Mapping[str, Any],
+    wanted: Schedule | None,
+    before: Schedule | None,
+) -> None:
+    """Make or change the schedule of `--schedule` if the option differs from that `before`.
+
+    Otherwise the schedule stays, also if the operator has changed, paused or removed it.
+    """
+    if wanted is None or wanted == before:
+        return
+    place, schedule = f"/deployments/{deployment['id']}/schedules", wanted.model_dump()
+    there = [each["id"] for each in deployment["schedules"] if each["slug"] == SLUG]
+    if there:
+        prefect.ask(f"{place}/{there[0]}", {"schedule": schedule}, method="PATCH")
+    else:
+        prefect.ask(place, [{"schedule": schedule, "active": True, "slug": SLUG}])
 
 
 def _polling(plan: ServePlan) -> dict[str, float]:

@@ -18,7 +18,7 @@ from prefect.engine import handle_engine_signals
 from prefect.exceptions import Abort, ObjectNotFound, Pause
 from prefect.flow_engine import run_flow
 
-from flows.orchestration.cluster_errors import LostWorkersError
+from flows.orchestration.local_cluster import LostWorkersError
 from flows.orchestration.prefect_api import UnreachablePrefectError
 from flows.service import deployed
 from flows.service.child import end_with_parent

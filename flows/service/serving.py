@@ -19,8 +19,9 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from data_contracts.operations import Service, Serving
-from flows.orchestration.prefect_database import begin_database, keep_database
 from flows.orchestration.prefect_environment import (
+    begin_database,
+    keep_database,
     one_authority,
     problem_at,
     require_login,
@@ -28,8 +29,7 @@ from flows.orchestration.prefect_environment import (
 )
 from flows.service.health import at_prefect
 from flows.service.layout import PRIORITIES
-from flows.service.plan import ServePlan
-from flows.service.service_secrets import Secrets
+from flows.service.plan import Secrets, ServePlan
 from flows.web.http_server import require_free_ports
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.store import Store

@@ -17,9 +17,8 @@ from flows.service.channels import Channel, channels_of
 from flows.service.inbox import watch_once
 from flows.service.match_runs import MatchRuns
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
-from flows.service.plan import ServePlan
+from flows.service.plan import METRICS_TOKEN, ServePlan
 from flows.service.recovery import Liveness, recover
-from flows.service.service_secrets import METRICS_TOKEN
 from flows.web.http_server import serve_http
 from worldpose.store.run_queue import ENDED, queue_of
 from worldpose.store.store import Store

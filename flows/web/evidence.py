@@ -41,6 +41,9 @@ from worldpose.store.store import Run, Store
 CACHED_REVIEWS: Final = 16
 """Review requests whose images are kept in memory; drawing takes one or two seconds each."""
 
+CURVE_VALUES: Final = 4000
+"""Values of a curve that are sent; a plot is not as wide."""
+
 MOST_CAMERAS: Final = 4
 """Images of cameras that contradict the others; more than four are rarely wrong at once."""
 
@@ -75,6 +78,7 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/evidence")
     def evidence(match_id: str, request: str) -> dict[str, Any]:
         found = evidence_of(match_id, request)
+        every = max((-(-len(curve.values) // CURVE_VALUES) for curve in found.curves), default=1)
         return {
             "pictures": [picture.caption for picture in found.pictures],
             "tables": [
@@ -82,8 +86,10 @@ def routes(context: PageContext) -> APIRouter:
                 for table in found.tables
             ],
             "curves": [
-                {"title": curve.title, "values": _numbers(curve.values)} for curve in found.curves
+                {"title": curve.title, "values": _numbers(thin_curve(curve.values, every))}
+                for curve in found.curves
             ],
+            "frames_per_value": every,
             "first_frame": found.first_frame,
             "video": found.video,
             "clicked": found.clicked,
@@ -111,6 +117,19 @@ def routes(context: PageContext) -> APIRouter:
 
 def _numbers(values: NDArray[np.float64]) -> list[float | None]:
     return [None if np.isnan(value) else round(float(value), 5) for value in values]
+
+
+def thin_curve(values: NDArray[np.float64], every: int) -> NDArray[np.float64]:
+    """Thin values (n,) to the least and largest of each 2 * `every`, in order; NaN without any."""
+    if every <= 1:
+        return values
+    padded = np.pad(values, (0, -len(values) % (2 * every)), constant_values=np.nan)
+    bins = padded.reshape(-1, 2 * every)
+    gone = np.isnan(bins)
+    least = np.where(gone, np.inf, bins).argmin(axis=1)
+    largest = np.where(gone, -np.inf, bins).argmax(axis=1)
+    order = np.sort(np.stack([least, largest], axis=1), axis=1)
+    return np.take_along_axis(bins, order, axis=1).ravel()
 
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:

@@ -15,6 +15,7 @@ import numpy as np
 from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse, Response
 
+from data_contracts.records import Name
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.reports.cameras import health_picture
 from flows.reports.clip_video import clip_view, write_clip_video
@@ -23,7 +24,7 @@ from flows.reports.viewer import describe_video, viewer_clip
 from flows.results.best_results import (
     Origin,
     clips_of,
-    describe_later_run,
+    describe_age,
     find_clips,
     joint_tracks,
     open_results,
@@ -39,6 +40,7 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
+from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
@@ -140,31 +142,31 @@ def why_without_joints(run: Run, clip: str) -> str | None:
 
 
 def routes(context: PageContext) -> APIRouter:
-    """Create the routes of the results of a match's latest run that has people."""
+    """Create the routes of the results of a run; without `run_id`, the latest that has people."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
     files, shown = DrawnFiles(), _Clips()
 
-    def open_latest(match_id: str) -> tuple[Match, Run]:
+    def open_asked(match_id: str, run_id: str) -> tuple[Match, Run]:
         match = context.stored_match(match_id)
-        return match, open_results(context.store, match_id)
+        return match, open_results(context.store, match_id, run_id)
 
-    def open_clip(match_id: str, clip: str) -> ViewerClip:
-        match, run = open_latest(match_id)
+    def open_clip(match_id: str, clip: str, run_id: str) -> ViewerClip:
+        match, run = open_asked(match_id, run_id)
         if clip not in clips_of(run.record):
             raise HTTPException(404, "the run has no such clip")
         return shown.get(run, match, clip)
 
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
-        return _describe_results(context, *open_latest(match_id))
+        return _describe_results(context, *open_asked(match_id, LATEST))
 
     @router.get("/metrics")
-    def metrics(match_id: str) -> dict[str, Any]:
-        return _describe_metrics(context, *open_latest(match_id))
+    def metrics(match_id: str, run_id: Name = LATEST) -> dict[str, Any]:
+        return _describe_metrics(context, *open_asked(match_id, run_id))
 
     @router.get("/scenes/{clip}")
-    def scene(match_id: str, clip: str) -> Response:
-        return Response(encode_scene(open_clip(match_id, clip)), media_type=BINARY)
+    def scene(match_id: str, clip: str, run_id: Name = LATEST) -> Response:
+        return Response(encode_scene(open_clip(match_id, clip, run_id)), media_type=BINARY)
 
     @router.get("/scenes/{clip}/frames")
     def frames(
@@ -172,12 +174,14 @@ def routes(context: PageContext) -> APIRouter:
         clip: str,
         first: Annotated[int, Query(ge=0)],
         count: Annotated[int, Query(ge=1, le=10_000)],
+        run_id: Name = LATEST,
     ) -> Response:
-        return Response(encode_frames(open_clip(match_id, clip), first, count), media_type=BINARY)
+        shown_clip = open_clip(match_id, clip, run_id)
+        return Response(encode_frames(shown_clip, first, count), media_type=BINARY)
 
     @router.get("/report")
-    def report(match_id: str) -> FileResponse:
-        match, run = open_latest(match_id)
+    def report(match_id: str, run_id: Name = LATEST) -> FileResponse:
+        match, run = open_asked(match_id, run_id)
 
         def draw(file: Path) -> None:
             run_id = run.record.run_id
@@ -193,23 +197,23 @@ def routes(context: PageContext) -> APIRouter:
         )
 
     @router.get("/videos/{clip}")
-    def video(match_id: str, clip: str) -> FileResponse:
-        match, run = open_latest(match_id)
+    def video(match_id: str, clip: str, run_id: Name = LATEST) -> FileResponse:
+        match, run = open_asked(match_id, run_id)
         if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
             raise HTTPException(404, "no camera of such a clip has a video")
         return files.clip_video(context.store, run, match, clip)
 
     @router.get("/health/{clip}")
     def health(match_id: str, clip: str) -> Response:
-        match, run = open_latest(match_id)
+        match, run = open_asked(match_id, LATEST)
         pictures = health_picture(run, match, clip)
         if not pictures:
             raise HTTPException(404, "no cameras of such a clip place people together")
         return Response(pictures[0].png, media_type="image/png")
 
     @router.get("/exports/{form}")
-    def export_zip(match_id: str, form: str) -> FileResponse:
-        match, run = open_latest(match_id)
+    def export_zip(match_id: str, form: str, run_id: Name = LATEST) -> FileResponse:
+        match, run = open_asked(match_id, run_id)
         if form not in EXPORT_FORMATS:
             raise HTTPException(404, f"no such format; there are {', '.join(EXPORT_FORMATS)}")
 
@@ -243,7 +247,7 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     return {
         "run": record.run_id,
         "state": record.state,
-        "later": describe_later_run(context.store, record),
+        "later": describe_age(context.store, record),
         "formats": list(formats),
         "purposes": EXPORT_PURPOSES,
         "clips": [

@@ -8,9 +8,9 @@ import subprocess
 import pytest
 from command_line import worldpose
 
-from flows.orchestration import prefect_database
-from flows.orchestration.cluster_errors import require_room
-from flows.orchestration.prefect_database import begin_database
+from flows.orchestration import prefect_environment
+from flows.orchestration.local_cluster import require_room
+from flows.orchestration.prefect_environment import begin_database
 from worldpose.errors import MemoryLimitError, StoreError, require_memory
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
@@ -68,7 +68,7 @@ def test_a_run_on_a_full_disk_says_so_and_goes_on_when_there_is_room(
 def test_a_full_disk_names_the_project_and_not_the_kept_database(tmp_path, monkeypatch):
     kept = tmp_path / "kept.db"
     kept.write_bytes(b"empty")
-    monkeypatch.setattr(prefect_database, "kept_database", lambda: kept)
+    monkeypatch.setattr(prefect_environment, "kept_database", lambda: kept)
 
     def full(source, target):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), source, None, target)

@@ -10,6 +10,8 @@ import yaml
 from command_line import TINY, worldpose
 
 from flows.cli import main
+from flows.cli.finetune import _settings, finetune
+from worldpose.errors import UsageError
 from worldpose.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("server")
@@ -173,3 +175,18 @@ def test_a_run_without_people_is_partial_and_says_why(match, tmp_path):
     assert answer.code == 4
     assert "tracking/clip found no person" in answer.err
     assert "90 are needed (setting tracking.min_angle_rad, 1.57 rad)" in answer.err
+
+
+@pytest.mark.parametrize(
+    "starts", [["keypoints=absent"], ["people=a", "people=b"]], ids=["not trained", "twice"]
+)
+def test_initial_weights_that_would_be_ignored_are_refused(starts, tmp_path):
+    with pytest.raises(UsageError, match=f"--start {starts[-1]}"):
+        finetune(tmp_path / "labels.json", nets=["people"], starts=starts, project=str(tmp_path))
+
+
+def test_settings_of_the_training_come_as_one_value_or_each_alone():
+    given = _settings(['training={"steps": 7, "seed": 2}', "training.seed=3"]).training
+    assert (given.steps, given.seed) == (7, 3)
+    with pytest.raises(UsageError, match="valid dictionary"):
+        _settings(["training=5", "training.seed=3"])

@@ -1,7 +1,9 @@
-"""The command `synchronize` proposes clock offsets, draws them, and writes them on request."""
+"""Commands that find clock offsets, cameras and lenses, and write them on request."""
 
+import json
 import shutil
 
+import cv2
 import numpy as np
 import page_client
 import pytest
@@ -9,15 +11,21 @@ import yaml
 from command_line import succeed
 from typer.testing import CliRunner
 
+from data_contracts.cameras import LensCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.cli.app import app
 from flows.results.clock_offsets import propose
 from flows.run_record import latest_run
 from flows.service.inbox import run_key, take_in, watch_once
 from flows.service.layout import served_state
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.lens_files import read_lens_toml, write_lens_toml
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import align
 from worldpose.store.store import Store
 from worldpose.triangulation.synchronization import Synchronization
+from worldpose.video.files import write_video
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +139,175 @@ def test_offsets_are_in_the_cameras_own_frames_for_the_whole_match(
     found = Synchronization(np.array([0.0, late]), std, ("", ""), empty, empty, ((0, 1),))
     row = propose(spec, clip, ["a", "b"], [[(0, 0.0)], [(0, late)]], 1, found)
     np.testing.assert_allclose(row.proposed, proposed, atol=0.02)
+
+
+SIZE = (640, 480)
+FOCAL = 520.0
+OPTIONS = ("--columns", "7", "--rows", "4", "--square", "0.06")
+
+
+def photograph(rng):
+    """An image of a tilted checkerboard with 7 x 4 inner corners, without distortion."""
+    side = 40
+    squares = np.indices((5, 8)).sum(axis=0) % 2 * 255
+    page = np.kron(squares, np.ones((side, side))).astype(np.uint8)
+    page = cv2.copyMakeBorder(page, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
+    height, width = page.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
+    places = np.column_stack([(corners / side - [5.0, 3.5]) * 0.06, np.zeros(4)])
+    turn = cv2.Rodrigues(rng.uniform(-0.6, 0.6, 3))[0]
+    at = places @ turn.T + [*rng.uniform(-0.04, 0.04, 2), 0.75]
+    shown = FOCAL * at[:, :2] / at[:, 2:] + [319.5, 239.5]
+    way = cv2.getPerspectiveTransform((corners - 0.5).astype(np.float32), shown.astype(np.float32))
+    return cv2.warpPerspective(page, way, SIZE, flags=cv2.INTER_AREA, borderValue=128)
+
+
+@pytest.fixture(scope="module")
+def boards(tmp_path_factory):
+    """Images of camera `a`, a video of camera `b`."""
+    folder, rng = tmp_path_factory.mktemp("boards"), np.random.default_rng(2)
+    pictures = [photograph(rng) for _ in range(9)]
+    (folder / "int_a_img").mkdir()
+    for n, picture in enumerate(pictures[:8]):
+        cv2.imwrite(str(folder / "int_a_img" / f"{n}.png"), picture)
+    cv2.imwrite(str(folder / "int_a_img" / "9.png"), np.full(SIZE[::-1], 99, np.uint8))
+    frames = [np.repeat(picture[..., None], 3, axis=2) for picture in pictures for _ in range(5)]
+    write_video(folder / "b.mp4", frames, 10.0)
+    return folder
+
+
+def calibrate(*arguments):
+    return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+
+
+def test_images_and_a_video_become_lenses(boards, tmp_path):
+    out, plot = tmp_path / "lenses.toml", tmp_path / "lens.svg"
+    result = calibrate(boards, *OPTIONS, "--out", out, "--plot", plot, "--json")
+    assert result.exit_code == 0, result.exception
+    told = json.loads(result.stdout)["cameras"]
+    assert told["a"]["left_out"] == {"8": "no whole board found"}
+    assert told["a"]["images"] == 8
+    assert told["b"]["images"] >= 7
+    lenses = read_lens_toml(out, {"a": SIZE, "b": SIZE})
+    for lens in lenses.values():
+        assert lens.focal_px == pytest.approx(FOCAL, abs=max(3.0, 4.0 * lens.focal_std_px))
+    assert "<svg" in plot.read_text()
+    refused = calibrate(boards, *OPTIONS, "--out", out)
+    assert "a new file" in str(refused.exception), "people edit lenses"
+    other = tmp_path / "a.toml"
+    shown = calibrate(boards, *OPTIONS, "--out", other, "--camera", "a").stdout
+    assert "a: 9.png is left out: no whole board found" in shown
+
+
+def test_squares_in_place_of_corners_are_told(boards, tmp_path):
+    out = tmp_path / "lenses.toml"
+    options = ("--columns", "8", "--rows", "5", "--square", "0.06", "--camera", "a")
+    result = calibrate(boards, *options, "--out", out)
+    assert "a: the board has 7 x 4 inner corners; 8 x 5 is its number of squares" in result.stderr
+    lens = read_lens_toml(out, {"a": SIZE})["a"]
+    assert lens.focal_px == pytest.approx(FOCAL, abs=max(3.0, 4.0 * lens.focal_std_px))
+
+
+@pytest.mark.parametrize(
+    ("place", "options", "kind", "told"),
+    [
+        ("nowhere", (), InputError, "nowhere: expected a folder of images or a video for each cam"),
+        (".", ("--camera", "c"), UsageError, "--camera c: expected one of b, a, found 'c'"),
+        (".", ("--marker", "0.04"), UsageError, "expected --charuco together with --marker"),
+        (".", ("--plot", "lens.doc"), UsageError, "lens.doc: expected a file name that ends with"),
+        ("int_a_img", ("--rows", "5"), InputError, "a: board images: expected 4 images or more"),
+    ],
+)
+def test_what_is_wrong_is_told(boards, tmp_path, place, options, kind, told):
+    result = calibrate(boards / place, *OPTIONS, *options, "--out", tmp_path / "lenses.toml")
+    assert isinstance(result.exception, kind), result.exception
+    assert told in str(result.exception)
+    assert not (tmp_path / "lenses.toml").exists()
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A match without a pitch and calibration, with lenses; and the true cameras."""
+    folder = tmp_path_factory.mktemp("lab") / "lab"
+    options = ("--seed", "1", "--duration", "6", "--cameras", "4", "--calibrated")
+    succeed(
+        "simulate", "--scenario", "tiny", "--out", folder, *options, "--no-stills", "--no-video"
+    )
+    file = folder / "match.yaml"
+    content = yaml.safe_load(file.read_text()) | {"match_id": "lab", "pitch": "none"}
+    content["cameras"] = [each for each in content["cameras"] if each["kind"] == "static"]
+    content["clips"] = [
+        {key: value for key, value in clip.items() if not key.startswith("broadcast")}
+        for clip in content["clips"]
+    ]
+    file.write_text(yaml.safe_dump(content))
+    known = {each["id"] for each in content["cameras"]}
+    for place in (folder / "detections").iterdir():
+        if place.stem not in known:
+            place.unlink()
+    for name in ("annotations", "reference", "estimates", "broadcast"):
+        for place in (folder / name).rglob("*") if (folder / name).is_dir() else ():
+            if place.is_file():
+                place.unlink()
+    truth = read_calibration(folder / "calibration.toml")
+    (folder / "calibration.toml").unlink()
+    (folder / "pitch.json").unlink()
+    lenses = {
+        name: LensCalibration(
+            id=name,
+            image_size=one.image_size,
+            focal_px=float(np.mean(one.focal_px)),
+            principal_point_px=one.principal_point_px,
+            distortion=one.distortion,
+            focal_std_px=3.0,
+            principal_point_std_px=3.0,
+            distortion_std=0.005,
+        )
+        for name, one in truth.items()
+    }
+    write_lens_toml(folder / "lenses.toml", lenses)
+    return folder, truth
+
+
+def test_cameras_are_found_and_written_in_place_of_lenses(server, lab, tmp_path):
+    folder, truth = lab
+    options = ("--project", tmp_path / "p", "--stature", "1.83")
+    found = succeed("locate-cameras", folder, *options, "--json").json
+    assert found["written"] == [] and found["people"] >= 1
+    assert set(found["cameras"]) == set(truth)
+    shown = succeed("locate-cameras", folder, *options, "--apply").out
+    assert "cameras by the people" in shown and "calibration.toml" in shown
+    written = read_calibration(folder / "calibration.toml")
+    assert not (folder / "lenses.toml").exists() and (folder / "lenses.toml.before").exists()
+    places = np.array([Camera.from_calibration(written[name]).center for name in truth])
+    right = np.array([Camera.from_calibration(truth[name]).center for name in truth])
+    motion = align(places, right, with_scale=True)
+    far = np.linalg.norm(right - right.mean(axis=0), axis=1).mean()
+    off = np.linalg.norm(motion.apply(places) - right, axis=1)
+    assert off.max() < 0.03 * far
+    stated = np.array([found["cameras"][name]["position_std_m"] for name in truth])
+    assert (off < 4.0 * stated + 0.05).all()
+    refused = CliRunner().invoke(
+        app, ["locate-cameras", str(folder), *map(str, options), "--apply"]
+    )
+    assert isinstance(refused.exception, InputError)
+    assert "calibration.toml: expected no calibration there yet" in str(refused.exception)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ((), "--stature: expected either --stature or --distance"),
+        (("--stature", "1.8", "--distance", "cam00", "cam01", "3"), "found both"),
+        (("--distance", "cam00", "cam09", "3"), "--distance cam00 cam09 3: expected two of the"),
+        (("--stature", "1.8", "--clip", "b"), "--clip b: expected one of"),
+    ],
+)
+def test_wrong_options_of_locating_are_told_before_anything_is_computed(
+    lab, tmp_path, options, told
+):
+    folder, _ = lab
+    command = ["locate-cameras", str(folder), "--project", str(tmp_path / "p"), *options]
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, UsageError)
+    assert told in str(result.exception)

@@ -1,14 +1,25 @@
-"""The table of commands: every entry loads, and listing them imports none."""
+"""The table of commands, and commands that report on matches without running one."""
 
+import json
 import os
 import subprocess
 import sys
 
 import pytest
 import typer
+import yaml
+from run_records import run_record
 from typer.testing import CliRunner
 
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.run import UnitFailure, WaitingUnit
+from flows.cli import run as run_command
 from flows.cli.app import COMMANDS, app, summary
+from flows.registering import open_for_review, register
+from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.store.store import Store
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -75,3 +86,161 @@ def test_a_misspelt_command_names_the_one_that_may_be_meant():
     answer = CliRunner().invoke(app, ["simualte"])
     assert answer.exit_code == 2
     assert "No such command 'simualte'. Did you mean simulate?" in answer.output
+
+
+def made(folder, match_id, pitch=None):
+    """A match with two cameras, one of them calibrated, that saw people in frames 0 to 9."""
+    spec = MatchSpec(
+        match_id=match_id,
+        fps=25.0,
+        cameras=tuple(CameraSpec(id=f"cam{c}", width=640, height=480) for c in range(2)),
+        clips=(ClipSpec(id="clip", frame_count=10),),
+        pitch=pitch,
+    )
+    (folder / "detections").mkdir(parents=True)
+    (folder / "match.yaml").write_text(yaml.safe_dump(spec.model_dump(mode="json")))
+    for place, camera in enumerate(spec.cameras):
+        people = [
+            {
+                "image_id": frame,
+                "category_id": 1,
+                "keypoints": [100.0 + place + len(match_id), 100.0, 0.9] * 17,
+                "bbox": [90.0, 90.0, 20.0, 20.0],
+                "score": 0.9,
+            }
+            for frame in range(10)
+        ]
+        (folder / "detections" / f"{camera.id}.json").write_text(json.dumps(people))
+    write_calibration_toml(
+        folder / "calibration.toml",
+        {
+            "cam0": CameraCalibration(
+                id="cam0",
+                image_size=(640, 480),
+                focal_px=(600.0, 600.0),
+                principal_point_px=(320.0, 240.0),
+                distortion=(0.0,) * 5,
+                rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+                translation=(0.0, 0.0, 30.0),
+            )
+        },
+    )
+    return folder
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store.create(str(tmp_path / "project"))
+
+
+def said(store, *arguments):
+    return CliRunner().invoke(app, [*arguments, "--project", store.url])
+
+
+def test_an_edit_of_match_yaml_that_the_files_do_not_bear_out_is_refused(store, tmp_path):
+    folder = made(tmp_path / "a", "a")
+    register(store, folder, unfinished=True)
+    content = yaml.safe_load((folder / "match.yaml").read_text())
+    content["cameras"][1]["offset_frames"] = 500
+    (folder / "match.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match="the camera's offset_frames"):
+        open_for_review(store, "a")
+    assert store.registration("a").spec.cameras[1].offset_frames == 0
+    content["cameras"][1]["offset_frames"] = 2
+    (folder / "match.yaml").write_text(yaml.safe_dump(content))
+    assert open_for_review(store, "a").folder.spec.cameras[1].offset_frames == 2
+
+
+@pytest.mark.parametrize(
+    ("pitch", "told"),
+    [
+        (None, "to be clicked first: cam1; worldpose review serve shows the pages"),
+        (
+            "none",
+            "no calibration of cam1: on a pitch, delete the line `pitch: none` of match.yaml, "
+            "repeat this command, and click the markings on the pages; elsewhere, see worldpose "
+            "locate-cameras, or add the cameras to calibration.toml",
+        ),
+    ],
+)
+def test_a_camera_without_calibration_is_sent_where_it_can_get_one(store, tmp_path, pitch, told):
+    assert told in said(store, "ingest", str(made(tmp_path / "a", "a", pitch))).stdout
+
+
+def ended(state):
+    """The record of a run that ended so."""
+    waiting = tuple(
+        WaitingUnit(unit=f"detection/{name}", request=name, reasons=("",), rejected=name == "cam2")
+        for name in ("cam0", "cam1", "cam2")
+    )
+    failed = (UnitFailure(unit="tracking/clip", error="InputError", message="nobody"),)
+    return run_record(
+        match_id="a",
+        state=state,
+        executed=("ingest/cam0",),
+        failed=failed if state in ("failed", "partial") else (),
+        blocked=("triangulation/clip",),
+        waiting=waiting if state == "waiting" else (),
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "code", "told"),
+    [
+        ("complete", 0, "is complete: 1 computed, 0 reused, 0 failed"),
+        ("failed", 1, "is failed: 1 computed, 0 reused, 1 failed"),
+        ("failed", 1, "next: worldpose why a/tracking/clip"),
+        ("waiting", 3, "2 reviews pending, 1 rejected and to be corrected:"),
+        ("partial", 4, "1 failed and 1 blocked by that"),
+    ],
+)
+def test_the_exit_code_of_a_run_says_how_it_ended(state, code, told, store, tmp_path, monkeypatch):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    monkeypatch.setattr(run_command, "find_match", open_for_review)  # cam1 is not calibrated
+    monkeypatch.setattr(run_command, "run_match", lambda *_: ended(state))
+    answer = said(store, "run", "a")
+    assert (answer.exit_code, told in answer.stdout) == (code, True)
+    as_json = said(store, "run", "a", "--json")
+    assert as_json.exit_code == code
+    assert json.loads(as_json.stdout)["failed"] == (state in ("failed", "partial"))
+
+
+def test_of_several_folders_the_good_ones_are_taken_in_and_the_others_said(store, tmp_path):
+    good, none = str(made(tmp_path / "a", "a")), str(tmp_path / "none")
+    assert said(store, "ingest", none).exit_code == 1
+    answer = said(store, "ingest", none, good)
+    assert (answer.exit_code, store.matches()) == (4, ("a",))
+    assert f"error: {none}" in answer.stderr
+    assert said(store, "ingest", good).exit_code == 0
+
+
+def test_a_match_of_the_second_world_is_made_by_name(tmp_path):
+    listed = CliRunner().invoke(app, ["simulate", "--scenario", "list", "--json"])
+    assert "foreign-mixed" in json.loads(listed.stdout)["scenarios"]
+    words = ["simulate", "--scenario", "foreign-lab", "--seed", "1", "--duration", "0.2", "--json"]
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "lab")])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["match"] == "foreign-lab-1-0.2s"
+    assert (tmp_path / "lab" / "reference" / "world.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "option"),
+    [("foreign-lab", "--render"), ("foreign-lab", "--mocap"), ("tiny", "--recordings")],
+)
+def test_an_option_that_a_scenario_does_not_have_is_refused(tmp_path, scenario, option):
+    value = [] if option == "--render" else [str(tmp_path)]
+    words = ["simulate", "--scenario", scenario, "--out", str(tmp_path / "out"), option, *value]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, UsageError)
+    assert done.exception.where == option
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_match_whose_folder_has_moved_says_how_it_goes_on_and_does(store, tmp_path):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    (tmp_path / "a").rename(tmp_path / "b")
+    with pytest.raises(InputError, match=r"worldpose ingest FOLDER"):
+        open_for_review(store, "a")
+    register(store, tmp_path / "b", unfinished=True)
+    assert open_for_review(store, "a").folder.folder == tmp_path / "b"

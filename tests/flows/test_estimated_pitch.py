@@ -1,8 +1,11 @@
-"""Overlays draw the surface that a run estimated, not the one that pitch.json assumes."""
+"""Pitches that files give and that runs estimate."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+from command_line import succeed, worldpose
 
 from data_contracts.pitch import PitchSpec
 from flows.results.run_cameras import estimated_pitch
@@ -58,3 +61,69 @@ def test_static_cameras_draw_the_crown_and_the_end_fall_that_they_show():
         assert abs(drawn.height(52.5, 0.0) - drawn.height(0.0, 0.0) + 0.25) < 1e-9
     run = StoredRun(bundle_adjustment__cameras={"surface": None})
     assert estimated_pitch(run, GIVEN, SPEC) == GIVEN
+
+
+NAMES = (
+    *(f"corner_{side}_{end}" for side in ("left", "right") for end in ("near", "far")),
+    *(f"penalty_area_{side}_near_front" for side in ("left", "right")),
+    "center_mark",
+)
+
+
+@pytest.fixture
+def survey(tmp_path):
+    """A national grid's easting and northing of the standard pitch, turned by 90 degrees."""
+    rows = ["name,northing,easting,height"]
+    for name, (x, y, z) in zip(NAMES, PitchTemplate.standard().positions(NAMES), strict=True):
+        rows.append(f"{name},{5345000.0 + x:.4f},{512000.0 - y:.4f},{517.0 + z:.4f}")
+    path = tmp_path / "survey.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_survey_becomes_pitch_json(survey, tmp_path):
+    match = tmp_path / "match"
+    answer = succeed("import", "--pitch", survey, "--out", match, "--json").json
+    pitch = json.loads((match / "pitch.json").read_text())
+    assert (pitch["length"], pitch["width"]) == pytest.approx((105.0, 68.0), abs=1e-3)
+    assert pitch["crown"] == pytest.approx(0.2, abs=0.005)
+    # x along the touch line, y away from the main camera, whatever the grid's axes are
+    assert pitch["points"]["corner_right_far"] == pytest.approx([52.5, 34.0, -0.2], abs=0.005)
+    assert set(answer["offset_plan_m"]) == set(NAMES)
+    assert max(answer["offset_plan_m"].values()) < 0.001
+    again = worldpose("import", "--pitch", survey, "--out", match)
+    assert again.code == 2
+    assert "expected no pitch there yet" in again.err
+
+
+def test_a_survey_in_feet_is_refused_and_nothing_is_written(survey, tmp_path):
+    header, *rows = survey.read_text().splitlines()
+    places = np.array([[float(cell) for cell in row.split(",")[1:]] for row in rows]) / 0.3048
+    feet = [",".join([name, *map(str, place)]) for name, place in zip(NAMES, places, strict=True)]
+    survey.write_text("\n".join([header, *feet]) + "\n")
+    answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match")
+    assert answer.code == 1
+    assert "as feet are" in answer.err
+    assert "Traceback" not in answer.err
+    assert not (tmp_path / "match").exists()
+
+
+def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
+    folder = tmp_path / "m"
+    folder.mkdir()
+    (folder / "match.yaml").write_text(
+        "contract: 1\nmatch_id: m\nfps: 25\ncameras:\n"
+        "  - {id: east, width: 1920, height: 1080}\n"
+        "clips:\n  - {id: c, first_frame: 0, frame_count: 50}\n"
+    )
+    file = tmp_path / "clicks.xml"
+    file.write_text(
+        '<annotations><image name="a.png" width="1920" height="1080">'
+        '<points label="halfway_far" points="10.5,20.5;30.5,40.5"/></image></annotations>'
+    )
+    command = ["import", "--clicks", str(file), "--out", str(folder)]
+    assert "one image per static camera" in worldpose(*command).err
+    done = succeed(*command, "--camera", "east")
+    assert "'halfway_far' is clicked at (10, 20) and at (30, 40). Which one is meant?" in done.err
+    assert (folder / "annotations" / "static_calibration" / "east.json").is_file()
+    assert worldpose(*command, "--fps", "25").code == 2

@@ -1,4 +1,4 @@
-"""`worldpose evaluate` on files alone: what is scored, and what is said when nothing can be."""
+"""Evaluation on files alone, and the paper's ablation."""
 
 import shutil
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from command_line import succeed
 
+from flows.results.ablation import CLICKS, trial
 from flows.results.evaluation import score
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
@@ -100,3 +101,16 @@ def test_markers_are_laid_over_and_scored(tiny, tmp_path):
     # Micrometres in the file; the offset is found to a tenth of a millisecond.
     assert figures["mpjpe_mm"] == pytest.approx(0.0, abs=1.0)
     assert figures["persons"] == 1
+
+
+@pytest.mark.slow
+def test_people_and_markings_win_and_markings_alone_are_refused():
+    scores = trial(2, CLICKS["few clicks"])
+    true, both = scores["true cameras"], scores["+ BA, S and P"]
+    base, free = scores["base"], scores["+ BA, S, unguarded"]
+    assert both.g_mpjpe_mm < 1.02 * true.g_mpjpe_mm
+    assert both.ground_error_m < 0.5 * base.ground_error_m
+    # Lines fit better and people worse, as the paper warns; the held-out validation detects this.
+    assert free.marking_error_px < 0.7 * base.marking_error_px
+    assert free.g_mpjpe_mm > 1.1 * base.g_mpjpe_mm
+    assert scores["+ BA, S only"].changed < 0.2

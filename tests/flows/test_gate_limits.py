@@ -1,13 +1,17 @@
-"""Positions of gates, and the metrics that let a result pass."""
+"""Limits of gates, their reasons in words, and the advice of a run."""
+
+import re
+from pathlib import Path
 
 import pytest
 
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.gates import GATES
 from flows.method import METHOD
+from flows.review.advice import click_advice, clock_advice
+from flows.review.metric_words import UNITS, all_reasons, in_short, metric_words, reason_words
 
-CAMERAS, PEOPLE, IDENTITIES = (
-    GATES[stage] for stage in ("static_calibration", "detection", "tracking")
-)
+CAMERAS, PEOPLE = GATES["static_calibration"], GATES["detection"]
 ADJUSTMENT, ACCEPTANCE = GATES["bundle_adjustment"], GATES["body_fitting"]
 
 
@@ -96,3 +100,118 @@ def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
 )
 def test_how_bad_a_result_is_goes_by_its_worst_figure(gate, figures, excess):
     assert gate.excess(figures) == pytest.approx(excess, abs=1e-12)
+
+
+PAGES = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "words.js"
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [
+        (
+            "offset_rms_m is 0.05, at most 0.03 passes",
+            "distance of bodies from the seen joints: 5 cm",
+        ),
+        (
+            "held_out_certain_excess_m is 0.03 (knee, ankle), at most 0.01 passes",
+            "bodies are worse than joints by: 3 cm (knee, ankle), limit 1 cm",
+        ),
+        ("weak is 1, at most 0 passes", "the camera is uncertain: more clicks are needed"),
+        ("residual_px could not be computed", "residual could not be computed"),
+        ("Ada rejected it: the_click is 1", "Ada rejected it: the_click is 1"),
+        ("camera a is 3, at most wrong", "camera a is 3, at most wrong"),
+    ],
+)
+def test_reasons_of_gates_are_words(reason, words):
+    assert reason_words(reason).startswith(words)
+
+
+def test_every_metric_of_a_gate_is_put_into_words():
+    names = [name for gate in GATES.values() for name in gate.limits]
+    assert len(names) > 10
+    for name in names:
+        for reason in (f"{name} is 1, at most 0.5 passes", f"{name} could not be computed"):
+            said = reason_words(reason)
+            assert said != reason or "_" not in name
+            assert "_" not in said
+
+
+def test_metrics_have_their_unit_behind_the_value():
+    figures = {"offset_rms_m": 0.0512345, "m": 2.0, "undecided": 0.0, "offset_rms_m.knee": 1.0}
+    assert (
+        in_short(figures) == "distance of bodies from the seen joints 0.05123 m, m 2, "
+        "places where two tracks may be one person 0"
+    )
+    assert metric_words("expected_error_median_px") == ("expected error of the drawn pitch", "px")
+    assert all_reasons(["a_m is 2, at most 1 passes", "b"]) == "a: 2 m, limit 1 m; b"
+
+
+def test_the_pages_know_the_same_units():
+    (listed,) = re.findall(r"const UNITS = \{(.*?)\};", PAGES.read_text())
+    assert dict(re.findall(r'(\w+): "([^"]+)"', listed)) == UNITS
+
+
+def match(cameras, offset=0, clips=("clip",)):
+    return MatchSpec(
+        match_id="m",
+        fps=25.0,
+        cameras=tuple(
+            CameraSpec(id=f"cam{c}", width=10, height=10, offset_frames=0 if c else offset)
+            for c in range(cameras)
+        ),
+        clips=tuple(ClipSpec(id=clip, frame_count=9) for clip in clips),
+    )
+
+
+def figures(late, error=0.06):
+    """Metrics with clock offsets relative to their mean, and their standard errors [frame]."""
+    mean = sum(late) / len(late)
+    return {
+        "triangulation/clip": {f"clock_error_frames.cam{c}": error for c in range(len(late))},
+        "filtering/clip": {f"clock_late_frames.cam{c}": v - mean for c, v in enumerate(late)},
+    }
+
+
+@pytest.mark.parametrize(
+    ("cameras", "late", "told"),
+    [(3, 3.0, "3.0 match frames later"), (6, -2.2, "2.2 match frames earlier")],
+)
+def test_the_one_camera_out_of_step_is_told_its_offset(cameras, late, told):
+    found = clock_advice(figures([late] + [0.0] * (cameras - 1)), match(cameras, offset=3))
+    (text,) = found
+    assert text.startswith(f"camera cam0 shows {told} than the others")
+    assert f"set its offset_frames to {3 - round(late)} in match.yaml" in text
+
+
+def test_a_camera_with_a_frame_rate_of_its_own_is_told_its_own_frames():
+    spec = match(4, offset=7)
+    slow = spec.cameras[0].model_copy(update={"fps": spec.fps / 2})
+    spec = spec.model_copy(update={"cameras": (slow, *spec.cameras[1:])})
+    (text,) = clock_advice(figures([2.0, 0.0, 0.0, 0.0]), spec)
+    assert text.endswith("set its offset_frames to 6 in match.yaml")
+
+
+@pytest.mark.parametrize(("late", "error"), [(0.4, 0.01), (3.0, 1.0)])
+def test_what_no_whole_frame_mends_or_nobody_knows_is_not_told(late, error):
+    assert clock_advice(figures([late, 0.0, 0.0, 0.0], error), match(4)) == []
+
+
+def run(noise, cameras, freedom=8.0):
+    figures = {"click_noise_px": noise, "click_freedom": freedom}
+    return {f"static_calibration/cam{k}": figures for k in range(cameras)}
+
+
+def test_noisy_clicks_of_several_cameras_are_told_with_the_setting():
+    (text,) = click_advice(run(3.0, 10), {})
+    # 80 degrees of freedom: 3 / sqrt(160).
+    assert "10 cameras are 3.0 px off (standard error 0.2 px), stated are 1 px" in text
+    assert text.endswith("--set static_calibration.click_noise_px=3")
+
+
+@pytest.mark.parametrize(
+    ("noise", "cameras", "stated"),
+    [(1.0, 10, 1.0), (1.2, 40, 1.0), (3.0, 1, 1.0), (3.0, 10, 3.0), (0.4, 10, 1.0), (1.5, 2, 1.0)],
+)
+def test_honest_or_few_clicks_are_not(noise, cameras, stated):
+    settings = {"static_calibration": {"click_noise_px": stated}}
+    assert click_advice(run(noise, cameras), settings) == []

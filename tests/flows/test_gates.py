@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from data_contracts.review import MovedPoint, ReviewDecision
 from flows.cli.app import app
-from flows.cli.synchronize import compute_poses
+from flows.cli.locate import compute_poses
 from flows.gates import GATES, Gatekeeper
 from flows.match import IncompleteRunError
 from flows.method import METHOD
@@ -185,8 +185,7 @@ def test_always_asks_behind_every_gate_in_turn(store):
         (stage,) = {unit.partition("/")[0] for unit in units(record.waiting)}
         asked.append(stage)
         assert len(approve(store)) == len(record.waiting)  # all that wait
-    assert asked == gates
-    assert run(store, "always").state == "complete"
+    assert (asked, run(store, "always").state) == (gates, "complete")
     assert run(store, "always").run_id == latest_run(store, TINY).run_id
 
 

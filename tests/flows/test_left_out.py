@@ -1,14 +1,36 @@
-"""A camera that cannot be calibrated is left out; the match continues with a warning."""
+"""A camera that cannot be used is left out or found without clicks; the match continues."""
 
+import csv
 import json
 import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
+from types import SimpleNamespace
+from unittest.mock import patch
 
+import numpy as np
+import page_client
+import pytest
+import yaml
 from command_line import TINY, succeed, worldpose
 from filmed import write_filmed
+from test_broadcast_run import errors_of
 
+import worldpose as library
+from flows.match import IncompleteRunError
+from flows.registering import open_for_review, open_match
 from flows.reports.cameras import camera_table
+from flows.stages.broadcast_calibration import uncalibrated_warnings
+from flows.web.app_context import Continuing
+from flows.web.evidence import draw_evidence
+from worldpose.formats.release_cameras import read_camera
+from worldpose.formats.viewer_file import decode_part, read_viewer
+from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_spec
-from worldpose.store.store import open_run
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.renderer import render_pitch
+from worldpose.store.store import Store, open_run
+from worldpose.video.files import write_video
 
 
 def spoil(folder, camera):
@@ -92,3 +114,156 @@ def test_a_broken_video_leaves_its_camera_out_and_a_lost_one_hides_no_results(tm
     run = open_run(project, "filmed")
     rows = {row[0]: row[-1] for row in camera_table(run, read_spec(folder)).rows}
     assert rows["b"].startswith("left out: b.mp4")
+
+
+OTHER_END = {"left": "right", "right": "left", "near": "far", "far": "near"}
+
+
+def click_the_other_end(folder, camera):
+    """Give every click of a camera the name of its place at the pitch's other end."""
+    file = folder / "annotations" / "static_calibration" / f"{camera}.json"
+    clicked = json.loads(file.read_text())
+    for marking in (*clicked["points"], *clicked["drawn"]):
+        words = marking["name"].split("_")
+        marking["name"] = "_".join(OTHER_END.get(word, word) for word in words)
+    file.write_text(json.dumps(clicked))
+
+
+@pytest.mark.usefixtures("server")
+def test_a_camera_with_clicks_of_the_other_end_is_named_and_left_out(tiny, tmp_path):
+    match, project = shutil.copytree(tiny, tmp_path / "match"), tmp_path / "project"
+    click_the_other_end(match, "cam02")
+    answer = worldpose("run", match, "--project", project, "--until", "tracking")
+    assert answer.code == 0, answer.err
+    warning = " ".join(answer.err.split())
+    assert "camera cam02 is left out: its calibration is turned by half a turn" in warning
+    run = open_run(project, TINY)
+    assert list(run.record.left_out) == ["cam02"]
+    (fault,) = run["camera_consistency/clip"].attrs["faults"]
+    assert (fault["camera"], fault["kind"]) == ("cam02", "flipped")
+    assert fault["share_now"] < 0.3 < 0.8 < fault["share_corrected"]
+    tracks = run["tracking/clip"]
+    assert "cam02" not in tracks["camera"].values.tolist()
+    assert len(tracks["camera"].values.tolist()) == 5
+    assert run.record.figures["tracking/clip"]["unmatched_share"] < 0.1
+
+
+def test_a_camera_without_clicks_has_its_place_in_the_report(tiny, tmp_path):
+    folder, project = shutil.copytree(tiny, tmp_path / "match"), ("--project", tmp_path / "project")
+    (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
+    true = read_camera(tiny / "reference" / "cameras" / "cam00.npz", (1920, 1080))
+    x, y = true.center[:2] / [52.5, 34.0]
+    ends, place = (("left", "right"), x) if abs(x) > abs(y) else (("near", "far"), y)
+    spec = yaml.safe_load((folder / "match.yaml").read_text())
+    spec["cameras"][0] |= {"side": ends[int(place > 0.0)], "still": "stills/cam00.png"}
+    (folder / "match.yaml").write_text(yaml.safe_dump(spec))
+    still = render_pitch(true, PitchTemplate.standard(), None, 1)
+    write_still(folder / "stills" / "cam00.png", still)
+    listed = succeed("ingest", folder, *project)
+    assert "to be clicked" not in listed.out
+    succeed("run", folder, *project, "--until", "triangulation")
+    succeed("report", folder, *project, "--out", tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "proposed markings" in page
+
+
+def test_a_broadcast_video_that_nothing_calibrates_is_reported(store):
+    match = open_match(store, TINY)
+    assert uncalibrated_warnings(match) == ()
+    videos = {"clip": match.folder.folder / "broadcast" / "clip.mp4"}
+    (said,) = uncalibrated_warnings(replace(match, folder=replace(match.folder, videos=videos)))
+    assert "of clip clip is not used: it needs clicks in" in said
+
+
+def check_pages(folder, match):
+    """The pages reach the positions of the run, and say why there is no 3D."""
+    project = folder / "worldpose-data"
+    ada, path = page_client.log_in(page_client.served(project), "Ada"), f"/api/matches/{match}"
+    found = ada.get(f"{path}/results").json()
+    assert (found["state"], found["later"]) == ("partial", "")
+    assert set(found["formats"]) == {"positions", "minimap", "csv", "parquet", "viewer"}
+    for form in found["formats"]:
+        assert ada.get(f"{path}/results/exports/{form}").status_code == 200, form
+    assert ada.get(f"{path}/results/report").status_code == 200
+    (clip,) = found["clips"]
+    assert "one camera alone shows people" in clip["without_joints"]
+    assert "people are placed on the pitch from their feet" in clip["without_joints"]
+    # A person without joints is seen, too: the image is where the detection is.
+    person, *_ = ada.get(f"{path}/identities/clip").json()["people"]
+    assert any(person["way"])  # from above, the person is where the feet are
+    crop = {"person": person["id"], "frame": person["segments"][0][0]}
+    answer = ada.get(f"{path}/identities/clip/crop", params=crop)
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png"), answer.text
+
+    # A question about the tracks shows the paths of the feet.
+    store = Store.open(str(project))
+    keys = {"tracking/clip": store.run(match).results["tracking/clip"]}
+    asked = SimpleNamespace(gate="tracking", match_id=match, keys=keys)
+    with patch("flows.web.evidence.plot_paths") as plot:
+        draw_evidence(store, open_for_review(store, match), asked)
+    assert np.isfinite(plot.call_args[0][0].joints).all(axis=-1).any(axis=(0, 2)).sum() >= 10
+
+
+def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch):
+    store = Store.open(str(project_copy))
+    (match,) = store.matches()
+    why = "one camera alone shows people"
+    changed = {"run_id": store.reserve_run(match), "state": "partial", "warnings": (why,)}
+    record = store.run(match).model_copy(update=changed)
+    store.finish_run(record)
+    text = str(IncompleteRunError(record))
+    assert why in text
+    assert "0 " not in text
+    last = SimpleNamespace(state="failed", message=text, changed_at=datetime.now(UTC))
+    served = SimpleNamespace(link=lambda run: "http://prefect")
+    seen = SimpleNamespace(open=[], ended={match: last}, served=served)
+    monkeypatch.setattr(Continuing, "_look", lambda self: seen)
+    state = Continuing(store).state(match)
+    assert (state["code"], state["lines"]) == (4, [text])
+
+
+def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, tmp_path):
+    one = ("--scenario", "match", "--seed", 5, "--duration", 1, "--no-stills", "--cameras", 1)
+    succeed("simulate", *one, "--out", tmp_path / "one")
+    (tmp_path / "one/videos").mkdir()
+    grey = (np.full((1080, 1920, 3), 90, np.uint8) for _ in range(50))
+    write_video(tmp_path / "one/videos/cam00.mp4", grey, 50.0)
+    project = ("--project", tmp_path / "worldpose-data")
+    answer = worldpose("run", tmp_path / "one", *project)
+    assert answer.code == 4, answer.err
+    assert "one camera alone shows people" in answer.err
+    assert "people are placed on the pitch from their feet" in answer.err
+    assert "placed no joint" not in answer.err
+    match = library.read_match(tmp_path / "one").spec.match_id
+    succeed("export", match, *project, "--format", "positions", "--out", tmp_path / "out")
+    with (tmp_path / "out/positions/clip.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    view = tmp_path / "view.html"
+    succeed("export", match, *project, "--format", "viewer", "--out", view)
+    (parts,) = read_viewer(view)
+    scene, _ = decode_part(parts["scene"])
+    header, arrays = decode_part(parts["0"])
+    assert {person["kind"] for person in scene["people"]} == {"plane"}
+    shown = [scene["people"][column]["id"] for column in header["plane"]]
+    for row in rows:
+        at = int(row["frame"]) - scene["first"], shown.index(int(row["person"]))
+        assert (
+            np.abs(arrays["ground"][at][:2] - [float(row["x_m"]), float(row["y_m"])]).max() < 1e-3
+        )
+    page = tmp_path / "report.html"
+    succeed("report", match, "--out", page, "--no-videos", *project)
+    assert page.read_text().count("<td>plane</td>") == len({row["person"] for row in rows})
+    tiles = page.read_text()
+    assert f"{len(shown)}</b>" in tiles
+    assert "people on the pitch, 0 with joints" in tiles
+    assert "<b>0 m</b>" not in tiles
+    refused = worldpose("export", match, *project, "--format", "trc", "--out", tmp_path / "trc")
+    assert refused.code == 1
+    assert "expected a person with joints" in refused.err
+    check_pages(tmp_path, match)
+    errors, inside, people = errors_of(tmp_path / "out/positions/clip.csv", tmp_path / "one")
+    assert people >= 10
+    assert np.median(errors) < 0.3
+    assert inside > 0.9
+    heights = [float(row["height_m"]) for row in rows]
+    assert 1.6 < np.median(heights) < 2.0

@@ -121,12 +121,13 @@ def test_a_checkpoint_is_pulled_once_and_found_by_its_name(hub, tmp_path, monkey
     assert (place / "files" / "config.json").read_bytes() == CONFIG
     assert [path.name for path in tmp_path.iterdir()] == ["toy"]
     asked = len(hub.asked)
-    assert pull(checkpoint(), tmp_path, quiet) == place
-    assert len(hub.asked) == asked
+    assert (pull(checkpoint(), tmp_path, quiet), len(hub.asked)) == (place, asked)
     monkeypatch.setenv("WORLDPOSE_MODEL_FOLDER", str(tmp_path))
     before = weights_of(DetectionSettings(detector="model:toy"))
     assert len(before["model:toy"]) == 64
     assert "transformers" in before
+    with pytest.raises(InputError, match="expected a checkpoint of task pose, found detector"):
+        weights_of(DetectionSettings(pose="model:toy"))
     (place / "files" / "config.json").write_bytes(b"{}")
     assert weights_of(DetectionSettings(detector="model:toy")) != before
 

@@ -1,29 +1,29 @@
 """Costs that a run with its own Prefect server avoids."""
 
 import dataclasses
-import gc
 import http.client
-import importlib
 import os
 import sqlite3
 import ssl
 import subprocess
 import sys
 from contextlib import closing
-from types import SimpleNamespace
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
 import pytest
 from distributed import Client, Security
 
-from flows.orchestration import prefect_database
-from flows.orchestration.prefect_database import DATABASE, begin_database, keep_database
+from flows.orchestration import prefect_environment
 from flows.orchestration.prefect_environment import (
     AUTHORITIES,
     CLIENT_LOGIN,
+    DATABASE_FILE,
     SERVER_LOGIN,
     authorization,
+    begin_database,
+    keep_database,
     local_cluster_options,
     one_authority,
     prefect_server,
@@ -32,17 +32,16 @@ from flows.orchestration.prefect_environment import (
 )
 from flows.orchestration.private_cluster import PrivateCluster
 from flows.service.child import PARTS
-from flows.service.plan import ServePlan
-from flows.service.service_secrets import METRICS_TOKEN, secrets_of
+from flows.service.plan import METRICS_TOKEN, ServePlan, secrets_of
 from flows.service.serving import environment_of
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import InputError
 
 
 @pytest.fixture
 def kept(tmp_path, monkeypatch):
     """Where the empty database is kept, of which there is none yet."""
     file = tmp_path / "installation" / "prefect.db"
-    monkeypatch.setattr(prefect_database, "kept_database", lambda: file)
+    monkeypatch.setattr(prefect_environment, "kept_database", lambda: file)
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     return file
 
@@ -53,21 +52,20 @@ def tables(database):
         return set(opened.execute("select type, name, sql from sqlite_master"))
 
 
-def test_a_server_answers_its_run_alone_and_later_ones_begin_with_its_database(
-    tmp_path, kept, monkeypatch
-):
+def test_a_server_answers_its_run_alone_and_later_ones_begin_with_its_database(kept, monkeypatch):
     for name in ("PREFECT_API_URL", CLIENT_LOGIN, SERVER_LOGIN):  # of a server of other tests
         monkeypatch.delenv(name, raising=False)
-    first, second = tmp_path / "first", tmp_path / "second"
-    with prefect_server(str(first), is_local=True) as wait_until_ready:
+    with prefect_server(is_local=True) as wait_until_ready:
         wait_until_ready()
-        made = tables(first / "prefect" / DATABASE)
+        made = tables(Path(os.environ["PREFECT_HOME"]) / DATABASE_FILE)
         login = require_answers_for_its_run_alone()
     assert CLIENT_LOGIN not in os.environ
     assert len(made) > 50
     assert [file.name for file in kept.parent.iterdir()] == [kept.name]
-    with prefect_server(str(second), is_local=True) as wait_until_ready:
-        assert tables(second / "prefect" / DATABASE) == made  # before the server is up
+    with prefect_server(is_local=True) as wait_until_ready:
+        assert (
+            tables(Path(os.environ["PREFECT_HOME"]) / DATABASE_FILE) == made
+        )  # before the server is up
         assert os.environ[CLIENT_LOGIN] != login
         wait_until_ready()
     assert tables(kept) == made
@@ -85,21 +83,11 @@ def require_answers_for_its_run_alone():
         return connection.getresponse().status
 
     right = {"Authorization": authorization(login), "Content-Type": "application/json"}
-    assert ask(**right) == 200
-    assert ask() == 401
+    assert (ask(**right), ask()) == (200, 401)
     assert ask(Authorization=authorization(f"{login}x")) == 401
     assert ask(**right, Host="evil.example") == 421
     assert ask(**right, Origin="http://evil.example") == 403
     return login
-
-
-def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
-    (tmp_path / "prefect").touch()  # a file where the folder should be
-    with (
-        pytest.raises(StoreError, match=r"File exists.*run again.*results are unchanged"),
-        prefect_server(str(tmp_path), is_local=True),
-    ):
-        pass
 
 
 def test_a_prefect_server_without_a_login_does_not_start():
@@ -203,22 +191,6 @@ def test_own_workers_serve_their_run_alone():
                 connection.getresponse()
 
 
-def test_workers_collect_no_garbage_until_they_have_imported_all():
-    stopped = []
-    try:
-        preload = importlib.import_module("tasks.preload")
-        importlib.reload(preload)  # whether or not something had imported it
-        assert not gc.isenabled()
-        node = SimpleNamespace(http_server=SimpleNamespace(stop=lambda: stopped.append(True)))
-        preload.dask_setup(node)
-        assert stopped == [True]
-        assert gc.isenabled()
-        assert gc.get_freeze_count() > 0
-    finally:
-        gc.enable()
-        gc.unfreeze()
-
-
 def test_one_authority_is_read_by_those_on_this_machine_who_talk_plainly(tmp_path, monkeypatch):
     monkeypatch.delenv(AUTHORITIES, raising=False)
     file = one_authority(tmp_path)[AUTHORITIES]
@@ -238,15 +210,15 @@ def test_a_database_is_copied_and_kept_only_where_there_is_none_and_a_place(tmp_
     assert not kept.exists()
     kept.parent.mkdir()
     kept.write_bytes(b"empty")
-    (tmp_path / DATABASE).write_bytes(b"full")
+    (tmp_path / DATABASE_FILE).write_bytes(b"full")
     assert not begin_database(tmp_path)
-    assert (tmp_path / DATABASE).read_bytes() == b"full"
+    assert (tmp_path / DATABASE_FILE).read_bytes() == b"full"
     assert not begin_database(tmp_path / "copied")
-    files = [at / DATABASE for at in (tmp_path, tmp_path / "copied")]
+    files = [at / DATABASE_FILE for at in (tmp_path, tmp_path / "copied")]
     assert [file.stat().st_mode & 0o777 for file in files] == [0o600, 0o600]
     kept.unlink()
     kept.parent.rmdir()
     kept.parent.touch()  # a file where the folder should be: every server makes its own
     keep_database(tmp_path)
     assert begin_database(tmp_path / "another")
-    assert (tmp_path / "another" / DATABASE).stat().st_mode & 0o777 == 0o600
+    assert (tmp_path / "another" / DATABASE_FILE).stat().st_mode & 0o777 == 0o600

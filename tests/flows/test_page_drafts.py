@@ -126,8 +126,7 @@ def test_an_uploaded_match_arrives_whole(place, footage):
     assert (file["fps"], file["frames"]) == (pytest.approx(FPS), FRAMES)
     assert not view["is_ready"]
     answer = ada.post(f"{DRAFTS}/{draft}/finish", json={})
-    assert answer.status_code == 422
-    assert list(entries(place / "inbox")) == []
+    assert (answer.status_code, list(entries(place / "inbox"))) == (422, [])
     view = save(ada, view, a_match(file["name"])).json()
     assert (view["problems"], view["is_ready"]) == ([], True)
     answer = ada.post(f"{DRAFTS}/{draft}/finish", json={"priority": "urgent"})

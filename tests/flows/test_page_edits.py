@@ -1,16 +1,21 @@
-"""A correction on a page is stored, shown to all users, and overwrites no other user's edit."""
+"""Corrections on pages: kept for all, overwriting no other's, in groups, and undone together."""
 
 import shutil
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
+import page_client
 import pytest
 from command_line import TINY
+from long_journal import SESSION, write_corrections
 from page_client import MATCH, a_click, moved
 
-from flows.registering import open_match, register
+from data_contracts.review import Withdrawal
+from flows.registering import open_for_review, open_match, register
 from flows.review import corrections
 from flows.web import app_context
+from flows.web.corrections import SESSION_GAP
 from worldpose.errors import StoreError
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
@@ -136,3 +141,79 @@ def test_a_page_shows_the_pitch_as_it_was_corrected(ada, project_copy, monkeypat
         match = replace(opened, folder=replace(opened.folder, pitch=pitch))
         monkeypatch.setattr(app_context, "open_for_review", lambda *_, match=match: match)
         assert ada.get(path).json()["pitch"]["length"] == length
+
+
+@pytest.fixture
+def unrun_store(tiny, tmp_path):
+    """A project with a match that was not run."""
+    store = Store.create(str(tmp_path / "project"))
+    register(store, tiny, unfinished=True)
+    return store
+
+
+@pytest.fixture
+def ada_before_runs(unrun_store, tmp_path):
+    return page_client.log_in(page_client.served(tmp_path / "project"), "Ada")
+
+
+def groups(browser):
+    return browser.get(MATCH).json()["groups"]
+
+
+def test_corrections_are_grouped_by_person_camera_and_session(unrun_store, ada_before_runs):
+    count = 3 * SESSION + 10
+    write_corrections(unrun_store, TINY, count)
+    found = groups(ada_before_runs)
+    assert timedelta(hours=1) > SESSION_GAP  # sessions of the journal are an hour apart
+    assert [group["who"] for group in found] == ["Bob", "Ada", "Bob", "Ada"]
+    assert [group["count"] for group in found] == [11, SESSION, SESSION, SESSION - 1]
+    assert {group["owner"] for group in found} == {"cam00"}
+    assert found[1]["kinds"] == {"moved_point": SESSION // 10, "moved_keypoint": SESSION * 9 // 10}
+    assert ada_before_runs.get("/api/matches").json()["matches"][0]["corrections"] == count
+    path = f"{MATCH}/corrections/{found[1]['id']}"
+    pages = [
+        ada_before_runs.get(f"{path}?skip={skip}").json()["corrections"]
+        for skip in (0, 200, 400, 600)
+    ]
+    assert [len(page) for page in pages] == [200, 200, 100, 0]
+    ids = [each["id"] for page in pages for each in page]
+    assert (len(set(ids)), ids[-1]) == (SESSION, found[1]["id"])
+
+
+def test_a_group_is_undone_as_a_whole_and_only_as_it_was_seen(unrun_store, ada_before_runs):
+    write_corrections(unrun_store, TINY, SESSION + 10)
+    last, first = groups(ada_before_runs)
+    path = f"{MATCH}/corrections/{last['id']}/withdrawal"
+    assert ada_before_runs.post(path, json={"count": last["count"] - 1}).status_code == 409
+    entries = len(open_for_review(unrun_store, TINY).journal.entries)
+    answer = ada_before_runs.post(path, json={"count": last["count"], "why": "wrong camera"})
+    assert answer.json() == {"withdrawn": last["count"]}
+    assert groups(ada_before_runs) == [first]
+    journal = open_for_review(unrun_store, TINY).journal
+    assert len(journal.entries) == entries + 1  # all or none, however many there are
+    assert {each.why for each in journal.entries[-1].records} == {"wrong camera"}
+    assert ada_before_runs.post(path, json={"count": last["count"]}).status_code == 409
+    assert (
+        ada_before_runs.post(f"{MATCH}/corrections/none/withdrawal", json={"count": 0}).status_code
+        == 409
+    )
+
+
+def test_an_undo_that_is_repeated_is_done_and_goes_on_to_the_one_before(
+    ada_before_runs, unrun_store
+):
+    write_corrections(unrun_store, TINY, 3)
+    ids = [*read_journal(unrun_store, TINY).standing]
+    for name in (ids[2], ids[2], ids[1]):  # the answer to the first was lost
+        answer = ada_before_runs.post(f"{MATCH}/withdrawals", json={"correction": name})
+        assert answer.json() == {"withdrawn": name}
+    journal = read_journal(unrun_store, TINY)
+    assert [*journal.standing] == ids[:1]
+    assert sum(isinstance(each, Withdrawal) for each in journal.records) == 2
+    # What a page sends again, whose answer was lost as well, does not undo the withdrawal.
+    edit = journal.corrections[ids[2]].edit.model_dump(mode="json")
+    again = ada_before_runs.post(
+        f"{MATCH}/corrections", json={"edits": [{"id": ids[2], "edit": edit}]}
+    )
+    assert [each["id"] for each in again.json()["kept"]] == [ids[2]]
+    assert [*read_journal(unrun_store, TINY).standing] == ids[:1]

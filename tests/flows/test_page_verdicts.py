@@ -16,7 +16,7 @@ from flows.reports.clip_video import clip_view
 from flows.running import RunRequest, run_match
 from flows.web import app_context
 from flows.web.app_context import Continuing, PageContext
-from flows.web.evidence import asked_run
+from flows.web.evidence import asked_run, thin_curve
 from worldpose.errors import InputError
 from worldpose.review.journal import say
 from worldpose.store.store import Store, open_run
@@ -150,7 +150,7 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     evidence = ada.get(f"{path}/evidence").json()
     assert evidence["video"] == "cam02"
     assert evidence["pictures"] and evidence["tables"]
-    assert evidence["first_frame"] == clip.first_frame
+    assert (evidence["first_frame"], evidence["frames_per_value"]) == (clip.first_frame, 1)
     assert [len(each["values"]) for each in evidence["curves"]] == [clip.frame_count] * 4
     assert max(evidence["curves"][0]["values"]) <= len(run["body_fitting/clip"]["person"])
     answer = ada.get(f"{path}/video", headers={"range": "bytes=0-99"})
@@ -162,6 +162,12 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     assert len(pictures) == len(range(0, clip.frame_count, every))
     drawn = [np.ptp(picture.astype(int), axis=2).max() for picture in pictures]
     assert min(drawn) > 40  # coloured lines over grey
+
+
+def test_a_curve_of_a_long_clip_keeps_its_least_and_largest_values_in_order():
+    gap = [np.nan] * 4
+    found = thin_curve(np.array([1.0, 5.0, 0.0, 1.0, *gap, 3.0, 2.0]), every=2)
+    assert np.array_equal(found, [5.0, 0.0, np.nan, np.nan, 3.0, 2.0], equal_nan=True)
 
 
 def test_evidence_is_of_the_newest_run_with_the_results_asked_about(store):

@@ -21,6 +21,8 @@ pytestmark = [
     pytest.mark.timeout(1200),  # four runs, each after a reviewer's answer
 ]
 SCRIPT = Path(__file__).with_name("pages_in_browser.mjs")
+STUBBED = Path(__file__).with_name("stubbed_in_browser.mjs")
+STATIC = Path(__file__).parents[2] / "flows" / "web" / "static"
 
 
 @pytest.fixture
@@ -144,3 +146,22 @@ def test_a_camera_is_calibrated_from_nothing_and_the_run_goes_on_by_itself(
     errors = ground_errors(found, truth, pitch)
     print(json.dumps({"median [m]": float(np.median(errors)), "largest": float(errors.max())}))
     assert np.median(errors) < 0.02
+
+
+def test_pages_lose_and_repeat_nothing_at_a_slow_or_refusing_server(tmp_path):
+    seen = drive(STUBBED, {"static": str(STATIC)}, tmp_path, 200)
+    # What is open shows a new run, and asks for nothing of two runs.
+    plot = "/api/matches/final/offsets/plot?run_id="
+    assert seen["before"] == ["north\t1", f"{plot}0001", 1]
+    assert seen["after"] == ["north\t2", f"{plot}0002", 0]
+    assert seen["scenes"] == ["?run_id=0001", "?run_id=0002"]
+    # What is asked for while something is saved or written waits for its turn.
+    assert seen["names"] == ["kane", "rice"]
+    assert seen["written"] == ["usd?run_id=0002", "c3d?run_id=0002"]
+    # A held key counts once, but moves on.
+    assert (seen["removed"], seen["row"], seen["decided"]) == ([1], "4", ["q1"])
+    assert (seen["curves"], seen["tables"]) == (1, 1)
+    assert (seen["drawn"], seen["same"], seen["other"], seen["kept"]) == (0, "saved", "refused", 1)
+    assert seen["refused"] == "north.png: expected a PNG image, found damaged bytes"
+    assert seen["frame"] == "north, frame 151"
+    assert seen["views"] == ["no calibration of south"]

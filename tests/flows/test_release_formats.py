@@ -25,7 +25,7 @@ from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import CHALLENGE15, HALPE26, fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import ORIGINS
-from worldpose.errors import InputError, UsageError, WorldposeError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats.challenge import read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
 from worldpose.formats.release_cameras import read_camera
@@ -223,15 +223,6 @@ def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_
     np.testing.assert_array_equal(np.isnan(camera.focal[:, 0]), [False, False, False, True])
 
 
-def test_a_format_that_needs_the_broadcast_camera_says_so(match_folder, tmp_path):
-    run = origin(match_folder, body_fitting__A_1=bodies())
-    with pytest.raises(
-        WorldposeError, match=r"broadcast_calibration/A_1.*Calibrate the clip's broadcast camera"
-    ):
-        write("challenge", run, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
     written = write("tracks", run, tmp_path / "out")
@@ -315,20 +306,6 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     unstated = replace(run, licence=None)
     write("c3d", unstated, tmp_path / "unstated")
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
-
-
-def test_a_usd_scene_has_the_people_and_the_notes(match_folder, tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed")
-    from pxr import Usd
-
-    run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
-    (path,) = write("usd", run, tmp_path)
-    assert path.relative_to(tmp_path).as_posix() == "scenes/A_1.usdc"
-    stage = Usd.Stage.Open(str(path))
-    notes = stage.GetRootLayer().customLayerData
-    assert notes["licence"] == "For tests alone." and notes["clip"] == "A_1"
-    assert stage.GetPrimAtPath("/world/person_008").GetCustomDataByKey("kind") == "mixed"
-    assert stage.GetPrimAtPath("/world/pitch").IsValid()
 
 
 def test_filled_joints_are_flagged(match_folder, tmp_path):

@@ -13,7 +13,7 @@ from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
 from data_contracts.run import UnitFailure
 from flows import reprocess, run_plan
 from flows.cli.app import app
-from flows.cli.reprocess import exit_code
+from flows.cli.run import exit_code
 from flows.layers import PROJECT, write_layer
 from flows.method import METHOD
 from flows.registering import open_match, register

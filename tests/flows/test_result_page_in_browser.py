@@ -27,7 +27,6 @@ def test_people_are_seen_in_3d_and_played(project_copy, tmp_path):
     is_person = (blue > 1.2 * green) & (green > 1.5 * red) & (blue > 60)
     assert is_person.sum() > 30
     assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
-    assert seen["reports"] == [[5, 120], [5, 120]]
-    assert seen["cameras"] == 6
+    assert (seen["reports"], seen["cameras"]) == ([[5, 120], [5, 120]], 6)
     assert seen["refused"].startswith("usd: needs the extra usd")
     assert seen["pages"] == 1

@@ -1,13 +1,24 @@
-"""Metrics of two runs: better or worse by the stated rule, independent of person ids."""
+"""Runs are compared, named and pinned; their units say where they come from."""
+
+import json
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from camera_builders import plain_camera
+from command_line import TINY
 from run_records import run_record
+from typer.testing import CliRunner
 
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
+from data_contracts.review import Correction, DeletedDetection, MovedPoint
+from flows.cli.app import app
 from flows.results import comparison
 from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
+from flows.review.verdicts import unit_origins
+from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
+from worldpose.store.store import Store
 
 
 def record(figures):
@@ -101,3 +112,122 @@ def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):
         "clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before + 9.0, after + 9.0
     )
     assert comparison._worst(away, "cam01", {"cam01": camera}, {"cam01": camera}) == []
+
+
+@pytest.fixture
+def command(project_copy):
+    """The command line in this process, on a project with one finished run."""
+
+    def run(*arguments):
+        asked = [*arguments, "--project", str(project_copy)]
+        answer = CliRunner().invoke(app, asked, catch_exceptions=True)
+        if answer.exception is not None and not isinstance(answer.exception, SystemExit):
+            raise answer.exception
+        return answer
+
+    return run
+
+
+def test_a_pinned_run_has_a_name_and_stays(command, project_copy):
+    store = Store.open(project_copy)
+    second = store.run(TINY).model_copy(update={"run_id": store.reserve_run(TINY)})
+    store.finish_run(second)
+    assert command("pin", f"{TINY}/0001", "paper", "--who", "Ada").exit_code == 0
+    assert "run 0001 is pinned as paper" in command("status").stdout
+    assert "run 0001 is pinned as paper" in command("status", TINY).stdout
+    answer = command("diff", f"{TINY}/paper", f"{TINY}/0002", "--json")
+    compared = json.loads(answer.stdout)["compared"]
+    assert {each["kind"] for each in compared} == {"match", "clip", "camera", "player"}
+    assert {each["mark"] for each in compared} == {"unchanged"}
+    with pytest.raises(InputError, match="not pinned"):
+        command("gc", "--forget", f"{TINY}/0001")
+    assert "removed 0 things" in command("gc", "--keep-last", "1", "--delete").stdout
+    assert command("unpin", f"{TINY}/paper").exit_code == 0
+    assert "removed 1 things" in command("gc", "--keep-last", "1", "--delete").stdout
+    assert store.runs(TINY) == ("0002",)
+
+
+def test_status_names_a_damaged_pin(command, project_copy):
+    assert command("pin", TINY, "gold", "--who", "Ada").exit_code == 0
+    file = project_copy / "pins" / TINY / "gold.json"
+    file.write_bytes(file.read_bytes()[:20])
+    (row,) = json.loads(command("status", "--json").stdout)["matches"]
+    assert f"pins/{TINY}/gold.json" in row["problem"]
+    assert row["now"] == "usable with reservations"  # its results can still be used
+    assert f"pins/{TINY}/gold.json" in command("status").stdout.replace("\n", "")
+
+
+@pytest.mark.parametrize("name", ["0007", "latest", "a/b", ""])
+def test_a_name_that_is_none_is_refused(command, name):
+    with pytest.raises(InputError, match="name of"):
+        command("pin", TINY, name, "--who", "Ada")
+
+
+MADE_FROM = {
+    "static_calibration/a": (),
+    "static_calibration/b": (),
+    "tracking/one": ("static_calibration/a", "static_calibration/b"),
+    "tracking/two": ("static_calibration/a", "static_calibration/b"),
+    "body_fitting/one": ("tracking/one",),
+    "body_fitting/two": ("tracking/two",),
+}
+
+
+def moved(camera, frame=None):
+    return Correction(
+        id=f"{camera}.{frame}",
+        match_id="m",
+        edit=MovedPoint(camera=camera, marking="corner_left_near", frame=frame, xy=(1.0, 1.0)),
+        who="Ada",
+        made_at=datetime(2026, 1, 2, tzinfo=UTC),
+        based_on={},
+    )
+
+
+def test_a_correction_marks_what_it_corrects_alone():
+    origins = unit_origins(MADE_FROM, [moved("a")], ())
+    assert origins == dict.fromkeys(MADE_FROM, "automatic") | {"static_calibration/a": "corrected"}
+
+
+def test_a_correction_of_a_detection_marks_whatever_found_it():
+    edit = DeletedDetection(camera="a", frame=3, detection=0)
+    out = moved("a").model_copy(update={"edit": edit})
+    given = dict.fromkeys(("ingest/a", "ingest/ab", "detection/ab.one"), ())
+    assert unit_origins(given, [out], ())["ingest/a"] == "corrected"
+    found = {**given, "detection/a.one": ()}
+    origins = unit_origins(found, [out], ())
+    assert [unit for unit in found if origins[unit] == "corrected"] == ["detection/a.one"]
+
+
+def test_a_refusal_reaches_all_that_is_made_from_it():
+    origins = unit_origins(MADE_FROM, [], ["tracking/one"])
+    refused = {unit for unit, origin in origins.items() if origin == "rejected"}
+    assert refused == {"tracking/one", "body_fitting/one"}
+    everything = unit_origins(MADE_FROM, [moved("a")], ["static_calibration/a"])
+    assert {u for u, o in everything.items() if o == "automatic"} == {"static_calibration/b"}
+
+
+def test_a_folders_digest_is_of_the_names_and_contents_below_it():
+    def files(**contents):
+        paths = {name.replace("_", "/") + ".png": digit * 64 for name, digit in contents.items()}
+        listed = [
+            SourceFile(path=path, size=1, modified_ns=1, sha256=digest)
+            for path, digest in paths.items()
+        ]
+        camera = CameraSpec(id="cam00", width=1920, height=1080)
+        clip = ClipSpec(id="clip", first_frame=0, frame_count=2)
+        spec = MatchSpec(match_id="m", fps=50, cameras=[camera], clips=[clip])
+        return Registration(spec=spec, folder="m", identity="b" * 64, files=listed)
+
+    first = files(videos_cam00_1="1", videos_cam00_2="2", videos_cam01_1="1")
+    assert first.digest_of("videos/cam00/1.png") == "1" * 64
+    assert first.digest_of("videos/cam0") is None
+    assert first.digest_of("videos/cam00") != first.digest_of("videos/cam01")
+    for other in (
+        files(videos_cam00_1="1", videos_cam00_3="2"),
+        files(videos_cam00_1="1", videos_cam00_2="3"),
+        files(videos_cam00_1="1"),
+    ):
+        assert other.digest_of("videos/cam00") != first.digest_of("videos/cam00")
+    moved = files(videos_cam01_1="1", videos_cam01_2="2")
+    assert moved.digest_of("videos/cam01") == first.digest_of("videos/cam00")

@@ -1,5 +1,7 @@
 """The verdict on a run, from metrics and warnings that can be judged by hand."""
 
+import re
+
 import pytest
 
 from data_contracts.run import UnitFailure
@@ -17,6 +19,12 @@ HEALTHY = {
 
 UNHEALTHY = {"unhealthy_s.cam2": 2.2, "unhealthy_s.cam3": 3.0}
 UNHEALTHY |= {"unhealthy_from_frame.cam3": 0, "unhealthy_to_frame.cam3": 74}
+UNREADABLE = {"unreadable_share": 0.05, "unreadable_from_frame": 7, "unreadable_to_frame": 11}
+MISPLACED = {"misplacement_m.cam1": 0.05, "misplacement_m.cam4": 0.08}
+NO_NUMBER = {"misplacement_m.cam1": float("nan"), "misplacement_m.cam2": 0.01}
+MOVED = {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1}
+WORSE = {"held_out_certain_excess_m.knee": 0.02, "held_out_certain_excess_m.hip": 0.001}
+PLANE = {"unmatched_share": 0.1, "plane_std_m": 9.0}
 ABSENT = {"absent_from_frame": 40, "absent_to_frame": 64, "absent_person": 7}
 
 
@@ -34,85 +42,31 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
 @pytest.mark.parametrize(
     ("unit", "figures", "said"),
     [
-        (
-            "detection/cam1.clip",
-            {"unreadable_share": 0.05, "unreadable_from_frame": 7, "unreadable_to_frame": 11},
-            "the video of cam1 in clip has no image, or none that can be decoded, for 5 % (limit "
-            "1 %) of the frames, longest in frames 7 to 11.",
-        ),
-        (
-            "tracking/clip",
-            {"absent_share": 0.2, **ABSENT},
-            "people are missing in clip for 20 % (limit 5 %) of the time, longest person 7 in ",
-        ),
-        (
-            "tracking/clip",
-            {"unmatched_share": 0.3},
-            "no track follows 30 % (limit 15 %) of the people",
-        ),
-        ("tracking/clip", {"mean_ray_distance_m": 0.2}, "cameras disagree by 20 cm (limit 15 cm) "),
-        ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
-        (
-            "retriangulation/clip",
-            UNHEALTHY,
-            "the keypoints of cam3, cam2 depart from the people in clip, or its images are bad, "
-            "for 3 s (limit 2 s) at a time, longest in frames 0 to 74.",
-        ),
-        (
-            "retriangulation/clip",
-            {"misplacement_m.cam1": 0.05, "misplacement_m.cam4": 0.08},
-            "the calibration of cam4 displaces people in clip by 8 cm (limit 5 cm).",
-        ),
-        (
-            "bundle_adjustment/cameras",
-            {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1},
-            "the people contradict the calibration of cam4: the adjustment moves it by 7.1",
-        ),
-        ("body_fitting/clip", {"offset_rms_m": 0.05}, "bodies in clip lie 5 cm (limit 3 cm) off"),
-        (
-            "body_fitting/clip",
-            {"held_out_certain_excess_m.knee": 0.02, "held_out_certain_excess_m.hip": 0.001},
-            "bodies in clip are farther from the images than triangulated joints are (knee), by 2",
-        ),
-        (
-            "broadcast_calibration/clip",
-            {"expected_error_median_px": 4.0},
-            "the broadcast camera of clip is uncertain by 4 px (limit 3 px).",
-        ),
-        (
-            "retriangulation/clip",
-            {"filled_share": 0.1},
-            "no camera sees 10 % (limit 5 %) of the joints in clip: motion alone places them.",
-        ),
+        ("detection/cam1.clip", UNREADABLE, "the video of cam1 in clip has no image, .* 7 to 11"),
+        ("tracking/clip", {"absent_share": 0.2, **ABSENT}, "missing in clip for 20 % .* person 7"),
+        ("tracking/clip", {"unmatched_share": 0.3}, r"no track follows 30 % \(limit 15 %\)"),
+        ("tracking/clip", {"mean_ray_distance_m": 0.2}, r"disagree by 20 cm \(limit 15 cm\)"),
         ("tracking/clip", {"corrections_refused": 2.0}, "2 corrections of clip do not"),
-        (
-            "static_calibration/cam1",
-            {"clicks_wrong": 5.0},
-            "clicks of cam1 contradict the others and are not used: 5.",
-        ),
-        (
-            "broadcast_tracking/clip",
-            {"unmatched_share": 0.1, "plane_std_m": 9.0},
-            "places of people in clip are uncertain by 9 m (limit 1 m).",
-        ),
+        ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
+        ("retriangulation/clip", UNHEALTHY, r"cam3, cam2 depart .* 3 s \(limit 2 s\) .* 0 to 74"),
+        ("retriangulation/clip", MISPLACED, r"cam4 displaces people in clip by 8 cm \(limit 5"),
+        ("retriangulation/clip", {"filled_share": 0.1}, r"no camera sees 10 % \(limit 5 %\)"),
+        ("bundle_adjustment/cameras", MOVED, "contradict the calibration of cam4: .* by 7.1"),
+        ("body_fitting/clip", {"offset_rms_m": 0.05}, r"bodies in clip lie 5 cm \(limit 3 cm\)"),
+        ("body_fitting/clip", WORSE, r"bodies in clip are farther .* \(knee\), by 2"),
+        ("broadcast_calibration/clip", {"expected_error_median_px": 4.0}, r"4 px \(limit 3 px\)"),
+        ("static_calibration/cam1", {"clicks_wrong": 5.0}, "clicks of cam1 contradict .*: 5"),
+        ("broadcast_tracking/clip", PLANE, r"places of people .* 9 m \(limit 1 m\)"),
         # A metric that is not there, or not a number, is no good one.
-        (
-            "triangulation/other",
-            {"unhealthy_share": 0.0},
-            "uncertainty of the joints could not be computed in other. Look at it",
-        ),
-        (
-            "retriangulation/clip",
-            {"misplacement_m.cam1": float("nan"), "misplacement_m.cam2": 0.01},
-            "misplacement could not be computed in clip (cam1).",
-        ),
+        ("triangulation/other", {"unhealthy_share": 0.0}, "could not be computed in other"),
+        ("retriangulation/clip", NO_NUMBER, r"misplacement could not be computed in clip \(cam1\)"),
     ],
 )
 def test_a_metric_beyond_its_limit_is_a_reservation(unit, figures, said):
     found = judge(unit, figures=figures)
     assert found.verdict == "usable with reservations"
     (text,) = found.reservations
-    assert text.startswith(said)
+    assert re.search(said, text)
 
 
 @pytest.mark.parametrize(

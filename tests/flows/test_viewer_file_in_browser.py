@@ -63,8 +63,7 @@ def test_pages_fit_their_screens(seen):
 
 
 def test_keys_move_through_time_colours_and_cameras(seen):
-    assert (seen["last"], seen["stepped"]) == (59, 1)
-    assert seen["colours"] == "spread"
+    assert ((seen["last"], seen["stepped"]), seen["colours"]) == ((59, 1), "spread")
     assert seen["through"] == "broadcast"
     assert seen["played"] > 20
 

@@ -71,8 +71,7 @@ def test_a_failed_channel_is_tried_again_later_and_keeps_no_other_waiting(
     pauses = [0.0]
     for _ in range(10):
         pauses.append(dispatcher.deliver(ABSENT, pauses[-1]))
-    assert pauses[1:4] == [30.0, 60.0, 120.0]
-    assert pauses[-1] == LONGEST_PAUSE
+    assert (pauses[1:4], pauses[-1]) == ([30.0, 60.0, 120.0], LONGEST_PAUSE)
     webhook.codes += [204, 500]
     pause = dispatcher.deliver(dispatcher.channels[1])
     assert (pause, len(webhook.posted)) == (30.0, 2)  # it stops at the first failure

@@ -92,8 +92,7 @@ def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):
     for size in (10, 100, len(whole)):
         clock.now += 10.0
         file.write_bytes(whole[:size])
-        assert desk.look() == 0
-        assert desk.known()["small"][0] == "arriving"
+        assert (desk.look(), desk.known()["small"][0]) == (0, "arriving")
     # It was whole at 1030 s: the ten seconds count from then, regardless of earlier waiting.
     clock.now = 1039.9
     assert (desk.look(quiet=10.0), desk.take_in(quiet=10.0)) == (0, [])
@@ -166,8 +165,7 @@ def test_a_second_copy_is_refused_with_the_name_of_the_first(desk, drop):
     desk.look()
     desk.take_in()
     known = desk.known()
-    assert known["first"][0] == "taken"
-    assert known["second"][0] == "refused"
+    assert (known["first"][0], known["second"][0]) == ("taken", "refused")
     assert "tiny-0-0.2s-3cameras-2players, registered from" in known["second"][1]
     assert len(desk.begun) == 1
     # One that moves to another queue is known; it asks for its run, which is that of before.
@@ -216,8 +214,7 @@ def test_a_match_that_ends_the_process_stops_no_other_and_is_refused(desk, drop)
     pitch.write_text(pitch.read_text() + " ")
     desk.look()
     first = watch_once(desk.state, desk.inbox, 0.0)
-    assert die(desk) == 137
-    assert desk.known()["aaa"] == ("arriving", "being taken in")
+    assert (die(desk), desk.known()["aaa"]) == (137, ("arriving", "being taken in"))
     assert desk.store.matches() == (), "it was the first"
     again = watch_once(desk.state, desk.inbox, 0.0)
     assert len(again) == 2

@@ -132,8 +132,7 @@ def test_a_summary_that_is_damaged_or_of_another_match_is_made_again(store):
     whole = path.read_bytes()
     for text in (whole[:-9], whole.replace(b"ready", b"readx"), b"", b"{}"):
         path.write_bytes(text)
-        assert read_summary(store, TINY) == first
-        assert path.read_bytes() == whole
+        assert (read_summary(store, TINY), path.read_bytes()) == (first, whole)
     path.rename(path.with_name("other.json"))
     assert read_summary(store, "other").problem
     assert read_summary(store, TINY) == first

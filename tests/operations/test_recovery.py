@@ -50,8 +50,7 @@ def test_of_two_writers_of_a_state_one_wins_and_all_states_stay(queue, tmp_path)
     other = RunQueue(LocalBlobs(tmp_path))  # of another process
     assert other.change(run, "cancelled", "by Ada").number == 2
     assert queue.change(run, "begun") is None
-    assert queue.latest(run).state == "cancelled"
-    assert queue.open_runs() == []
+    assert (queue.latest(run).state, queue.open_runs()) == ("cancelled", [])
     assert queue.take(a_run()) == queue.latest(run)  # asked for once more after a lost answer
     files = sorted(path.name for path in (tmp_path / "queue" / "match" / "m").iterdir())
     assert files == ["id-m.0001.json", "id-m.0002.json"]

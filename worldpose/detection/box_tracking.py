@@ -174,17 +174,19 @@ class BoxCleaner:
             frames: rising numbers, images, and detections; None where no detector ran.
         """
         settings = self._settings
-        lag = max(settings.max_gap_frames, settings.stride)
+        gap = max(settings.max_gap_frames, settings.stride)
+        # A frame is held until a track that begins there can have all of its sightings.
+        lag = max(gap, settings.stride * (settings.min_hits - 1))
         for number, image, people in frames:
             self._held.append(_BufferedFrame(number, image))
             if people is not None:
-                self._add_detections(number, people, lag)
+                self._add_detections(number, people, gap)
             while self._held and number - self._held[0].number >= lag:
                 yield self._release_frame()
         while self._held:
             yield self._release_frame()
 
-    def _add_detections(self, number: int, people: People, lag: int) -> None:
+    def _add_detections(self, number: int, people: People, gap: int) -> None:
         later = 1 if self._last is None else number - self._last
         self._last = number
         self._searched += 1
@@ -197,7 +199,7 @@ class BoxCleaner:
             if before is None:
                 self._tracks[int(track)] = _BoxTrack(number, box, float(score))
                 continue
-            if 1 < number - before.number <= lag:
+            if 1 < number - before.number <= gap:
                 self._fill(int(track), before, number, box, float(score))
             before.number, before.box, before.score = number, box, float(score)
             before.sightings += 1
@@ -240,11 +242,13 @@ def detect_strided(
 ) -> Iterator[tuple[int, Image | None, People | None]]:
     """Yield each frame with its detections; detectors run on every `stride`-th and the last one.
 
+    In place of one without an image, they run on the frames before and after it.
+
     Args:
         frames: rising numbers with images; None where there is none.
         detect: detects people in images of one size.
         stride: frames between runs of the detector.
-        batch: images per call of the detector.
+        batch: most images per call of the detector; fewer where many frames lie between.
     """
     waiting: list[tuple[int, Image | None]] = []
     chosen: list[int] = []
@@ -260,10 +264,14 @@ def detect_strided(
 
     for number, image in frames:
         waiting.append((number, image))
-        if image is not None and (due is None or number >= due):
+        if due is not None and number < due:
+            continue
+        if image is not None:
             chosen.append(len(waiting) - 1)
             due = number + stride
-        if len(chosen) == batch:
+        elif len(waiting) > 1 and waiting[-2][1] is not None and len(waiting) - 2 not in chosen:
+            chosen.append(len(waiting) - 2)
+        if len(chosen) == batch or (image is not None and len(waiting) >= max(batch, stride)):
             yield from iterate_found()
     last = next((at for at in reversed(range(len(waiting))) if waiting[at][1] is not None), None)
     if last is not None and last not in chosen:

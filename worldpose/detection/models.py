@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 from collections.abc import Callable, Hashable
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 from data_contracts.checkpoint import Checkpoint
 from worldpose.cache_folder import user_cache
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from worldpose.detection.landmark_net import LandmarkEstimator
 
 Loaded = TypeVar("Loaded")
+Task = Literal["detector", "pose"]
 
 LIBRARIES: Final = {
     "embedded": ("torch", "onnxruntime"),
@@ -92,7 +95,7 @@ def _share(load: Callable[[], Loaded], name: str, path: Path | None, *how: Hasha
 
     Nets have no state, so all units of a process use the same ones.
     """
-    files = [] if path is None else sorted(path.rglob("*")) if path.is_dir() else [path]
+    files = [] if path is None else sorted(path.rglob("*")) if path.is_dir() else _net_files(path)
     stamps = [
         (each, each.stat().st_mtime_ns, each.stat().st_size) for each in files if each.exists()
     ]
@@ -116,13 +119,13 @@ def load_detectors(settings: DetectionSettings) -> list[Detector]:
     how = settings.device, settings.half, settings.person_classes
     return [
         _share(partial(_detector, kind, path, settings), kind, path, *how)
-        for kind, path in map(_split_name, settings.detector)
+        for kind, path in (_split_name(name, "detector") for name in settings.detector)
     ]
 
 
 def load_pose(settings: DetectionSettings) -> PoseEstimator:
     """Return the pose estimator that the settings name; raises as `load_detectors`."""
-    kind, path = _split_name(settings.pose)
+    kind, path = _split_name(settings.pose, "pose")
     how = settings.device, settings.half
     estimator = _share(partial(_pose, kind, path, settings), f"pose {kind}", path, *how)
     return FlipTest(estimator) if settings.flip_test else estimator
@@ -141,7 +144,7 @@ def _pose(kind: str, path: Path | None, settings: DetectionSettings) -> PoseEsti
     if kind == "embedded":
         return load_bundled_pose(path, settings.device, settings.half)
     assert path is not None  # as parted
-    if kind == "onnx":
+    if kind.startswith("onnx"):  # of a catalog's entry, with any form
         from worldpose.detection.onnx_nets import load_onnx_pose
 
         return load_onnx_pose(path, settings.device)
@@ -161,7 +164,7 @@ def _detector(kind: str, path: Path | None, settings: DetectionSettings) -> Dete
         return load_onnx_detector(path, settings.device, form, settings.person_classes)
     from worldpose.detection.transformers_nets import TransformersDetector
 
-    return TransformersDetector(path, settings.device, settings.half)
+    return TransformersDetector(path, settings.device, settings.half, settings.person_classes)
 
 
 def load_bundled_detector(
@@ -237,10 +240,12 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
     Raises:
         InputError: an unknown kind, or missing weights.
     """
-    names = (*settings.detector, settings.pose, *(["embedded"] if settings.landmarks else []))
+    names: list[tuple[str, Task]] = [(name, "detector") for name in settings.detector]
+    names += [(settings.pose, "pose")]
+    names += [("embedded", "pose")] if settings.landmarks else []
     found: dict[str, str | None] = {}
-    for name in names:
-        kind, path = _split_name(name)
+    for name, task in names:
+        kind, path = _split_name(name, task)
         found[name] = None if path is None else digest_of_weights(path)
         for library in LIBRARIES[kind.partition("-")[0]]:
             found[library] = _installed_version(library)
@@ -256,7 +261,9 @@ def _installed_version(library: str) -> str | None:
 
 
 def digest_of_weights(path: Path) -> str:
-    """Return SHA-256 of a file, or of all files of a folder with their names.
+    """Return SHA-256 of a file, or of several files with their names.
+
+    Several are those of a folder, or an ONNX file and its external data.
 
     Raises:
         InputError: the path does not exist.
@@ -269,32 +276,54 @@ def digest_of_weights(path: Path) -> str:
             todo="Put the weights there, or correct the name. A relative path starts at the "
             "working directory.",
         )
-    return digest_of_files(path)
+    files = [path] if path.is_dir() else _net_files(path)
+    if len(files) == 1:
+        return digest_of_files(path)
+    each = "".join(f"{digest_of_files(file)} {file.name}\n" for file in files)
+    return hashlib.sha256(each.encode()).hexdigest()
 
 
-def _split_name(name: str) -> tuple[str, Path | None]:
+def _net_files(path: Path) -> list[Path]:
+    """Return a file of weights and the files that it names as its external data (ONNX).
+
+    Each tensor outside has an entry of key `location` and, as its value, a path beside the file.
+    """
+    if not path.is_file():
+        return [path]
+    names, content = set[bytes](), b""
+    with path.open("rb") as file:
+        while part := file.read(1 << 24):
+            content = content[-150:] + part  # longer than an entry
+            # Field 1 is the key, field 2 the value; one byte holds a length below 128.
+            entries = re.finditer(rb"\n\x08location\x12([\x01-\x7f])", content)
+            names |= {content[at.end() : at.end() + at[1][0]] for at in entries}
+    beside = (path.parent / os.fsdecode(name) for name in sorted(names) if b"\0" not in name)
+    return [path, *(file for file in beside if file.is_file())]
+
+
+def _split_name(name: str, task: Task) -> tuple[str, Path | None]:
     """Return the kind of a model and the path of its weights; None for those that ship."""
     kind, colon, path = name.partition(":")
     if kind == "model" and path:
-        return _find_pulled(path)
+        return _find_pulled(path, task)
     library, dash, _form = kind.partition("-")
-    unknown = library not in LIBRARIES or (dash and library != "onnx")
+    unknown = library not in LIBRARIES or (dash and (library != "onnx" or task == "pose"))
     if unknown or (colon and not path) or (kind != "embedded" and not path):
         raise InputError(
             f"detection: {name!r}",
-            expected="embedded, embedded:FILE, model:NAME, transformers:FOLDER, onnx:FILE or "
-            "onnx-FORM:FILE",
+            expected="embedded, embedded:FILE, model:NAME, transformers:FOLDER, onnx:FILE or, of a "
+            "detector, onnx-FORM:FILE",
             found=repr(name),
             todo="Correct detection.detector or detection.pose.",
         )
     return kind, Path(path).expanduser().resolve() if path else None
 
 
-def _find_pulled(name: str) -> tuple[str, Path]:
+def _find_pulled(name: str, task: Task) -> tuple[str, Path]:
     """Return kind and path of a pulled checkpoint.
 
     Raises:
-        InputError: the checkpoint was not pulled.
+        InputError: the checkpoint was not pulled, or has another task.
     """
     folder = model_folder()
     # A name is never a path.
@@ -306,6 +335,13 @@ def _find_pulled(name: str) -> tuple[str, Path]:
             expected=f"a pulled checkpoint in {folder}",
             found="none of this name",
             todo=f"Pull it: worldpose models pull {name}. worldpose models list shows the names.",
+        )
+    if pulled.task != task:
+        raise InputError(
+            f"detection.{task}: 'model:{name}'",
+            expected=f"a checkpoint of task {task}",
+            found=pulled.task,
+            todo="Name another. worldpose models list shows the setting of each.",
         )
     files = folder / name / PULLED_FILES
     return pulled.kind, files if pulled.kind == "transformers" else files / pulled.files[0].name

@@ -83,9 +83,8 @@ def load_onnx_detector(
     outputs = _probe(net)
     chosen = FORMS[form or recognize_form(net.where, outputs, net.size)]
     names = _class_names(net.metadata)
-    return _OnnxDetector(
-        net, chosen, _person_classes(net.where, chosen, outputs, names, person_classes)
-    )
+    count = None if chosen.classes is None else chosen.classes(outputs)
+    return _OnnxDetector(net, chosen, find_person_classes(net.where, count, names, person_classes))
 
 
 def recognize_form(where: str, outputs: Outputs, size: tuple[int, int]) -> str:
@@ -184,22 +183,25 @@ def _class_names(metadata: Mapping[str, str]) -> dict[int, str]:
     """Return the class names that an exporter wrote into the file; {} if there are none."""
     try:
         names = parse_in_turn(lambda: ast.literal_eval(metadata.get("names", "{}")))
-    except (SyntaxError, ValueError):
+        pairs = list(names.items() if isinstance(names, dict) else enumerate(names))
+        if all(isinstance(name, int) for _, name in pairs):  # numbers by name
+            pairs = [(number, name) for name, number in pairs]
+        return {int(number): str(name) for number, name in pairs}
+    except (SyntaxError, ValueError, TypeError):
         return {}
-    if isinstance(names, list | tuple):
-        names = dict(enumerate(names))
-    return {int(k): str(name) for k, name in names.items()} if isinstance(names, dict) else {}
 
 
-def _person_classes(
-    where: str,
-    form: Form,
-    outputs: Outputs,
-    names: Mapping[int, str],
-    asked: Sequence[int] | None,
+def find_person_classes(
+    where: str, count: int | None, names: Mapping[int, str], asked: Sequence[int] | None
 ) -> tuple[int, ...]:
-    """Return the classes of people."""
-    count = None if form.classes is None else form.classes(outputs)
+    """Return the classes of people of a net.
+
+    Args:
+        where: its file, for messages.
+        count: number of its classes; None = not known.
+        names: names of its classes; {} if it has none.
+        asked: `detection.person_classes`.
+    """
     if asked is not None:
         if count is not None and any(number >= count for number in asked):
             raise InputError(

@@ -37,7 +37,6 @@ class OnnxNet:
         size: width, height of its input [px].
         channels_last: whether it takes (batch, height, width, 3), as TensorFlow has it.
         dtype: dtype of its input.
-        batch: images per call; None for any number.
         metadata: what the exporter wrote into the file.
         outputs: shape of each output, with None for dynamic sizes.
     """
@@ -56,7 +55,7 @@ class OnnxNet:
         self.where = str(file)
         self._session = open_session(file, device)
         inputs = self._session.get_inputs()
-        shape = [side if isinstance(side, int) else None for side in inputs[0].shape]
+        shape = [n if isinstance(n, int) and n > 0 else None for n in inputs[0].shape]
         # Names of a second input for the width and height of the image [px].
         sizes = inputs[1:] and inputs[1].name in ("orig_target_sizes", "target_sizes")
         if len(inputs) > 1 + bool(sizes) or len(shape) != 4 or 3 not in (shape[1], shape[3]):
@@ -66,12 +65,18 @@ class OnnxNet:
                 found=f"{len(inputs)} inputs, the first of shape {inputs[0].shape}",
                 todo="Export the net without further inputs.",
             )
+        if shape[0] not in (None, 1) or inputs[0].type not in _DTYPES:
+            raise InputError(
+                self.where,
+                expected=f"a batch of 1 or of any size, of {', '.join(_DTYPES)}",
+                found=f"an input of shape {inputs[0].shape}, {inputs[0].type}",
+                todo="Export the net with batch 1 and float32.",
+            )
         self._names = [each.name for each in inputs]
         self.channels_last = shape[3] == 3
-        self.batch = shape[0]
         height, width = shape[1:3] if self.channels_last else shape[2:4]
         self.size = (width or default_size[0], height or default_size[1])
-        self.dtype: np.dtype[Any] = _DTYPES.get(inputs[0].type, np.dtype(np.float32))
+        self.dtype: np.dtype[Any] = _DTYPES[inputs[0].type]
         self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
         self.outputs = [
             tuple(side if isinstance(side, int) else None for side in output.shape)
@@ -192,7 +197,7 @@ class _OnnxPose:
         size = self._net.size
         mappings = frame_from_crop(crops_around(boxes, size), size)
         crops: Image | Singles = np.stack([cut_crop(image, each, size, 0) for each in mappings])
-        if self._normal:
+        if self._normal and not np.issubdtype(self._net.dtype, np.integer):  # else it converts
             crops = (crops.astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         outputs = [output.astype(np.float64) for output in self._net.run(crops)]
         points, confidence = _read_keypoints(outputs, size)

@@ -33,7 +33,8 @@ from worldpose.detection.models import (
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
 from worldpose.detection.turning import QuarterTurn
-from worldpose.detection.views import TiledDetector
+from worldpose.detection.views import as_frame_detector
+from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_areas
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
@@ -100,6 +101,7 @@ class DetectionReport:
         bridged: boxes that were filled in.
         flickers: boxes of tracks with too few sightings.
         unsure: people without a single keypoint, or with the pose of a better box.
+        cut: people beyond `max_people` in a frame.
         beside: occluded people found next to others; later steps may drop some.
         is_given: whether the boxes were given, not detected.
         quarters: turns of the images by 90 degrees, counterclockwise, for the nets.
@@ -115,6 +117,7 @@ class DetectionReport:
     bridged: int = 0
     flickers: int = 0
     unsure: int = 0
+    cut: int = 0
     beside: int = 0
     is_given: bool = False
     quarters: int = 0
@@ -206,15 +209,11 @@ class PeopleFinder:
                 None = not known, scores stay.
             landmarks: finds points besides COCO-17 of the people found; None = none.
         """
-        self._detectors = [
-            detector
-            if detector.view_size is None
-            else TiledDetector(detector, settings.zooms, settings.view_overlap, settings.nms_iou)
-            for detector in detectors
-        ]
+        self._detectors = [as_frame_detector(each, settings) for each in detectors]
         self._estimator, self._settings, self._score_map = estimator, settings, score_map
         self._landmarks = landmarks
         self._parts: list[Part] | None = None
+        self._most = settings.max_people
         self.report = DetectionReport()
 
     def find(
@@ -229,17 +228,21 @@ class PeopleFinder:
         its side or upside down are turned, if the nets then find more in some of them.
 
         Args:
-            frames: numbers that rise by one, each with its image; None where there is none.
+            frames: numbers that rise by one, each with its image (height, width, 3) RGB of bytes;
+                None where there is none.
             place: camera and pitch; None keeps the crowd.
             given: known people by frame, in place of those of the detectors, all of whom stay: no
                 box is added, left out because of its score or its place, or tracked. None = detect.
+
+        Raises:
+            InputError: an image has another form or size than the first, or than the camera's.
         """
+        frames = _require_rgb(frames, place)
         self.report = DetectionReport(is_given=given is not None)
         turn = None if place is None else QuarterTurn.of(place.camera)
         if turn is None or place is None:
             yield from self._find(frames, place, given)
             return
-        frames = iter(frames)
         first = list(islice(frames, 16))
         frames = chain(first, frames)
         if given is None and not self._are_upright([image for _, image in first], turn):
@@ -275,7 +278,7 @@ class PeopleFinder:
         """Yield the people of upright images as `find` does."""
         # Frames decoded while earlier ones are searched.
         frames = self._wait_for(read_ahead(frames, 8))
-        cleaner = BoxCleaner(self._settings)
+        cleaner, self._most = BoxCleaner(self._settings), self._settings.max_people
         self._parts = None
         if (
             place is not None
@@ -295,7 +298,9 @@ class PeopleFinder:
             )
         else:
             found = ((number, image, given.get(number, NO_PEOPLE)) for number, image in frames)
-            self.report.boxes = sum(len(people.scores) for people in given.values())
+            counts = [len(people.scores) for people in given.values()]
+            self.report.boxes = sum(counts)
+            self._most = max(self._most, *counts, 0)
         rows: list[KeypointDetections] = []
         numbers: list[int] = []
         while batch := list(islice(found, self._settings.batch)):
@@ -376,7 +381,8 @@ class PeopleFinder:
             near = each.select(there | (np.arange(len(there)) < detected))
             distinct = suppress_poses(near, settings.min_keypoint_confidence, settings.oks_nms)
             self.report.unsure += len(near.score) - len(distinct.score)
-            best = np.sort(np.argsort(-distinct.score, kind="stable")[: settings.max_people])
+            best = np.sort(np.argsort(-distinct.score, kind="stable")[: self._most])
+            self.report.cut += len(distinct.score) - len(best)
             chosen = distinct.select(best)
             if self._score_map is not None:
                 chosen = replace(chosen, score=self._score_map.probability(chosen.score))
@@ -393,16 +399,37 @@ class PeopleFinder:
         return [nobody if image is None else next(rows) for image, _ in batch]
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
-        """Return the detections of frames in one record, padded to `max_people` with NaN."""
+        """Return the detections of frames in one record, padded with NaN."""
         arrays = {}
         for name, like in rows[0].arrays().items():
-            shape = (len(rows), self._settings.max_people, *like.shape[1:])
+            shape = (len(rows), self._most, *like.shape[1:])
             arrays[name] = np.full(shape, np.nan, dtype=np.float32)
             for row, found in zip(arrays[name], rows, strict=True):
                 row[: len(found.score)] = found.arrays()[name]
         self.report.detections += sum(len(found.score) for found in rows)
         self.report.frames += len(rows)
         return rows[0].with_arrays(arrays, np.array(numbers, dtype=np.int64))
+
+
+def _require_rgb(
+    frames: Iterable[tuple[int, Image | None]], place: Place | None
+) -> Iterator[tuple[int, Image | None]]:
+    """Yield frames with images whose bytes are in order; refuse those that no net takes."""
+    size = None if place is None else tuple(place.camera.image_size.tolist())
+    for number, image in frames:
+        if image is None:
+            yield number, None
+            continue
+        size, given = size or image.shape[1::-1], (image.dtype, image.shape)
+        if given != (np.dtype(np.uint8), (*size[::-1], 3)):
+            raise InputError(
+                f"image {number}",
+                expected="uint8 RGB (height, width, 3) of {} x {} px, as the camera or the first "
+                "image has it".format(*size),
+                found=f"{image.dtype} {image.shape}",
+                todo="Convert the images, for example with cv2.cvtColor and cv2.resize.",
+            )
+        yield number, np.ascontiguousarray(image)
 
 
 def detect_people(
@@ -416,7 +443,7 @@ def detect_people(
     """Return the people in consecutive images of one camera.
 
     Args:
-        images: (height, width, 3) RGB, in order; read once.
+        images: (height, width, 3) RGB uint8 of one size, in order; read once.
         settings: detectors, pose net and thresholds. The defaults are the bundled nets.
         detectors: own detectors in place of those that the settings name; scores stay theirs.
         camera: calibrated camera, whose images are turned upright for the nets; with `pitch`,
@@ -427,7 +454,7 @@ def detect_people(
         Detections (frames, detections), with frame numbers from 0 on.
 
     Raises:
-        InputError: a net or its file is missing or invalid.
+        InputError: a net or its file is missing or invalid, or an image has another form or size.
     """
     finder = PeopleFinder(
         load_detectors(settings) if detectors is None else detectors,

@@ -31,7 +31,8 @@ class DetectionSettings(Record):
     person_classes: tuple[ClassNumber, ...] | None = Field(
         default=None, min_length=1, max_length=100
     )
-    """Classes of people in ONNX detectors [1]; None: those whose names say so, or COCO's person."""
+    """Classes of people in ONNX and transformers detectors [1]; None: those whose names say so, or
+    COCO's person."""
     pose: str = "embedded"
     """Estimator of keypoints, named in the same way."""
     flip_test: bool = False
@@ -67,7 +68,8 @@ class DetectionSettings(Record):
     """Gaps of a track up to this length are filled with linearly interpolated boxes [frame]. Frames
     are buffered for as long, which costs memory. A third of a second is a step of a sprint."""
     min_hits: int = Field(default=2, ge=1, le=1000)
-    """A track with fewer sightings, where as many frames were searched, is a flicker [1]."""
+    """A track with fewer sightings, where as many frames were searched, is a flicker [1]. Frames
+    are buffered until a track can have as many."""
     pitch_margin_m: float = Field(default=2.5, ge=0, le=1000)
     """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins,
     sprints over the line and assistants, 1.5 m out, stay: the position of a far foot is accurate to
@@ -86,7 +88,7 @@ class DetectionSettings(Record):
     """If two poses in a frame are more similar than this, the pose with the better box stays [1,
     COCO's object keypoint similarity]."""
     max_people: int = Field(default=64, ge=1, le=1024)
-    """Most people per frame; those with the best scores stay."""
+    """Most people per frame; those with the best scores stay. Given boxes all stay."""
 
     @model_validator(mode="after")
     def _refuse_occluded_search_without_bundled_net(self) -> Self:

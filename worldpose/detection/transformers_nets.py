@@ -15,6 +15,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import MIN_SCORE, People
+from worldpose.detection.onnx_detectors import find_person_classes
 from worldpose.detection.onnx_nets import import_library
 from worldpose.errors import InputError
 
@@ -22,16 +23,20 @@ from worldpose.errors import InputError
 class TransformersDetector:
     """A detector of the DETR family."""
 
-    def __init__(self, folder: Path, device: str, half: bool) -> None:
+    def __init__(
+        self, folder: Path, device: str, half: bool, person_classes: Sequence[int] | None = None
+    ) -> None:
         """Load a saved checkpoint.
 
         Args:
             folder: folder with config.json, model.safetensors and preprocessor_config.json.
             device: `cpu` or `cuda`.
             half: compute in half precision, on a GPU only.
+            person_classes: as of `load_onnx_detector`.
 
         Raises:
-            InputError: transformers or a GPU is missing, or the folder holds no such net.
+            InputError: transformers or a GPU is missing, the folder holds no such net, or its
+                classes of people are unknown.
         """
         self._torch, library = (import_library(n, str(folder)) for n in ("torch", "transformers"))
         # Kinds of detectors, by `model_type` of config.json.
@@ -39,14 +44,12 @@ class TransformersDetector:
         # The processors without a suffix need torchvision.
         named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
         self._processor = _load_net(folder, named)
-        net = _load_net(folder, library.AutoModelForObjectDetection, use_safetensors=True)
-        self._net = _place_net(net, device, half)
+        self._net = net = _load_weights(folder, library.AutoModelForObjectDetection, device, half)
         self._device, self._half = device, half
-        self._person = next(
-            (number for number, name in net.config.id2label.items() if name.lower() == "person"),
-            # Class of people where the checkpoint does not name its classes.
-            0,
-        )
+        # transformers writes LABEL_0, LABEL_1 and so on where a checkpoint has no names.
+        names = {k: n for k, n in net.config.id2label.items() if not n.startswith("LABEL_")}
+        count = net.config.num_labels
+        self._people = find_person_classes(str(folder), count, names, person_classes)
         size = self._processor.size
         self._size = (int(size.get("width", 640)), int(size.get("height", 640)))
 
@@ -66,7 +69,7 @@ class TransformersDetector:
             (found,) = self._processor.post_process_object_detection(
                 outputs, threshold=MIN_SCORE, target_sizes=[image.shape[:2]]
             )
-            person = (found["labels"] == self._person).cpu().numpy()
+            person = np.isin(found["labels"].cpu().numpy(), self._people)
             boxes = found["boxes"].cpu().numpy().astype(np.float64)[person] - 0.5
             scores = found["scores"].cpu().numpy().astype(np.float64)[person]
             people.append(People(boxes, scores))
@@ -82,8 +85,14 @@ class TransformersPose:
         # Kinds of pose estimators.
         _kind(folder, library, ("vitpose",))
         self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
-        net = _load_net(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
-        self._net = _place_net(net, device, half)
+        self._net = net = _load_weights(folder, library.VitPoseForPoseEstimation, device, half)
+        if net.config.num_labels != 17:
+            raise InputError(
+                str(folder),
+                expected="the 17 keypoints of COCO",
+                found=f"{net.config.num_labels} keypoints",
+                todo="Name a checkpoint that was trained on COCO keypoints.",
+            )
         self._device, self._half = device, half
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
@@ -128,9 +137,11 @@ def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
 
 
 def _load_net(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
+    from safetensors import SafetensorError  # late: it comes with the libraries of nets
+
     try:
         return named.from_pretrained(str(folder), local_files_only=True, **further)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
         raise InputError(
             str(folder),
             expected="a folder with config.json, preprocessor_config.json and model.safetensors",
@@ -139,9 +150,20 @@ def _load_net(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _place_net(net: Any, device: str, half: bool) -> Any:  # noqa: ANN401
+def _load_weights(folder: Path, named: Any, device: str, half: bool) -> Any:  # noqa: ANN401
+    """Return a net with the weights of a folder, which must have all of them."""
     from worldpose.detection.net_inference import require_gpu  # late: it needs torch
 
+    net, told = _load_net(folder, named, use_safetensors=True, output_loading_info=True)
+    # Buffers are computed where they are absent.
+    missing = sorted(told["missing_keys"] & {name for name, _ in net.named_parameters()})
+    if missing:
+        raise InputError(
+            str(folder),
+            expected=f"the weights of a {type(net).__name__}",
+            found=f"none of {len(missing)} parameters, such as {missing[0]}",
+            todo="Save the whole net, with its head, with save_pretrained.",
+        )
     require_gpu(device)
     net = net.eval().to(device)
     return net.half() if half and device == "cuda" else net

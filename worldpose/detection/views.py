@@ -12,6 +12,7 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import Detector, People, PoseEstimator
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import suppress
 
 
@@ -92,6 +93,13 @@ class TiledDetector:
             | ((y1 > self._size[1] - edge) & (view.y + self._size[1] < low))
         )
         return People(view.to_frame(people.boxes[~cut]), people.scores[~cut])
+
+
+def as_frame_detector(detector: Detector, settings: DetectionSettings) -> Detector:
+    """Return a detector of whole frames; one with a view size gets views of them."""
+    if detector.view_size is None:
+        return detector
+    return TiledDetector(detector, settings.zooms, settings.view_overlap, settings.nms_iou)
 
 
 def _starts(length: int, view: int, overlap: float) -> list[int]:

@@ -22,6 +22,7 @@ from data_contracts.conventions import COCO17
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse
+from worldpose.detection.views import as_frame_detector
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.keypoint_sets import PointOrder, order_by_names
 from worldpose.video.folder import declared_size, decode_image, open_video
@@ -361,7 +362,8 @@ def _frames(videos: Sequence[Path], every: int) -> Iterator[tuple[str, Image]]:
 def _write_detections(
     frames: Iterable[tuple[str, Image]], folder: Path, settings: DetectionSettings
 ) -> int:
-    detectors, pose = load_detectors(settings), load_pose(settings)
+    detectors = [as_frame_detector(each, settings) for each in load_detectors(settings)]
+    pose = load_pose(settings)
     (folder / "pictures").mkdir(parents=True)
     proposed, size = [], (0, 0)
     for name, picture in frames:

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,21 +209,34 @@ def some_pictures(
 def pictures_at(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer], *, grey: bool = False
 ) -> Iterator[Image | None]:
-    """Yield the frame of each number; None for a negative one.
-
-    Args:
-        video: their source.
-        numbers: (pictures,) rising, with repetitions.
-        grey: as of `Pictures.frames`.
+    """Yield the frame of each number as `readable_at` does.
 
     Raises:
         InputError: a frame cannot be decoded.
     """
-    there = numbers[numbers >= 0]
-    span = (int(there[0]), int(there[-1]) + 1) if len(there) else (0, 0)
-    shown = video.frames(*span, grey=grey)
-    at, picture = -1, None
+    shown = readable_at(video, numbers, grey=grey)
+    for number, picture in zip(numbers.tolist(), shown, strict=True):
+        if picture is None and number >= 0:
+            raise video.damage_error(number)
+        yield picture
+
+
+def readable_at(
+    video: VideoReader | ImageFolder, numbers: NDArray[np.integer], *, grey: bool = False
+) -> Iterator[Image | None]:
+    """Yield the frame of each number; None for a negative one, and where none can be decoded.
+
+    Args:
+        video: their source.
+        numbers: (pictures,) with repetitions; decoding begins again where they go back.
+        grey: as of `Pictures.frames`.
+    """
+    only = set(numbers.tolist())
+    end = max(only, default=0) + 1
+    at, picture = end, cast("Image | None", None)
     for number in numbers.tolist():
+        if 0 <= number < at:
+            at, shown = -1, video.readable(number, end, grey=grey, only=only)
         while at < number:
             at, picture = next(shown)
         yield picture if number >= 0 else None

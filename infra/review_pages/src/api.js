@@ -43,15 +43,19 @@ async function reach(path, what) {
   return answer;
 }
 
+// Change something. Who logs in again in another tab has another form secret: it is fetched, unless it is another person's.
+async function change(call, path, method, kind, body) {
+  const send = () => call(path, { method, headers: { "content-type": kind, "x-form-secret": session?.form_secret ?? "" }, body });
+  const [sent, answer] = [session, await send()];
+  if (answer.status !== 403 || !sent) return answer;
+  const now = await get("/api/session");
+  if (now.who !== sent.who || now.form_secret === sent.form_secret) return answer;
+  session = now;
+  return send();
+}
+
 async function ask(method, path, body) {
-  const answer = await reach(path, {
-    method,
-    headers:
-      method === "GET"
-        ? {}
-        : { "content-type": "application/json", "x-form-secret": session?.form_secret ?? "" },
-    body: body === undefined ? undefined : JSON.stringify(body),
-  });
+  const answer = await (method === "GET" ? reach(path) : change(reach, path, method, "application/json", JSON.stringify(body)));
   if (answer.status === 401) {
     location.assign("/login");
     throw new Refusal(401, { error: "log in first" });
@@ -71,11 +75,7 @@ export async function getBytes(path) {
 
 // Send bytes, and return what the server says of them: the caller decides what a refusal means.
 export async function putBytes(path, bytes) {
-  const answer = await fetch(path, {
-    method: "PUT",
-    headers: { "content-type": "application/octet-stream", "x-form-secret": session?.form_secret ?? "" },
-    body: bytes,
-  });
+  const answer = await change(fetch, path, "PUT", "application/octet-stream", bytes);
   if (answer.status === 401) location.assign("/login");
   return { status: answer.status, content: await answer.json().catch(() => ({})) };
 }

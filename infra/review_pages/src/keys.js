@@ -7,6 +7,9 @@ export function isTyping(event) {
   return event.defaultPrevented || event.isComposing || Boolean(event.target.closest?.(FIELDS)) || document.querySelector("dialog[open]") !== null;
 }
 
+// Whether a held key repeats what its first press did: only moving on may be repeated.
+export const isHeld = (event) => event.repeat && !/^(Arrow\w+|[jk])$/.test(event.key);
+
 // The part of a page that was used last has the shortcuts; a page with one part has no areas.
 let area = "";
 export const enter = (name) => (area = name);

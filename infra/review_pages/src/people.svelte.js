@@ -18,6 +18,7 @@ export class People {
   #frame = null; // the frame asked for last
   #asking = false;
   #wanted = null;
+  #unseen = null; // why the other cameras said nothing
 
   constructor(match, owner) {
     this.owner = owner;
@@ -76,8 +77,10 @@ export class People {
       try {
         const found = await get(`${this.where}/views?${asked}`);
         if (who === this.who) this.views = found;
+        if (this.problem === this.#unseen) this.problem = "";
       } catch (error) {
         this.views = null;
+        this.problem = this.#unseen = error.message;
       }
     }
     this.#asking = false;

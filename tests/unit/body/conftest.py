@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from worldpose.body.body_file import load_open_body
-from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body.model import BodyParameters
 
 
 @pytest.fixture(scope="session")
-def open_body() -> BodyModel:
+def open_body():
     return load_open_body()
 
 
 @pytest.fixture(scope="session")
-def corrected_body(open_body: BodyModel) -> BodyModel:
+def corrected_body(open_body):
     """The open body with made-up pose correctives of 5 mm, the part it lacks of SMPL's layout."""
     rng = np.random.default_rng(5)
     directions = 0.005 * rng.normal(size=(len(open_body.template), 3, 207)).astype(np.float32)
@@ -21,7 +21,7 @@ def corrected_body(open_body: BodyModel) -> BodyModel:
 
 
 @pytest.fixture
-def people() -> BodyParameters:
+def people():
     """Five differently shaped people in wild poses, tens of metres from the origin."""
     rng = np.random.default_rng(1)
     return BodyParameters(

@@ -1,10 +1,7 @@
 """Pickles like those of SMPL, with the classes that its authors used; no number is SMPL's."""
 
-from __future__ import annotations
-
 import pickle
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
@@ -15,7 +12,7 @@ import scipy.sparse
 class Ch:
     """Stands for chumpy.ch.Ch: an array and the bookkeeping that it is pickled with."""
 
-    def __init__(self, x: np.ndarray) -> None:
+    def __init__(self, x):
         self.x = x
         self._dirty_vars = {"x"}
         self._itr = None
@@ -25,7 +22,7 @@ class Ch:
 class Select:
     """Stands for chumpy.reordering.Select: elements picked out of an array."""
 
-    def __init__(self, a: object, idxs: np.ndarray, preferred_shape: tuple[int, ...]) -> None:
+    def __init__(self, a, idxs, preferred_shape):
         self.a, self.idxs, self.preferred_shape = a, idxs, preferred_shape
 
 
@@ -34,7 +31,7 @@ for kind, module in ((Ch, "chumpy.ch"), (Select, "chumpy.reordering")):
 
 
 @contextmanager
-def chumpy() -> Iterator[None]:
+def chumpy():
     """While it lasts, chumpy can be imported, as when SMPL's files were written."""
     modules = {name: ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
     modules["chumpy.ch"].Ch = Ch
@@ -47,12 +44,12 @@ def chumpy() -> Iterator[None]:
             del sys.modules[name]
 
 
-def pickled(content: object, protocol: int = 2) -> bytes:
+def pickled(content, protocol=2):
     with chumpy():
         return pickle.dumps(content, protocol=protocol)
 
 
-def smpl_like(arrays: dict[str, np.ndarray]) -> dict[str, object]:
+def smpl_like(arrays):
     """Arrays under SMPL's keys as its files hold them: chumpy, sparse and plain."""
     shapedirs = arrays["shapedirs"].astype(np.float64)
     return {

@@ -1,9 +1,20 @@
+"""The body model against worked examples, its derivatives, and folded keypoints."""
+
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from worldpose.body.body_file import KEYS, find_body, load_body, read_npz_arrays, save_body
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import (
+    BODY25,
+    JOINT_OF_POINT,
+    SKELETONS,
+    VERTEX_OF_POINT,
+    fold_keypoints,
+    fold_regressor,
+)
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError, UsageError
 from worldpose.geometry.rigid import Rigid
@@ -131,3 +142,135 @@ def test_a_body_that_is_not_installed_is_refused(tmp_path, open_body, name):
     save_body(tmp_path / "bodies" / "other.npz", open_body)
     with pytest.raises(UsageError, match="one of open-neutral/2, open-neutral/3, other"):
         find_body(name, tmp_path / "bodies")
+
+
+NAMES = ("betas", "global_orient", "body_pose", "transl")
+STEP = 1e-6
+
+
+@pytest.fixture(params=["open_body", "corrected_body"])
+def folded(request):
+    return fold_keypoints(request.getfixturevalue(request.param), BODY25)
+
+
+def differences(folded, people, name):
+    """Central differences (..., keypoints, 3, parameters)."""
+    given = getattr(people, name)
+    columns = []
+    for column in range(given.shape[-1]):
+        step = STEP * np.eye(given.shape[-1])[column]
+        up, down = (replace(people, **{name: given + sign * step}) for sign in (1, -1))
+        columns.append((folded(up) - folded(down)) / (2.0 * STEP))
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("name", NAMES[:3])
+def test_derivatives_are_those_of_differences(folded, people, name):
+    jacobian = ChainedKeypoints.of(folded).differentiate(people)
+    # Rounding at 100 m over a step of 1e-6: 1e-8; the step's own error is far below.
+    np.testing.assert_allclose(
+        getattr(jacobian, name), differences(folded, people, name), atol=5e-8
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.1001, 3.0])
+def test_angles_of_any_size_have_exact_derivatives(folded, angle):
+    axis = np.array([0.48, -0.6, 0.64])
+    pose = np.zeros((23, 3))
+    pose[[0, 3, 8, 16]] = angle * axis
+    person = BodyParameters(np.zeros(10), angle * axis, pose.ravel(), np.zeros(3))
+    jacobian = ChainedKeypoints.of(folded).differentiate(person)
+    np.testing.assert_allclose(jacobian.keypoints, folded(person), atol=1e-14)
+    for name in ("global_orient", "body_pose"):
+        # Rounding at 1 m over a step of 1e-6, and the step's own error of 1e-12.
+        np.testing.assert_allclose(
+            getattr(jacobian, name), differences(folded, person, name), atol=2e-9
+        )
+
+
+def test_a_missing_person_is_missing_and_the_next_is_not(open_body, people):
+    pose = people.body_pose.copy()
+    pose[1] = np.nan
+    chained = ChainedKeypoints.of(fold_keypoints(open_body, ("left_wrist",)))
+    jacobian = chained.differentiate(replace(people, body_pose=pose))
+    assert np.isnan(jacobian.keypoints[1]).all()
+    np.testing.assert_array_equal(jacobian.pose[2], chained.differentiate(people).pose[2])
+
+
+# The requirement is 0.02 mm; double precision at tens of metres gives 1e-11.
+FOLD_ROUNDING = 1e-10
+
+
+def keypoints_of_the_surface(model, parameters, points):
+    """The same points picked out of the mesh and the joints."""
+    joints, vertices = model.joints(parameters), model.vertices(parameters)
+    return np.stack(
+        [
+            joints[..., JOINT_OF_POINT[point], :]
+            if point in JOINT_OF_POINT
+            else vertices[..., VERTEX_OF_POINT[point], :]
+            for point in points
+        ],
+        axis=-2,
+    )
+
+
+def test_folded_keypoints_are_those_of_the_surface_with_pose_correctives(corrected_body, people):
+    folded = fold_keypoints(corrected_body, SKELETONS["body25"])(people)
+    expected = keypoints_of_the_surface(corrected_body, people, SKELETONS["body25"])
+    np.testing.assert_allclose(folded, expected, atol=FOLD_ROUNDING)
+    # The correctives take part: they move the face by millimetres.
+    plain = replace(corrected_body, pose_directions=np.zeros((6890, 3, 0)))
+    moved = np.abs(fold_keypoints(plain, SKELETONS["body25"])(people) - folded)
+    assert moved.max() > 1e-3
+
+
+def test_a_vertex_of_a_model_of_another_size_is_refused(open_body):
+    cut = replace(
+        open_body,
+        template=open_body.template[:6000],
+        shape_directions=open_body.shape_directions[:6000],
+        pose_directions=open_body.pose_directions[:6000],
+        joint_regressor=np.full((24, 6000), 1 / 6000),
+        weights=open_body.weights[:6000],
+        faces=open_body.faces[:0],
+    )
+    with pytest.raises(InputError, match="6000 vertices"):
+        fold_keypoints(cut, ("nose",))
+    assert fold_keypoints(cut, ("neck",)).joint_shares[0, 12] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("joints", "vertices"),
+    [
+        (np.zeros((2, 24)), np.zeros((2, 6890))),
+        (np.full((2, 24), 1 / 24), np.zeros((3, 6890))),
+        (np.full((2, 23), 1 / 23), np.zeros((2, 6890))),
+    ],
+)
+def test_a_regressor_that_is_no_mean_is_refused(open_body, joints, vertices):
+    with pytest.raises(InputError, match="keypoint regressor"):
+        fold_regressor(open_body, joints, vertices)
+
+
+def test_left_points_are_on_the_left_of_the_open_body(open_body):
+    for point, vertex in VERTEX_OF_POINT.items():
+        x = open_body.template[vertex, 0]
+        side = {"left": 1, "right": -1}.get(point.split("_")[0], 0)
+        # The nose is in the middle within a centimetre.
+        assert np.sign(x) == side if side else abs(x) < 0.01
+
+
+def test_face_and_feet_of_the_open_body_are_where_they_belong(open_body):
+    at = {point: open_body.template[vertex] for point, vertex in VERTEX_OF_POINT.items()}
+    for side in ("left", "right"):
+        ankle = open_body.joint_template[JOINT_OF_POINT[f"{side}_ankle"]]
+        assert at[f"{side}_heel"][2] < ankle[2] < at[f"{side}_big_toe"][2]
+        assert abs(at[f"{side}_big_toe"][0]) < abs(at[f"{side}_small_toe"][0])
+        # The sole: within 4 cm of the lowest point of the body.
+        for point in ("heel", "big_toe", "small_toe"):
+            assert at[f"{side}_{point}"][1] < open_body.template[:, 1].min() + 0.04
+        assert at["nose"][2] > at[f"{side}_eye"][2] > at[f"{side}_ear"][2] + 0.05
+        assert at[f"{side}_eye"][1] > at["nose"][1]
+        # The ears are 13 to 20 cm apart.
+        assert 0.065 < abs(at[f"{side}_ear"][0]) < 0.1

@@ -5,13 +5,12 @@ torch = pytest.importorskip("torch")
 
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
 from worldpose.body.keypoints import SKELETONS, fold_keypoints  # noqa: E402
-from worldpose.body.model import BodyParameters  # noqa: E402
 
 # Double precision at tens of metres.
 ROUNDING = 1e-10
 
 
-def tensors(parameters: BodyParameters, dtype=torch.float64) -> list[torch.Tensor]:
+def tensors(parameters, dtype=torch.float64):
     names = ("betas", "global_orient", "body_pose", "transl")
     return [torch.tensor(getattr(parameters, name), dtype=dtype) for name in names]
 

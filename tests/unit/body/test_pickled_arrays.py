@@ -21,7 +21,7 @@ _BENIGN_EVENTS = {"open", "builtins.id", "object.__getattr__", "object.__setattr
 _events: list[str] | None = None
 
 
-def _note_event(event: str, args: tuple) -> None:
+def _note_event(event, args):
     # Other threads, as of a scheduler that serves other tests, read no pickle here.
     if _events is not None and threading.current_thread() is threading.main_thread():
         _events.append(event)
@@ -30,7 +30,7 @@ def _note_event(event: str, args: tuple) -> None:
 sys.addaudithook(_note_event)
 
 
-def read(tmp_path, stream: bytes, key: str = "a"):
+def read(tmp_path, stream, key="a"):
     """The array, after a check that the interpreter neither imported nor ran anything for it."""
     global _events
     path = tmp_path / "model.pkl"

@@ -1,17 +1,38 @@
-"""Fits of bodies whose truth is known, and of data at its worst."""
+"""Bodies fitted to known joints: shape, objective, points and constraints by rays."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_monocular import broadcast
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
+from data_contracts.conventions import FEET
+from data_contracts.keypoints import KeypointDetections
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting import estimate
+from worldpose.body_fitting.bones import Shape, pool_shapes
 from worldpose.body_fitting.estimate import fit_bodies
-from worldpose.body_fitting.evidence import JOINT_SPREAD, MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.evidence import (
+    JOINT_SPREAD,
+    MIRRORED_OFFSETS,
+    Contacts,
+    PersonEvidence,
+    body_axes,
+)
+from worldpose.body_fitting.extra_points import perceived_points
+from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
+from worldpose.body_fitting.poses import PoseSolver
+from worldpose.body_fitting.ray_constraints import find_ray_constraints
 from worldpose.body_fitting.report import far_offsets, report_fit
+from worldpose.body_fitting.residuals import PersonObjective, Pose
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.shapes import fit_shapes, spread_intervals
 from worldpose.errors import InputError
+from worldpose.triangulation.results import ExtraJoints
 
 SETTINGS = BodyFittingSettings()
 
@@ -141,3 +162,234 @@ def test_offsets_are_far_beyond_the_chance_of_all_joints_together():
     clips[0, 3] = [0.09, 0.0, 0.0]
     assert far_offsets(clips[0], bias)["ear"] == pytest.approx((0.09, 0.08226))
     assert not far_offsets(clips[0], np.zeros(17))  # not known
+
+
+SOLVER = PoseSolver(ChainedKeypoints.of(KEYPOINTS), load_pose_prior(), SETTINGS, None)
+
+
+def people(count, frames, noise, seed=5):
+    """Walkers, and their joints and covariance by person."""
+    rng = np.random.default_rng(seed)
+    truths = [walker(frames, rng) for _ in range(count)]
+    parts = [seen(truth, noise, rng) for truth in truths]
+    return truths, {p: (part[0][:, 0], part[1][:, 0]) for p, part in enumerate(parts)}
+
+
+def fit(joints, known=None, solver=SOLVER):
+    """Shapes of people, from the intervals of their tracks that the settings choose."""
+    sampled = {
+        person: [
+            (places[part], covariance[part])
+            for part in spread_intervals(len(places), 50.0, solver.settings)
+        ]
+        for person, (places, covariance) in joints.items()
+    }
+    return fit_shapes(solver, sampled, known or {}, 50.0)
+
+
+@pytest.mark.parametrize("frames", [100, 1500])
+def test_neither_people_nor_offsets_grow_with_the_length_of_a_clip(frames):
+    truths, joints = people(3, frames, 0.02)
+    shapes = fit(joints)
+    off = [height(shapes.people[p].betas) - height(t.betas[0]) for p, t in enumerate(truths)]
+    # Nobody stands on a ground and the detector has no offsets. Noise leaves 10 mm and 3 mm; with
+    # the poses' own weight of the prior and all frames, 1500 of them make it 128 mm and 24 mm.
+    assert np.abs(off).max() < 0.02
+    assert np.sqrt((shapes.offsets**2).mean()) < 0.005
+
+
+def test_what_other_clips_know_of_a_person_counts():
+    truths, joints = people(1, 50, 0.04)
+    true = truths[0].betas[0]
+    sure = Shape(true, 1e-4 * np.eye(MODEL.shapes))
+    alone = fit(joints).people[0]
+    known = fit(joints, {0: sure}).people[0]
+    assert np.linalg.norm(known.betas - true) < 0.1 < np.linalg.norm(alone.betas - true)
+    assert np.trace(known.covariance) < 1e-2 * np.trace(alone.covariance)
+
+
+@pytest.fixture
+def track():
+    rng = np.random.default_rng(5)
+    truth = walker(5, rng)
+    joints, covariance = seen(truth, 0.02, rng)
+    joints[1, 0, 4] = np.nan
+    settings = BodyFittingSettings()
+    contacts = Contacts(np.ones((5, 2)), np.ones((4, 2)), np.full((5, 2), 0.07))
+    evidence = PersonEvidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
+    chained = ChainedKeypoints.of(KEYPOINTS)
+    made = PersonObjective(
+        chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts
+    )
+    angles = truth.body_pose @ GATHER.T + 0.1 * rng.standard_normal((5, 30))
+    pose = Pose(truth.transl + 0.01, truth.global_orient, angles, truth.betas[0])
+    return made, pose
+
+
+def test_gradient_by_frames_and_betas_agrees_with_finite_differences(track):
+    made, pose = track
+    rng = np.random.default_rng(1)
+    at = made.equations(pose, np.zeros((17, 3)), bordered=True)
+    small = 1e-6
+    for _ in range(5):
+        step, betas = rng.standard_normal((5, 36)), rng.standard_normal(MODEL.shapes)
+        costs = [
+            made.equations(
+                pose.apply_step(sign * small * step, sign * small * betas),
+                np.zeros((17, 3)),
+                bordered=True,
+            ).cost
+            for sign in (1.0, -1.0)
+        ]
+        slope = (costs[0] - costs[1]) / (2.0 * small)
+        expected = (at.gradient * step).sum() + at.border_gradient[: MODEL.shapes] @ betas
+        # Betas feel the smoothness only through the poses, so that it does not shorten limbs,
+        # and offsets turn with the pose: both are left out, a hundredth of the whole.
+        assert slope == pytest.approx(expected, rel=0.02, abs=0.02 * np.abs(at.gradient).sum())
+
+
+def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counted_once():
+    # Each clip knows the first component to 0.5 besides the prior: 1 / (1 + 4) of variance.
+    covariance = np.diag([0.2, 1.0])
+    clips = [Shape(np.array([0.8 * seen, 0.0]), covariance) for seen in (1.0, 2.0)]
+    pooled = pool_shapes(clips, 1.0)
+    # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
+    np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
+
+
+CAMERA = broadcast(1)
+
+
+def tracked(keypoints, index):
+    return KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index)
+
+
+def scene(frames, hidden):
+    """A person who weaves before one camera, and the joints, without `hidden` frames."""
+    rng = np.random.default_rng(6)
+    truth = walker(frames, rng)
+    weaving = 0.3 * np.sin(2.0 * np.pi * 0.8 * np.arange(frames) / 50.0)
+    truth = BodyParameters(
+        truth.betas,
+        truth.global_orient,
+        truth.body_pose,
+        truth.transl + weaving[:, None] * [1.0, 0.0, 0.0],
+    )
+    exact = KEYPOINTS(truth)
+    joints, covariance = seen(truth, 0.01, rng)
+    joints[hidden] = np.nan
+    keypoints = CAMERA.project(exact[:, None].reshape(frames, 1, 17, 3))[:, :, None]
+    return exact, joints, covariance, keypoints, np.zeros((frames, 1, 1), dtype=np.int64)
+
+
+def test_stretches_of_one_view_are_filled_better_than_by_motion_alone():
+    length = 25
+    hidden = slice(20, 20 + length)
+    exact, joints, covariance, keypoints, index = scene(40 + length, hidden)
+    settings = BodyFittingSettings(max_filled_gap_s=2.0)
+    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
+    alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
+    lined = fit_bodies(
+        MODEL, ClipEvidence(joints, covariance, 50.0, ray_constraints=[lines]), settings
+    )
+    before, after = (
+        np.linalg.norm(x.joints - exact[:, None], axis=-1)[hidden].mean() for x in (alone, lined)
+    )
+    # Half a second is 64 % of what it was, one and a half are 22 %.
+    assert after < 0.75 * before
+    np.testing.assert_array_equal(
+        np.flatnonzero(lined.filled[:, 0]), np.arange(*hidden.indices(999))
+    )
+    trace = np.trace(lined.covariance[:, 0, 11], axis1=-2, axis2=-1)
+    middle = 20 + length // 2
+    # Less sure than where it was triangulated, and the less the longer ago.
+    assert trace[middle] > 1.5 * trace[10]
+
+
+def test_lines_pass_through_the_joints_they_see():
+    exact, joints, _, keypoints, index = scene(30, slice(10, 20))
+    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
+    assert lines.seen[10:20].all() and not lines.seen[:10].any() and not lines.seen[20:].any()
+    off = np.einsum("fpjab,fpjb->fpja", lines.across, lines.points - exact[:, None])
+    # The joints of a person stand 0.8 rad / 70 from his middle at most, and the points 1 m too far
+    # or too near.
+    assert np.linalg.norm(off, axis=-1)[10:20].max() < 0.015
+    # Required distance of the line's point from the track, whose walker swings the arms.
+    assert np.linalg.norm(lines.points - exact[:, None], axis=-1)[10:20].max() < 0.8
+
+
+POINTS = fold_keypoints(MODEL, FEET)
+NOISE = 0.01
+BIAS = 0.024
+LEFT = np.array([[0.0, 0.0, 0.02], [0.015, 0.0, 0.01], [0.0, 0.01, -0.02]])
+OFFSETS = np.concatenate([LEFT, LEFT * [-1.0, 1.0, 1.0]])
+"""Of a shoe: toes ahead and to the side, heel behind [m]: left, up, forward."""
+
+
+def fitted_people(count, frames, seed, *, offsets=0.0):
+    """Walkers who roll their feet: bodies, evidence with feet."""
+    rng = np.random.default_rng(seed)
+    bodies = []
+    for n in range(count):
+        body = walker(frames, rng)
+        pose = body.body_pose.copy()
+        wave = np.sin(2.0 * np.pi * 1.2 * np.arange(frames) / 50.0 + n)
+        for joint, sign in ((7, 1.0), (8, -1.0)):
+            pose[:, 3 * (joint - 1)] = 0.15 + 0.4 * sign * wave
+            pose[:, 3 * (joint - 1) + 1] = 0.15 * sign
+        bodies.append(replace(body, body_pose=pose))
+    joints, covariance, feet = [], [], []
+    for body in bodies:
+        own, spread = seen(body, NOISE, rng)
+        joints.append(own)
+        covariance.append(spread)
+        there = POINTS(body) + perceived_points(MODEL, FEET, body, offsets * np.ones((6, 3)))
+        feet.append(there + NOISE * rng.standard_normal(there.shape))
+    places = np.stack(feet, axis=1)
+    stated = np.broadcast_to((NOISE**2 + BIAS**2) * np.eye(3), (*places.shape, 3)).copy()
+    views = np.full(places.shape[:3], 4, np.uint8)
+    extra = ExtraJoints(FEET, places, stated, views, np.full(6, BIAS))
+    evidence = ClipEvidence(
+        np.concatenate(joints, axis=1), np.concatenate(covariance, axis=1), 50.0, extra=extra
+    )
+    return bodies, evidence
+
+
+def errors(fit, bodies):
+    """Mean error of heels and toes, and of ankles [m]."""
+    truth = np.stack([POINTS(body) for body in bodies], axis=1)
+    ankles = np.stack([KEYPOINTS(body)[:, 15:] for body in bodies], axis=1)
+    feet = np.linalg.norm(POINTS(fit.parameters) - truth, axis=-1).mean()
+    return feet, np.linalg.norm(fit.joints[:, :, 15:] - ankles, axis=-1).mean()
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return fitted_people(2, 60, 1)
+
+
+def test_rolling_feet_are_fitted(walk):
+    bodies, evidence = walk
+    without = fit_bodies(MODEL, replace(evidence, extra=None), SETTINGS)
+    with_feet = fit_bodies(MODEL, evidence, SETTINGS)
+    assert without.extra is None and with_feet.extra.points == FEET
+    before, ankles_before = errors(without, bodies)
+    after, ankles_after = errors(with_feet, bodies)
+    assert before > 0.04 and after < 0.012
+    assert ankles_after < ankles_before
+    np.testing.assert_allclose(with_feet.extra.joints, POINTS(with_feet.parameters), atol=1e-12)
+    np.testing.assert_array_equal(without.betas, with_feet.betas)  # they determine no shape
+
+
+def test_offsets_of_shoes_are_learned_and_do_not_move_the_ankles():
+    bodies, evidence = fitted_people(3, 60, 2, offsets=OFFSETS)
+    fit = fit_bodies(MODEL, evidence, SETTINGS)
+    # A turn of the foot moves all its points: what it explains is no offset.
+    length = fit.extra.offsets[0, 2] - fit.extra.offsets[2, 2]
+    assert length == pytest.approx(OFFSETS[0, 2] - OFFSETS[2, 2], abs=0.012)
+    np.testing.assert_allclose(
+        fit.extra.offsets[:3], fit.extra.offsets[3:] * [-1.0, 1.0, 1.0], atol=1e-12
+    )
+    feet, ankles = errors(fit, bodies)
+    assert feet < 0.02 and ankles < 0.015

@@ -1,7 +1,5 @@
 """Files of methods of one image: their names, shapes and conventions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from camera_builders import plain_camera

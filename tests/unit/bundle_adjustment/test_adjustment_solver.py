@@ -1,13 +1,24 @@
-"""Cameras and points adjusted together, against known truth."""
+"""The solver of bundle adjustment: its derivatives, its answers on known scenes, and its report."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs import rig
 
+from worldpose.bundle_adjustment.report import keypoint_outliers, review_clicks
+from worldpose.bundle_adjustment.residuals import KeypointNoise
 from worldpose.bundle_adjustment.solver import solve
+from worldpose.bundle_adjustment.uncertainty import relative_covariance, similarity_steps
 from worldpose.errors import InputError, InternalError
-from worldpose.static_calibration.parameters import PARAMETERS, step_camera
+from worldpose.geometry.camera_model import STEP
+from worldpose.geometry.optimize.schur_complement import (
+    CameraEquations,
+    PointObservations,
+    cost,
+    eliminate,
+)
+from worldpose.static_calibration.parameters import PARAMETERS, project_with_jacobian, step_camera
 
 DISTURBED = np.array([2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1, 5e-3, 3.0, 3.0, 0.01, 0.005, 0.0])
 
@@ -111,3 +122,143 @@ def test_numbers_that_are_not_finite_are_no_fault_of_the_cameras(scene):
     information[1] = np.nan
     with pytest.raises(InternalError, match="no number"):
         solve(replace(problem, camera_information=information))
+
+
+ORIGIN = np.array([0.3, -0.2, 1.0])
+
+
+@pytest.mark.parametrize("scale", [np.inf, 2.0])
+def test_the_gradient_is_the_slope_of_the_cost(scene, scale):
+    problem, _, points = scene(noise=3.0)
+    problem = replace(problem, scale=np.full(len(problem.image), scale))
+    first_of = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
+    evidence = PointObservations(
+        *(problem.points, problem.point_information, first_of, problem.camera_of),
+        *(problem.image, problem.weight, problem.scale),
+    )
+    numbers = problem.cameras.numbers
+    rows, columns = np.zeros((3 * len(points), 1)), np.full((4, STEP), -1)
+    blocks, gradient = np.zeros((4, STEP, STEP)), np.zeros((4, STEP))
+    equations = CameraEquations(columns, rows, blocks, gradient)
+    eliminate(numbers, points, evidence, 0.0, 0, len(points), equations)
+    for parameter in range(STEP):
+        step = np.zeros((4, STEP))
+        step[1, parameter] = 1e-6
+        high = cost(step_camera(problem.cameras, step).numbers, points, evidence)
+        low = cost(step_camera(problem.cameras, -step).numbers, points, evidence)
+        # The cost is the sum of squares, the gradient that of half of it.
+        slope = 0.5 * (high - low) / 2e-6
+        assert slope == pytest.approx(gradient[1, parameter], rel=1e-4, abs=1e-2)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(8)
+
+
+@pytest.mark.parametrize("parameter", range(7))
+def test_steps_are_the_derivatives_of_cameras_that_follow(rng, parameter):
+    cameras, points = rig(3, rng), rng.normal(0.0, 0.5, (10, 3))
+    small = np.zeros(7)
+    small[parameter] = 1e-6
+    away = points - ORIGIN
+    moved = points + small[:3] + np.cross(small[3:6], away) + small[6] * away
+    seen = step_camera(cameras, similarity_steps(cameras, ORIGIN) @ small).project(moved)
+    # A thousand pixels times the square of the step are left.
+    np.testing.assert_allclose(seen, cameras.project(points), atol=1e-8)
+
+
+def test_what_cameras_err_by_in_common_is_taken_apart(rng):
+    cameras, points = rig(4, rng), rng.normal(0.0, 0.5, (40, 3)) + ORIGIN
+    by_step = np.stack([project_with_jacobian(camera, points)[1] for camera in cameras])
+    information = np.einsum("cnai,cnaj->cij", by_step, by_step)
+    steps = similarity_steps(cameras, ORIGIN).reshape(48, 7)
+    common = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03, 0.005]) ** 2
+    own = np.zeros(48)
+    relative, together = relative_covariance(
+        steps @ common @ steps.T + np.diag(own), cameras, information, ORIGIN
+    )
+    np.testing.assert_allclose(together, common, atol=1e-10)
+    np.testing.assert_allclose(relative, 0.0, atol=1e-10)
+    # Independent errors of a millimetre: three of four quarters are relative.
+    own.reshape(4, 12)[:, 3:6] = 1e-6
+    relative, _ = relative_covariance(np.diag(own), cameras, information, ORIGIN)
+    share = np.einsum("cii->c", relative[:, 3:6, 3:6]) / 3e-6
+    assert (share > 0.1).all()
+    assert (share < 1.0).all()
+
+
+def found(made, cameras, limit=4.2, longest=10_000):
+    return keypoint_outliers(made, cameras, KeypointNoise(), limit, longest)
+
+
+def test_planted_keypoints_come_first(clip):
+    made, true, _ = clip(cameras=8, frames=20, noise=0.9)
+    rng = np.random.default_rng(8)
+    image = made.detections.keypoints.copy()
+    chosen = rng.permutation(20 * 8 * 6 * 17)[:300]
+    rows = np.column_stack(np.unravel_index(chosen, (20, 8, 6, 17)))
+    planted = {tuple(row) for row in rows.tolist()}
+    for row in sorted(planted):
+        angle, length = rng.uniform(0.0, 2.0 * np.pi), 0.9 * rng.uniform(4.0, 30.0)
+        image[row] += length * np.array([np.cos(angle), np.sin(angle)])
+    listed = found(replace(made, detections=replace(made.detections, keypoints=image)), true)
+    first = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
+    assert (np.diff(listed.surprise) <= 0).all()
+    hits = planted & set(first[: len(planted)])
+    # Errors of 4 to 30 standard deviations, give or take the keypoint's own, among 16,320.
+    assert len(hits) >= 0.95 * len(planted)
+
+
+@pytest.mark.parametrize(
+    ("rests", "surprise"),
+    # 12 px across and 9 px down at 1 px; across the camera has 0.6 px, less or besides that.
+    [(True, np.hypot(12.0 / 0.8, 9.0)), (False, np.hypot(12.0 / np.sqrt(1.36), 9.0))],
+)
+def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests, surprise):
+    made, true, _ = clip()
+    clicks = made.clicks[2]
+    image, inlier = clicks.points_image.copy(), clicks.inlier.copy()
+    image[4] = true[2].project(clicks.points_world[4:5])[0] + [12.0, -9.0]
+    inlier[4] = rests
+    changed = replace(clicks, points_image=image, inlier=inlier)
+    all_clicks = (*made.clicks[:2], changed, *made.clicks[3:])
+    covariance = np.zeros_like(made.covariance)
+    covariance[2, PARAMETERS.index("cx"), PARAMETERS.index("cx")] = 0.36
+    review = review_clicks(all_clicks, true, covariance, click_noise=1.0)
+    assert (review.camera[0], review.name[0]) == (2, "point_4")
+    np.testing.assert_allclose(review.residual[0], [-12.0, 9.0], atol=1e-9)
+    assert review.surprise[0] == pytest.approx(surprise, rel=1e-9)
+    assert review.surprise[1] < 4.2
+
+
+IMPOSSIBLE = {
+    "behind the camera": [0.0, 0.0, -30.0],
+    "outside the lens's field of view": [70.0, 0.0, 10.0],
+}
+
+
+@pytest.mark.parametrize("problem", IMPOSSIBLE)
+def test_a_click_on_a_point_that_the_camera_cannot_image_is_first_and_says_why(clip, problem):
+    made, true, _ = clip()
+    # A lens that folds at twice the focal length.
+    true = replace(true, distortion=np.array([[-0.08, 0.0, 0.0, 0.0, 0.0]] * 5))
+    made = replace(made, cameras=replace(made.cameras, distortion=true.distortion))
+    clicks = made.clicks[2]
+    pose = true[2].cam_from_world
+    place = pose.inverse().apply(np.array([IMPOSSIBLE[problem]]))
+    changed = replace(
+        clicks,
+        names=(*clicks.names, "impossible"),
+        points_world=np.concatenate([clicks.points_world, place]),
+        points_image=np.concatenate([clicks.points_image, [[960.0, 540.0]]]),
+        inlier=np.append(clicks.inlier, False),
+    )
+    clip_of = replace(made, clicks=(*made.clicks[:2], changed, *made.clicks[3:]))
+    review = review_clicks(clip_of.clicks, true, made.covariance, click_noise=1.0)
+    assert (review.camera[0], review.name[0]) == (2, "impossible")
+    assert np.isnan(review.residual[0]).all()
+    assert review.surprise[0] == np.inf
+    assert problem in review.problem[0]
+    assert not any(review.problem[1:])
+    assert np.isfinite(review.residual[1:]).all()

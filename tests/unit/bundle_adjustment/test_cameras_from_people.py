@@ -5,16 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
+from rigs import errors
 
 from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
+from worldpose.bundle_adjustment.clip import Clicks
+from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.held_out_validation import held_out_errors
 from worldpose.bundle_adjustment.people_cameras import KnownLength, locate_cameras
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import align
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.triangulation.estimate import triangulate_joints
 
 FPS = 50.0
 SIZE = (1280, 960)
@@ -186,3 +193,235 @@ def test_groups_that_show_different_people_are_named(walkers, cameras):
     halls = [lens(cameras[c], f"{hall}{c}") for hall in "ab" for c in range(4)]
     with pytest.raises(InputError, match="2 groups that share no person: a0, a1, a2, a3; b0, b1"):
         locate_cameras(halls, both, FPS, KnownLength(1.8))
+
+
+QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
+
+
+def test_people_bring_cameras_together(clip):
+    made, true, _ = clip()
+    adjusted = adjust_cameras(made, QUICK)
+    assert adjusted.accepted.all()
+    # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints per camera leave;
+    # what all cameras share stays as calibration has it.
+    assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
+    assert (adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]).all()
+    assert all(reason.startswith("accepted") for reason in adjusted.reasons)
+
+
+def test_covariance_covers_the_error(clip):
+    squared = []
+    for seed in range(8):
+        made, true, _ = clip(seed=seed, lasting=0.7)
+        adjusted = adjust_cameras(made, QUICK)
+        center = adjusted.cameras.center - true.center
+        rotation = true.cam_from_world.rotation
+        spread = rotation.swapaxes(1, 2) @ adjusted.covariance[:, 3:6, 3:6] @ rotation
+        squared += [off @ np.linalg.solve(s, off) for off, s in zip(center, spread, strict=True)]
+    # Chi-square with three degrees of freedom: 40 values have a mean of 3 +- 0.4 if they were
+    # independent, and those of one trial share the world's place.
+    assert 1.8 < np.mean(squared) < 4.5
+
+
+def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
+    made, true, _ = clip(clicked=6, seed=2)
+    clustered = []
+    for clicks in made.clicks:
+        # All in a tenth of the pitch: the lens is free to do anything elsewhere.
+        near = 0.3 * clicks.points_world + [14.0, 14.0, 0.0]
+        clustered.append(near)
+    rng = np.random.default_rng(5)
+    made = replace(
+        made,
+        clicks=tuple(
+            replace(
+                clicks,
+                points_world=near,
+                points_image=true[c].project(near) + 1.5 * rng.standard_normal((6, 2)),
+            )
+            for c, (clicks, near) in enumerate(zip(made.clicks, clustered, strict=True))
+        ),
+    )
+    adjusted = adjust_cameras(made, QUICK.model_copy(update={"evidence": "markings"}))
+    assert errors(adjusted.refused, true).max() > 2.0 * errors(made.cameras, true).max()
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
+    np.testing.assert_array_equal(adjusted.covariance, made.covariance)
+    assert all(reason.startswith("refused: the loss of") for reason in adjusted.reasons)
+
+
+@pytest.mark.parametrize("case", ["nobody", "one camera", "two cameras in line", "no markings"])
+def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case):
+    if case == "one camera":
+        made, *_ = clip(cameras=1)
+    elif case == "two cameras in line":
+        made, *_ = clip(cameras=2)
+    else:
+        made, *_ = clip(frames=6)
+    settings, reason = QUICK, "no person has enough inlier cameras"
+    if case == "nobody":
+        made = replace(made, joints=np.full_like(made.joints, np.nan))
+    if case == "no markings":
+        count = len(made.clicks)
+        made = replace(made, clicks=(Clicks.none(),) * count)
+        settings = QUICK.model_copy(update={"evidence": "markings"})
+        reason = "no camera has a clicked marking"
+    adjusted = adjust_cameras(made, settings)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
+    assert all(reason in said for said in adjusted.reasons)
+
+
+@pytest.mark.parametrize("evidence", ["markings_and_players", "markings"])
+def test_the_papers_adjustment_finds_the_cameras_of_exact_markings_and_people(clip, evidence):
+    pytest.importorskip("torch")
+    from worldpose.bundle_adjustment.paper_variant import adjust_unguarded
+
+    made, true, _ = clip(noise=0.0, clicked=14)
+    exact = tuple(
+        replace(one, points_image=true[c].project(one.points_world))
+        for c, one in enumerate(made.clicks)
+    )
+    made = replace(made, clicks=exact)
+    settings, frames = BundleAdjustmentSettings(evidence=evidence), np.arange(8)
+    found = adjust_unguarded(made, settings, frames, frames)
+    assert found.accepted.all()
+    np.testing.assert_allclose(found.cameras.center, true.center, atol=1e-3)
+    tangential = replace(made.cameras, distortion=made.cameras.distortion + 0.001)
+    with pytest.raises(InputError, match="tangential"):
+        adjust_unguarded(replace(made, cameras=tangential), settings, frames, frames)
+
+
+CASES = {
+    "exact": ([0.0] * 3, [0.0] * 3, 1.0),
+    "small": ([1e-4] * 3, [0.005] * 3, 1.0),
+    "large": ([5e-3] * 3, [0.3] * 3, 1.0),
+    "focal": ([0.0] * 3, [0.0] * 3, 1.1),
+}
+"""Errors about and along the axes [rad, m], and a factor of the focal length of camera 1."""
+
+
+def given(clip, cameras, **changes):
+    """The clip without clicks, with exact covariances of these cameras."""
+    seen = changes.get("detections", clip.detections)
+    placed = triangulate_joints(cameras, seen, clip.triangulation)
+    return replace(
+        clip,
+        cameras=cameras,
+        covariance=np.zeros_like(clip.covariance),
+        clicks=(Clicks.none(),) * len(cameras.focal),
+        joints=placed.joints,
+        views=placed.views.astype(np.int64),
+        **changes,
+    )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_joints_are_never_worse_than_with_the_given_cameras(clip, case):
+    made, true, joints = clip(cameras=4, frames=40, lasting=1.0, seed=3)
+    turn, shift, focal = CASES[case]
+    rng = np.random.default_rng(5)
+    step = np.zeros((4, 12))
+    step[:, :6] = np.array([*turn, *shift]) * rng.standard_normal((4, 6))
+    step[1, 6] = np.log(focal)
+    made = given(made, step_camera(true, step))
+    adjusted = adjust_cameras(made)
+    told = adjusted.covariance if adjusted.accepted.all() else None
+    after = triangulate_joints(adjusted.cameras, made.detections, made.triangulation, told).joints
+    before, after = (
+        np.nanmean(np.linalg.norm(each - joints, axis=-1)) for each in (made.joints, after)
+    )
+    assert after < before + 0.001
+    if case in ("exact", "small"):
+        assert not adjusted.accepted.any()
+        np.testing.assert_array_equal(adjusted.motion, 0.0)
+        assert all(reason.startswith("refused") for reason in adjusted.reasons)
+    else:
+        assert after < 0.9 * before
+
+
+def test_refused_given_cameras_do_not_pull_the_others(clip):
+    made, true, _ = clip(cameras=8, frames=60, lasting=1.0, seed=1)
+    # Two cameras err by 5 cm together, and have too few keypoints for a change.
+    step = np.zeros((8, 12))
+    scale = np.array([1e-3] * 3 + [0.1] * 3)
+    step[:, :6] = scale * np.random.default_rng(2).standard_normal((8, 6))
+    step[:2, 3:6] = true.cam_from_world.rotation[:2] @ [0.3, 0.0, 0.0]
+    cameras = step_camera(true, step)
+    confidence = made.detections.confidence.copy()
+    confidence[:, :2, :, ::2] = 0.0
+    seen = replace(made.detections, confidence=confidence)
+    made = given(made, cameras, detections=seen)
+    adjusted = adjust_cameras(made, BundleAdjustmentSettings(min_judges=1200))
+    np.testing.assert_array_equal(adjusted.accepted, [False] * 2 + [True] * 6)
+    np.testing.assert_array_equal(adjusted.cameras.numbers[:2], cameras.numbers[:2])
+    others = seen.detection_index.copy()
+    others[:, :2] = -1
+    before, after = (
+        triangulate_joints(each, seen.assign_people(others), made.triangulation).joints
+        for each in (cameras, adjusted.cameras)
+    )
+    # No more than their share of eight cameras.
+    assert np.linalg.norm(np.nanmean(after - before, axis=(0, 1, 2))) < 0.3 * 2 / 8
+
+
+QUICK_CHECK = BundleAdjustmentSettings(max_frames=8, folds=2)
+WRONG = 2
+
+
+def placed_again(clip):
+    """The clip with its people triangulated with the cameras that it has now."""
+    detections = clip.detections
+    placed = triangulate_joints(clip.cameras, detections, clip.triangulation)
+    return replace(clip, joints=placed.joints, views=placed.views.astype(np.int64))
+
+
+@pytest.fixture
+def honest(clip):
+    """A clip of eight cameras, the true ones, and the errors that adjustment leaves them."""
+    made, true, _ = clip(cameras=8, seed=3)
+    # Calibrations of one or two pixels, not of ten: three views or more agree about every joint.
+    covariance = 0.02 * made.covariance
+    spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    step = spread * np.random.default_rng(7).standard_normal((8, 12))
+    made = placed_again(replace(made, cameras=step_camera(true, step), covariance=covariance))
+    adjusted = adjust_cameras(made, QUICK_CHECK)
+    assert adjusted.accepted.all()
+    return made, true, errors(adjusted.cameras, true)
+
+
+def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
+    made, true, _ = clip(cameras=8, seed=3)
+    exact = placed_again(replace(made, cameras=true, covariance=1e-4 * made.covariance))
+    adjusted = adjust_cameras(exact, QUICK_CHECK)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, true.numbers)
+    np.testing.assert_array_equal(adjusted.covariance, exact.covariance)
+    # By chance the loss of some falls and that of others rises.
+    falls = adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]
+    assert falls.any()
+    assert all("standard errors" in adjusted.reasons[c] for c in np.flatnonzero(falls))
+    assert adjusted.evidence.shift > 0.0  # that of the proposed change
+
+
+def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(honest):
+    made, true, clean = honest
+    step = np.zeros((8, 12))
+    step[WRONG, 1] = 0.02  # 40 px, two hundred times what its calibration states
+    adjusted = adjust_cameras(
+        placed_again(replace(made, cameras=step_camera(made.cameras, step))), QUICK_CHECK
+    )
+    assert adjusted.accepted.all()
+    left = errors(adjusted.cameras, true)
+    # It had a say in where the world is: without it the others lose an eighth of their knowledge.
+    assert np.delete(left, WRONG).mean() < 1.25 * np.delete(clean, WRONG).mean()
+    # A hundredth of what it was, and more than the others': people alone place it.
+    assert left[WRONG] < 0.4
+
+
+def test_true_cameras_are_judged_by_the_noise_alone(clip):
+    made, true, _ = clip(cameras=6, noise=1.0)
+    frames = np.arange(24)
+    held = held_out_errors(made, true, frames, np.ones((24, 6), dtype=bool), robust_scale=100.0)
+    # Two axes of unit variance, and what the joint of five other views adds: 2 (1 + 3 / (2 x 5)).
+    assert np.nanmean(held.loss) == pytest.approx(2.6, rel=0.05)

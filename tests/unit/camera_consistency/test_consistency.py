@@ -107,8 +107,7 @@ def stated(camera, kind):
 def test_cameras_that_agree_are_confirmed(pitch):
     cameras = rig()
     result = check(cameras, seen(cameras, walkers()), pitch=pitch)
-    assert result.faults == ()
-    assert result.confirmed == (0, 1, 2, 3, 4)
+    assert (result.faults, result.confirmed) == ((), (0, 1, 2, 3, 4))
 
 
 @pytest.mark.parametrize("kind", ["flipped", "mirrored", "both", "focal", "pose", "degrees"])
@@ -133,8 +132,7 @@ def test_cameras_of_another_match_are_strangers_without_a_diagnosis():
     keypoints = seen(rig(), walkers())
     others = [(-5, -50, 12), (45, -38, 8), (55, 5, 16), (40, 40, 9), (5, 52, 10)]
     result = check([looking(place, (25.0, 1.0, 1.0)) for place in others], keypoints)
-    assert result.faults == ()
-    assert result.strangers == (0, 1, 2, 3, 4)
+    assert (result.faults, result.strangers) == ((), (0, 1, 2, 3, 4))
 
 
 @pytest.mark.parametrize("change", ["axes", "unit"])

@@ -38,8 +38,7 @@ from worldpose.geometry.rigid import Rigid
 def test_a_sound_data_set_passes(written, model):
     for kind, compared in (("static", True), ("plain", False), ("challenge", True)):
         figures, found = findings(written / kind, model)
-        assert found == []
-        assert (figures.frames, figures.persons) == (FRAMES, PERSONS)
+        assert (found, (figures.frames, figures.persons)) == ([], (FRAMES, PERSONS))
         assert figures.plausible_share == 1.0
         assert (figures.reprojection_median_px is not None) == compared
         if compared:

@@ -135,8 +135,7 @@ def test_a_release_has_the_bodies_of_the_folder_of_its_run(model, origins, tmp_p
 
 def test_a_sound_data_set_passes_and_hides_the_truth(written):
     report = check_data_set(written / "set", written / "truth")
-    assert report.findings == ()
-    assert len(report.clips) == 6
+    assert (report.findings, len(report.clips)) == ((), 6)
     public = {
         path.relative_to(written / "set").as_posix() for path in written.rglob("set/test/*/*")
     }

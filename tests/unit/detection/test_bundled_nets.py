@@ -1,7 +1,12 @@
+"""The nets that ship with the project: what they find, in which form, and in which views."""
+
 import numpy as np
 import pytest
 import torch
+from camera_builders import look_at_camera
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.testing import assert_allclose
+from pydantic import ValidationError
 from safetensors.torch import save
 
 from worldpose.detection.bundled_detector import BundledDetector
@@ -13,12 +18,21 @@ from worldpose.detection.bundled_nets import (
     load_weights,
     save_weights,
 )
-from worldpose.detection.bundled_pose import BundledPoseEstimator
+from worldpose.detection.bundled_pose import (
+    BundledPoseEstimator,
+    CropEstimates,
+    assign_joints,
+    find_occluded_people,
+)
+from worldpose.detection.enlargement import expect_parts, find_small
+from worldpose.detection.interfaces import People
 from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
-from worldpose.detection.net_inference import QuantizedNet
+from worldpose.detection.net_inference import QuantizedNet, run_together
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.registration import digest_of_files
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.training.labels import read_picture
@@ -171,3 +185,128 @@ def test_files_that_are_no_weights_are_refused_and_run_nothing(tmp_path):
     file.write_bytes(save(PeopleNet().state_dict()))  # of another program
     with pytest.raises(InputError, match="weights of something else"):
         load_weights(file, PeopleNet())
+
+
+SHAPE = (1080, 1920, 3)
+
+
+def people(*boxes, score=0.9):
+    return People(np.array(boxes, dtype=float).reshape(-1, 4), np.full(len(boxes), score))
+
+
+def test_small_people_are_seen_in_enlarged_tiles_and_tall_ones_are_not():
+    small = [(x, 500.0, x + 10.0, 520.0) for x in np.arange(100.0, 1900.0, 100.0)]
+    step = (36.0, 2.0)
+    tiles = find_small(people(*small), SHAPE, step)
+    assert len(tiles) == 4  # 1782 px and a margin on both sides, enlarged, in tiles of 1024 px
+    for box in small:
+        # Each person's centre lies in one tile, whose crop shows the person whole.
+        (tile,) = [t for t in tiles if len(t.merge(people(), seen(t, box)).scores)]
+        assert np.all(np.array(tile.corner) < box[:2]) and np.all(np.array(tile.end) > box[2:])
+        np.testing.assert_allclose(tile.to_frame(seen(tile, box)).boxes, [box], atol=1e-9)
+    tall = [(x, 400.0, x + 20.0, 440.0) for x in np.arange(100.0, 1900.0, 50.0)]
+    assert find_small(people(*small, *tall), SHAPE, step) == []
+    # If no box is sure, all boxes give the size.
+    assert find_small(people(*small, score=0.1), SHAPE, step)
+    assert find_small(people(), SHAPE, step) == []
+
+
+def seen(part, *boxes):
+    """Boxes of the frame as found in the crop of a part."""
+    shift = np.tile(np.array(part.corner), 2)
+    return people(*((np.array(boxes) - shift + 0.5) * part.zoom - 0.5))
+
+
+def looking(focal):
+    return look_at_camera((0.0, -75.0, 22.0), (0.0, 5.0, 0.0), focal)
+
+
+def test_a_calibrated_camera_tells_where_people_are_small():
+    pitch = PitchTemplate.standard()
+    assert {part.zoom for part in expect_parts(looking(3200.0), pitch, 2.5)} == {0.5}  # 136 px
+    assert {part.zoom for part in expect_parts(looking(12000.0), pitch, 2.5)} == {0.5, 0.25}
+    assert {tile.zoom for tile in expect_parts(looking(1000.0), pitch, 2.5)} == {2.0, 3.0}
+    camera = looking(1250.0)
+    tiles = expect_parts(camera, pitch, 2.5)
+    assert {tile.zoom for tile in tiles} == {2.0}
+    for y, wanted in ((33.0, True), (-33.0, False)):  # 20 and 48 px
+        (feet, head) = camera.project(np.array([[5.0, y, 0.0], [5.0, y, 1.8]]))
+        middle = 0.5 * (feet + head)
+        box = np.array([middle[0] - 4, head[1], middle[0] + 4, feet[1]])
+        found = any(len(tile.to_frame(seen(tile, box)).scores) for tile in tiles)
+        assert found == wanted
+
+
+FRONT = np.array([100.0, 50.0, 140.0, 150.0])
+HIDDEN = FRONT + [18.0, -6.0, 18.0, -6.0]
+FAR = FRONT + [300.0, 0.0, 300.0, 0.0]
+
+
+class Told:
+    """Finds the present person nearest to the box, except those given as neighbours.
+
+    If all are given as neighbours, it finds one of them.
+    """
+
+    def __init__(self, *there, fit=0.9):
+        self.there, self.fit, self.asked = np.array(there).reshape(-1, 4), fit, []
+
+    def __call__(self, _, asked):
+        if not asked:
+            return []
+        ((boxes, others),) = asked
+        self.asked.append(boxes)
+        shares = box_iou(boxes, self.there)
+        for row, known in zip(shares, others, strict=True):
+            row[(box_iou(self.there, known) > 0.7).any(axis=1)] *= 1e-3
+        seen = self.there[shares.argmax(axis=1)] if len(self.there) else np.full_like(boxes, np.nan)
+        across = np.linspace(0.0, 1.0, 17)[:, None]
+        joints = seen[:, None, :2] + (seen[:, 2:] - seen[:, :2])[:, None] * across
+        places = np.repeat(joints[:, :, None], 4, axis=2) + np.arange(4.0)[:, None]
+        flat = np.full((len(boxes), 17, 4), 0.8)
+        return [CropEstimates(places, flat, flat, seen, np.full(len(boxes), self.fit))]
+
+
+def found(*boxes, score=0.8):
+    return People(np.array(boxes).reshape(-1, 4), np.full(len(boxes), score))
+
+
+def test_who_is_hidden_by_half_is_found_once_with_his_own_box_and_pose():
+    look = Told(FRONT, HIDDEN, FAR)
+    (people,) = run_together([find_occluded_people(found(FRONT, FAR))], look)
+    assert_allclose(people.boxes, [HIDDEN])
+    assert_allclose(people.score, [np.cbrt(0.3 * 0.9 * 0.8)])
+    assert_allclose(people.keypoints[0, 0], HIDDEN[:2])
+    assert_allclose(people.keypoints[0, 16], HIDDEN[2:])
+    # A step of 0.35 widths to either side of both; then about the one who was seen.
+    assert_allclose(look.asked[0][:, 0], [86.0, 386.0, 114.0, 414.0])
+    assert_allclose(look.asked[1], [HIDDEN] * len(look.asked[1]))
+
+
+@pytest.mark.parametrize("people", [found(FRONT, FAR), found(FRONT, HIDDEN, FAR), found()])
+def test_where_all_are_known_nobody_is_found(people):
+    (others,) = run_together([find_occluded_people(people)], Told(*people.boxes))
+    assert (others.boxes.shape, others.score.shape) == ((0, 4), (0,))
+    assert others.keypoints.shape == (0, 17, 2)
+    assert others.confidence.shape == (0, 17)
+
+
+@pytest.mark.parametrize("pose", ["onnx:net.onnx", "transformers:net"])
+def test_another_pose_net_does_not_search_for_occluded_people(pose):
+    with pytest.raises(ValidationError, match="find_occluded needs the bundled pose net"):
+        DetectionSettings(find_occluded=True, pose=pose)
+    assert DetectionSettings(find_occluded=True, pose="embedded:net.safetensors").find_occluded
+
+
+def test_a_joint_is_not_put_where_a_neighbour_has_that_of_the_other_side():
+    places, mass = np.zeros((2, 17, 2, 2)), np.zeros((2, 17, 2))
+    # Joints of their own, far from all others, but for one's left ankle and the other's right.
+    places[..., 0, 1] = np.arange(34).reshape(2, 17) * 100.0
+    mass[..., 0] = 1.0
+    left, right = 15, 16
+    places[0, left, 0] = places[1, right, 0] = [5.0, -100.0]
+    places[1, right, 1], mass[1, right] = [20.0, -100.0], [0.5, 0.4]
+    taken = assign_joints(
+        places, mass, np.array([[0.0, 0.0, 40.0, 100.0], [20.0, 0.0, 60.0, 100.0]])
+    )
+    assert np.argwhere(taken).tolist() == [[1, right]]

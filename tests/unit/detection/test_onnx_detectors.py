@@ -1,11 +1,25 @@
-"""Forms of ONNX detectors: recognized by outputs of their kind, decoded to hand-made boxes."""
+"""Nets of others: forms of ONNX outputs, and crops for pose nets."""
+
+import hashlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from worldpose.detection.models import load_detectors
-from worldpose.detection.onnx_detectors import FORMS, _class_names, _person_classes, recognize_form
+from data_contracts.conventions import COCO17_FLIP
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection import onnx_nets
+from worldpose.detection.crops import crops_around, cut_crop, frame_from_crop
+from worldpose.detection.models import digest_of_weights, load_detectors, weights_of
+from worldpose.detection.onnx_detectors import (
+    FORMS,
+    _class_names,
+    find_person_classes,
+    recognize_form,
+)
+from worldpose.detection.onnx_nets import OnnxNet, _OnnxPose
 from worldpose.detection.settings import DetectionSettings
+from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
 
 SIZE = (96, 64)
@@ -98,7 +112,8 @@ OUTPUTS = {
 def test_a_form_is_recognized_and_its_person_decoded(form):
     outputs, score = OUTPUTS[form]
     assert recognize_form("net.onnx", outputs, SIZE) == form
-    people = _person_classes("net.onnx", FORMS[form], outputs, {}, None)
+    count = FORMS[form].classes and FORMS[form].classes(outputs)
+    people = find_person_classes("net.onnx", count, {}, None)
     found = FORMS[form].decode(outputs, SIZE, people)
     np.testing.assert_allclose(found.boxes, [BOX], atol=1e-9)
     np.testing.assert_allclose(found.scores, [score])
@@ -122,13 +137,11 @@ def test_unknown_outputs_are_refused_with_all_forms(outputs):
 
 def test_classes_of_people_are_named_numbered_or_asked_for():
     football = {0: "ball", 1: "goalkeeper", 2: "player", 3: "Referee"}
-    outputs = [np.zeros((8, CELLS))]
 
     def classes(names, asked=None):
-        return _person_classes("net.onnx", FORMS["yolov8"], outputs, names, asked)
+        return find_person_classes("net.onnx", 4, names, asked)
 
-    assert classes(football) == (1, 2, 3)
-    assert classes(football, [2]) == (2,)
+    assert (classes(football), classes(football, [2])) == ((1, 2, 3), (2,))
     assert classes({}, [1, 2]) == (1, 2)
     with pytest.raises(InputError, match="4 classes without names"):
         classes({})
@@ -137,8 +150,14 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     with pytest.raises(InputError, match="below 4"):
         classes({}, [4])
     assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
+    assert _class_names({"names": "['ball']"}) == _class_names({"names": "{'ball': 0}"})
     assert _class_names({"names": "['ball']"}) == {0: "ball"}
-    assert _class_names({"names": "__import__('os')"}) == _class_names({}) == {}
+    assert (
+        _class_names({"names": "{'a': 'b'}"})
+        == _class_names({"names": "f()"})
+        == _class_names({})
+        == {}
+    )
 
 
 def test_nets_take_channels_and_grey_levels_as_in_their_training():
@@ -162,3 +181,112 @@ def test_an_unknown_form_is_refused_with_the_known_ones(tmp_path):
     file.write_bytes(b"none")
     with pytest.raises(InputError, match=r"one of yolox: .*rtmdet: "):
         load_detectors(DetectionSettings(detector=f"onnx-yolo99:{file}"))
+
+
+def test_a_crop_shows_the_box_and_its_points_come_back():
+    picture = np.zeros((400, 600, 3), dtype=np.uint8)
+    rng = np.random.default_rng(2)
+    for size in (20, 90, 300):  # enlarged, reduced a little and much
+        x, y = rng.uniform([200, 180], [260, 200])
+        column, row = int(x + 0.5 * size * 0.4), int(y)
+        picture[:] = 0
+        picture[row - 6 : row + 7, column - 6 : column + 7] = 255  # a square around the point
+        box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
+        mapping = frame_from_crop(crops_around(box, (48, 64))[0], (48, 64))
+        crop = cut_crop(picture, mapping, (48, 64), 0)[..., 0].astype(float)
+        middle = np.array(
+            [
+                np.average(np.arange(48), weights=crop.sum(0)),
+                np.average(np.arange(64), weights=crop.sum(1)),
+            ]
+        )
+        back = mapping[:, :2] @ middle + mapping[:, 2]
+        if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
+            continue  # the square reaches over the crop: its middle is another
+        # A fifth of a crop's pixel: the square's hard edges are sampled twice.
+        np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, mapping[0, 0]))
+
+
+class Leaning:
+    """Sees joint j at column 10 j of the box, `late` px too far right; no wrists to the left."""
+
+    def estimate(self, picture, boxes):
+        columns = np.where(
+            picture[0, 0, 0] == 1, 10.0 * np.arange(17), 10.0 * np.array(COCO17_FLIP)
+        )
+        sign = 1.0 if picture[0, 0, 0] == 1 else -1.0  # the first column is marked
+        start = boxes[:, 0] if sign > 0 else boxes[:, 2]
+        x = start[:, None] + sign * columns + 2.0
+        confidence = np.full(x.shape, 0.8 if sign > 0 else 0.4)
+        confidence[:, 9] = np.nan
+        keypoints = np.stack([x, np.repeat(boxes[:, 1:2], 17, axis=1)], axis=2)
+        keypoints[:, 9] = np.nan
+        return KeypointDetections.from_keypoints(keypoints, confidence)
+
+
+def test_what_leans_to_one_side_is_set_right_by_the_mirror():
+    picture = np.zeros((50, 300, 3), dtype=np.uint8)
+    picture[0, 0] = 1
+    boxes = np.array([[20.0, 5.0, 100.0, 45.0]])
+    poses = FlipTest(Leaning()).estimate(picture, boxes)
+    expected = 20.0 + 10.0 * np.arange(17) + (0.8 * 2.0 - 0.4 * 2.0) / 1.2
+    expected[9] = 20.0 + 90.0 - 2.0  # seen in the mirror alone, and the other in the image
+    expected[10] = 20.0 + 100.0 + 2.0
+    np.testing.assert_allclose(poses.keypoints[0, :, 0], expected)
+    np.testing.assert_allclose(poses.keypoints[0, :, 1], 5.0)
+    assert poses.confidence[0, [0, 9, 10]].tolist() == pytest.approx([0.6, 0.4, 0.8])
+
+
+@pytest.mark.parametrize(
+    "name", [{"detector": "yolo"}, {"detector": "onnx:"}, {"pose": "onnx-rtmpose:FILE"}]
+)
+def test_an_unknown_name_of_a_net_is_refused(name):
+    with pytest.raises(InputError, match="onnx:FILE"):
+        weights_of(DetectionSettings(**name))
+
+
+def test_external_data_of_a_net_is_part_of_its_digest(tmp_path):
+    net, data = tmp_path / "model.onnx", tmp_path / "model.onnx.data"
+    net.write_bytes(b"net")
+    alone = digest_of_weights(net)
+    data.write_bytes(b"other")
+    assert digest_of_weights(net) == alone == hashlib.sha256(b"net").hexdigest()
+    net.write_bytes(b"\x6a\x1b\n\x08location\x12\x0fmodel.onnx.data")
+    before = digest_of_weights(net)
+    data.write_bytes(b"weights")
+    assert digest_of_weights(net) != before
+
+
+def test_a_net_that_takes_bytes_gets_grey_levels():
+    given = []
+
+    def run(crops):
+        given.append(crops)
+        return [np.ones((len(crops), 17, 4, 4))]
+
+    net = SimpleNamespace(size=(6, 8), dtype=np.dtype(np.uint8), run=run)
+    _OnnxPose(net, normal=True).estimate(
+        np.full((50, 50, 3), 130, np.uint8), np.array([[10.0, 10.0, 30.0, 40.0]])
+    )
+    np.testing.assert_array_equal(given[0], 130)
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"), [([8, 3, 64, 64], "tensor(float)"), ([1, 3, 64, 64], "tensor(double)")]
+)
+def test_a_net_with_another_batch_or_type_is_refused(monkeypatch, shape, kind):
+    taken = [SimpleNamespace(name="x", shape=shape, type=kind)]
+    session = SimpleNamespace(get_inputs=lambda: taken)
+    monkeypatch.setattr(onnx_nets, "open_session", lambda *_: session)
+    with pytest.raises(InputError, match="batch 1 and float32"):
+        OnnxNet("net.onnx", "cpu", (64, 64))
+
+
+def test_a_file_that_is_no_net_is_refused(tmp_path):
+    pytest.importorskip("onnxruntime")
+    file = tmp_path / "net.onnx"
+    file.write_bytes(b"none")
+    with pytest.raises(InputError, match="ONNX file"):
+        load_detectors(DetectionSettings(detector=f"onnx:{file}"))
+    with pytest.raises(InputError, match="nothing"):
+        weights_of(DetectionSettings(detector=f"onnx:{tmp_path / 'other.onnx'}"))

@@ -12,7 +12,7 @@ PICTURE = np.random.default_rng(0).integers(0, 255, (180, 240, 3), dtype=np.uint
 pytestmark = pytest.mark.slow  # torch and transformers take ten seconds to come
 
 
-def rt_detr_v2(transformers):
+def rt_detr_v2(transformers, names=("ball", "person")):
     backbone = transformers.RTDetrResNetConfig(
         embedding_size=16,
         hidden_sizes=[16, 24, 32, 48],
@@ -32,9 +32,9 @@ def rt_detr_v2(transformers):
         decoder_layers=2,
         decoder_attention_heads=2,
         encoder_attention_heads=2,
-        num_labels=2,
-        id2label={0: "ball", 1: "person"},
-        label2id={"ball": 0, "person": 1},
+        num_labels=len(names),
+        id2label=dict(enumerate(names)),
+        label2id={name: number for number, name in enumerate(names)},
     )
     return transformers.RTDetrV2ForObjectDetection(config)
 
@@ -62,11 +62,7 @@ def test_a_saved_detector_finds_boxes_in_the_picture(tmp_path):
     assert (middle > -1.0).all() and (middle < [240.0, 180.0]).all()
 
 
-def test_a_saved_vitpose_gives_points_around_each_box(tmp_path):
-    transformers = pytest.importorskip("transformers")
-    import torch
-
-    torch.manual_seed(0)
+def save_vitpose(transformers, folder, count=17):
     backbone = transformers.VitPoseBackboneConfig(
         image_size=[64, 48],
         patch_size=[16, 16],
@@ -77,12 +73,18 @@ def test_a_saved_vitpose_gives_points_around_each_box(tmp_path):
         out_features=["stage2"],
     )
     config = transformers.VitPoseConfig(
-        backbone_config=backbone, num_labels=17, use_simple_decoder=True
+        backbone_config=backbone, num_labels=count, use_simple_decoder=True
     )
-    transformers.VitPoseForPoseEstimation(config).eval().save_pretrained(tmp_path)
-    transformers.VitPoseImageProcessorPil(size={"height": 64, "width": 48}).save_pretrained(
-        tmp_path
-    )
+    transformers.VitPoseForPoseEstimation(config).eval().save_pretrained(folder)
+    transformers.VitPoseImageProcessorPil(size={"height": 64, "width": 48}).save_pretrained(folder)
+
+
+def test_a_saved_vitpose_gives_points_around_each_box(tmp_path):
+    transformers = pytest.importorskip("transformers")
+    import torch
+
+    torch.manual_seed(0)
+    save_vitpose(transformers, tmp_path)
     estimator = load_pose(DetectionSettings(pose=f"transformers:{tmp_path}"))
     boxes = np.array([[40.0, 30.0, 70.0, 110.0], [150.0, 60.0, 180.0, 140.0]])
     poses = estimator.estimate(PICTURE, boxes)
@@ -94,6 +96,9 @@ def test_a_saved_vitpose_gives_points_around_each_box(tmp_path):
         # A crop is a quarter larger than its box, and as wide as its shape asks.
         assert (np.abs(found - (box[:2] + box[2:]) / 2.0) < [60.0, 70.0]).all()
     assert estimator.estimate(PICTURE, np.empty((0, 4))).keypoints.shape == (0, 17, 2)
+    save_vitpose(transformers, tmp_path, 133)
+    with pytest.raises(InputError, match="found 133 keypoints"):
+        load_pose(DetectionSettings(pose=f"transformers:{tmp_path}"))
 
 
 def test_pickled_weights_and_foreign_folders_are_refused(tmp_path):
@@ -107,3 +112,41 @@ def test_pickled_weights_and_foreign_folders_are_refused(tmp_path):
         load_detectors(DetectionSettings(detector=f"transformers:{folder}"))
     with pytest.raises(InputError, match=r"config\.json"):
         load_detectors(DetectionSettings(detector=f"transformers:{tmp_path}"))
+
+
+def test_classes_of_people_follow_the_rule_of_onnx_detectors(tmp_path):
+    transformers = pytest.importorskip("transformers")
+    unnamed = tuple(f"LABEL_{number}" for number in range(80))
+    football = ("ball", "goalkeeper", "player", "referee")
+    for names, asked, expected in (
+        (football, None, (1, 2, 3)),
+        (football, [2], (2,)),
+        (unnamed, None, (0,)),
+        (unnamed[:4], None, None),
+    ):
+        folder = tmp_path / f"{len(names)}{asked}{expected}"
+        rt_detr_v2(transformers, names).save_pretrained(folder)
+        transformers.RTDetrImageProcessorPil().save_pretrained(folder)
+        settings = DetectionSettings(detector=f"transformers:{folder}", person_classes=asked)
+        if expected is None:
+            with pytest.raises(InputError, match="4 classes without names"):
+                load_detectors(settings)
+        else:
+            assert load_detectors(settings)[0]._people == expected
+
+
+def test_weights_that_are_cut_or_lack_the_head_are_refused(tmp_path):
+    transformers = pytest.importorskip("transformers")
+    from safetensors.torch import load, save_file
+
+    rt_detr_v2(transformers).save_pretrained(tmp_path)
+    transformers.RTDetrImageProcessorPil().save_pretrained(tmp_path)
+    file, settings = tmp_path / "model.safetensors", f"transformers:{tmp_path}"
+    content, weights = file.read_bytes(), load(file.read_bytes())
+    file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=r"model\.safetensors"):
+        load_detectors(DetectionSettings(detector=settings))
+    headless = {name: each for name, each in weights.items() if "class_embed" not in name}
+    save_file(headless, file, metadata={"format": "pt"})
+    with pytest.raises(InputError, match=r"none of .* parameters.*class_embed"):
+        load_detectors(DetectionSettings(detector=settings))

@@ -1,12 +1,17 @@
-"""Marker files that the test writes, laid over a prediction whose place and time are known."""
+"""Markers and places of others as references: read, laid over, and scored."""
+
+import json
 
 import numpy as np
 import pytest
 from people_samples import person
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
+from flows.cli.app import app
 from worldpose.errors import InputError
+from worldpose.evaluation.challenge import ALL, score_submission
 from worldpose.evaluation.marker_reference import (
     align_reference,
     map_marker_names,
@@ -15,6 +20,8 @@ from worldpose.evaluation.marker_reference import (
     read_markers,
 )
 from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.evaluation.position_reference import align_positions, read_positions
+from worldpose.formats.challenge import write_submission
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import write_markers
 
@@ -140,8 +147,7 @@ def test_time_place_and_people_are_found_again(tmp_path, markers, prediction):
     assert float(found.motion.scale) == 1.0
     assert found.residual < 1e-3
     scores, _ = evaluate_joints(prediction, reference)
-    assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
-    assert scores.coverage == 1.0
+    assert (scores.mpjpe_mm, scores.coverage) == (pytest.approx(0.0, abs=1.0), 1.0)
 
 
 def test_a_clip_that_starts_late_is_found_by_the_times_of_the_file_or_its_first_sample(
@@ -175,3 +181,178 @@ def test_damaged_files_are_named(tmp_path, name):
         read_markers(tmp_path / name)
     with pytest.raises(InputError, match="found nothing"):
         read_markers(tmp_path / "none" / name)
+
+
+NAMES = ("home_11", "away_4", "home_7")
+
+
+def tracks():
+    """Three people who walk apart; their hips are 0.9 m high."""
+    frames = np.arange(100, 130)
+    start = np.array([[-20.0, 8.0], [3.0, -5.0], [30.0, 12.0]])
+    way = np.array([[0.1, 0.0], [0.0, 0.2], [-0.1, 0.1]])
+    places = start + (frames - 100)[:, None, None] * way
+    joints = np.full((30, 3, 17, 3), np.nan)
+    joints[:, :, [11, 12], :2] = places[:, :, None] + [[-0.15, 0.0], [0.15, 0.0]]
+    joints[:, :, [11, 12], 2] = 0.9
+    return JointTracks(frames, np.array([4, 5, 9]), joints), places
+
+
+def wide(places, first=0):
+    lines = ["period_id,frame_id,ball_x,ball_y," + ",".join(f"{n}_x,{n}_y,{n}_s" for n in NAMES)]
+    for n, row in enumerate(places.tolist()):
+        lines.append(f"1,{first + n},0,0," + ",".join(f"{x:.3f},{y:.3f},1.5" for x, y in row))
+    return "\n".join(lines)
+
+
+def long(places, first=0):
+    lines = ["frame_id,player_id,x,y"]
+    for n, row in enumerate(places.tolist()):
+        people = [("ball", (0.0, 0.0)), *zip(NAMES, row, strict=True)]
+        lines += [f"{first + n},{name},{x:.3f},{y:.3f}" for name, (x, y) in people]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("form", [wide, long])
+@pytest.mark.parametrize("way", [(1, 1), (-1, -1), (1, -1)])
+def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
+    mine, places = tracks()
+    file = tmp_path / "positions.csv"
+    file.write_text(form((places + [0.0, 0.1]) * way, first=7000))
+    predicted, given, notes = align_positions(file, mine, 100)
+    assert notes[-1] == "people: {4: home_11, 5: away_4, 9: home_7}"
+    assert len(notes) == 1 + (way != (1, 1))
+    scores, _ = evaluate_joints(predicted, given, fps=25.0)
+    assert scores.mpjpe_mm == pytest.approx(100.0)
+    assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
+    mine, places = tracks()
+    mine = JointTracks(mine.frames - 100, mine.person_ids, mine.joints)
+    lines = wide(places[::2], first=0).splitlines()
+    if timed:
+        times = [f",0 days 00:00:{n / 12.5:09.6f}" for n in range(len(lines) - 1)]
+        lines = [line + more for line, more in zip(lines, [",timestamp", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    predicted, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=25.0)
+    assert "each frame of the positions is 2 frames of the match" in notes[0]
+    scores, _ = evaluate_joints(predicted, given, fps=25.0)
+    assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
+    assert given.frames.tolist() == list(range(29))
+
+
+@pytest.mark.parametrize(
+    "form",
+    ["{:.1f}", "00:00:{:02.0f}", "{:.0f}", "{:.5f}"],
+    ids=["tenths", "clock", "s", "minutes"],
+)
+def test_coarse_clocks_leave_each_row_at_its_frame(tmp_path, form):
+    mine, _ = tracks()
+    joints = np.tile(mine.joints[:1], (90, 1, 1, 1))
+    joints[..., 0] += 0.1 * np.arange(90)[:, None, None]
+    mine = JointTracks(np.arange(90), mine.person_ids, joints)
+    lines = wide(joints[:, :, 11:13, :2].mean(axis=2)).splitlines()
+    times = [
+        form.format(n // 5 / 5 if "1f" in form else n / 1500 if "5f" in form else n // 25)
+        for n in range(90)
+    ]
+    lines = [",".join(pair) for pair in zip(lines, ["time_s", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    _, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=25.0)
+    assert (given.frames.tolist(), len(notes)) == (list(range(90)), 1)
+    both = [f"{line},{time}" for line, time in zip(lines, ["timestamp", *times], strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(both))
+    assert len(read_positions(tmp_path / "positions.csv")[0]) == 90
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda places: places / [105.0, 68.0] + 0.5, "metres from the centre spot"),
+        (lambda places: 100.0 * places, "metres from the centre spot"),
+        (lambda places: places + [5.0, 0.0], "people of the match, one way round"),
+        (lambda places: places * [0.0, 1.0], "people of the match, one way round"),
+    ],
+)
+def test_places_in_other_units_or_of_others_are_refused(tmp_path, change, words):
+    mine, places = tracks()
+    file = tmp_path / "positions.csv"
+    file.write_text(wide(change(places), first=100))
+    with pytest.raises(InputError, match=words):
+        align_positions(file, mine)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a,b\n1,2\n", "frame_id,p_x\n1,2\n", "frame,p_x,p_y\n1,a,2\n"]
+)
+def test_other_files_are_refused(tmp_path, text):
+    (tmp_path / "positions.csv").write_text(text)
+    with pytest.raises(InputError, match="to_df"):
+        read_positions(tmp_path / "positions.csv")
+
+
+def submission(path, **clips):
+    write_submission(path, clips)
+    return path
+
+
+def poses(persons=2, frames=3):
+    return np.random.default_rng(0).normal(size=(persons, frames, 15, 3))
+
+
+@pytest.mark.parametrize(
+    ("joint", "whole", "local"),
+    # A toe of 15 joints; a hip, which moves the mid-hip by half of it and with it every joint.
+    [(14, 0.15 / 15, 0.15 / 15), (7, 0.15 / 15, 0.075), (slice(None), 0.15, 0.0)],
+)
+def test_the_score_is_the_global_error_and_five_times_the_local_one(tmp_path, joint, whole, local):
+    true, found = poses(), poses()
+    found[:, :, joint, 0] += 0.15
+    truth = submission(tmp_path / "true.zip", one=true)
+    mine = submission(tmp_path / "mine.zip", one=found)
+    score = score_submission(mine, truth)["one"]
+    np.testing.assert_allclose((score.global_m, score.local_m), (whole, local), atol=1e-6)
+    assert score.poses == 6
+    told = CliRunner().invoke(
+        app, ["evaluate", "--prediction", str(mine), "--reference", str(truth), "--json"]
+    )
+    assert json.loads(told.stdout)["challenge_score"] == pytest.approx(whole + 5 * local, abs=1e-5)
+
+
+def test_clips_count_by_their_joints_and_absent_people_do_not_count(tmp_path):
+    true = {"a": poses(1, 1), "b": poses(1, 3)}
+    found = {clip: array + (clip == "b") * np.array([0.4, 0, 0]) for clip, array in true.items()}
+    true["b"][0, 2] = np.nan
+    scores = score_submission(
+        submission(tmp_path / "p.zip", **found), submission(tmp_path / "t.zip", **true)
+    )
+    assert scores[ALL].poses == 3
+    assert scores[ALL].global_m == pytest.approx(2 * 0.4 / 3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda p: {"one": p[:1]}, "persons, frames, 15, 3"),
+        (lambda p: {"two": p}, "no such clip"),
+        (lambda p: {"one": np.where(np.arange(3)[:, None, None] == 1, np.nan, p)}, "frame 1"),
+    ],
+)
+def test_a_missing_clip_person_or_pose_is_refused(tmp_path, change, told):
+    truth = submission(tmp_path / "t.zip", one=poses())
+    with pytest.raises(InputError, match=told):
+        score_submission(submission(tmp_path / "p.zip", **change(poses())), truth)
+
+
+def test_a_table_without_its_last_empty_rows_is_scored_and_a_lacking_pose_is_refused(tmp_path):
+    pytest.importorskip("pyarrow")
+    true, found = poses(), poses() + [0.1, 0.0, 0.0]
+    true[1], true[:, 2] = np.nan, np.nan
+    truth = submission(tmp_path / "true.parquet", one=true)
+    score = score_submission(submission(tmp_path / "mine.zip", one=found), truth)["one"]
+    assert (score.global_m, score.poses) == (pytest.approx(0.1), 2)
+    short = submission(tmp_path / "short.parquet", one=found[:, :1])
+    with pytest.raises(InputError, match=r"1 without one|15 without one"):
+        score_submission(short, truth)

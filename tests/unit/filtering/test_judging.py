@@ -1,13 +1,30 @@
-"""Keypoints and boxes compared with bodies: planted errors are found, and few others."""
+"""Joints are judged by their views; missing people are searched for; lasting errors are found."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from bystander import NOISE, SIZE, as_stated, expected
 from planted_errors import plant
 
-from worldpose.filtering.judging import judge_detections, learn_keypoint_spread
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.settings import RedetectionSettings
+from worldpose.filtering.judging import Residuals, judge_detections, learn_keypoint_spread
+from worldpose.filtering.redetection import (
+    MissingPeople,
+    judge_search_results,
+    search_missing_people,
+    select_missing_people,
+)
 from worldpose.filtering.settings import FilteringSettings
+from worldpose.filtering.systematic_errors import (
+    TERMS,
+    SystematicErrors,
+    ViewBias,
+    learn_systematic_errors,
+    learn_view_bias,
+    watch_motion,
+)
 
 SETTINGS = FilteringSettings()
 
@@ -77,4 +94,209 @@ def test_sides_that_were_put_right_are_no_contradiction(scene):
     # Each keypoint keeps its verdict at the place where the detector put it.
     np.testing.assert_allclose(
         found.mahalanobis_distance[frame, camera, place], honest[left_right], rtol=1e-3
+    )
+
+
+SEARCH_SETTINGS = RedetectionSettings()
+
+
+def sought(bodies, *seen, **kwargs):
+    known = np.zeros(bodies.image.shape[:2], dtype=bool)
+    known[:, list(seen)] = True
+    found = select_missing_people(bodies, known, SIZE, SEARCH_SETTINGS, **kwargs)
+    return found.person.tolist(), found.hidden
+
+
+def test_who_was_not_detected_is_looked_for_where_the_body_is():
+    bodies = expected((0.0, 0.0), (3.0, 0.0))
+    found = select_missing_people(bodies, np.array([[True, False]]), SIZE, SEARCH_SETTINGS)
+    assert (found.frame.tolist(), found.person.tolist(), found.hidden) == ([0], [1], 0)
+    np.testing.assert_array_equal(found.boxes, bodies.boxes[0, 1:])
+
+
+@pytest.mark.parametrize(
+    ("where", "deviation"),
+    [
+        ((0.0, 40.0), 0.02),  # 31 px high
+        ((0.0, 0.0), 0.2),  # may be any person there
+        ((10.05, 0.0), 0.02),  # at the border: seven joints are in the image
+        ((0.0, -30.0), 0.02),  # behind the camera
+    ],
+)
+def test_who_would_not_be_seen_well_is_not_looked_for(where, deviation):
+    assert sought(expected(where, deviation=deviation)) == ([], 0)
+
+
+def test_who_is_hidden_is_not_looked_for_and_counted():
+    behind = expected((0.0, 0.0), (0.0, 1.0))
+    assert (sought(behind, 0), sought(behind, 1)) == (([], 1), ([0], 0))
+
+
+RESULT_SETTINGS = RedetectionSettings()
+KINDS = ("found", "unsure", "elsewhere", "another")
+
+
+def seek(bodies, *persons):
+    """Look for these persons of the only frame."""
+    return MissingPeople(
+        np.zeros(len(persons), int), np.array(persons), bodies.boxes[0, persons], 0
+    )
+
+
+def answer(bodies, *persons, off=(0.0, 0.0), confidence=0.9):
+    """Return detections of these bodies with an offset [px]."""
+    keypoints = bodies.image[0, list(persons)] + off
+    count = len(persons)
+    return KeypointDetections(
+        keypoints, np.full((count, 17), confidence), bodies.boxes[0, persons] + 0.0, np.ones(count)
+    )
+
+
+def judge(bodies, answers, sought, detected=()):
+    pose = bodies.image[:, list(detected)] if len(detected) else np.empty((1, 0, 17, 2))
+    boxes = bodies.boxes[:, list(detected)] if len(detected) else np.empty((1, 0, 4))
+    none = np.full(pose.shape[:3], np.nan)
+    given_ = KeypointDetections(pose, none, boxes, none[..., 0])
+    return judge_search_results(
+        answers, sought, bodies, given_, as_stated(), NOISE, RESULT_SETTINGS
+    )
+
+
+def kinds(verdicts):
+    return [next(k for k in KINDS if getattr(verdicts, k)[n]) for n in range(len(verdicts.found))]
+
+
+def test_an_answer_where_the_body_is_is_the_person_s():
+    bodies = expected((0.0, 0.0), (3.0, 0.0))
+    verdicts = judge(bodies, answer(bodies, 0, off=(1.0, -1.0)), seek(bodies, 0), detected=[1])
+    assert kinds(verdicts) == ["found"]
+    assert not verdicts.rejected.any()
+
+
+def test_the_neighbour_s_pose_is_the_neighbour_s():
+    # A hand's breadth apart, and so unsure that either pose would do for both.
+    bodies = expected((0.0, 0.0), (0.2, 0.0), deviation=0.14)
+    assert kinds(judge(bodies, answer(bodies, 1), seek(bodies, 0))) == ["another"]
+
+
+def test_of_two_who_are_given_one_pose_the_nearer_has_it():
+    bodies = expected((0.0, 0.0), (0.08, 0.0), deviation=0.1)
+    both = answer(bodies, 0, 0)
+    assert kinds(judge(bodies, both, seek(bodies, 0, 1))) == ["found", "another"]
+
+
+def test_a_wrist_that_is_not_the_body_s_is_left_out():
+    bodies = expected((0.0, 0.0))
+    seen = answer(bodies, 0)
+    seen.keypoints[0, 9] += 25.0
+    verdicts = judge(bodies, seen, seek(bodies, 0))
+    assert kinds(verdicts) == ["found"]
+    assert np.flatnonzero(verdicts.rejected[0]).tolist() == [9]
+
+
+class Seeing:
+    """Finds a person in the middle of each box, with low confidence in one arm."""
+
+    def estimate(self, picture, boxes):
+        middle = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:])
+        confidence = np.full((len(boxes), 17), 0.8)
+        confidence[:, 9] = 0.01
+        return KeypointDetections.from_keypoints(np.repeat(middle, 17, axis=1), confidence)
+
+
+class Asked(Seeing):
+    """Records the requested boxes."""
+
+    def estimate(self, picture, boxes):
+        self.boxes = boxes.tolist()
+        return super().estimate(picture, boxes)
+
+
+def test_neighbours_who_overlap_are_shown_to_the_net_and_answered_for_by_nobody():
+    bodies = expected((0.0, 0.0))
+    sought = seek(bodies, 0)
+    left, top, right, bottom = sought.boxes[0].tolist()
+    beside = [right - 1.0, top, right + 30.0, bottom]
+    touching = [left - 30.0, top, left, bottom]
+    detected = np.array([[touching, beside, [np.nan] * 4]])
+    net, picture = Asked(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    answers = search_missing_people([(0, picture)], sought, net, 0.05, detected)
+    assert net.boxes == [[left, top, right, bottom], beside]
+    np.testing.assert_allclose(answers.keypoints[0, 0, 0], 0.5 * (left + right), atol=1e-12)
+
+
+def test_who_is_like_somebody_that_was_not_found_is_found_all_the_same():
+    # Four pixels from one to the next: the similarity of poses is 0.8, and 0.5 over eight.
+    bodies = expected((0.0, 0.0), (0.08, 0.0), (0.16, 0.0), deviation=0.1)
+    off = np.array([0.0, 0.2, 0.4])[:, None, None] * [1.0, 0.0]
+    verdicts = judge(bodies, answer(bodies, 0, 1, 2, off=off), seek(bodies, 0, 1, 2))
+    assert kinds(verdicts) == ["found", "another", "found"]
+
+
+ROWS = 3000
+
+
+@pytest.fixture(scope="module")
+def biased_scene():
+    return plant(44, duration=0.6)
+
+
+def seen_from_all_sides(shift, noise=1.0):
+    """Residuals of one joint after another, with a direction and a size for each row."""
+    rng = np.random.default_rng(2)
+    azimuth, scale = rng.uniform(-np.pi, np.pi, ROWS), rng.uniform(30.0, 80.0, ROWS)
+    missed = shift(azimuth, scale) + noise * rng.normal(size=(ROWS, 17, 2))
+    zero = np.zeros(ROWS, dtype=np.int64)
+    variance = np.full((ROWS, 17), noise**2)
+    return Residuals(zero, zero, zero, missed, variance, 1.0), azimuth, scale
+
+
+def test_a_bias_that_goes_with_the_side_is_found():
+    bias = ViewBias(np.random.default_rng(1).normal(0.0, 0.02, (17, 2, TERMS)))
+    misses, *seen = seen_from_all_sides(bias.shift)
+    misses.missed[:1000, 3] = np.nan
+    found = learn_view_bias(misses, *seen)
+    # 1 px at 55 px per metre over 3,000 rows: 0.5 mm; five of these.
+    np.testing.assert_allclose(found.coefficient, bias.coefficient, atol=0.0025)
+
+
+def with_a_late_camera(scene, frames, held):
+    """The scene's systematic, and what was detected there with a camera of which that is late.
+
+    Args:
+        held: share of the clock offset in people's offsets.
+    """
+    motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
+    late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
+    at = np.nonzero(scene.suspects.detections.detection_index >= 0)
+    keypoints = scene.suspects.detections.keypoints.copy()
+    shift = late[:, None, None, None] * motion.image_motion
+    keypoints[(*at[:2], scene.suspects.detections.detection_index[at])] += shift[at]
+    offsets = held * np.nan_to_num(shift.mean(axis=-2))
+    detections = replace(scene.suspects.detections, keypoints=keypoints)
+    suspects = replace(scene.suspects, detections=detections, offsets=offsets)
+    return SystematicErrors(ViewBias.none(), late), motion, suspects
+
+
+def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_back():
+    scene = plant(31, duration=2.0)
+    true, motion, suspects = with_a_late_camera(scene, 0.6, held=0.0)
+    people = (scene.cameras, scene.joints, scene.views, motion, suspects)
+    systematic = learn_systematic_errors(*people, FilteringSettings(), 25.0)
+    # The coupling between viewing-angle errors and clocks is below 0.1 frame.
+    late = true.late - true.late.mean()
+    np.testing.assert_allclose(systematic.late - systematic.late.mean(), late, atol=0.07)
+    right = suspects.subtract(systematic.shift(motion, scene.views))
+    exact = replace(systematic, late=np.zeros(6)).shift(motion, scene.views)
+    on_time = scene.suspects.subtract(exact).detections.keypoints
+    at = np.nonzero(scene.suspects.detections.detection_index >= 0)
+    place = (*at[:2], scene.suspects.detections.detection_index[at])
+    here = at[1] == 1
+    honest = ~scene.displaced[place][here]
+
+    def beside(found):
+        return np.linalg.norm((found - on_time)[place][here][honest], axis=-1)
+
+    assert np.nanmean(beside(right.detections.keypoints)) < 0.4 * np.nanmean(
+        beside(suspects.subtract(exact).detections.keypoints)
     )

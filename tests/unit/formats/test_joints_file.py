@@ -1,20 +1,30 @@
+"""Files of arrays, of text and of tables: what is written is read, and what lies is refused."""
+
 import io
+import json
+import sys
 import zipfile
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from data_contracts.conventions import COCO17
 from worldpose.body.model import BodyParameters
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
+from worldpose.formats import files
 from worldpose.formats.archives import read_npz
+from worldpose.formats.files import read_json, read_toml, read_yaml
 from worldpose.formats.joints_file import (
     JointTracks,
+    fill_gaps,
     read_joints,
     read_poses,
     write_joints,
     write_poses,
 )
+from worldpose.formats.tables import joints_table, write_csv, write_parquet
 
 
 @pytest.fixture
@@ -207,7 +217,155 @@ def test_a_packed_size_that_is_more_than_the_file_does_not_excuse_a_bomb(tmp_pat
         read_npz(path, 1 << 30)
 
 
-def test_no_archive_is_refused(tmp_path):
-    (tmp_path / "a.npz").write_bytes(b"no archive")
-    with pytest.raises(InputError, match="expected a whole npz file"):
-        read_npz(tmp_path / "a.npz", 1000)
+@pytest.fixture
+def refused(tmp_path):
+    def check(read, content, words):
+        path = tmp_path / "file"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(InputError) as caught:
+            read(path)
+        assert words in str(caught.value)
+        assert str(path) in caught.value.where
+
+    return check
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("a: &x [1, 2]\nb: *x\n", "alias"),
+        ("fps: 25\nfps: 30\n", "'fps' is given twice"),
+        ("1: a\n'1': b\n", "'1' is given twice"),
+        ("a: " + "[" * 100, "more than 32 levels"),
+        ("? [a]\n: 1\n", "unhashable"),
+        ("a: 1\n--- \nb: 2\n", "but found another document"),
+        ("!!python/object/apply:os.system [x]", "python/object"),
+        ("a: b: c\n", "line 1, column 5"),
+        *((f"fps: {text}\n", "") for text in ('!!int ""', "!!bool maybe", "!!timestamp soon")),
+        ("a: " + "9" * 5000, "digits"),
+        (b"a: \xff\n", "UTF-8"),
+        (b"a: \x00\n", "YAML"),
+    ],
+)
+def test_hostile_or_broken_yaml_is_refused(refused, content, words):
+    refused(read_yaml, content, words)
+
+
+def test_a_flood_of_entries_is_refused_before_it_is_built(refused, monkeypatch):
+    monkeypatch.setattr(files, "EVENTS", 1000)
+    refused(read_yaml, "- a\n" * 1001, "more than 1000 entries")
+
+
+@pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
+def test_a_file_beyond_the_limit_is_refused_unread(refused, read):
+    refused(read, b"#" * (files.SETTINGS_BYTES + 1), "2097153 bytes")
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"a": ', "", "[" + "9" * 5000 + "]"])
+def test_broken_json_is_refused(refused, content):
+    refused(read_json, content, "expected JSON")
+
+
+def test_a_key_that_would_take_hours_is_refused(refused):
+    refused(read_toml, "a" + ".a" * 300_000 + " = 1", "lines of at most 4096")
+
+
+@pytest.mark.parametrize("content", ["a = ", "a = 1\na = 2", "a = " + "[" * 4000, "x = 2024-99-99"])
+def test_broken_toml_is_refused(refused, content):
+    refused(read_toml, content, "expected TOML")
+
+
+FPS = 50.0
+NOTES = {"licence": "For tests alone.", "joints": "COCO-17"}
+
+
+@pytest.fixture
+def tracks_of_kinds():
+    joints = np.random.default_rng(0).uniform(-50.0, 50.0, (4, 2, 17, 3))
+    joints[1, 1] = np.nan
+    covariance = np.zeros((4, 2, 17, 3, 3)) + np.diag([1e-4, 4e-4, 9e-4])
+    views = np.full((4, 2, 17), 3)
+    views[2, 0, 4] = 0
+    source = np.full(views.shape, 2)
+    source[:, :, 9] = 3
+    return JointTracks(
+        np.arange(100, 104), np.array([4, 9]), joints, covariance, views, source=source
+    )
+
+
+def walker(speed=2.0, stride_s=0.9, seconds=5.0):
+    """A person who walks along (0.6, 0.8), whose ankles swing 0.4 m about the hips."""
+    time = np.arange(round(seconds * FPS)) / FPS
+    direction = np.array([0.6, 0.8, 0.0])
+    joints = np.zeros((len(time), 1, 17, 3)) + (speed * time[:, None] * direction)[:, None, None]
+    for joint, phase in ((15, 0.0), (16, np.pi)):
+        swing = 0.4 * np.sin(2 * np.pi * time / stride_s + phase)
+        joints[:, 0, joint] += swing[:, None] * direction
+    return JointTracks(np.arange(len(time)) + 7, np.array([3]), joints)
+
+
+def check_joints(table, tracks, atol):
+    assert len(table) == 2 * 4 * 17 - 17
+    assert list(table.columns[5:11]) == ["x_m", "y_m", "z_m", "x_std_m", "y_std_m", "z_std_m"]
+    row = table[(table.frame == 102) & (table.person == 4) & (table.joint == "right_ear")]
+    np.testing.assert_allclose(
+        row[["x_m", "y_m", "z_m"]].to_numpy()[0], tracks.joints[2, 0, 4], atol=atol
+    )
+    np.testing.assert_allclose(row[["x_std_m", "z_std_m"]].to_numpy()[0], [0.01, 0.03])
+    assert row.time_s.item() == pytest.approx(2.04)
+    assert (row.views.item(), row.filled.item(), row.kind.item()) == (0, True, "triangulated")
+    assert table.filled.sum() == 1
+    assert ((table.source == 3) == (table.joint == "left_wrist")).all()
+    assert set(table.source) == {2, 3}
+    assert set(table[table.person == 9].kind) == {"mixed"}
+    assert not ((table.frame == 101) & (table.person == 9)).any()
+
+
+def test_joints_come_back_from_csv(tracks_of_kinds, tmp_path):
+    table = joints_table(tracks_of_kinds, FPS, {4: "triangulated", 9: "mixed"})
+    file, about = write_csv(tmp_path / "a.csv", table, NOTES)
+    back = pd.read_csv(file)
+    check_joints(back, tracks_of_kinds, 5.1e-6)  # written to 0.01 mm
+    description = json.loads(about.read_text())
+    assert [column["name"] for column in description["tableSchema"]["columns"]] == list(back)
+    assert (about.name, description["dc:license"]) == ("a.csv-metadata.json", "For tests alone.")
+
+
+def test_joints_come_back_from_parquet_exactly(tracks_of_kinds, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = joints_table(tracks_of_kinds, FPS, {4: "triangulated", 9: "mixed"})
+    (file,) = write_parquet(tmp_path / "a.parquet", table, NOTES)
+    check_joints(pd.read_parquet(file), tracks_of_kinds, 0.0)
+    assert parquet.read_schema(file).metadata[b"licence"] == b"For tests alone."
+    assert list(pd.read_parquet(file).joint.cat.categories) == list(COCO17)
+
+
+def test_parquet_without_pyarrow_is_refused(tracks_of_kinds, tmp_path, monkeypatch):
+    # Before: a first table without pyarrow would decide how pandas stores strings from then on.
+    table = pd.DataFrame({"a": [1]})
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UsageError, match=r"pip install 'worldpose\[tables\]'"):
+        write_parquet(tmp_path / "a.parquet", table, NOTES)
+    assert not (tmp_path / "a.parquet").exists()
+
+
+def test_gaps_are_filled_on_the_way_and_flagged():
+    whole = walker()
+    joints, covariance = whole.joints.copy(), np.zeros((250, 1, 17, 3, 3)) + np.eye(3)
+    joints[:10], joints[-10:] = np.nan, np.nan
+    joints[100:104] = np.nan
+    keep = np.delete(np.arange(250), 200)  # a frame that all people lack
+    views = np.full((249, 1, 17), 4)
+    gappy = JointTracks(whole.frames[keep], whole.person_ids, joints[keep], covariance[keep], views)
+    filled = fill_gaps(gappy)
+    np.testing.assert_array_equal(filled.frames, whole.frames)
+    assert np.isnan(filled.joints[:10]).all() and np.isnan(filled.joints[-10:]).all()
+    there = np.r_[10:240]
+    # Hips move straight; ankles swing with 2.8 m/s relative to them, so that 0.1 s bend little.
+    np.testing.assert_allclose(filled.joints[there, 0, 11], whole.joints[there, 0, 11], atol=1e-9)
+    np.testing.assert_allclose(filled.joints[there], whole.joints[there], atol=0.01)
+    made = np.zeros(250, bool)
+    made[[*range(100, 104), 200]] = True
+    np.testing.assert_array_equal(filled.views[there, 0, 3] == 0, made[there])
+    np.testing.assert_array_equal(np.isnan(filled.covariance[there, 0, 3, 0, 0]), made[there])
+    np.testing.assert_array_equal(filled.joints[~made], joints[~made])

@@ -1,4 +1,4 @@
-"""The order of the points in files of 2D poses: by name, by model, by lengths in the images."""
+"""Points in files of 2D poses: their order by name, by model, by lengths; and forms of JSON."""
 
 import json
 
@@ -266,25 +266,6 @@ def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
     assert list(map(frame_numbers(names).get, names))[: len(wanted)] == wanted
 
 
-def test_a_refusal_of_several_clips_says_so(tmp_path):
-    names = ["take1_10", "take1_11", "take2_5"]
-    (tmp_path / "a_json").mkdir()
-    for name in names:
-        (tmp_path / "a_json" / f"{name}.json").write_text('{"people": []}')
-    people = [{"image_id": f"{name}.jpg", "keypoints": points(COCO17)} for name in names]
-    (tmp_path / "b.json").write_text(json.dumps(people))
-    images = [{"id": n, "file_name": f"{name}.jpg"} for n, name in enumerate(names)]
-    listed = data_set(tmp_path / "c.json", images)
-    said = r"expected one number that rises by image .*found 'take1_10\..*several clips or times"
-    for read, path in (
-        (read_openpose_folder, tmp_path / "a_json"),
-        (read_coco_results, tmp_path / "b.json"),
-        (read_coco_results, listed),
-    ):
-        with pytest.raises(InputError, match=said):
-            read(path)
-
-
 def test_pictures_of_one_number_are_refused_and_frame_id_helps_out(tmp_path):
     images = [{"id": n, "file_name": f"{n}ab.jpg", "frame_id": n + 4} for n in (3, 5)]
     found = read_coco_results(data_set(tmp_path / "a.json", images))
@@ -350,3 +331,89 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     listed = read_coco_results(tmp_path / "a.json")
     assert listed.changes == (17, 1, 0, 0, 0)
     np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])
+
+
+PLACES = np.array([BODY[name] for name in COCO17]) + (500.25, 300.5)
+SURE = np.linspace(0.3, 1.2, 17).round(2)
+
+
+def mmpose():
+    return {
+        "keypoints": PLACES.tolist(),
+        "keypoint_scores": SURE.tolist(),
+        "bbox": [[90, 80, 950, 940]],
+        "bbox_score": 0.8,
+    }
+
+
+def ultralytics(scale=1.0):
+    x, y = (scale * PLACES).T.tolist()
+    return {
+        "name": "person",
+        "class": 0,
+        "confidence": 0.8,
+        "box": {"x1": 90, "y1": 80, "x2": 950, "y2": 940},
+        "keypoints": {"x": x, "y": y, "visible": SURE.tolist()},
+    }
+
+
+def demo(first=1):
+    frames = [{"frame_id": first + n, "instances": [mmpose()] * (n != 1)} for n in range(3)]
+    names = {str(n): name for n, name in enumerate(COCO17)}
+    return {"meta_info": {"keypoint_id2name": names}, "instance_info": frames}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        demo(),
+        demo(0),
+        demo(0)["instance_info"],
+        [[ultralytics()], [], [ultralytics()]],
+        [json.dumps([ultralytics()]), "[]", json.dumps([ultralytics()])],
+    ],
+)
+def test_a_file_of_all_frames(tmp_path, content):
+    (tmp_path / "cam.json").write_text(json.dumps(content))
+    found = read_people(tmp_path / "cam.json")
+    assert found.people.frame.tolist() == [0, 2]
+    np.testing.assert_allclose(found.people.keypoints[1, 0], PLACES, rtol=1e-6)
+    np.testing.assert_allclose(found.people.confidence[1, 0], np.minimum(SURE, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(found.people.boxes[1, 0], [90, 80, 950, 940])
+    assert found.changes.clamped == 2 * (SURE > 1.0).sum()
+
+
+def test_keypoints_without_scores_are_sure(tmp_path):
+    person = ultralytics()
+    person["keypoints"]["visible"] = None
+    (tmp_path / "cam.json").write_text(json.dumps([[person]]))
+    assert (read_people(tmp_path / "cam.json").people.confidence == 1.0).all()
+
+
+@pytest.mark.parametrize("person", [mmpose(), ultralytics()])
+def test_a_file_of_each_frame(tmp_path, person):
+    info = {"meta_info": {}, "instance_info": [person]}
+    for number, people in ((7, info), (8, []), (9, [person, person])):
+        (tmp_path / f"cam_{number:06d}.json").write_text(json.dumps(people))
+    people = read_people(tmp_path).people
+    assert people.frame.tolist() == [7, 8, 9]
+    np.testing.assert_allclose(people.keypoints[2, 1], PLACES, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ([ultralytics()], "people of one image"),
+        ([[ultralytics(1e-3)]], "shares of the image"),
+        ([[{"name": "person", "box": {}}]], "of poses, not of boxes"),
+        (demo(5), "begin with 0 or 1"),
+        ([[{**ultralytics(), "keypoints": {"x": [1], "y": [1, 2]}}]], "lists of 1 and 2"),
+        ([[{**mmpose(), "keypoint_scores": [1.0]}]], "lists of 17 and 17 and 1"),
+        ([[{**mmpose(), "keypoints": [[1, 2, 3]] * 17}]], "result 0, keypoints"),
+    ],
+)
+def test_what_does_not_say_its_frame_or_pixels_is_refused(tmp_path, content, words):
+    (tmp_path / "cam.json").write_text(json.dumps(content))
+    with pytest.raises(InputError) as caught:
+        read_people(tmp_path / "cam.json")
+    assert words in str(caught.value)

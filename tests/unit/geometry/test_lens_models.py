@@ -1,8 +1,9 @@
-"""The lens models behind one interface, against OpenCV and finite differences."""
+"""Models of lenses against OpenCV, and the limits of distortion."""
 
 import cv2
 import numpy as np
 import pytest
+from camera_builders import plain_camera
 
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import (
@@ -10,6 +11,7 @@ from worldpose.geometry.lens_models import (
     LensModel,
     by_coefficients,
     distort,
+    fold_radius,
     fold_squared,
     lens_rows,
     undistort,
@@ -120,3 +122,79 @@ def made_pose(made, step):
         made.image_size,
         made.lens_model,
     )
+
+
+def plane_camera(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0):
+    """A camera whose pixels are the distorted coordinates on the plane z = 1."""
+    return plain_camera(1.0, (0.0, 0.0), Rigid.identity(), (2, 2), lens=(k1, k2, p1, p2, k3))
+
+
+def on_plane(points):
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def spokes(radii, count=12):
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return (np.asarray(radii)[:, None, None] * directions).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("k1", "k2", "k3", "squared"),
+    [
+        (0.0, 0.0, 0.0, np.inf),
+        (0.3, 0.2, 0.1, np.inf),
+        (-1 / 3, 0.0, 0.0, 1.0),  # 1 - s
+        (0.0, -1 / 5, 0.0, 1.0),  # 1 - s^2
+        (0.0, 0.0, -1 / 7, 1.0),  # 1 - s^3
+        (-2.5 / 3, 1 / 5, 0.0, 0.5),  # (1 - 2 s)(1 - s / 2)
+        (-3 / 3, 2.75 / 5, -0.75 / 7, 2 / 3),  # (1 - 3 s / 2)(1 - s / 2)(1 - s)
+        (2 / 3, -3 / 5, 0.0, 1.0),  # (1 - s)(1 + 3 s): rises first
+        (-1.0 / 3, 1.0 / 5, 0.0, np.inf),  # 1 - s + s^2 > 0 everywhere
+        (-1.0, 5.0, 0.0, np.inf),  # barrel near the centre, never folding
+        (-1.0 / 3, 1.0 / 5, -1.0 / 7, 1.0),  # (1 - s)(1 + s^2)
+        (0.0, -1e-12 / 5, 0.0, 1e6),  # 1 - 1e-12 s^2
+        (-0.5, 3e-306, 0.0, 2 / 3),  # a term that is nothing beside the others
+    ],
+)
+def test_fold_is_the_first_zero_of_the_slope(k1, k2, k3, squared):
+    # A root of a polynomial with rounded coefficients: well conditioned in all these cases.
+    np.testing.assert_allclose(fold_radius([k1, k2, 0.0, 0.0, k3]), np.sqrt(squared), rtol=1e-12)
+
+
+def test_points_at_and_beyond_the_fold_have_no_image():
+    camera = plane_camera(k1=-1 / 3)  # folds at 1, where the image radius is 2 / 3
+    points = on_plane([[0.999, 0.0], [1.001, 0.0], [0.0, 1.5], [-5.0, 0.0]])
+    found = camera.project_with_jacobians(points)
+    assert found.status.tolist() == [RayStatus.OK] + 3 * [RayStatus.BEYOND_FOLD]
+    assert np.isfinite(camera.project(points)).all(axis=-1).tolist() == [True, False, False, False]
+
+
+def test_pixels_beyond_the_folded_image_have_no_ray():
+    rays = plane_camera(k1=-1 / 3).unproject([[0.666, 0.0], [0.0, 0.667], [3.0, 4.0]])
+    assert rays.status.tolist() == [RayStatus.OK] + 2 * [RayStatus.BEYOND_FOLD]
+    assert np.isnan(rays.directions[1:]).all()
+
+
+@pytest.mark.parametrize("k", [(-0.4, 0.0, 0.0), (-0.3, 0.1, -0.05), (0.2, -1.0, 0.0)])
+def test_inverse_holds_up_to_the_brink_of_the_fold(k):
+    k1, k2, k3 = k
+    camera = plane_camera(k1=k1, k2=k2, k3=k3)
+    fold = float(fold_radius([k1, k2, 0.0, 0.0, k3]))
+    # At 1e-7 before the fold the image is 1e-14 short of its limit; at 1e-8 that is rounding.
+    points = spokes(fold * (1.0 - np.logspace(-1, -7, 7)))
+    image = camera.project(on_plane(points))
+    rays = camera.unproject(image)
+    assert rays.valid.all()
+    back = camera.project(rays.directions)
+    # The image returns to rounding even where the point itself is ill determined.
+    np.testing.assert_allclose(back, image, atol=1e-15)
+
+
+def test_missing_pixels_and_cameras_are_missing():
+    rays = plane_camera(k1=0.1).unproject([[np.nan, 0.0], [0.0, np.inf], [0.0, 0.0]])
+    assert rays.status.tolist() == [RayStatus.MISSING, RayStatus.MISSING, RayStatus.OK]
+    absent = plane_camera(k1=np.nan)
+    assert absent.unproject([[0.0, 0.0]]).status.tolist() == [RayStatus.MISSING]
+    assert absent.project_with_jacobians([[0.0, 0.0, 1.0]]).status.tolist() == [RayStatus.MISSING]
+    assert np.isnan(absent.project([[0.0, 0.0, 1.0]])).all()

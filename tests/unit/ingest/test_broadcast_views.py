@@ -1,15 +1,24 @@
-"""Broadcast cameras of a clip: their names, their files, and the images at match frames."""
+"""Views of broadcast cameras, and clicked markings of stills and key frames."""
 
+import json
+import struct
+import zlib
+
+import cv2
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 from pydantic import ValidationError
 
+from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.errors import InputError
 from worldpose.ingest.clock import ImageClock, rows_at
-from worldpose.ingest.footage import footage_size, image_clock, unit_frames
-from worldpose.ingest.match_folder import read_match
+from worldpose.ingest.footage import footage_size, image_clock, read_still, unit_frames
+from worldpose.ingest.match_folder import read_match, require_calibrated
+from worldpose.ingest.writing import MatchAnnotations
 
 SIZE = {"width": 1920, "height": 1080}
 
@@ -140,3 +149,179 @@ def test_an_offset_of_the_match_rate_is_rounded_and_its_rest_is_lateness():
     spec = match("main", 12.25)
     assert unit_frames(spec, "goal").offset == -88
     assert image_clock(spec, "goal").late.tolist() == [-0.25] * 6
+
+
+CLICKED = ClickedMarkings(
+    points=(
+        ClickedPoint(name="corner_left_near", xy=(12.25, 900.5)),
+        ClickedPoint(name="center_mark", xy=(-0.5, 1079.5)),
+    ),
+    drawn=(DrawnMarking(name="center_circle", xy=((3.0, 4.0), (5.5, 6.5))),),
+)
+
+
+@pytest.fixture
+def folder(write_tiny):
+    """A match whose second camera is clicked."""
+    annotations = MatchAnnotations(clicked={"cam2": CLICKED})
+    return write_tiny(("cam1",), annotations=annotations)
+
+
+def file_of(folder):
+    return folder / "annotations" / "static_calibration" / "cam2.json"
+
+
+def refusal(folder):
+    with pytest.raises(InputError) as caught:
+        read_match(folder)
+    return caught.value
+
+
+def test_clicks_are_read_as_written(folder):
+    match = read_match(folder)
+    assert match.clicked == {"cam2": CLICKED}
+    require_calibrated(match)
+
+
+def test_a_still_of_another_size_or_no_picture_is_refused(tmp_path):
+    path = tmp_path / "cam.png"
+    cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
+    with pytest.raises(InputError, match=r"cam.png.*1920 x 1080 px.*found 30 x 20"):
+        read_still(path, (1920, 1080))
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InputError, match="40 bytes that are none"):
+        read_still(path, (30, 20))
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="0 bytes that are none"):
+        read_still(path, (30, 20))
+
+
+def entries(**changes):
+    content = {"points": [{"name": "center_mark", "xy": [100.0, 200.0]}], "drawn": []}
+    return json.dumps(content | changes)
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "told"),
+    [
+        (entries(points=[{"name": "corner_left_nea", "xy": [1, 2]}]), "points[0].name", "near"),
+        (entries(drawn=[{"name": "halfway", "xy": [[1, 2]]}]), "drawn[0].name", "halfway_line"),
+        (entries(drawn=[{"name": "center_mark", "xy": [[1, 2]]}]), "drawn[0].name", "a marking"),
+        (entries(points=[{"name": "center_mark", "xy": [1921, 2]}]), "points[0].xy", "1920 x 1080"),
+        (
+            entries(drawn=[{"name": "center_circle", "xy": [[1, 2], [3, -1.1]]}]),
+            "drawn[0].xy[1]",
+            "in the image",
+        ),
+        (entries(points=[{"name": "center_mark", "xy": [np.nan, 2]}]), "points[0].xy[0]", "finite"),
+        (entries(points=[{"name": "center_mark", "xy": [1, 2]}] * 2), "points[1].name", "again"),
+        (entries(points=[]), "", "points or drawn markings"),
+        (entries(drawn=[{"name": "center_circle", "xy": []}]), "drawn[0].xy", "at least 1"),
+        ('{"pionts": []}', "pionts", "points"),
+        ("{", "", "JSON"),
+    ],
+)
+def test_a_wrong_entry_is_refused_by_file_and_place(folder, content, place, told):
+    file_of(folder).write_text(content)
+    error = refusal(folder)
+    assert error.where == (f"{file_of(folder)}: {place}" if place else str(file_of(folder)))
+    assert told in str(error)
+
+
+def test_a_file_of_no_static_camera_is_refused(folder):
+    file_of(folder).rename(file_of(folder).with_name("main.json"))  # the broadcast camera
+    error = refusal(folder)
+    assert error.where.endswith("main.json")
+    assert "a static camera: cam1, cam2" in error.expected
+
+
+def test_clicks_without_a_pitch_are_refused(folder):
+    match_file = folder / "match.yaml"
+    match_file.write_text(match_file.read_text() + "pitch: none\n")
+    assert "pitch: none" in refusal(folder).expected
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG", "TIFF", "BMP", "WEBP"])
+def test_a_still_of_every_kind_is_read_as_it_is_shown(tmp_path, form):
+    picture = np.random.default_rng(1).integers(0, 255, (18, 32, 3), dtype=np.uint8)
+    path = tmp_path / f"cam.{form.lower()}"
+    more = {"quality": 95} if form == "JPEG" else {"lossless": True} if form == "WEBP" else {}
+    Image.fromarray(picture).save(path, form, **more)
+    stored = read_still(path, (32, 18))
+    if form != "JPEG":
+        np.testing.assert_array_equal(stored, picture)
+        return
+    tag = Image.Exif()
+    tag[0x0112] = 6  # shown after a quarter turn clockwise
+    Image.fromarray(picture).save(path, form, exif=tag, **more)
+    np.testing.assert_array_equal(read_still(path, (18, 32)), np.rot90(stored, -1))
+    with pytest.raises(InputError, match="found 18 x 32 as shown, with the turn of its EXIF tag"):
+        read_still(path, (32, 18))
+
+
+def clicks(name="center_mark", xy=(640.0, 360.0)):
+    return ClickedMarkings(points=(ClickedPoint(name=name, xy=xy),))
+
+
+PICKED = KeyFrames(
+    key_frames=(
+        KeyFrame(frame=0, markings=clicks()),
+        KeyFrame(frame=40, markings=clicks("corner_left_near", (3.5, 8.0))),
+    )
+)
+
+
+@pytest.fixture
+def write(write_tiny):
+    def write(key_frames, clip="goal"):
+        return write_tiny(annotations=MatchAnnotations(key_frames={clip: key_frames}))
+
+    return write
+
+
+def test_key_frames_are_read_as_written(write):
+    assert read_match(write(PICKED)).key_frames == {"goal": PICKED}
+
+
+def test_key_frames_of_something_else_are_refused(write):
+    with pytest.raises(InputError, match=r"cam1\.json.*a clip with a broadcast camera: goal"):
+        write(PICKED, clip="cam1")
+
+
+@pytest.mark.parametrize("frames", [(4, 4), (9, 4)])
+def test_frames_out_of_order_or_twice_are_refused(write, frames):
+    picked = KeyFrames(key_frames=tuple(KeyFrame(frame=f, markings=clicks()) for f in frames))
+    with pytest.raises(InputError, match=r"goal\.json: key_frames: .*rising order"):
+        write(picked)
+
+
+@pytest.mark.parametrize(
+    ("markings", "place"),
+    [
+        (clicks("centre_mark"), r"key_frames\[0\]\.markings\.points\[0\]\.name.*center_mark"),
+        (clicks(xy=(5000.0, 2.0)), r"key_frames\[0\]\.markings\.points\[0\]\.xy.*image of"),
+        (ClickedMarkings(), r"key_frames\[0\]\.markings: .*Click some"),
+    ],
+)
+def test_a_wrong_entry_is_named(write, markings, place):
+    with pytest.raises(InputError, match=place):
+        write(KeyFrames(key_frames=(KeyFrame(frame=3, markings=markings),)))
+
+
+def test_a_small_file_that_declares_a_huge_still_is_refused_unread(tmp_path):
+    """A PNG of 60,000 x 60,000 pixels takes 254 bytes, and would take 10.8 GB of memory."""
+    path = tmp_path / "cam.png"
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(60_000))), (b"IEND", b"")]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+    )
+    assert path.stat().st_size < 300
+    with pytest.raises(
+        InputError, match=r"cam.png.*at most .* pixels, found .* bytes that are none"
+    ):
+        read_still(path, (1920, 1080))

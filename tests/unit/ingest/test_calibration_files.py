@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 
-from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import read_calibration
@@ -92,8 +91,7 @@ def test_anipose_camera_is_called_by_its_name(read):
     cameras = read(ANIPOSE)
     assert list(cameras) == ["left"]
     camera = cameras["left"]
-    assert camera.image_size == (1032, 776)
-    assert camera.focal_px == (1063.5, 1071.8)
+    assert (camera.image_size, camera.focal_px) == ((1032, 776), (1063.5, 1071.8))
     assert camera.principal_point_px == (511.7, 350.1)
     assert camera.distortion == (-0.1, 0.02, 0.001, -0.002, 0.003)
     assert camera.translation == (-0.5, 0.9, 2.6)
@@ -204,7 +202,7 @@ def test_qualisys_camera_projects_as_it_stands(read):
     np.testing.assert_allclose(pixel([1.0, 3.0, 0.0]), [960, 430], atol=1e-9)
 
 
-def _matrix(camera: CameraCalibration):
+def _matrix(camera):
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 

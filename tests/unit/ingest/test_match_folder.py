@@ -1,13 +1,20 @@
+"""A match folder is read, written and checked as its description says."""
+
 import json
+import math
 
 import numpy as np
 import pytest
 import yaml
 
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
+from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.match_folder import read_match, require_calibrated, unclicked_clips
+from worldpose.ingest.validation import validate_record
+from worldpose.ingest.writing import write_match, write_offsets
 
 
 @pytest.fixture
@@ -31,8 +38,7 @@ def refusal(folder):
 
 def test_a_complete_folder_is_read(match_folder, spec, make_camera):
     match = read_match(match_folder)
-    assert match.spec == spec
-    assert match.folder == match_folder
+    assert (match.spec, match.folder) == (spec, match_folder)
     assert list(match.calibrations) == ["cam1", "cam2"]
     assert match.calibrations["cam1"].image_size == (1920, 1080)
     assert {name: path.name for name, path in match.detections.items()} == {
@@ -40,8 +46,7 @@ def test_a_complete_folder_is_read(match_folder, spec, make_camera):
         "cam2": "cam2.npz",
         "goal": "goal.npz",
     }
-    assert match.videos == {}
-    assert match.pitch == PitchSpec()
+    assert (match.videos, match.pitch) == ({}, PitchSpec())
     (match_folder / "detections" / "README.txt").write_text("x")
     (match_folder / "detections" / "._cam1.json").write_text("x")
     assert read_match(match_folder).detections == match.detections
@@ -221,3 +226,194 @@ def test_a_broadcast_camera_covers_its_clip(match_folder, make_people):
 def test_a_unit_without_detections_is_refused(match_folder, unit_id):
     with pytest.raises(InputError, match="those of cam1, cam2, goal"):
         read_unit(read_match(match_folder), unit_id)
+
+
+@pytest.fixture
+def one():
+    return MatchSpec(
+        match_id="one",
+        fps=25.0,
+        cameras=(CameraSpec(id="cam1", width=1920, height=1080),),
+        clips=(ClipSpec(id="clip", frame_count=3),),
+    )
+
+
+def files(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_a_written_match_is_read_as_it_was(tmp_path, one, make_people, make_camera):
+    people = make_people()
+    write_match(
+        tmp_path / "m",
+        one,
+        calibrations={"cam1": make_camera()},
+        observations={"cam1": people},
+        pitch=PitchSpec(length=104.2),
+    )
+    match = read_match(tmp_path / "m")
+    assert match.spec == one
+    (tmp_path / "usual").mkdir()
+    assert (tmp_path / "m").stat().st_mode == (tmp_path / "usual").stat().st_mode
+    assert match.pitch == PitchSpec(length=104.2)
+    back = read_observations(match.detections["cam1"])
+    assert {name: array.tobytes() for name, array in back.arrays().items()} == {
+        name: array.tobytes() for name, array in people.arrays().items()
+    }
+    assert sorted(files(tmp_path / "m")) == [
+        "calibration.toml",
+        "detections/cam1.npz",
+        "match.yaml",
+        "pitch.json",
+    ]
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "link"])
+def test_what_is_there_is_left_as_it_was(tmp_path, one, make_people, kind):
+    target = tmp_path / "m"
+    if kind == "folder":
+        target.mkdir()
+        (target / "mine").write_bytes(b"precious")
+    elif kind == "file":
+        target.write_bytes(b"precious")
+    else:
+        (tmp_path / "elsewhere").mkdir()
+        target.symlink_to(tmp_path / "elsewhere")
+    before = sorted(tmp_path.rglob("*")), files(tmp_path)
+    with pytest.raises(InputError, match="left as it was"):
+        write_match(target, one, calibrations={}, observations={"cam1": make_people()})
+    assert (sorted(tmp_path.rglob("*")), files(tmp_path)) == before
+
+
+def test_a_failure_on_the_way_leaves_nothing(tmp_path, one, make_people):
+    def fail(folder):
+        raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        write_match(
+            tmp_path / "m", one, calibrations={}, observations={"cam1": make_people()}, further=fail
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["cam9", "../cam1"])
+def test_data_of_unknown_cameras_are_refused(tmp_path, one, make_people, make_camera, name):
+    people = {"cam1": make_people()}
+    with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
+        write_match(
+            tmp_path / "m", one, calibrations={}, observations={**people, name: people["cam1"]}
+        )
+    with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
+        write_match(tmp_path / "m", one, calibrations={name: make_camera()}, observations=people)
+
+
+def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
+    file = tmp_path / "match.yaml"
+    file.write_text(
+        "match_id: m  # the final\n"
+        "fps: 25\n"
+        "cameras:\n"
+        "  - {id: a, width: 64, height: 48, offset_frames: 3}   # late\n"
+        "  - {id: b, width: 64, height: 48}\n"
+        "  - id: c\n"
+        "    width: 64   # small\n"
+        "    height: 48\n"
+        "  - {id: d, width: 64, height: 48, offset_frames: 1}\n"
+        "clips:\n"
+        "  - {id: clip, frame_count: 3}\n"
+    )
+    write_offsets(tmp_path, {"a": -12, "b": 2, "c": 7})
+    assert file.read_text() == (
+        "match_id: m  # the final\n"
+        "fps: 25\n"
+        "cameras:\n"
+        "  - {id: a, width: 64, height: 48, offset_frames: -12}   # late\n"
+        "  - {id: b, offset_frames: 2, width: 64, height: 48}\n"
+        "  - id: c\n"
+        "    offset_frames: 7\n"
+        "    width: 64   # small\n"
+        "    height: 48\n"
+        "  - {id: d, width: 64, height: 48, offset_frames: 1}\n"
+        "clips:\n"
+        "  - {id: clip, frame_count: 3}\n"
+    )
+    with pytest.raises(InputError, match=r"match.yaml: expected the cameras z, found others"):
+        write_offsets(tmp_path, {"z": 1})
+    assert "offset_frames: 7" in file.read_text()
+
+
+def match(**changes):
+    content = {
+        "match_id": "final",
+        "fps": 25,
+        "cameras": [
+            {"id": "cam1", "width": 1920, "height": 1080},
+            {"id": "cam2", "width": 1920, "height": 1080},
+        ],
+        "clips": [{"id": "clip", "frame_count": 10}],
+    }
+    return {key: value for key, value in {**content, **changes}.items() if value is not ...}
+
+
+def camera(**changes):
+    return {"id": "cam2", "width": 1920, "height": 1080, **changes}
+
+
+def record_refusal(data, model=MatchSpec):
+    with pytest.raises(InputError) as caught:
+        validate_record(model, data, "match.yaml")
+    return caught.value
+
+
+def test_plain_data_becomes_the_record():
+    spec = validate_record(MatchSpec, match(), "match.yaml")
+    assert (spec.fps, spec.cameras[1].id, spec.clips[0].frame_count) == (25.0, "cam2", 10)
+
+
+FIRST = "match.yaml: cameras[0]"
+
+
+@pytest.mark.parametrize(
+    ("data", "where", "expected", "found", "todo"),
+    [
+        (match(fps=...), "match.yaml: fps", "a value", "nothing", "Add"),
+        (match(fps=-1), "match.yaml: fps", "greater than or equal to 1", "-1", "Correct"),
+        (match(fps="25"), "match.yaml: fps", "a valid number", "'25'", "Correct"),
+        (match(fps=math.nan), "match.yaml: fps", "a finite number", "nan", "Correct"),
+        (match(match_id=12), "match.yaml: match_id", "a valid string", "12", "quotes: '12'"),
+        (match(match_id=False), "match.yaml: match_id", "a valid string", "no, off", "'no'"),
+        (match(match_id="../x"), "match.yaml: match_id", "letters", "'../x'", "Rename"),
+        (match(match_id="a" * 65), "match.yaml: match_id", "64", "aaa...", "Rename"),
+        (match(contract=2), "match.yaml: contract", "1", "2", "version of worldpose"),
+        (match(cameras={"a": 1}), "match.yaml: cameras", "a valid array", "a mapping", "Correct"),
+        (match(cameras=[camera(kind="fixed")]), f"{FIRST}.kind", "'broadcast'", "'fixed'", ""),
+        (match(cameras=[camera(id=None)]), f"{FIRST}.id", "a valid string", "nothing", "Correct"),
+        (
+            match(cameras=[camera(), camera(widht=1)]),
+            "match.yaml: cameras[1].widht",
+            "width",
+            "'widht'",
+            "'width'?",
+        ),
+        (match(extra=1), "match.yaml: extra", "match_id", "'extra'", "Remove it"),
+        (
+            match(cameras=[camera(), camera()]),
+            "match.yaml",
+            "agree",
+            "used twice: ['cam2']",
+            "named",
+        ),
+        (match(cameras=[]), "match.yaml: cameras", "at least 1", "0", "Correct"),
+        ([1], "match.yaml", "a mapping", "[1]", "Correct"),
+    ],
+)
+def test_refusal_names_key_expected_found_and_what_to_do(data, where, expected, found, todo):
+    error = record_refusal(data)
+    assert error.where == where
+    assert expected in error.expected
+    assert found in error.found
+    assert todo in error.todo

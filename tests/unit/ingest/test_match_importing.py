@@ -1,17 +1,27 @@
+"""Matches made of given files: units of pitches, sizes, names; and their registration."""
+
+import hashlib
 import json
+import os
 import re
 import unicodedata
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from calibration_writers import write_easymocap
+from pydantic import ValidationError
 
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
-from worldpose.ingest.footage import read_unit
+from worldpose.ingest.clock import camera_frames, remaining_offset, simplest_offset
+from worldpose.ingest.footage import UnitFrames, read_unit
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated
+from worldpose.ingest.pitch_file import read_pitch
+from worldpose.ingest.registration import register_match
 from worldpose.video.files import write_video
 
 
@@ -230,3 +240,194 @@ def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
     spec, notes = import_videos(folder, tmp_path / "videos", tmp_path / "m")
     assert [(camera.id, camera.width) for camera in spec.cameras] == [("one", 64), ("two", 64)]
     assert notes == ["camera three is left out: it has no pose"]
+
+
+SPEC = MatchSpec(
+    match_id="m",
+    fps=25,
+    cameras=(CameraSpec(id="cam", width=1920, height=1080),),
+    clips=(ClipSpec(id="clip", frame_count=1),),
+)
+
+
+def read(folder, content):
+    (folder / "pitch.json").write_text(json.dumps(content))
+    return read_pitch(folder, SPEC)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"length": 105000.0, "width": 68000.0}, "length: .*105000, which looks like millimetres"),
+        ({"length": 10500, "width": 6800}, "length: .*10500, which looks like centimetres"),
+        ({"length": 345.0, "width": 223.0}, "length: .*345, which looks like feet"),
+        ({"width": 20.0}, "width: expected 40 to 100 metres, found 20. Give all lengths"),
+        ({"crown": 50.0}, "crown"),
+        ({"points": {"corner_left_near": [-52500.0, -34000.0, 0.0]}}, "looks like millimetres"),
+        ({"points": {"corner_left_near": [-57.4, -37.2, 0.0]}}, "which looks like yards"),
+        ({"points": {"corner_left_near": [52.5, -34.0, 0.0]}}, "points.corner_left_near: expected"),
+        (
+            {"arcs": {"a": {"center": "x", "radius": 1e9, "start_angle": 0, "end_angle": 1}}},
+            "radiu",
+        ),
+    ],
+)
+def test_a_pitch_that_is_not_in_metres_is_refused(tmp_path, content, message):
+    with pytest.raises(InputError, match=message) as refused:
+        read(tmp_path, content)
+    assert "pitch.json" in refused.value.where
+
+
+def test_a_pitch_of_another_size_is_taken_where_the_file_says_so(tmp_path):
+    assert read(tmp_path, {"length": 61.0, "width": 43.0, "any_size": True}).length == 61.0
+
+
+OLD = 1_700_000_000
+
+
+@pytest.fixture
+def folder(match_folder):
+    """The tiny match with every kind of file, all of them old."""
+    for name in ("videos/cam1.mp4", "stills/cam1.png", "annotations/pitch/cam1.json"):
+        (match_folder / name).parent.mkdir(parents=True)
+        (match_folder / name).write_bytes(name.encode())
+    (match_folder / "pitch.json").write_text('{"length": 104.0}')
+    (match_folder / "reference").mkdir()
+    (match_folder / "reference" / "joints.npz").write_bytes(b"truth")
+    (match_folder / "notes.txt").write_bytes(b"mine")
+    settle(match_folder)
+    return match_folder
+
+
+def settle(folder):
+    for path in folder.rglob("*"):
+        os.utime(path, (OLD, OLD))
+
+
+def register(folder, previous=None):
+    return register_match(read_match(folder), previous)
+
+
+def test_every_file_of_the_match_is_registered_with_its_digest(folder):
+    registered = register(folder)
+    assert [file.path for file in registered.files] == [
+        *("annotations/pitch/cam1.json", "calibration.toml", "detections/cam1.npz"),
+        *("detections/cam2.npz", "detections/goal.npz", "match.yaml", "pitch.json"),
+        *("stills/cam1.png", "videos/cam1.mp4"),
+    ]
+    for file in registered.files:
+        content = (folder / file.path).read_bytes()
+        assert file.sha256 == hashlib.sha256(content).hexdigest()
+        assert file.size == len(content)
+    assert registered.folder == str(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [
+        ("videos/cam1.mp4", False),
+        ("detections/goal.npz", False),
+        ("pitch.json", False),
+        ("annotations/pitch/cam1.json", True),
+        ("stills/cam1.png", True),
+        ("calibration.toml", True),
+        ("reference/joints.npz", True),
+        ("notes.txt", True),
+    ],
+)
+def test_identity_is_of_videos_detections_and_pitch(folder, name, same):
+    before = register(folder)
+    addition = b" " if name.endswith("json") else b"\n"
+    (folder / name).write_bytes((folder / name).read_bytes() + addition)
+    settle(folder)
+    after = register(folder)
+    assert (after.identity == before.identity) is same
+    registered = {file.path for file in before.files}
+    assert (after.files != before.files) is (name in registered)
+
+
+def test_unchanged_files_are_not_read_again(folder, monkeypatch):
+    first = register(folder)
+
+    def refuse(file, digest):
+        raise AssertionError(f"read {file.name}")
+
+    monkeypatch.setattr(hashlib, "file_digest", refuse)
+    assert register(folder, first) == first
+
+
+def test_an_empty_file_is_refused(folder):
+    (folder / "videos" / "cam1.mp4").write_bytes(b"")
+    with pytest.raises(InputError, match="found 0 bytes") as caught:
+        register(folder)
+    assert caught.value.where.endswith("videos/cam1.mp4")
+
+
+def test_a_file_that_changes_while_it_is_read_is_refused(folder, monkeypatch):
+    digest = hashlib.file_digest
+
+    def grow(file, name):
+        with (folder / "videos" / "cam1.mp4").open("ab") as video:
+            video.write(b"more")
+        return digest(file, name)
+
+    monkeypatch.setattr(hashlib, "file_digest", grow)
+    with pytest.raises(InputError, match="still being written"):
+        register(folder)
+
+
+FRAME = np.arange(8)
+
+
+@pytest.mark.parametrize(
+    ("offset", "rate", "shown"),
+    [
+        (3, 1.0, [3, 4, 5, 6, 7, 8, 9, 10]),
+        (((3, 0), (4, -2)), 1.0, [0, 1, 2, 3, 2, 3, 4, 5]),  # two frames lost after frame 3
+        (((0, 0), (4, 2)), 1.0, [0, 2, 3, 5, 6, 7, 8, 9]),  # fast until frame 4
+        (0, 0.5, [0, 1, 1, 2, 2, 3, 3, 4]),
+    ],
+)
+def test_a_match_frame_has_its_nearest_camera_frame(offset, rate, shown):
+    assert camera_frames(FRAME, offset, rate).tolist() == shown
+
+
+def test_the_rest_is_how_much_later_the_camera_frame_is():
+    # Exact frames are 0, 1.5, 3, 4.5, 6 at a rate of 1.5 frames per match frame.
+    assert remaining_offset(FRAME[:5], 0, 1.5) == pytest.approx([0, 1 / 3, 0, 1 / 3, 0])
+
+
+def test_people_of_a_fast_camera_lie_on_match_frames(make_people, tmp_path):
+    people = make_people(0, 12)
+    frames = UnitFrames(0, 8, ((0, 0), (4, 2)), ((0, 2), (4, 4)))
+    placed = frames.place(tmp_path, replace(people, frame=np.arange(12)))
+    np.testing.assert_array_equal(placed.frame, [0, 1, 4, 5, 6, 7])
+    np.testing.assert_array_equal(placed.keypoints, people.keypoints[[0, 2, 6, 7, 8, 9]])
+
+
+@pytest.mark.parametrize(
+    ("offset", "kind", "told"),
+    [
+        (0.5, "static", r"in pairs as \[\[0, 0.5\]\]"),
+        (((3, 1), (3, 2)), "static", "rising match frames"),
+        ((), "static", "rising match frames"),
+        (((0, 1), (9, 2)), "broadcast", "broadcast_offset_frames"),
+        (7.0, "broadcast", "broadcast_offset_frames"),
+    ],
+)
+def test_an_offset_that_cannot_be_read_is_refused(offset, kind, told):
+    with pytest.raises(ValidationError, match=told):
+        CameraSpec(id="a", width=9, height=9, kind=kind, offset_frames=offset)
+
+
+@pytest.mark.parametrize(
+    ("frame", "exact", "written"),
+    [
+        ([0], [-0.4], 0),
+        ([0, 74, 75], [0.1, 0.1, -4.9], ((74, 0.0), (75, -5.0))),
+        ([0, 999], [0.0, -5.674], ((0, 0.0), (999, -5.67))),
+        ([5, 30, 31, 90], [2.0, 2.0, 0.0, 3.0], ((5, 2.0), (30, 2.0), (31, 0.0), (90, 3.0))),
+    ],
+)
+def test_offsets_are_written_as_simply_as_they_are(frame, exact, written):
+    assert simplest_offset(np.array(frame), np.array(exact)) == written

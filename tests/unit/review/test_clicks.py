@@ -1,5 +1,6 @@
-"""Corrections lie over what was clicked; what no longer applies is said, and nothing is lost."""
+"""Corrections of clicks and detections, and changes by annotators."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.review import (
@@ -19,8 +21,11 @@ from data_contracts.review import (
     RedrawnMarking,
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
+from worldpose.errors import InputError
+from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import replay_corrections
+from worldpose.review.detections import find_changes, image_name, replay_detections
 from worldpose.review.journal import append, read_journal
 from worldpose.store.blobs import Entry
 from worldpose.store.store import Store
@@ -214,3 +219,162 @@ def test_two_editors_at_once_lose_and_overwrite_nothing(folder):
     saved = np.array([interleave(folder, rng) for _ in range(100)])
     # Both outcomes have to come about for the test to say anything.
     assert saved[:, 0].min() < saved[:, 0].max() <= 5
+
+
+NAME = image_name("cam_03", 120)
+
+
+def person(detection, shift=0.0):
+    keypoints = np.arange(34.0).reshape(17, 2) + shift
+    keypoints[3] = np.nan
+    visible = np.full(17, 2, dtype=np.int8)
+    visible[3] = 0
+    return AnnotatedPerson(np.array([0.0, 0.0, 34.0, 34.0]), keypoints, visible, detection)
+
+
+def picture(*people, name=f"pictures/{NAME}", size=(100, 50)):
+    return AnnotatedImage(name, size, people)
+
+
+BEFORE = [picture(person(0), person(7))]
+
+
+@pytest.mark.parametrize(
+    "name", [f"pictures/{NAME}", NAME, f"/data/upload/3/f00-{NAME}", f"a\\{NAME}"]
+)
+def test_what_only_was_rounded_is_no_change(name):
+    back = [picture(person(7, 0.004), person(0, -0.004), name=name)]
+    changes = find_changes(BEFORE, back, "file")
+    assert (changes.edits, changes.pictures, changes.boxes) == ((), 1, 0)
+    assert find_changes(BEFORE, [], "file").edits == ()  # a picture that did not come back
+
+
+def test_moved_hidden_found_added_and_deleted_are_told_apart():
+    changed = person(7)
+    changed.keypoints[0] = (5.0, 6.0)
+    changed.keypoints[1] = np.nan
+    changed.keypoints[3] = (9.0, 9.5)
+    new = replace(person(None), box=np.array([1.0, 2.0, 30.0, 40.0]))
+    changes = find_changes(BEFORE, [picture(changed, new)], "file")
+    deleted, nose, eye, ear, added = changes.edits
+    assert (deleted.kind, deleted.detection) == ("deleted_detection", 0)
+    assert {(each.camera, each.frame) for each in changes.edits} == {("cam_03", 120)}
+    assert [(each.joint, each.was, each.xy) for each in (nose, eye, ear)] == [
+        ("nose", (0.0, 1.0), (5.0, 6.0)),
+        ("left_eye", (2.0, 3.0), None),
+        ("left_ear", None, (9.0, 9.5)),
+    ]
+    assert (added.detection, added.box) == (8, (1.0, 2.0, 30.0, 40.0))
+    assert added.keypoints[2:4] == ((4.0, 5.0), None)
+
+
+@pytest.mark.parametrize(
+    ("back", "found"),
+    [
+        ([picture(name="other_000001.png")], "other_000001"),
+        ([picture(size=(50, 100))], "50 x 100"),
+        ([picture(), picture(name=NAME)], NAME),
+        ([picture(person(3))], "detection 3"),
+        ([picture(person(7), person(7))], "detection 7"),
+    ],
+)
+def test_what_is_not_of_this_export_is_refused(back, found):
+    with pytest.raises(InputError, match=found):
+        find_changes(BEFORE, back, "file")
+
+
+FIRST = 50
+"""Match frame of the first row."""
+
+
+def observations():
+    """Two frames, two people; the second is not there in the second frame."""
+    keypoints = np.arange(2 * 2 * 17 * 2, dtype=np.float32).reshape(2, 2, 17, 2)
+    confidence = np.full((2, 2, 17), 0.5, dtype=np.float32)
+    boxes = np.ones((2, 2, 4), dtype=np.float32)
+    score = np.full((2, 2), 0.9, dtype=np.float32)
+    for array in (keypoints, confidence, boxes, score):
+        array[1, 1] = np.nan
+    return KeypointDetections(keypoints, confidence, boxes, score, np.arange(FIRST, FIRST + 2))
+
+
+def keypoint(xy, was=(0.0, 1.0), **where):
+    place = {"camera": "a", "frame": FIRST, "detection": 0, "joint": "nose"} | where
+    return MovedKeypoint(**place, was=was, xy=xy)
+
+
+def deleted(frame=FIRST, detection=0, was=None):
+    return DeletedDetection(camera="a", frame=frame, detection=detection, was=was)
+
+
+def added_person(detection, frame=FIRST + 1, nose=(3.0, 4.0)):
+    keypoints = (nose,) + (None,) * 16
+    box = (1.0, 2.0, 5.0, 9.0)
+    return AddedDetection(
+        camera="a", frame=frame, detection=detection, box=box, keypoints=keypoints
+    )
+
+
+def changed(edit):
+    """Return the changes of an edit, as (name, index) of every value."""
+    found, before = observations(), observations()
+    replay = replay_detections(found, [edit])
+    assert replay.objections == (None,)
+    assert all(map(same, found.arrays().values(), before.arrays().values()))  # the input stays
+    after = replay.observations.arrays()
+    return {
+        name: np.argwhere(~((array == after[name]) | (np.isnan(array) & np.isnan(after[name]))))
+        for name, array in before.arrays().items()
+    }
+
+
+def same(one, other):
+    return np.array_equal(one, other, equal_nan=True)
+
+
+def test_a_keypoint_taken_out_is_not_seen_any_more():
+    places = changed(keypoint(None))
+    assert places["keypoints"].tolist() == [[0, 0, 0, 0], [0, 0, 0, 1]]
+    assert places["confidence"].tolist() == [[0, 0, 0]]
+    assert len(places["boxes"]) == len(places["score"]) == 0
+
+
+def test_a_keypoint_put_elsewhere_is_certain():
+    replay = replay_detections(observations(), [keypoint((7.5, 8.5))])
+    assert replay.observations.keypoints[0, 0, 0].tolist() == [7.5, 8.5]
+    assert replay.observations.confidence[0, 0, 0] == 1.0
+    again = keypoint((0.0, 1.0), was=(7.5, 8.5))
+    there_and_back = replay_detections(observations(), [keypoint((7.5, 8.5)), again])
+    assert there_and_back.objections == (None, None)
+    assert same(there_and_back.observations.keypoints, observations().keypoints)
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (keypoint(None, frame=FIRST - 1), f"no frame {FIRST - 1}"),
+        (keypoint(None, frame=FIRST + 1, detection=1), "no detection 1"),
+        (keypoint(None, was=(0.0, 1.5)), "was (0.0, 1.5) when it was corrected, and is [0.0, 1.0]"),
+        (keypoint((1.0, 1.0), was=None), "was not seen when"),
+        (deleted(frame=FIRST + 1, detection=1), "no detection 1"),
+        (deleted(was=(1.0, 1.0, 1.0, 2.0)), "was [1.0, 1.0, 1.0, 2.0] when it was deleted"),
+        (added_person(0), "there is a detection 0"),
+        (added_person(3), "2 is the next"),
+    ],
+)
+def test_what_does_not_fit_what_was_seen_says_why_and_changes_nothing(edit, reason):
+    replay = replay_detections(observations(), [edit])
+    (objection,) = replay.objections
+    assert reason in objection
+    for name, array in replay.observations.arrays().items():
+        assert same(array, observations().arrays()[name])
+
+
+def test_an_added_person_takes_a_free_place_and_is_certain():
+    places = changed(added_person(1))
+    assert places["keypoints"].tolist() == [[1, 1, 0, 0], [1, 1, 0, 1]]
+    assert places["confidence"].tolist() == [[1, 1, 0]]
+    assert places["boxes"].tolist() == [[1, 1, k] for k in range(4)]
+    after = replay_detections(observations(), [added_person(1)]).observations
+    assert (after.score[1, 1], after.confidence[1, 1, 0]) == (1.0, 1.0)
+    assert after.boxes[1, 1].tolist() == [1.0, 2.0, 5.0, 9.0]

@@ -1,11 +1,32 @@
+"""Simulated matches: cameras, people, renderings, recordings, and the second world."""
+
+import ast
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.formats.joints_file import read_joints
+from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.match_folder import read_match
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.foreign import rigs as foreign_rigs
+from worldpose.simulation.foreign.detectors import PROFILES
+from worldpose.simulation.foreign.matches import simulate_foreign_match
+from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.recorded_files import read_bvh
+from worldpose.simulation.recordings import read_clip, read_trajectories
+from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
+from worldpose.simulation.settings import RenderingSettings
 
 TINY = SCENARIOS["tiny"]
 
@@ -24,8 +45,7 @@ def scene():
 
 def test_the_folder_is_a_match_with_clicks_detections_and_a_surveyed_pitch(match, scene):
     read = read_match(match)
-    assert read.spec.match_id == "tiny-1"
-    assert read.calibrations == {}
+    assert (read.spec.match_id, read.calibrations) == ("tiny-1", {})
     assert not (match / "stills").exists()
     assert read.pitch == scene.surveyed
     for name, observations in scene.observations.items():
@@ -65,3 +85,232 @@ def test_every_scenario_makes_a_match(name, tmp_path):
         assert np.isfinite(people.score).sum(axis=1).mean() > 1.0
         camera = np.load(tmp_path / name / "reference" / "cameras" / f"{view}.npz")
         assert camera["K"].shape == camera["R"].shape == (frames, 3, 3)
+
+
+SOURCES = Path(foreign_rigs.__file__).parent
+LAB = FOREIGN_SCENARIOS["foreign-lab"]
+
+
+def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
+    imported = {
+        node.module
+        for path in SOURCES.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom)
+    }
+    first = {name for name in imported if name.startswith("worldpose.simulation.")}
+    shared = {f"worldpose.simulation.{name}" for name in ("recorded_files", "reference")}
+    assert first > shared
+    assert all(name.startswith("worldpose.simulation.foreign") for name in first - shared)
+    bodies = {name for name in imported if name.startswith("worldpose.body")}
+    assert bodies == {"worldpose.body.occlusions"}
+
+
+@pytest.mark.parametrize("name", FOREIGN_SCENARIOS)
+def test_every_scenario_makes_a_match_that_the_factory_takes(tmp_path, name):
+    scenario = FOREIGN_SCENARIOS[name]
+    spec = simulate_foreign_match(scenario, 7, tmp_path / "match", duration=0.2)
+    match = read_match(tmp_path / "match")
+    assert match.spec == spec
+    assert scenario.cameras[0] <= len(spec.cameras) <= scenario.cameras[1]
+    truth = read_joints(tmp_path / "match" / "reference" / "joints.npz")
+    assert scenario.people[0] <= len(truth.person_ids) <= scenario.people[1]
+    assert np.isfinite(truth.joints).all()
+    record = json.loads((tmp_path / "match" / "reference" / "world.json").read_text())
+    assert len(record["people"]) == len(truth.person_ids)
+    assert record["detector"]["name"] in PROFILES
+    defined = read_joints(tmp_path / "match" / "reference" / "defined_joints.npz")
+    apart = np.linalg.norm(defined.joints - truth.joints, axis=-1)
+    assert 0.01 < apart.mean() < 0.12
+    for camera in spec.cameras:
+        size = (camera.width, camera.height)
+        file = tmp_path / "match" / "reference" / "cameras" / f"{camera.id}.npz"
+        pixels = read_camera(file, size).project(truth.joints.reshape(-1, 3))
+        assert np.isfinite(pixels).any()
+
+
+NAMES = ("hip", "neck", "head", "head_end", "elbow", "rForeArm")
+SIDES = [f"{side}{name}" for side in "lr" for name in ("Thigh", "Shin", "Foot", "Shldr", "Hand")]
+
+
+def test_a_joint_or_rate_that_is_missing_is_named(tmp_path):
+    names = np.array([*NAMES, *SIDES])
+    joints = np.zeros((9, len(names), 3))
+    np.savez(tmp_path / "clip.npz", joints=joints, joint_names=names, fps=60.0)
+    with pytest.raises(InputError, match="left elbow"):
+        read_clip(tmp_path / "clip.npz")
+    np.savez(tmp_path / "bad.npz", joints=joints[:, :2])
+    with pytest.raises(InputError, match="fps"):
+        read_clip(tmp_path / "bad.npz")
+
+
+TIME = np.arange(0.0, 6.0, 0.1)
+
+
+def tracked(path, **changes):
+    """A person who runs along x at 4 m/s, and a standing one."""
+    runner = np.stack([4.0 * TIME - 10.0, 0.0 * TIME + 5.0], axis=-1)
+    keeper = np.tile([-50.0, 1.0], (len(TIME), 1))
+    content = {"xy": np.stack([runner, keeper], axis=1), "time": TIME + 100.0, **changes}
+    np.savez(path, **{name: value for name, value in content.items() if value is not None})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"xy": np.zeros((60, 2))}, "xy of shape"),
+        ({"xy": np.full((60, 2, 2), np.nan)}, "0 people"),
+        ({"time": None}, "neither time nor fps"),
+        ({"xy": np.zeros((2, 2, 2)), "time": np.arange(2.0)}, "2 samples"),
+        ({"time": np.zeros(60)}, "1 samples"),
+        ({"xy": np.array([None])}, "pickled"),
+    ],
+)
+def test_unusable_files_are_refused(tmp_path, changes, found):
+    with pytest.raises(InputError, match=found):
+        read_trajectories(tracked(tmp_path / "t.npz", **changes), 60.0)
+
+
+def test_a_match_is_driven_by_them_and_its_id_names_the_file(tmp_path):
+    file = tracked(tmp_path / "t.npz")
+    spec = simulate_match(
+        SCENARIOS["match"],
+        1,
+        tmp_path / "m",
+        MatchOptions(duration=0.4, cameras=2, stills=False, video=False, trajectories=file),
+    )
+    assert spec.match_id.startswith("match-1-0.4s-2cameras-tracks")
+    assert spec.clips[0].frame_count == 20
+    with np.load(tmp_path / "m" / "reference" / "joints.npz") as truth:
+        assert truth["joints"].shape == (20, 2, 17, 3)
+
+
+PITCH = PitchTemplate.standard()
+PLAIN = RenderingSettings(light="floodlights", noise=0.0, stripes=0.0)
+# A camera of a quarter of the usual size, which renders in a twentieth of the time.
+VIEW = look_at_camera(
+    *((-30.0, -60.0, 22.0), (-35.0, 0.0, 0.0), 560.0, (480, 270)),
+    middle=(242.0, 131.0),
+    lens=(-0.1, 0.02, 0.0, 0.0, 0.0),
+    roll=0.01,
+)
+
+
+def cv_pixels(points):
+    matrix = np.diag([*VIEW.focal, 1.0])
+    matrix[:2, 2] = VIEW.principal_point
+    pose = VIEW.cam_from_world
+    lens = np.array(VIEW.distortion)
+    return cv2.projectPoints(points, pose.rotvec, pose.translation, matrix, lens)[0].reshape(-1, 2)
+
+
+def paint_middle(pixel, normal, fresh, bare):
+    """Return the offset [px] of the paint's centre from a pixel, along the normal."""
+    t = np.arange(-4.0, 4.01, 0.25)
+    at = pixel + t[:, None] * normal
+    added = (fresh[..., 1] - bare[..., 1]).astype(np.float32)
+    x, y = at.T.astype(np.float32)
+    profile = cv2.remap(added, x[None], y[None], cv2.INTER_LINEAR)[0]
+    return float((t * profile).sum() / profile.sum())
+
+
+@pytest.mark.parametrize("surveyed", [False, True])
+def test_paint_lies_where_opencv_projects_the_template(surveyed):
+    points = {
+        "penalty_area_left_near_front": (-36.05, -20.1, -0.03),
+        "center_mark": (0.0, 0.0, 0.3),
+    }
+    pitch = PitchTemplate.from_spec(PitchSpec(points=points)) if surveyed else PITCH
+    fresh = render_pitch(VIEW, pitch, None, 0, PLAIN).astype(int)
+    bare = render_pitch(VIEW, pitch, None, 0, PLAIN.model_copy(update={"paint": 0.0})).astype(int)
+    middles = []
+    for name in ("penalty_area_left_front", "penalty_area_left_near", "halfway_line"):
+        samples = pitch.sample_lines(0.05)
+        line = samples.points_world[samples.marking == samples.names.index(name)]
+        pixels = cv_pixels(line)
+        for index in range(60, len(line) - 60, 10):
+            along = pixels[index + 1] - pixels[index - 1]
+            normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+            near = np.abs(line[index] - [-36.0, 0.0, 0.0])[1]
+            inside = (pixels[index] > 8).all() and (pixels[index] < VIEW.image_size - 9).all()
+            if inside and not (name.endswith("front") and near < 10.0):
+                middles.append(paint_middle(pixels[index], normal, fresh, bare))
+    assert len(middles) > 50
+    # Grey levels and straight interpolation; worn paint moves single places of lines that are a
+    # pixel wide here.
+    assert abs(np.mean(middles)) < 0.015
+    assert np.percentile(np.abs(middles), 95) < 0.15
+
+
+ARM = """HIERARCHY
+ROOT hip
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT upper
+  {
+    OFFSET 0 10 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT lower
+    {
+      OFFSET 0 0 5
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET 2 0 0
+      }
+    }
+  }
+}
+MOTION
+Frames: 3
+Frame Time: 0.02
+1 2 3 0 0 0  0 0 0  0 0 0
+1 2 3 90 0 0  0 0 0  0 0 0
+0 0 0 90 90 0  0 0 90  0 90 0
+"""
+
+
+def written(folder, text):
+    path = folder / "clip.bvh"
+    path.write_text(text)
+    return path
+
+
+def test_positions_are_those_worked_out_by_hand(tmp_path):
+    capture = read_bvh(written(tmp_path, ARM))
+    assert capture.names == ("hip", "upper", "lower", "lower_end")
+    assert capture.fps == 50.0
+    expected = [
+        # Nothing turned: offsets add up.
+        [[1, 2, 3], [1, 12, 3], [1, 12, 8], [3, 12, 8]],
+        # A quarter turn about z takes y to -x and x to y.
+        [[1, 2, 3], [-9, 2, 3], [-9, 2, 8], [-9, 4, 8]],
+        # The root turns by Z then X: Rz Rx takes y to z, z to x and x to y, so (0, 10, 0) goes to
+        # z. The upper joint's Ry takes z to x and x to -z, then the root x to y: (0, 0, 5) goes
+        # along y. The lower's Rx leaves x, which Ry takes to -z and the root to -x.
+        [[0, 0, 0], [0, 0, 10], [0, 5, 10], [-2, 5, 10]],
+    ]
+    np.testing.assert_allclose(capture.positions, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("HIERARCHY", "SKELETON", "'SKELETON' as word 1"),
+        ("Frames: 3", "Frames: 4", "4 frames of 12 channels"),
+        ("0.02", "0", "every 0 s"),
+        ("OFFSET 0 10 0", "OFFSET 0 ten 0", "'ten'"),
+        (
+            "3 Zrotation Xrotation Yrotation",
+            "3 Zrotation Xrotation Wrotation",
+            "Wrotation of upper",
+        ),
+        ("1 2 3 0 0 0", "1 2 3 nan 0 0", "'nan'"),
+        (ARM[ARM.index("lower") :], "", "ends too early"),
+    ],
+)
+def test_what_is_wrong_is_said(old, new, found, tmp_path):
+    with pytest.raises(InputError, match=found):
+        read_bvh(written(tmp_path, ARM.replace(old, new, 1)))

@@ -39,7 +39,7 @@ def paint_of(camera, names, pitch=PITCH):
     return straighten_paint(ridges, np.ones(size[::-1], np.bool_), guess_lens(0.0, size), 1.0)
 
 
-def seat(index: int, seed: int = 0):
+def seat(index, seed=0):
     """A camera of the synthetic stadium, and the generator that continues from it."""
     rng = np.random.default_rng([seed, index])
     rig = SCENARIOS["match"].rig
@@ -70,7 +70,7 @@ def click(camera, rng, count=10, noise=1.0, wrong=0.0):
     )
 
 
-def points(pixels) -> ClickedMarkings:
+def points(pixels):
     return ClickedMarkings(
         points=tuple(
             ClickedPoint(name=str(k), xy=(float(x), float(y))) for k, (x, y) in pixels.items()
@@ -78,7 +78,7 @@ def points(pixels) -> ClickedMarkings:
     )
 
 
-def draw(camera, names, rng, count=4, noise=0.0, pitch=PITCH) -> tuple[DrawnMarking, ...]:
+def draw(camera, names, rng, count=4, noise=0.0, pitch=PITCH):
     """Pixels on the visible part of markings."""
     drawn = []
     for name in names:

@@ -1,13 +1,17 @@
-"""Line refinement against the camera that an image was rendered with."""
+"""Lines and circles are found in stills and refine a camera."""
 
 from functools import cache
 
+import cv2
 import numpy as np
 from camera_builders import look_at_camera
+from clicking_people import pinhole
 
 from worldpose.body.model import BodyParameters
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
+from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
+from worldpose.static_calibration.from_paint.thin_paint import trace_marking
 from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
@@ -123,3 +127,80 @@ def test_covariance_holds_the_truth_and_says_more_than_the_start():
     # Mean of chi-square with 11 degrees of freedom is 11; of six starts with one image, below 17
     # in all but one case of a thousand. The template is exact here, which makes it smaller.
     assert np.mean(distances) < 17.0
+
+
+SIZE = (1920, 400)
+
+
+def grass(seed=80):
+    rng = np.random.default_rng(seed)
+    image = np.full((SIZE[1], SIZE[0], 3), (70, 110, 60), np.float64)
+    return image + rng.normal(0.0, 3.0, (SIZE[1], SIZE[0], 1))
+
+
+def paint(image, places, strength=0.45):
+    """Add a line one pixel wide along places (n, 2), at sub-pixel accuracy."""
+    cover = np.zeros(image.shape[:2], np.uint8)
+    shift = 4
+    points = np.round(places * 2**shift).astype(np.int32)
+    cv2.polylines(cover, [points], False, 255, 1, cv2.LINE_AA, shift)
+    return image + (230.0 - image) * strength * (cover[..., None] / 255.0)
+
+
+def as_picture(image):
+    return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def projected():
+    x = np.linspace(20.0, 1900.0, 200)
+    return np.stack([x, 200.0 - 0.03 * x], axis=1)
+
+
+def true_places(offset=4.0, sag=2.0):
+    """The real line: beside its projection and bent."""
+    line = projected()
+    share = (line[:, 0] - 960.0) / 960.0
+    return line + np.stack([np.zeros(len(line)), offset - sag * share**2], axis=1)
+
+
+def test_thin_paint_beside_its_projection_is_traced_despite_letters():
+    image = paint(grass(), true_places())
+    rng = np.random.default_rng(81)
+    for x in range(900, 1500, 14):  # letters behind the line
+        y = 200.0 - 0.03 * x - 4.0 + rng.uniform(-2.0, 2.0)
+        cv2.rectangle(image, (x, int(y)), (x + 9, int(y) + 2), (220.0, 220.0, 220.0), -1)
+    found = trace_marking(as_picture(image), projected())
+    assert len(found) > 150
+    expected = np.interp(found[:, 0], *true_places().T)
+    assert np.abs(np.median(found[:, 1] - expected)) < 0.15
+    assert np.quantile(np.abs(found[:, 1] - expected), 0.95) < 1.0
+
+
+CIRCLE_SIZE = (1280, 720)
+
+
+def circle_camera(aim, focal, center=(-2.0, -66.0, 15.0)):
+    return pinhole(center, (*aim, 0.0), focal, CIRCLE_SIZE)
+
+
+def farthest(found, true, names):
+    """The largest distance of the markings' pixels in two cameras, up to half a turn [px]."""
+    off = []
+    for turn in (1.0, -1.0):
+        moved = []
+        for name in names:
+            places = PITCH.marking_points(name, 0.5)
+            pixels = true.project(places)
+            others = found.project(places * [turn, turn, 1.0])
+            seen = ((pixels >= 0.0) & (pixels <= np.array(CIRCLE_SIZE) - 1.0)).all(axis=1)
+            moved.append(np.linalg.norm(others - pixels, axis=1)[seen].max())
+        off.append(max(moved))
+    return min(off)
+
+
+def test_a_midfield_still_is_calibrated_on_the_stated_side():
+    true = circle_camera((0.0, 1.0), 2300.0)
+    still = render_pitch(true, PITCH, None, 5)
+    found = calibrate_without_clicks(PITCH, still, side="far").estimate.camera
+    assert found.center[1] > 30.0  # the image looks the same from the near side
+    assert farthest(found, true, ("halfway_line", "center_circle")) < 3.0

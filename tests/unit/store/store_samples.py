@@ -1,11 +1,8 @@
 """A small stage for the store's tests, and the processes that are killed while writing it."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import tempfile
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,12 +11,10 @@ from run_records import run_record
 import data_contracts.arrays
 from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
-from data_contracts.run import RunRecord
 from data_contracts.work import Recipe, Work
 from worldpose.store.blobs import install_fault_hook
 from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Store
-from worldpose.store.writer import ResultWriter
 
 FRAMES, PERSONS = 40, 3
 SMALL_CHUNK, SMALL_SHARD = 512, 2
@@ -51,7 +46,7 @@ LAYOUT = GroupLayout(
 ATTRIBUTES: dict[str, Any] = {"detector": "none", "camera": ["left", "right"]}
 
 
-def sample_arrays(seed: int = 0) -> dict[str, Any]:
+def sample_arrays(seed=0):
     """The arrays that cannot be left out: few files, as S3 tests pay by the file."""
     rng = np.random.default_rng(seed)
     joints = rng.normal(size=(FRAMES, PERSONS, 3))
@@ -63,7 +58,7 @@ def sample_arrays(seed: int = 0) -> dict[str, Any]:
     }
 
 
-def all_sample_arrays() -> dict[str, Any]:
+def all_sample_arrays():
     """An array of every kind."""
     return {
         **sample_arrays(),
@@ -73,11 +68,11 @@ def all_sample_arrays() -> dict[str, Any]:
     }
 
 
-def sample_coordinates() -> dict[str, Any]:
+def sample_coordinates():
     return {"frame": np.arange(100, 100 + FRAMES)}
 
 
-def sample_recipe(unit: str = "clip", **changes: Any) -> Recipe:
+def sample_recipe(unit="clip", **changes):
     fields: dict[str, Any] = {
         "match_id": "final",
         "stage": "tracking",
@@ -91,34 +86,32 @@ def sample_recipe(unit: str = "clip", **changes: Any) -> Recipe:
     return Recipe(**(fields | changes))
 
 
-def sample_work(store: Store, recipe: Recipe | None = None, run_id: str = "0001") -> Work:
+def sample_work(store, recipe=None, run_id="0001"):
     recipe = recipe or sample_recipe()
     return Work(
         project=store.url, folder="/match", recipe=recipe, key=recipe_key(recipe), run_id=run_id
     )
 
 
-def publish(
-    store: Store, recipe: Recipe | None = None, seed: int = 0, run_id: str = "0001"
-) -> ResultWriter:
+def publish(store, recipe=None, seed=0, run_id="0001"):
     with store.publish(sample_work(store, recipe, run_id)) as writer:
         writer.write(LAYOUT, sample_arrays(seed), sample_coordinates(), ATTRIBUTES)
         writer.figures["mean_views"] = 2.5
     return writer
 
 
-def place(recipe: Recipe | None = None) -> tuple[str, str, str, str]:
+def place(recipe=None):
     recipe = recipe or sample_recipe()
     return recipe.match_id, recipe.stage, recipe.unit, recipe_key(recipe)
 
 
-def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
+def sample_record(run_id, *recipes, **changes):
     results = {recipe.name: recipe_key(recipe) for recipe in recipes}
     own = {"match_id": "final", "results": results, "executed": tuple(results)}
     return run_record(**({"run_id": run_id, **own} | changes))
 
 
-def run_once(store: Store, *recipes: Recipe) -> str:
+def run_once(store, *recipes):
     """A whole run: what exists is reused, the rest computed, the record written."""
     recipes = recipes or (sample_recipe(),)
     run_id = store.reserve_run("final")
@@ -129,7 +122,7 @@ def run_once(store: Store, *recipes: Recipe) -> str:
     return run_id
 
 
-def sample_registration(match_id: str = "final", folder: str = "/match") -> Registration:
+def sample_registration(match_id="final", folder="/match"):
     spec = MatchSpec(
         match_id=match_id,
         fps=50,
@@ -144,9 +137,7 @@ PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(["pytest", "worldpose.store", "worldpose.store.groups", "obstore"])
 
 
-def run_process(
-    target: Callable[..., None], *arguments: Any
-) -> multiprocessing.context.ForkServerProcess:
+def run_process(target, *arguments):
     """A started process that sees this one's object storage."""
     process = PROCESSES.Process(
         target=_with_environment,
@@ -162,9 +153,7 @@ def run_process(
     return process
 
 
-def _with_environment(
-    environment: Mapping[str, str], temporary: str, target: Callable[..., None], *arguments: Any
-) -> None:
+def _with_environment(environment, temporary, target, *arguments):
     os.environ.update(environment)
     tempfile.tempdir = temporary
     data_contracts.arrays.CHUNK_BYTES = SMALL_CHUNK
@@ -172,7 +161,7 @@ def _with_environment(
     target(*arguments)
 
 
-def run_and_die(url: str, point: str, sabotage: Callable[[], None] | None = None) -> None:
+def run_and_die(url, point, sabotage=None):
     """Runs the sample and dies, as from kill -9, the first time it is at `point`."""
     if sabotage:
         sabotage()

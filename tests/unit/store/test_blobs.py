@@ -1,13 +1,9 @@
 """One behaviour of two media."""
 
-from __future__ import annotations
-
 import errno
 import os
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from obstore.store import MemoryStore
@@ -20,7 +16,7 @@ from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
 
-def test_what_is_put_is_read(store: Store) -> None:
+def test_what_is_put_is_read(store):
     blobs = store.blobs
     assert blobs.read("a/b") is None
     assert not blobs.exists("a/b")
@@ -34,14 +30,13 @@ def test_what_is_put_is_read(store: Store) -> None:
     assert blobs.read("a/b") is None
 
 
-def test_new_is_put_once(store: Store) -> None:
+def test_new_is_put_once(store):
     assert store.blobs.put_new("a/b", b"first")
     assert not store.blobs.put_new("a/b", b"second")
-    assert store.blobs.read("a/b") == b"first"
-    assert store.blobs.staged_entries() == []
+    assert (store.blobs.read("a/b"), store.blobs.staged_entries()) == (b"first", [])
 
 
-def test_of_many_that_put_one_new_file_one_succeeds(store: Store) -> None:
+def test_of_many_that_put_one_new_file_one_succeeds(store):
     for number in range(5):
         with ThreadPoolExecutor(4) as pool:
             done = list(
@@ -54,29 +49,29 @@ def test_of_many_that_put_one_new_file_one_succeeds(store: Store) -> None:
         assert store.blobs.read(f"race/{number}") == str(done.index(True)).encode() * 1000
 
 
-def failing(code: int) -> Callable[..., Any]:
-    def fail(*_: object, **__: object) -> None:
+def failing(code):
+    def fail(*_, **__):
         raise OSError(code, os.strerror(code))
 
     return fail
 
 
 @pytest.fixture(params=[errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
-def without_links(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def without_links(request, monkeypatch):
     """What exFAT, SMB and FUSE answer to link()."""
     monkeypatch.setattr(os, "link", failing(request.param))
 
 
 @pytest.fixture
-def losing_replies(monkeypatch: pytest.MonkeyPatch) -> None:
+def losing_replies(monkeypatch):
     """Execute every link and rename twice, as NFS does when the first reply is lost."""
     link, rename = os.link, Path.rename
 
-    def link_twice(source: Any, target: Any) -> None:
+    def link_twice(source, target):
         link(source, target)
         link(source, target)
 
-    def rename_twice(source: Path, target: Any) -> Path:
+    def rename_twice(source, target):
         rename(source, target)
         return rename(source, target)
 
@@ -85,7 +80,7 @@ def losing_replies(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("losing_replies")
-def test_a_lost_reply_to_the_rename_of_a_result_is_success(tmp_path: Path) -> None:
+def test_a_lost_reply_to_the_rename_of_a_result_is_success(tmp_path):
     store = Store.create(tmp_path / "project")
     assert run_once(store) == "0001"
     assert store.has(*place())
@@ -93,7 +88,7 @@ def test_a_lost_reply_to_the_rename_of_a_result_is_success(tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("without_links")
-def test_without_hard_links_a_file_is_still_created_whole_and_once(tmp_path: Path) -> None:
+def test_without_hard_links_a_file_is_still_created_whole_and_once(tmp_path):
     store = Store.create(tmp_path / "project")
     with ThreadPoolExecutor(8) as pool:
         contents = [f"{number} ".encode() * 10_000 for number in range(16)]
@@ -107,9 +102,9 @@ def test_without_hard_links_a_file_is_still_created_whole_and_once(tmp_path: Pat
 
 @pytest.mark.usefixtures("without_links")
 def test_a_disk_with_neither_links_nor_exclusive_renames_is_refused_with_the_cause(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> int:
+    tmp_path, monkeypatch
+):
+    def fail(*_):
         folder_module.ctypes.set_errno(errno.EINVAL)
         return -1
 
@@ -123,12 +118,10 @@ def test_a_disk_with_neither_links_nor_exclusive_renames_is_refused_with_the_cau
     assert "ext4" in str(caught.value)
 
 
-def test_a_disk_that_syncs_no_folders_is_fine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_syncs_no_folders_is_fine(tmp_path, monkeypatch):
     sync = os.fsync
 
-    def only_files(descriptor: int) -> None:
+    def only_files(descriptor):
         if Path(f"/proc/self/fd/{descriptor}").is_dir():
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         sync(descriptor)
@@ -139,13 +132,11 @@ def test_a_disk_that_syncs_no_folders_is_fine(
     assert verify(store) == ()
 
 
-def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(tmp_path, monkeypatch):
     pieces = [b"ab", b"cd"]
 
     class Answer:
-        def stream(self) -> Iterator[bytes]:
+        def stream(self):
             return iter(pieces)
 
     monkeypatch.setattr(objects.obstore, "get", lambda *_: Answer())
@@ -156,7 +147,7 @@ def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
     blobs.download("a/b", tmp_path / "new")
     assert (tmp_path / "new").read_bytes() == b"abcd"
 
-    def broken(*_: object) -> None:
+    def broken(*_):
         raise OSError("connection reset")
 
     monkeypatch.setattr(objects.obstore, "get", broken)
@@ -165,7 +156,7 @@ def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
 
 
 @pytest.mark.parametrize("name", ["settings/project.yaml", "matches/m.json"])
-def test_a_file_below_a_folder_of_object_storage_has_a_mark(name: str) -> None:
+def test_a_file_below_a_folder_of_object_storage_has_a_mark(name):
     blobs = objects.ObjectBlobs("bucket", "")
     vars(blobs)["_s3"] = MemoryStore()
     assert blobs.marks([name]) == [0]

@@ -1,33 +1,38 @@
-"""Every damage is found and named (F15)."""
+"""Every damage is found and named; runs are numbered, locked, pinned and read."""
 
-from __future__ import annotations
-
+import json
+import os
+import shutil
+import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 from store_samples import (
+    PROCESSES,
     place,
     publish,
     run_once,
+    run_process,
     sample_recipe,
     sample_record,
     sample_registration,
 )
 
 from data_contracts.pin import Pin
-from worldpose.errors import CorruptionError
-from worldpose.store.documents import seal
-from worldpose.store.garbage import plan_gc
+from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.store.documents import canonical_json, digest, seal
+from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair, verify
 from worldpose.store.paths import ResultId
-from worldpose.store.runs import list_pins, pin_run
-from worldpose.store.store import Store
+from worldpose.store.runs import alone, list_pins, may_be_running, pin_run, unpin_run
+from worldpose.store.store import Store, open_run
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @pytest.fixture
-def full(folder_store: Store) -> Store:
+def full(folder_store):
     """A project with every kind of file in it."""
     store = folder_store
     store.register(sample_registration())
@@ -36,26 +41,25 @@ def full(folder_store: Store) -> Store:
     return store
 
 
-def all_paths(store: Store) -> list[str]:
+def all_paths(store):
     tops = ("results", "runs", "matches")
     return ["project.json", *(entry.path for top in tops for entry in store.blobs.entries(top))]
 
 
-def flip(store: Store, path: str, number: int) -> bytes:
+def flip(store, path, number):
     """Flips one bit of a file and returns what it was."""
     data = store.blobs.read(path)
-    assert data is not None
     flipped = bytearray(data)
     flipped[(number * 37) % len(data)] ^= 1 << (number % 8)
     store.blobs.put(path, bytes(flipped))
     return data
 
 
-def is_document(path: str) -> bool:
+def is_document(path):
     return not path.startswith("results/") or path.endswith("/manifest.json")
 
 
-def test_flipped_bits_in_all_data_are_found_in_one_go(full: Store) -> None:
+def test_flipped_bits_in_all_data_are_found_in_one_go(full):
     damaged = [path for path in all_paths(full) if not is_document(path)]
     assert len(damaged) > 20
     for number, path in enumerate(damaged):
@@ -65,7 +69,7 @@ def test_flipped_bits_in_all_data_are_found_in_one_go(full: Store) -> None:
     assert all(finding.path in finding.problem for finding in found)
 
 
-def test_flipped_bit_in_any_record_or_manifest_is_found_there(full: Store) -> None:
+def test_flipped_bit_in_any_record_or_manifest_is_found_there(full):
     damaged = [path for path in all_paths(full) if is_document(path)]
     # The project, two manifests, a run, a reservation and a registration.
     assert len(damaged) == 6
@@ -76,7 +80,7 @@ def test_flipped_bit_in_any_record_or_manifest_is_found_there(full: Store) -> No
     assert verify(full) == ()
 
 
-def test_foreign_file_is_found(full: Store) -> None:
+def test_foreign_file_is_found(full):
     foreign = [
         f"{ResultId(*place()).path}/joints/c/9/0/0",
         "results/final/tracking/stray",
@@ -92,7 +96,7 @@ def test_foreign_file_is_found(full: Store) -> None:
     assert repair(full, findings)[1] == (), "it is not ours to move"
 
 
-def test_foreign_files_break_no_reader(full: Store) -> None:
+def test_foreign_files_break_no_reader(full):
     """macOS and back-up programs put files of their own on shares."""
     names = (
         *("matches/.x.json", "matches/._final.json", "matches/a/b.json", "runs/.DS_Store"),
@@ -102,8 +106,7 @@ def test_foreign_files_break_no_reader(full: Store) -> None:
     )
     for path in names:
         full.blobs.put(path, b"{}")
-    assert full.matches() == ("final",)
-    assert full.runs("final") == ("0001",)
+    assert (full.matches(), full.runs("final")) == (("final",), ("0001",))
     assert full.run("final").run_id == "0001"
     assert [each.run_id for each in full.unfinished_runs("final")] == ["0002"]
     assert list_pins(full.blobs, "final") == ()
@@ -112,7 +115,7 @@ def test_foreign_files_break_no_reader(full: Store) -> None:
     assert full.reserve_run("final") == "0003"
 
 
-def test_repair_sets_damaged_records_aside_and_readers_go_on(full: Store) -> None:
+def test_repair_sets_damaged_records_aside_and_readers_go_on(full):
     run_once(full)
     pin_run(
         full.blobs, Pin(name="v1", match_id="final", run_id="0001", who="A", why="", pinned_at=NOW)
@@ -124,16 +127,14 @@ def test_repair_sets_damaged_records_aside_and_readers_go_on(full: Store) -> Non
     for read in (full.run, full.registration, full.unfinished_runs):
         with pytest.raises(CorruptionError, match="verify --repair"):
             read("final")
-    assert repair(full, verify(full)) == ((), tuple(damaged))
-    assert verify(full) == ()
-    assert full.run("final").run_id == "0001"
-    assert full.matches() == ()
+    assert (repair(full, verify(full)), verify(full)) == (((), tuple(damaged)), ())
+    assert (full.run("final").run_id, full.matches()) == ("0001", ())
     assert list_pins(full.blobs, "final") == ()
     assert len(full.blobs.read("runs/final/0003.json.damaged") or b"") == 40
     assert full.reserve_run("final") == "0004", "the number of a damaged run is not given again"
 
 
-def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
+def test_whole_file_in_a_wrong_place_is_found(folder_store):
     full = folder_store
     full.blobs.put("runs/final/0007.json", seal(sample_record("0008")))
     full.blobs.put("matches/semi.json", seal(sample_registration("final")))
@@ -143,7 +144,7 @@ def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
     ]
 
 
-def test_repair_withdraws_what_is_damaged_and_nothing_else(full: Store) -> None:
+def test_repair_withdraws_what_is_damaged_and_nothing_else(full):
     path = f"{ResultId(*place()).path}/joints/c/0/0/0"
     full.blobs.put(path, b"changed")
     assert repair(full, verify(full)) == ((ResultId(*place()),), ())
@@ -151,3 +152,146 @@ def test_repair_withdraws_what_is_damaged_and_nothing_else(full: Store) -> None:
     assert full.has(*place(sample_recipe("late")))
     publish(full)
     assert verify(full) == ()
+
+
+def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store):
+    store = folder_store
+    run_once(store)
+    assert store.reserve_run("final") == "0002"
+    assert store.run("final").run_id == "0001"
+    (unfinished,) = store.unfinished_runs("final")
+    assert (unfinished.run_id, unfinished.pid) == ("0002", os.getpid())
+    assert may_be_running(unfinished)
+    with pytest.raises(InputError, match="an unfinished run"):
+        store.run("final", "0002")
+
+
+def reserve_some(url, outcome):
+    store = Store.open(url)
+    outcome.put([store.reserve_run("final") for _ in range(4)])
+
+
+def hold_and_die(url, outcome):
+    with alone(Store.open(url).blobs, "a", wait=False) as is_held:
+        outcome.put(is_held)
+        time.sleep(60.0)
+
+
+def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store):
+    blobs, outcome = folder_store.blobs, PROCESSES.Queue()
+    other = PROCESSES.Process(target=hold_and_die, args=(folder_store.url, outcome))
+    other.start()
+    assert outcome.get(timeout=60)
+    with alone(blobs, "a", wait=False) as is_held, alone(blobs, "b", wait=False) as is_other:
+        assert (is_held, is_other) == (False, True)
+    other.kill()
+    other.join()
+    with alone(blobs, "a", wait=False) as is_held:
+        assert is_held
+    locks = Path(folder_store.url, "locks")
+    shutil.rmtree(locks)
+    locks.write_text("")  # as on a disk without locks
+    with alone(blobs, "a", wait=False) as is_held, alone(blobs, "a", wait=False) as is_second:
+        assert (is_held, is_second) == (True, False)
+
+
+def test_processes_get_different_numbers(store):
+    outcome = PROCESSES.Queue()
+    processes = [run_process(reserve_some, store.url, outcome) for _ in range(3)]
+    numbers = [number for _ in processes for number in outcome.get(timeout=60)]
+    for process in processes:
+        process.join(60)
+    assert sorted(numbers) == [f"{number:04d}" for number in range(1, 13)]
+    unfinished = store.unfinished_runs("final")
+    assert [may_be_running(run) for run in unfinished] == [False] * 12
+
+
+PLAN_NOW = timedelta(0)
+
+
+def pin(name, run_id="0001", why=""):
+    return Pin(
+        match_id="final", name=name, run_id=run_id, who="Ada", why=why, pinned_at=datetime.now(UTC)
+    )
+
+
+@pytest.fixture
+def two_runs(folder_store):
+    run_once(folder_store, sample_recipe("first"))
+    run_once(folder_store, sample_recipe("second"))
+    return folder_store
+
+
+def test_a_pinned_run_and_its_results_outlast_all_others(two_runs):
+    pin_run(two_runs.blobs, pin("paper"))
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    assert plan.garbage == ()
+    unpin_run(two_runs.blobs, "final", "paper")
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    assert {item.reason for item in plan.garbage} == {"run forgotten", "no kept run reaches it"}
+    collect(two_runs, plan)
+    assert two_runs.runs("final") == ("0002",)
+
+
+def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs):
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    pin_run(two_runs.blobs, pin("paper"))
+    with pytest.raises(StoreError, match="Make a new plan"):
+        collect(two_runs, plan)
+    assert two_runs.runs("final") == ("0001", "0002")
+
+
+def test_a_name_is_as_good_as_a_number(two_runs):
+    pin_run(two_runs.blobs, pin("paper"))
+    assert two_runs.run("final", "paper").run_id == "0001"
+    assert open_run(two_runs.url, "final", "paper").record.run_id == "0001"
+    with pytest.raises(InputError, match="no such run"):
+        two_runs.run("final", "other")
+
+
+def test_a_name_is_one_run_s_for_good(two_runs):
+    kept = pin_run(two_runs.blobs, pin("paper", why="first"))
+    assert pin_run(two_runs.blobs, pin("paper", why="again")) == kept
+    with pytest.raises(InputError, match="run 0001 pinned under"):
+        pin_run(two_runs.blobs, pin("paper", run_id="0002"))
+    pin_run(two_runs.blobs, pin("best", run_id="0001"))
+    assert [each.name for each in list_pins(two_runs.blobs, "final")] == ["best", "paper"]
+    with pytest.raises(InputError, match="best, paper"):
+        unpin_run(two_runs.blobs, "final", "other")
+
+
+def rewrite(store, path, change):
+    """A document as another version would have sealed it."""
+    fields = json.loads(store.blobs.read(path) or b"")
+    del fields["checksum"]
+    change(fields)
+    sealed = {**fields, "checksum": digest(canonical_json(fields))}
+    store.blobs.put(path, canonical_json(sealed) + b"\n")
+
+
+def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_store):
+    run_once(folder_store)
+    rewrite(folder_store, "project.json", lambda fields: fields.update(store_format="0"))
+    with pytest.raises(InputError, match=r"store_format.*expected '3', found '0'") as refused:
+        Store.open(folder_store.url)
+    assert "Use the version of worldpose that made the project" in str(refused.value)
+    with pytest.raises(InputError, match="store_format"):
+        Store.create(folder_store.url)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda fields: fields.update(mood="good"), "the unknown field mood"),
+        (lambda fields: fields.pop("usability"), "no field usability"),
+    ],
+)
+def test_a_run_that_another_version_recorded_is_refused_as_such(folder_store, change, found):
+    run_once(folder_store)
+    rewrite(folder_store, "runs/final/0001.json", change)
+    with pytest.raises(InputError, match=f"found {found}: another version") as refused:
+        folder_store.run("final")
+    assert "worldpose run FOLDER --project NEW" in str(refused.value)
+    # It is not damaged, but it is said.
+    (finding,) = verify(folder_store)
+    assert "another version" in finding.problem

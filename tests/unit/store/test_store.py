@@ -1,10 +1,6 @@
-from __future__ import annotations
-
 import errno
 import os
 import pickle
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,10 +30,9 @@ from worldpose.errors import (
 from worldpose.store.integrity import verify
 from worldpose.store.paths import ResultId
 from worldpose.store.store import Store
-from worldpose.store.writer import ResultWriter
 
 
-def test_result_comes_back_with_labels_units_and_conventions(store: Store) -> None:
+def test_result_comes_back_with_labels_units_and_conventions(store):
     with store.publish(sample_work(store)) as writer:
         writer.write(LAYOUT, all_sample_arrays(), sample_coordinates(), ATTRIBUTES)
         writer.figures["mean_views"] = 2.5
@@ -56,25 +51,24 @@ def test_result_comes_back_with_labels_units_and_conventions(store: Store) -> No
     assert "centre spot" in data.attrs["conventions"]["world"]
     assert data.attrs["detector"] == "none"
     assert (data.attrs["match"], data.attrs["stage"], data.attrs["unit"]) == place()[:3]
-    assert manifest is not None
     assert manifest.figures == {"mean_views": 2.5}
     assert manifest == store.manifest(*place())
 
 
-def test_unknown_result_is_a_store_error_that_says_what_to_run(store: Store) -> None:
+def test_unknown_result_is_a_store_error_that_says_what_to_run(store):
     assert not store.has(*place())
     with pytest.raises(StoreError, match="worldpose run final"):
         store.open_result(*place())
 
 
-def publish_together(url: str, barrier: object, outcome: object) -> None:
+def publish_together(url, barrier, outcome):
     store = Store.open(url)
-    barrier.wait(30)  # type: ignore[attr-defined]
+    barrier.wait(30)
     writer = publish(store, run_id=f"{os.getpid()}")
-    outcome.put(writer.manifest.content)  # type: ignore[attr-defined,union-attr]
+    outcome.put(writer.manifest.content)
 
 
-def test_many_writers_of_one_key_make_one_result(store: Store) -> None:
+def test_many_writers_of_one_key_make_one_result(store):
     barrier, outcome = PROCESSES.Barrier(4), PROCESSES.Queue()
     writers = [run_process(publish_together, store.url, barrier, outcome) for _ in range(4)]
     contents = {outcome.get(timeout=60) for _ in writers}
@@ -82,21 +76,19 @@ def test_many_writers_of_one_key_make_one_result(store: Store) -> None:
         writer.join(60)
         assert writer.exitcode == 0
     assert contents == {store.manifest(*place()).content}
-    assert verify(store) == ()
-    assert store.blobs.staged_entries() == []
+    assert (verify(store), store.blobs.staged_entries()) == ((), [])
 
 
-def test_manifest_of_another_result_is_corruption(folder_store: Store) -> None:
+def test_manifest_of_another_result_is_corruption(folder_store):
     publish(folder_store)
     other = sample_recipe("other")
     data = folder_store.blobs.read(ResultId(*place()).manifest_path)
-    assert data is not None
     folder_store.blobs.put(ResultId(*place(other)).manifest_path, data)
     with pytest.raises(CorruptionError, match="of another result"):
         folder_store.manifest(*place(other))
 
 
-def test_opening_no_project_says_how_to_make_one(url: str) -> None:
+def test_opening_no_project_says_how_to_make_one(url):
     with pytest.raises(InputError, match=r"no worldpose project at .*worldpose init"):
         Store.open(url)
 
@@ -111,13 +103,11 @@ def test_opening_no_project_says_how_to_make_one(url: str) -> None:
         ("pathlib.Path.open", errno.ENOSPC),
     ],
 )
-def test_failing_disk_is_a_store_error_and_a_retry_succeeds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str, code: int
-) -> None:
+def test_failing_disk_is_a_store_error_and_a_retry_succeeds(tmp_path, monkeypatch, failing, code):
     store = Store.create(tmp_path / "project")
     publish(store, sample_recipe("earlier"))
 
-    def fail(*_: object, **__: object) -> None:
+    def fail(*_, **__):
         raise OSError(code, os.strerror(code))
 
     with monkeypatch.context() as patch:
@@ -127,13 +117,12 @@ def test_failing_disk_is_a_store_error_and_a_retry_succeeds(
     assert str(tmp_path / "project") in str(caught.value)
     assert "Published results are unchanged" in str(caught.value)
     assert not store.has(*place())
-    assert verify(store) == ()
-    assert store.blobs.staged_entries() == []
+    assert (verify(store), store.blobs.staged_entries()) == ((), [])
     publish(store)
     assert verify(store) == ()
 
 
-def test_absent_bucket_is_a_store_error_that_names_it(bucket: str) -> None:
+def test_absent_bucket_is_a_store_error_that_names_it(bucket):
     with pytest.raises(StoreError, match=r"s3://nowhere/project\.json.*AWS_ENDPOINT_URL"):
         Store.create("s3://nowhere")
     with pytest.raises(InputError, match="no bucket"):
@@ -142,11 +131,10 @@ def test_absent_bucket_is_a_store_error_that_names_it(bucket: str) -> None:
         Store.open("gs://elsewhere/project")
 
 
-def test_run_gives_its_results_by_unit(store: Store) -> None:
+def test_run_gives_its_results_by_unit(store):
     run_once(store, sample_recipe("late"), sample_recipe())
     run = worldpose.open_run(store.url, "final")
-    assert list(run) == ["tracking/clip", "tracking/late"]
-    assert len(run) == 2
+    assert (list(run), len(run)) == (["tracking/clip", "tracking/late"], 2)
     assert run.record.run_id == "0001"
     assert "tracking/clip" in run
     np.testing.assert_array_equal(run["tracking/clip"].joints, sample_arrays()["joints"])
@@ -155,16 +143,16 @@ def test_run_gives_its_results_by_unit(store: Store) -> None:
     assert "tracking/late" in repr(run)
 
 
-def write_sample(writer: ResultWriter) -> None:
+def write_sample(writer):
     writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
 
 
-def write_twice(writer: ResultWriter) -> None:
+def write_twice(writer):
     write_sample(writer)
     write_sample(writer)
 
 
-def write_no_number(writer: ResultWriter) -> None:
+def write_no_number(writer):
     write_sample(writer)
     writer.figures["error_px"] = float("nan")
 
@@ -178,21 +166,18 @@ def write_no_number(writer: ResultWriter) -> None:
         ({"recipe": sample_recipe("other")}, write_sample, InputError, "of its recipe"),
     ],
 )
-def test_work_that_breaks_the_rules_is_not_published(
-    folder_store: Store, change: Any, write: Any, error: Any, told: str
-) -> None:
+def test_work_that_breaks_the_rules_is_not_published(folder_store, change, write, error, told):
     work = sample_work(folder_store).model_copy(update=change)
     with pytest.raises(error, match=told), folder_store.publish(work) as writer:
         write(writer)
     assert folder_store.results() == ()
 
 
-def test_a_key_is_computed_once_and_other_bytes_are_an_error(store: Store, tmp_path: Path) -> None:
+def test_a_key_is_computed_once_and_other_bytes_are_an_error(store, tmp_path):
     twin = Store.create(tmp_path / "twin")
     first = publish(store, run_id="0001").manifest
-    assert first is not None
     assert publish(store, run_id="0002").manifest == first
-    assert publish(twin).manifest.content == first.content  # type: ignore[union-attr]
+    assert publish(twin).manifest.content == first.content
     # 40 frames of 72 bytes in chunks of at least 512 bytes: 8 frames each, two chunks in a file;
     # views are all zero, and written nevertheless.
     files = [file.path for file in first.files]
@@ -209,11 +194,10 @@ def test_a_key_is_computed_once_and_other_bytes_are_an_error(store: Store, tmp_p
     assert pickle.loads(pickle.dumps(store)).has(*place())
 
 
-def test_lost_or_changed_chunk_is_corruption_and_never_a_fill_value(store: Store) -> None:
+def test_lost_or_changed_chunk_is_corruption_and_never_a_fill_value(store):
     publish(store)
     path = f"{ResultId(*place()).path}/joints/c/1/0/0"
     data = store.blobs.read(path)
-    assert data is not None
     # Frames 16 to 23 and 24 to 31, then the index of places and sizes with its CRC-32C.
     (_, second), (start, _) = np.frombuffer(data[-36:-4], "<u8").reshape(2, 2).tolist()
     assert start == second
@@ -237,9 +221,7 @@ def test_lost_or_changed_chunk_is_corruption_and_never_a_fill_value(store: Store
 BAD = ["", "/", "/etc/passwd", "..", "a/../b", "a/..", "./a", "a//b", "a/", "a\0b", "a\nb", "a\\b"]
 
 
-def test_path_that_could_leave_the_project_is_refused_by_every_method(
-    store: Store, tmp_path: Path
-) -> None:
+def test_path_that_could_leave_the_project_is_refused_by_every_method(store, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     blobs = store.blobs
     for path in BAD:
@@ -258,6 +240,6 @@ def test_path_that_could_leave_the_project_is_refused_by_every_method(
 
 
 @pytest.mark.parametrize("key", ["", "0" * 31, "0" * 33, "G" * 32, "A" * 32, "../" + "0" * 29])
-def test_key_that_is_no_key_is_refused(key: str) -> None:
+def test_key_that_is_no_key_is_refused(key):
     with pytest.raises(InputError, match="32 lower-case"):
         ResultId("final", "tracking", "clip", key)

@@ -1,7 +1,5 @@
 """Cameras on a ring round the origin, standing people, and what the cameras see of them."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
@@ -20,10 +18,10 @@ SKELETON = np.array(
 
 
 @pytest.fixture
-def ring() -> Callable[[int], Camera]:
+def ring():
     """Cameras 30 m from the origin, 6 to 9 m up, looking at it with 1500 px focal length."""
 
-    def build(count: int) -> Camera:
+    def build(count):
         cameras = []
         for n in range(count):
             angle = 2 * np.pi * (n + 0.3) / count
@@ -38,10 +36,10 @@ def ring() -> Callable[[int], Camera]:
 
 
 @pytest.fixture
-def people() -> Callable[[np.ndarray], np.ndarray]:
+def people():
     """Joints (..., 17, 3) of people who stand upright at ground places (..., 2)."""
 
-    def build(places: np.ndarray) -> np.ndarray:
+    def build(places):
         places = np.asarray(places, dtype=float)
         ground = np.concatenate([places, np.zeros((*places.shape[:-1], 1))], axis=-1)
         return SKELETON + ground[..., None, :]
@@ -50,10 +48,10 @@ def people() -> Callable[[np.ndarray], np.ndarray]:
 
 
 @pytest.fixture
-def seen() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+def seen():
     """Keypoints and confidence of people (frames, persons, 17, 3): detection n is person n."""
 
-    def build(camera: Camera, joints: np.ndarray, noise: float = 1.0, seed: int = 0):
+    def build(camera, joints, noise=1.0, seed=0):
         frames, persons = joints.shape[:2]
         image = camera.project(joints.reshape(frames, 1, persons * 17, 3))
         keypoints = image.reshape(frames, -1, persons, 17, 2)

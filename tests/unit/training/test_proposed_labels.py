@@ -14,6 +14,8 @@ from worldpose.training.labels import read_labels
 class Brightness:
     """Sees one person, whose keypoints say how bright the image is."""
 
+    view_size = None
+
     def detect(self, pictures):
         return [People(np.array([[1.0, 1.0, 9.0, 19.0]]), np.array([0.9])) for _ in pictures]
 
@@ -44,3 +46,18 @@ def test_a_folder_of_images_is_labelled_as_a_video_is(tmp_path):
     names = [f"{camera}_{number:06d}.png" for camera in ("cam00", "cam01") for number in (0, 2, 4)]
     assert [picture.path.name for picture in found] == names
     assert [picture.keypoints[0, 0, 0] for picture in found] == [0.0, 20.0, 40.0] * 2
+
+
+def test_a_detector_with_a_fixed_size_gets_views_of_the_frame(tmp_path, monkeypatch):
+    class Views(Brightness):
+        view_size = (12, 10)
+
+        def detect(self, pictures):
+            assert {picture.shape for picture in pictures} == {(10, 12, 3)}
+            return [People(np.array([[4.0, 4.0, 6.0, 8.0]]), np.array([0.9]))] * len(pictures)
+
+    monkeypatch.setattr(labels, "load_detectors", lambda settings: [Views()])
+    settings = DetectionSettings(zooms=(0.5,))  # the whole frame alone
+    labels.propose_labels([images(tmp_path / "cam00")], 5, tmp_path / "labels", settings)
+    (found,) = read_labels(tmp_path / "labels" / "labels.json")
+    np.testing.assert_allclose(found.boxes, [[8.5, 8.5, 12.5, 16.5]])

@@ -1,7 +1,5 @@
 """Cameras on a ring round the origin, and views of known joints."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
@@ -10,10 +8,10 @@ from worldpose.geometry.cameras import Camera
 
 
 @pytest.fixture
-def ring() -> Callable[..., Camera]:
+def ring():
     """Cameras 30 m from the origin, 8 m up, 1500 px focal length, with distortion."""
 
-    def build(count: int, arc: float = 2 * np.pi) -> Camera:
+    def build(count, arc=2 * np.pi):
         cameras = []
         for n in range(count):
             angle = arc * n / count
@@ -31,10 +29,10 @@ def ring() -> Callable[..., Camera]:
 
 
 @pytest.fixture
-def seen() -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def seen():
     """Keypoints, confidence and detection index of joints (frames, persons, joints, 3)."""
 
-    def build(camera: Camera, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def build(camera, joints):
         frames, persons, count, _ = joints.shape
         image = camera.project(joints.reshape(frames, 1, persons * count, 3))
         keypoints = image.reshape(frames, -1, persons, count, 2)

@@ -3,7 +3,6 @@
 import numpy as np
 
 from data_contracts.conventions import COCO17
-from worldpose.geometry.cameras import Camera
 
 FPS = 50.0
 MIRRORED = [
@@ -17,7 +16,7 @@ SWINGING = np.array([0, 0, 0, 0, 0, 1, 2, 1, 2, 1, 2, 3, 4, 3, 4, 3, 4])
 """Which part of the body a joint swings with: head, arms, legs. Limbs stay as long as they are."""
 
 
-def runner(frames: int, persons: int = 2, seed: int = 0) -> np.ndarray:
+def runner(frames, persons=2, seed=0):
     """Joints (frames, persons, 17, 3) [m] on circles, limbs swinging at 2 Hz."""
     rng = np.random.default_rng(seed)
     body = rng.uniform([-0.25, -0.25, 0.0], [0.25, 0.25, 1.8], (persons, 17, 3))
@@ -30,9 +29,7 @@ def runner(frames: int, persons: int = 2, seed: int = 0) -> np.ndarray:
     return body + way[:, :, None] + swing[..., None] * [1.0, 0.5, 0.2]
 
 
-def detections(
-    camera: Camera, joints: np.ndarray, noise: float, seed: int = 1
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def detections(camera, joints, noise, seed=1):
     """Keypoints with white noise [px], confidence 1 and the index of every person."""
     frames, persons, count, _ = joints.shape
     image = camera.project(joints.reshape(frames, 1, persons * count, 3))

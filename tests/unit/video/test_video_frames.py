@@ -1,5 +1,6 @@
-"""Frames come back by their number, whatever the container does with times."""
+"""Frames of videos by number, and videos that are broken, turned or of another rate."""
 
+import struct
 from fractions import Fraction
 
 import av
@@ -7,7 +8,9 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
+from worldpose.ingest.footage import write_still
 from worldpose.video.files import VideoReader, index_frames, write_video
+from worldpose.video.folder import index_video, open_video, pictures_at
 from worldpose.video.pictures import FrameIndex
 
 SIZE = (48, 64)
@@ -23,6 +26,13 @@ def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
     assert write_video(path, numbered(55), 25.0, quality=5) == 55
     return path
+
+
+def test_each_number_has_its_frame_also_where_numbers_repeat_and_go_back(clip):
+    numbers = np.array([-1, 10, 10, 11, 12, -1, 8, 9, 9, 30])
+    with VideoReader(clip) as video:
+        shown = list(pictures_at(video, numbers))
+    assert [-1 if one is None else round((one.mean() - 10) / 4) for one in shown] == list(numbers)
 
 
 def test_frames_beyond_the_end_are_refused(clip):
@@ -166,3 +176,192 @@ def test_a_video_without_two_equal_steps_is_refused_because_its_rate_varies():
     index = FrameIndex(stamps, np.ones(9, bool), Fraction(1, 1000), SIZE[::-1])
     with pytest.raises(InputError, match=r"rate that varies: images are 0\.02 to 0\.11 s apart"):
         index.on_clock(round(index.fps, 3), "phone.mp4")
+
+
+def video_of_numbers(count):
+    """Grey images whose left half tells their number in steps of 4, the codec's error below 2."""
+    pictures = np.full((count, *SIZE, 3), 128, dtype=np.uint8)
+    pictures[:, :, :32] = (10 + 4 * np.arange(count, dtype=np.uint8))[:, None, None, None]
+    return pictures
+
+
+def number_of(picture):
+    return round((float(picture[4:40, 4:28].mean()) - 10.0) / 4.0)
+
+
+def encode(path, stamps, *, rotation=None, container_options=None):
+    """H.264 with B-frames and a key frame every 10, shown at `stamps` [ms]."""
+    with av.open(str(path), "w", options=container_options or {}) as container:
+        options = {"crf": "5", "bf": "2", "g": "10", "sc_threshold": "0"}
+        stream = container.add_stream("libx264", rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        if rotation is not None:
+            stream.set_display_rotation(rotation)
+        for picture, stamp in zip(video_of_numbers(len(stamps)), stamps, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = int(stamp), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def numbers_read(path, start=0, stop=None):
+    with open_video(path) as video:
+        return [
+            (number, None if picture is None else number_of(picture))
+            for number, picture in video.readable(start, stop)
+        ]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        ((-1, 0, 0, 1), "a display matrix that mirrors them"),
+        ((0, 1, 1, 0), "a display matrix that mirrors them"),
+        ((0.996, 0.087, -0.087, 0.996), "turns them by 5 degrees"),
+        ((0, 0, 0, 0), "an empty display matrix"),
+    ],
+)
+def test_a_display_matrix_that_is_no_quarter_turn_is_refused(tmp_path, matrix, said):
+    path = encode(tmp_path / "turned.mp4", 40 * np.arange(4), rotation=90)
+    content, one = bytearray(path.read_bytes()), 1 << 16
+    place = content.index(b"tkhd") + 44  # of the matrix in this box of version 0
+    a, b, c, d = (round(each * one) for each in matrix)
+    content[place : place + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        index_video(path)
+
+
+@pytest.mark.parametrize("rotation", [90, 180, 270])
+def test_a_turned_camera_s_pictures_stand_upright(tmp_path, rotation):
+    path = encode(tmp_path / "turned.mp4", 40 * np.arange(12), rotation=rotation)
+    with open_video(path) as video:
+        pictures = [picture for _, picture in video.readable()]
+    upright = np.rot90(video_of_numbers(12)[7], round(rotation / 90))
+    assert pictures[7].shape == upright.shape
+    assert video.index.size == upright.shape[1::-1]
+    assert np.abs(pictures[7].astype(int) - upright).mean() < 3.0  # the codec's error
+
+
+def test_a_file_cut_off_ends_early_and_says_where(tmp_path):
+    whole = encode(
+        tmp_path / "whole.mp4", 40 * np.arange(50), container_options={"movflags": "faststart"}
+    )
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(whole.read_bytes()[: int(0.7 * whole.stat().st_size)])
+    read = numbers_read(cut)
+    good = [number for number, found in read if found is not None]
+    assert 10 <= len(good) < 50
+    assert all(found == number for number, found in read if found is not None)
+    # Complete data on disk is read: only the rest of the last group before the cut is lost.
+    assert good[: len(good) // 10 * 10] == list(range(len(good) // 10 * 10))
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("ts", "mpeg2video"), ("mp4", "libx264")])
+def test_a_video_that_begins_before_its_first_key_frame_is_read_from_there(tmp_path, suffix, codec):
+    options = {"bf": "2", "g": "12", "qmax": "2", "sc_threshold": "1000000000"}
+    whole, cut = tmp_path / f"whole.{suffix}", tmp_path / f"cut.{suffix}"
+    with av.open(str(whole), "w") as target:
+        stream = target.add_stream(codec, rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        for n, picture in enumerate(video_of_numbers(36)):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = n, Fraction(1, 25)
+            target.mux(stream.encode(frame))
+        target.mux(stream.encode(None))
+    with av.open(str(whole)) as source:
+        packets = [packet for packet in source.demux(video=0) if packet.size]
+        keys = [n for n, packet in enumerate(packets) if packet.is_keyframe]
+        # The second group of MPEG-2 is open: its first pictures in order are before its key frame.
+        begin = keys[1] if suffix == "ts" else keys[1] - 3
+        with av.open(str(cut), "w") as target:
+            stream = target.add_stream_from_template(source.streams.video[0])
+            for packet in packets[begin:]:
+                packet.stream = stream
+                target.mux(packet)
+    read = [number for _, number in numbers_read(cut)]
+    assert 24 < len(read) <= 28
+    assert read[-24:] == list(range(12, 36))
+
+
+def test_several_streams_of_video_are_refused(tmp_path):
+    with av.open(str(tmp_path / "two.mov"), "w") as target:
+        streams = [target.add_stream("mpeg4", rate=25) for _ in range(2)]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        for stream in streams:
+            target.mux(
+                stream.encode(av.VideoFrame.from_ndarray(video_of_numbers(1)[0], format="rgb24"))
+            )
+            target.mux(stream.encode(None))
+    with pytest.raises(
+        InputError, match="one video stream, found stream 0 of 64 x 48 px, stream 1"
+    ):
+        index_video(tmp_path / "two.mov")
+
+
+def test_a_damaged_stretch_is_missing_up_to_the_next_key_frame(tmp_path):
+    path = encode(tmp_path / "damaged.mp4", 40 * np.arange(50))
+    with av.open(str(path)) as container:
+        places = [p.pos for p in container.demux(video=0) if p.size and p.is_keyframe]
+    content = bytearray(path.read_bytes())
+    content[places[1] + 12 : places[1] + 72] = bytes(60)  # in the group of frames 10 to 19
+    path.write_bytes(content)
+    read = dict(numbers_read(path))
+    assert [read[n] for n in range(10)] == list(range(10))
+    assert [read[n] for n in range(10, 20)] == [None] * 10
+    assert [read[n] for n in range(20, 50)] == list(range(20, 50))
+    for start in (13, 16, 19):  # the same where reading begins after the damage
+        assert numbers_read(path, start, 22) == [(n, read[n]) for n in range(start, 22)]
+
+
+def test_images_count_by_their_numbers_and_a_gap_is_a_missing_frame(tmp_path):
+    for number in (7, 8, 10):
+        write_still(tmp_path / f"frame_{number:03d}.png", video_of_numbers(11)[number])
+    assert index_video(tmp_path).on_clock(25.0, "images").tolist() == [0, 1, -1, 2]
+    assert numbers_read(tmp_path) == [(0, 7), (1, 8), (2, 10)]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["first"], "end in numbers"),
+        (["9" * 40], "at most 18 digits"),
+        # One odd number does not fill the memory.
+        (["0", "2000000000"], "2000000000 frames after the first"),
+    ],
+)
+def test_images_whose_names_do_not_number_them_are_refused(tmp_path, names, message):
+    for name in names:
+        write_still(tmp_path / f"{name}.png", video_of_numbers(1)[0])
+    with pytest.raises(InputError, match=message):
+        index_video(tmp_path).on_clock(25.0, "images")
+
+
+def write_lie(path, size, told):
+    """Write one PNG image of a size in a MOV file whose header tells another."""
+    with av.open(str(path), "w") as target:
+        stream = target.add_stream("png", rate=25)
+        stream.width, stream.height = size
+        stream.pix_fmt = "gray"
+        for packet in (*stream.encode(av.VideoFrame(*size, "gray")), *stream.encode(None)):
+            target.mux(packet)
+    content = path.read_bytes()
+    at, ends = content.rindex(b"moov"), [struct.pack(">HH", *each) for each in (size, told)]
+    path.write_bytes(content[:at] + content[at:].replace(*ends))
+
+
+@pytest.mark.parametrize("told", [(12000, 12000), (64, 64)])
+def test_too_many_pixels_are_refused_before_they_are_decoded(told, tmp_path):
+    write_lie(tmp_path / "huge.mov", (12000, 12000), told)
+    with pytest.raises(InputError, match="more than 100,000,000 pixels"):
+        index_video(tmp_path / "huge.mov")
+
+
+def test_a_list_of_other_files_is_no_video(tmp_path):
+    write_lie(tmp_path / "other.mov", (64, 64), (64, 64))
+    (tmp_path / "video.mp4").write_text("ffconcat version 1.0\nfile other.mov\n")
+    with pytest.raises(InputError, match="a list of other files"):
+        index_video(tmp_path / "video.mp4")

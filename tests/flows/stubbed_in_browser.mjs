@@ -1,0 +1,220 @@
+// The pages at a server whose answers are stubs: slow, refusing, or of another run; prints what it saw as one JSON object.
+
+import { readFileSync } from "node:fs";
+import { open, task, tell } from "../chromium.mjs";
+
+const seen = { errors: [], outside: [] };
+const KINDS = { html: "text/html", js: "text/javascript", css: "text/css" };
+const at = "2026-01-01T00:00:00Z";
+const wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
+let page = null;
+
+// A page with `answer` as its server: content, or [status, content].
+async function at_server(place, answer) {
+  await page?.close();
+  page = await open({ errors: [], outside: [] }); // refusals are errors on the console
+  page.setDefaultTimeout(10000);
+  page.on("pageerror", (error) => seen.errors.push(error.message));
+  await page.route("**/*", async (route) => {
+    const { pathname, search } = new URL(route.request().url());
+    if (!pathname.startsWith("/api/")) {
+      const file = pathname === "/" ? "/index.html" : pathname;
+      return route.fulfill({ body: readFileSync(task.static + file), contentType: KINDS[file.split(".").pop()] });
+    }
+    const given = (await answer(pathname, search, route.request().postDataJSON(), route.request().headers())) ?? (pathname.includes("/detections/") ? [404, {}] : {});
+    const [status, content] = Array.isArray(given) && typeof given[0] === "number" ? given : [200, given];
+    return route.fulfill({ status, contentType: "application/json", body: JSON.stringify(content) }).catch(() => {});
+  });
+  await page.goto(`http://127.0.0.1:9/#/${place}`);
+}
+
+const session = { who: "Ada", role: "approver", form_secret: "one", project: "p", takes_files: true };
+const question = (k) => ({
+  id: `q${k}`, unit: `bundle_adjustment/part${k}`, excess: 9 - k, state: "waits", question: "Good?", said: [], consequences: {}, figures: {},
+  reasons: [], created_at: at, decision: null, gate: "bundle_adjustment",
+});
+const matchOf = (run, reviews) => ({
+  match: "final", is_unseen: false, problem: null, damage: [], has_image: true, corrections: 0, first_clicks: 0, stale: 0, at_work: null,
+  run: { id: run, state: "complete", finished_at: at, gates: "auto", usability: { verdict: "good", reservations: [] }, failed: 0 },
+  waiting: reviews.filter((each) => each.state === "waits").map(({ id, unit }) => ({ id, unit, rejected: false })), reviews, to_click: [], groups: [],
+  state: { name: "ready", words: "ready", why: "", todo: "", seconds: null, units: {} },
+  cameras: ["north", "south"].map((id) => ({ id, given: true, clicks: 0, has_picture: false, figures: {} })),
+  clips: [{ id: "half", first_frame: 100, frame_count: 200, cameras: ["north"], has_video: false, key_frames: [], pick_next: [], has_tracks: true }],
+  failures: [], stages: [], next_versions: [], left_out: {}, warnings: [],
+});
+const resultsOf = (run) => ({
+  run, state: "complete", later: "", formats: ["csv", "usd", "c3d"], purposes: { csv: "", usd: "", c3d: "" },
+  clips: [{ id: "half", video: null, without_joints: null }],
+});
+const trackOf = (id, name) => ({ id, name, seen: { north: 1 }, segments: [[100, 299]], views: 2, way: [[0, 0]] });
+
+// A new run while the page is open; two names at once; two downloads at once.
+async function showNewRun() {
+  let [run, slow] = ["0001", 0];
+  const [asked, names, sent, written] = [[], {}, [], []];
+  await at_server("match/final", async (path, search, body) => {
+    if (path.includes("/scenes/")) asked.push(search);
+    if (path.includes("/scenes/")) return [500, { error: "stub" }];
+    if (path.includes("/exports/")) written.push(`${path.split("/").at(-1)}${search}`);
+    if (path.includes("/exports/")) await wait(0.5);
+    if (path === "/api/session") return session;
+    if (path === "/api/matches/final") return matchOf(run, []);
+    if (path.endsWith("/results")) return resultsOf(run);
+    if (path.endsWith("/metrics")) return { metrics: [{ kind: "camera", name: "north", values: { "x clicks_wrong": Number(run) } }], names: {}, before: null, problem: "", changes: [], unchanged: 0 };
+    if (path.endsWith("/offsets")) return body ? {} : { clip: "half", cameras: [], changed: { south: Number(run) }, warning: "" };
+    if (path.endsWith("/runs")) return [];
+    if (path.endsWith("/corrections")) {
+      const { edit } = body.edits[0];
+      sent.push(edit.name);
+      names[edit.person] = edit.name;
+    }
+    if (!path.includes("/identities/")) return null;
+    await wait(slow);
+    return { clip: "half", fps: 25, first_frame: 100, frame_count: 200, step: 1, pitch: null, roster: [], events: [], has_video: false, joins: [], people: [7, 8].map((id) => trackOf(id, names[id] ?? null)) };
+  });
+  await page.click("summary >> text=Metrics per camera");
+  await page.click("summary >> text=Clocks of the cameras");
+  await page.click("[data-apply]");
+  const look = async () => [
+    (await page.locator('[data-metrics="camera"] tbody').innerText()).trim(), await page.locator("[data-clocks] img").getAttribute("src"),
+    await page.locator("[data-clocks] [role=status]").count(),
+  ];
+  await page.waitForSelector("[data-clocks] [role=status]");
+  seen.before = await look();
+  run = "0002";
+  await page.waitForSelector("[data-apply]").catch(() => {});
+  await wait(1);
+  seen.after = await look();
+  seen.scenes = [...new Set(asked)];
+  for (const form of ["usd", "c3d"]) await page.click(`[data-downloads] a >> text=${form}`);
+  await wait(3);
+  seen.written = [...new Set(written)];
+  slow = 1;
+  for (const [id, name] of [[7, "kane"], [8, "rice"]]) {
+    await page.dblclick(`[data-person="${id}"]`);
+    await page.fill('input[aria-label="Name"]', name);
+    await page.keyboard.press("Enter");
+  }
+  await wait(4);
+  seen.names = sent;
+}
+
+const held = async (key, count) => {
+  for (let k = 0; k < count; k++) {
+    await page.keyboard.down(key);
+    await wait(0.15);
+  }
+  await page.keyboard.up(key);
+};
+
+// A question whose evidence comes at the second request, with a long curve, and whose video cannot be drawn; held keys.
+async function ask() {
+  let reviews = [1, 2, 3, 4].map(question);
+  let isThere = false;
+  const [decided, removed] = [[], []];
+  await at_server("match/final?review=q1", (path, search, body) => {
+    if (path === "/api/session") return session;
+    if (path === "/api/matches/final") return matchOf("0001", reviews);
+    if (path.endsWith("/results")) return { ...resultsOf("0001"), clips: [] };
+    if (path.endsWith("/runs")) return [];
+    if (path.endsWith("/video")) return [422, { error: "the video is damaged" }];
+    if (path.endsWith("/outliers")) return [1, 2, 3, 4, 5].map((k) => ({ surprise: 9, of: "click", out: removed.includes(k), edit: { kind: "moved_point", camera: "north", frame: k, marking: `point${k}`, xy: null } }));
+    if (path.endsWith("/evidence") && !isThere) return [500, { error: "no memory" }];
+    if (path.endsWith("/evidence")) {
+      const curves = [{ title: "error", values: Array(135000).fill(0.5) }];
+      return { pictures: [], tables: [{ title: "Joins", columns: ["a"], rows: [["one"]] }], curves, first_frame: 0, frames_per_value: 1, video: "north", clicked: [] };
+    }
+    if (path.endsWith("/corrections")) removed.push(body.edits[0].edit.frame);
+    if (path.endsWith("/decisions")) {
+      decided.push(...body.reviews);
+      reviews = reviews.map((each) => (body.reviews.includes(each.id) ? { ...each, state: "approve", decision: { verdict: "approve", who: "Ada", why: "", decided_at: at } } : each));
+    }
+    return null;
+  });
+  const evidence = page.locator("article.open .evidence");
+  await evidence.locator(".note >> text=no memory").waitFor();
+  isThere = true;
+  await evidence.locator("button >> text=Try again").click();
+  await evidence.locator("[data-outlier]").first().waitFor();
+  seen.curves = await evidence.locator("polyline").count();
+  await page.click("article.open .question");
+  await page.keyboard.press("v");
+  await evidence.locator(".note >> text=the video is damaged").waitFor();
+  seen.tables = await evidence.locator("h3 >> text=Joins").count();
+  await held("x", 5);
+  await held("ArrowDown", 3);
+  seen.row = await evidence.locator("tr.chosen").getAttribute("data-outlier");
+  await held("a", 5);
+  await wait(0.5);
+  Object.assign(seen, { removed, decided });
+}
+
+// Clicks: one behind the camera, and one after the same, then another person has logged in elsewhere.
+async function click() {
+  const [kept, refined] = [[], []];
+  let now = session;
+  const pitch = { length: 105, width: 68, points: { near: [-52.5, -34, 0], far: [-52.5, 34, 0] }, markings: {} };
+  const camera = { camera: { center: [0, -40, 8], focal: 1400 }, markings: {}, points: {}, drawn: [], wrong: ["far"], reasons: [], add_next: [], median: 0.1, p95: 0.2, limit: 0.15 };
+  const residuals = [{ name: "far", residual: null, surprise: null, inlier: false }, { name: "near", residual: [1, 1], surprise: 1, inlier: true }];
+  await at_server("picture/final/north", (path, search, body, headers) => {
+    if (path === "/api/session") return now;
+    if (body && headers["x-form-secret"] !== now.form_secret) return [403, { error: "the page is of another session: load it again" }];
+    if (path.endsWith("/preview")) return { ...camera, residuals };
+    if (path.endsWith("/corrections")) kept.push(body.edits.length);
+    if (path.endsWith("/north")) return { match: "final", owner: "north", frame: null, given: false, side: null, has_picture: false, size: [1920, 1080], pitch, points: { near: [200, 300], far: [900, 300] }, drawn: {}, figures: {}, reviews: [], cameras: ["north"], key_frames: [] };
+    return null;
+  });
+  await page.locator(".figures dl").waitFor();
+  seen.drawn = await page.locator(".figures .note.bad").count();
+  const state = async () => {
+    await page.keyboard.press("ArrowRight"); // moves the click
+    await wait(2);
+    return page.locator("[data-state]").getAttribute("data-state");
+  };
+  await page.locator("tbody tr").first().click();
+  now = { ...session, form_secret: "two" };
+  seen.same = await state();
+  now = { ...session, who: "Bob", form_secret: "three" };
+  seen.other = await state();
+  seen.kept = kept.length;
+}
+
+// An image that the server refuses.
+async function refuse() {
+  await at_server("picture/final/north", (path) => {
+    if (path === "/api/session") return session;
+    return path.endsWith("/image") ? [422, { error: "north.png: expected a PNG image, found damaged bytes" }] : { has_picture: true };
+  });
+  seen.refused = await page.locator("main [role=alert]").innerText();
+}
+
+// Arrow keys in a camera whose clips are not in rising order; the other cameras cannot be asked.
+async function step() {
+  await at_server("match/final", (path, search) => {
+    if (path === "/api/session") return session;
+    if (path === "/api/matches/final") return matchOf("0001", []);
+    if (path.endsWith("/results")) return { ...resultsOf("0001"), clips: [] };
+    if (path.endsWith("/runs")) return [];
+    if (path.endsWith("/queue")) return { left: 0, people: 1, next: [] };
+    if (path.endsWith("/views")) return [422, { error: "no calibration of south" }];
+    if (!path.endsWith("/detections/north")) return [404, {}];
+    const frame = Number(new URLSearchParams(search).get("frame") ?? 150);
+    const people = [{ detection: 0, box: [10, 10, 50, 90], score: 1, keypoints: [[30, 30]], confidence: [1] }];
+    return { frame, frames: [[200, 299], [100, 199]], size: [100, 100], has_picture: false, joints: ["nose"], bones: [], free: 1, note: "", cameras: ["north"], people };
+  });
+  await page.click("[data-edit]");
+  await page.locator("aside h2").click();
+  await page.keyboard.press("ArrowRight");
+  await page.locator("aside h2 >> text=frame 151").waitFor({ timeout: 3000 }).catch(() => {});
+  seen.frame = await page.locator("aside h2").innerText();
+  await page.locator("aside > table tbody tr").click();
+  await page.locator("aside [role=alert]").waitFor({ timeout: 3000 }).catch(() => {});
+  seen.views = await page.locator("aside [role=alert]").allInnerTexts();
+}
+
+await showNewRun();
+await ask();
+await click();
+await refuse();
+await step();
+await tell(seen);
