@@ -36,10 +36,10 @@ MIN_SIZE: Final = {
     ("clock", "drift"): 0.4,
     ("clock", "step"): 0.6,
     ("view", "drift"): 5e-4,
-    ("view", "step"): 1e-3,
+    ("view", "step"): 2e-3,
 }
 """Least size of a part: of a clock [frame], as a recorder loses whole frames, and the errors that
-views share differ between the ends of a clip; of a view [rad], where 0.001 is 1 to 3 pixels."""
+views share differ between the ends of a clip; of a view [rad], where 0.002 is a tenth of a degree."""
 MAX_VIEW: Final = np.array([0.2, 0.2, 0.2, 0.1])
 """Most that a view moves: rotation [rad] and growth [1]. People who agree nowhere show more."""
 MIN_GAIN: Final[dict[Kind, float]] = {"clock": 30.0, "view": 60.0}
