@@ -39,7 +39,7 @@ MIN_SIZE: Final = {
     ("view", "step"): 2e-3,
 }
 """Least size of a part: of a clock [frame], as a recorder loses whole frames, and the errors that
-views share differ between the ends of a clip; of a view [rad], where 0.002 is a tenth of a degree."""
+views share differ between the ends of a clip; of a view [rad], a tenth of a degree."""
 MAX_VIEW: Final = np.array([0.2, 0.2, 0.2, 0.1])
 """Most that a view moves: rotation [rad] and growth [1]. People who agree nowhere show more."""
 MIN_GAIN: Final[dict[Kind, float]] = {"clock": 30.0, "view": 60.0}
