@@ -149,16 +149,33 @@ class ChangeSums:
 
     def noise(self) -> Noise:
         """Return the noise by kind, and whether for drifts."""
-        noise: Noise = {}
-        for kind, unknowns in UNKNOWNS.items():
-            usual = float(chi2.median(len(unknowns)))
-            steps = [_median(self.steps(c, kind)) for c in range(self.cameras)]
-            bends = [_median(self.bends(c, kind)) for c in range(self.cameras)]
-            own = np.maximum(1.0, np.array(steps) / usual)
-            noise[kind, False] = np.maximum(own, np.median(own))
-            # A clip has few long blocks: those of all cameras tell together.
-            noise[kind, True] = np.maximum(noise[kind, False], np.median(bends) / usual)
-        return noise
+        clocks, usual = self._clock_noise(), float(chi2.median(len(UNKNOWNS["view"])))
+        steps = [_median(self.steps(c, "view")) for c in range(self.cameras)]
+        bends = [_median(self.bends(c, "view")) for c in range(self.cameras)]
+        own = np.maximum(1.0, np.array(steps) / usual)
+        views = np.maximum(own, np.median(own))
+        # A clip has few long blocks: those of all cameras tell together.
+        slow = np.maximum(views, np.median(bends) / usual)
+        return {
+            ("clock", False): clocks,
+            ("clock", True): clocks,
+            ("view", False): views,
+            ("view", True): slow,
+        }
+
+    def _clock_noise(self) -> Floats:
+        """Return the variance of a clock in seconds about its neighbours (cameras,) [1]."""
+        first = np.flatnonzero(np.diff(self.rows // max(1.0, round(self.fps)), prepend=-1.0))
+        # All cameras together: what changes in one shows in none of the others.
+        prior = np.diag(np.tile([1e-2, *PRIOR], self.cameras))
+        inverse = np.linalg.inv(np.add.reduceat(self.matrix, first) + prior)
+        late = (inverse @ np.add.reduceat(self.score, first)[..., None])[:, ::WIDTH, 0]
+        own = np.diagonal(inverse, axis1=1, axis2=2)[:, ::WIDTH]
+        off = late[1:-1] - 0.5 * (late[:-2] + late[2:])
+        if not len(off):
+            return np.ones(self.cameras)
+        variance = own[1:-1] + 0.25 * (own[:-2] + own[2:])
+        return np.maximum(1.0, np.median(off**2 / variance, axis=0) / float(chi2.median(1)))
 
 
 _INFORMATION: Final = 1e-2 * np.array([1e-2, *PRIOR])
