@@ -48,12 +48,15 @@ class ChangeSums:
         score: (bins, unknowns).
         rows: (bins,) middle of each bin [frame].
         fps: [1/s].
+        are_clocks_asked: a user asks for changes of clocks, and sees the evidence: the noise of a
+            clock is that of seconds about their neighbours.
     """
 
     matrix: Floats
     score: Floats
     rows: Floats
     fps: float
+    are_clocks_asked: bool = False
 
     @classmethod
     def join(cls, parts: Sequence[ChangeSums], cameras: int, fps: float) -> Self:
@@ -149,19 +152,18 @@ class ChangeSums:
 
     def noise(self) -> Noise:
         """Return the noise by kind, and whether for drifts."""
-        clocks, usual = self._clock_noise(), float(chi2.median(len(UNKNOWNS["view"])))
-        steps = [_median(self.steps(c, "view")) for c in range(self.cameras)]
-        bends = [_median(self.bends(c, "view")) for c in range(self.cameras)]
-        own = np.maximum(1.0, np.array(steps) / usual)
-        views = np.maximum(own, np.median(own))
-        # A clip has few long blocks: those of all cameras tell together.
-        slow = np.maximum(views, np.median(bends) / usual)
-        return {
-            ("clock", False): clocks,
-            ("clock", True): clocks,
-            ("view", False): views,
-            ("view", True): slow,
-        }
+        noise: Noise = {}
+        for kind, unknowns in UNKNOWNS.items():
+            usual = float(chi2.median(len(unknowns)))
+            steps = [_median(self.steps(c, kind)) for c in range(self.cameras)]
+            bends = [_median(self.bends(c, kind)) for c in range(self.cameras)]
+            own = np.maximum(1.0, np.array(steps) / usual)
+            noise[kind, False] = np.maximum(own, np.median(own))
+            # A clip has few long blocks: those of all cameras tell together.
+            noise[kind, True] = np.maximum(noise[kind, False], np.median(bends) / usual)
+        if self.are_clocks_asked:
+            noise["clock", False] = noise["clock", True] = self._clock_noise()
+        return noise
 
     def _clock_noise(self) -> Floats:
         """Return the variance of a clock in seconds about its neighbours (cameras,) [1]."""
@@ -175,7 +177,8 @@ class ChangeSums:
         if not len(off):
             return np.ones(self.cameras)
         variance = own[1:-1] + 0.25 * (own[:-2] + own[2:])
-        return np.maximum(1.0, np.median(off**2 / variance, axis=0) / float(chi2.median(1)))
+        middle = np.median(off**2 / variance, axis=0) / float(chi2.median(1))
+        return np.asarray(np.maximum(1.0, middle))
 
 
 _INFORMATION: Final = 1e-2 * np.array([1e-2, *PRIOR])

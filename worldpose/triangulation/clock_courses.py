@@ -64,7 +64,7 @@ def trace_clocks(
         every = 1 + index.size // 300_000
         people = replace(shifted, keypoints=moved, detection_index=index[:, :, ::every])
         add_up = partial(sum_clip, cameras, people, fps, np.arange(frames), settings=loose)
-        sums = add_up(bins=(max(1, round(0.2 * fps)), 1))
+        sums = replace(add_up(bins=(max(1, round(0.2 * fps)), 1)), are_clocks_asked=True)
         if not len(sums.rows):
             break
         fitted = fit_parts(sums, place_steps(parts, frames, fps, add_up), frames, ("clock",))
